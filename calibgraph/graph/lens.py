@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -36,15 +37,11 @@ from factors.lens_kernels import PINHOLE, RADTAN
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class LensSigmas:
+class LensSigmas(NamedTuple):
     """Prior standard deviations where the rig states none.
 
-    Attributes:
-        focal: of the logarithm of both focal lengths.
-        aspect: of the logarithm of fx / fy.
-        centre_px: of each coordinate.
-        radial: of a radial coefficient; a tangential one has ``TANGENTIAL_SHARE`` of it.
+    Of the logarithms of both focal lengths and of fx / fy, of each coordinate of the centre [px],
+    and of radial coefficients; tangential ones have ``TANGENTIAL_SHARE`` of these.
     """
 
     focal: float

@@ -26,57 +26,52 @@ from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, FOCAL
 
 Array = NDArray[np.float64]
 
-NAMES = ("focal length", "distortion", "principal point", "aspect ratio", "skew")
-SHAPES = NAMES[3:]
-"""Those that no lens has wrong by much."""
+FREE = (FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT, "skew")
+"""What is free, by number: parameters of a lens, and the skew."""
 
-_FREE = (FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT)
-FOCAL_NUMBER, RADIAL_NUMBER, X_NUMBER, Y_NUMBER, ASPECT_NUMBER, SKEW_NUMBER = range(6)
-_SKEW_SIGMA = 0.002  # in parts of fx
-
-_PARTS: dict[str, LensPart] = {
-    "focal length": "focal",
-    "distortion": "distortion",
-    "principal point": "centre",
-    "aspect ratio": "aspect",
+NAMES = {
+    "focal length": ("focal", "a focal length {} % longer", "a focal length {} % shorter"),
+    "distortion": ("distortion", "a k1 larger by {}", "a k1 smaller by {}"),
+    "principal point": ("centre", "a principal point off by ({}) px", ""),
+    "aspect ratio": ("aspect", "a ratio fx / fy {} % larger", "a ratio fx / fy {} % smaller"),
+    "skew": (None, "a skew of {} % of fx", "a skew of -{} % of fx"),
 }
-"""Parts of the lens that ``--estimate`` names; it has no skew."""
+"""Parameters that are judged: what ``--estimate`` calls them, and a lens with more or less."""
+
+SHAPES = "aspect ratio", "skew"
+"""Those that no lens has wrong by much."""
 
 RESIDUALS, IMAGES = "residuals over the image", "images"
 """What an estimate is by."""
 
 KINDS = {
-    RESIDUALS: {name: f"lens_{name.replace(' ', '_')}" for name in NAMES},
-    IMAGES: {name: name.replace(" ", "_") for name in NAMES},
+    by: {name: prefix + name.replace(" ", "_") for name in NAMES}
+    for by, prefix in ((RESIDUALS, "lens_"), (IMAGES, ""))
 }
 """Kinds of the checks."""
 LENS_KINDS = frozenset(kind for kinds in KINDS.values() for kind in kinds.values())
 
+_PARTS: tuple[LensPart, ...] = "focal", "aspect", "centre", "distortion"
+_SKEW_SIGMA = 0.002  # in parts of fx
 _ANYTHING = 1e6  # standard deviation of a parameter that is not determined
 _MOST_SIGMAS = 1e6  # enough for any probability
-_WORDS = {
-    "focal length": ("a focal length {} % longer", "a focal length {} % shorter"),
-    "distortion": ("a k1 larger by {}", "a k1 smaller by {}"),
-    "aspect ratio": ("a ratio fx / fy {} % larger", "a ratio fx / fy {} % smaller"),
-    "skew": ("a skew of {} % of fx", "a skew of -{} % of fx"),
-}
 
 
 def lens_variable(camera: Camera) -> LensVariable:
     """The lens of a camera with the parameters that are checked, at its calibration."""
-    all_of = LensVariable.of(camera, _PARTS.values(), LensSigmas.calibrated(camera)).free
+    all_of = LensVariable.of(camera, _PARTS, LensSigmas.calibrated(camera)).free
     sigmas = dict(zip(all_of.parameters, all_of.sigmas, strict=True))
-    free = FreeLens(camera.lens, _FREE, tuple(sigmas[name] for name in _FREE))
+    free = FreeLens(camera.lens, FREE[:-1], tuple(sigmas[name] for name in FREE[:-1]))
     return LensVariable(camera, free, np.zeros(len(free)))
 
 
 def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
-    """(6, 2, n) derivatives of the pixels of points (n, 3) by the parameters, last by the skew."""
-    lens, T, k = lens_variable(camera), camera.T_camera_lidar, camera.intrinsics_px
+    """(6, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
+    free, T, k = lens_variable(camera).free, camera.T_camera_lidar, camera.intrinsics_px
     points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    fields = np.empty((1 + len(lens.free), 2, len(points)))
-    lens.free.fill_columns(camera.lens, points, fields[:-1])
-    off_centre = fields[FOCAL_NUMBER] / lens.free.sigmas[FOCAL_NUMBER]
+    fields = np.empty((len(FREE), 2, len(points)))
+    free.fill_columns(camera.lens, points, fields[:-1])
+    off_centre = fields[0] / free.sigmas[0]
     fields[-1] = 0.5 * _SKEW_SIGMA * off_centre[::-1] * [[k.fx / k.fy], [k.fy / k.fx]]
     return fields
 
@@ -86,11 +81,11 @@ class LensParameter:
     """An estimate of one lens parameter together with the extrinsic.
 
     Attributes:
-        name: "focal length", "principal point", "distortion", "aspect ratio" or "skew".
+        name: one of ``NAMES``.
         values: (m,) change, in standard deviations of a calibrated lens.
         sigmas: (m,) their standard deviations, frames as clusters.
         twist: (6,) rotation [rad] and translation [m] by which the camera moves.
-        units: (m,) of the values, as people state them: relative, pixels, or of k1.
+        units: (m,) of the values: relative, pixels, or of k1.
     """
 
     name: str
@@ -100,21 +95,18 @@ class LensParameter:
     units: Array
 
     @staticmethod
-    def of(name: str, camera: Camera, freed: Freed, numbers: tuple[int, ...]) -> LensParameter:
-        """Of a fit of the parameters with these numbers."""
+    def of(name: str, camera: Camera, freed: Freed, *numbers: int) -> LensParameter:
+        """Of a fit whose last unknowns have these numbers; others may be free beside them."""
         units = np.array([*lens_variable(camera).free.sigmas, _SKEW_SIGMA])[[*numbers]]
-        twist = freed.compensating @ freed.values
-        return LensParameter(name, freed.values, freed.sigmas, twist, units)
+        values, sigmas = (each[-len(numbers) :] for each in (freed.values, freed.sigmas))
+        twist = freed.compensating[:, -len(numbers) :] @ values
+        return LensParameter(name, values, sigmas, twist, units)
 
     @property
-    def moved_deg(self) -> float:
-        """How far the camera turns."""
-        return float(np.degrees(np.linalg.norm(self.twist[:3])))
-
-    @property
-    def moved_cm(self) -> float:
-        """How far the camera's centre moves."""
-        return 100 * float(np.linalg.norm(self.twist[3:]))
+    def moved(self) -> tuple[float, float]:
+        """How far the camera turns [deg] and its centre moves [cm]."""
+        turned, shifted = np.linalg.norm(self.twist.reshape(2, 3), axis=1)
+        return float(np.degrees(turned)), 100 * float(shifted)
 
     @property
     def size(self) -> float:
@@ -138,67 +130,40 @@ class LensParameter:
         """
         if not self.sigma < _ANYTHING:
             return 0.0
-        moves = max(self.moved_deg / TOLERANCE[0], self.moved_cm / TOLERANCE[1])
+        moves = max(moved / most for moved, most in zip(self.moved, TOLERANCE, strict=True))
         tolerated = self.size / moves if moves else math.inf
-        usual = _Posterior(self.size, self.sigma, 1.0)
-        wrong = _Posterior(self.size, self.sigma, limit("lens_wrong"))
-        share = limit("lens_wrong_share")
-        is_wrong = float(expit(logit(share) + wrong.log_evidence - usual.log_evidence))
-        after, before = (1.0, 1.0) if self.name in SHAPES else wrong.beyond(tolerated)
-        if_wrong = max(is_wrong * after - share * before, 0.0)
-        after, before = usual.beyond(tolerated)
-        return if_wrong + (1 - is_wrong) * max(after - before, 0.0)
+        spreads, share = np.array([1.0, limit("lens_wrong")]), limit("lens_wrong_share")
+        total = np.hypot(self.sigma, spreads)
+        evidence = -(np.minimum(self.size / total, _MOST_SIGMAS) ** 2) / 2 - np.log(total)
+        is_wrong = float(expit(logit(share) + evidence[1] - evidence[0]))
+        gain = spreads / total
+        after = _share_beyond(tolerated, gain**2 * self.size, gain * self.sigma)
+        before = _share_beyond(tolerated, 0.0, spreads)
+        if self.name in SHAPES:
+            after[1] = before[1] = 1.0
+        if_wrong = max(is_wrong * after[1] - share * before[1], 0.0)
+        return float(if_wrong + (1 - is_wrong) * max(after[0] - before[0], 0.0))
 
     def describe(self) -> str:
         """The lens that would be right, in words."""
-        factor = 100 if self.name in ("focal length", *SHAPES) else 1
-        values, sigmas = factor * self.units * self.values, factor * self.units * self.sigmas
-        if self.name == "principal point":
-            each = map(_with_sigma, values, sigmas)
-            return f"a principal point off by ({', '.join(each)}) px"
-        more, less = _WORDS[self.name]
-        return (more if values[0] > 0 else less).format(_with_sigma(abs(values[0]), sigmas[0]))
+        _, more, less = NAMES[self.name]
+        units = 100 * self.units if "%" in more else self.units
+        values = units * (np.abs(self.values) if less else self.values)
+        numbers = ", ".join(map(_with_sigma, values, units * self.sigmas))
+        return (less if less and self.values[0] < 0 else more).format(numbers)
+
+
+def _share_beyond(size: float, mean: Array | float, sigma: Array) -> Array:
+    """The probability that normally distributed numbers are larger than a size."""
+    return np.asarray(ndtr((mean - size) / sigma) + ndtr((-mean - size) / sigma))
 
 
 def _with_sigma(value: float, sigma: float) -> str:
-    """A number with its standard deviation: as many digits as that has."""
+    """A number with its standard deviation, in two digits of that."""
     if not 0 < sigma < math.inf:
         return f"{value:.2g} +- unknown"
     decimals = max(0, 1 - math.floor(math.log10(sigma)))
     return f"{value:.{decimals}f} +- {sigma:.{decimals}f}"
-
-
-@dataclass(frozen=True)
-class _Posterior:
-    """Of a normally distributed number with mean zero that was measured.
-
-    Attributes:
-        measured: its measurement.
-        sigma: of the measurement's error.
-        spread: of the number.
-    """
-
-    measured: float
-    sigma: float
-    spread: float
-
-    @property
-    def total(self) -> float:
-        """Standard deviation of the measurement."""
-        return math.hypot(self.sigma, self.spread)
-
-    @property
-    def log_evidence(self) -> float:
-        """Of the measurement, up to a constant."""
-        sigmas = min(self.measured / self.total, _MOST_SIGMAS)
-        return -(sigmas**2) / 2 - math.log(self.total)
-
-    def beyond(self, size: float) -> tuple[float, float]:
-        """The probabilities that the number is larger than this, with and without measurement."""
-        gain = self.spread / self.total
-        mean, deviation = gain**2 * self.measured, gain * self.sigma
-        after = ndtr((mean - size) / deviation) + ndtr((-mean - size) / deviation)
-        return float(after), float(2 * ndtr(-size / self.spread))
 
 
 def check_parameter(found: LensParameter, by: str) -> Check:
@@ -208,16 +173,11 @@ def check_parameter(found: LensParameter, by: str) -> Check:
         found: its estimate.
         by: RESIDUALS or IMAGES.
     """
-    row, probability = threshold("lens"), found.probability
-    status = row.grade(probability)
-    text = (
-        f"by the {by}, {found.describe()}; the camera would move by {found.moved_deg:.2g} deg, "
-        f"{found.moved_cm:.2g} cm"
-    )
+    row, probability, (deg, cm) = threshold("lens"), found.probability, found.moved
+    status, (part, *_) = row.grade(probability), NAMES[found.name]
+    text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
     if status != "PASS":
-        text += f": {row.advice}"
-        if found.name in _PARTS:
-            text += f"; or run with --estimate {_PARTS[found.name]}"
+        text += f": {row.advice}" + (f"; or run with --estimate {part}" if part else "")
     check = row.describe(probability, status, text, name=f"{found.name} by the {by}: {row.name}")
     return replace(check, kind=KINDS[by][found.name])
 

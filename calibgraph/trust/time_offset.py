@@ -20,7 +20,7 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.linear_fit import MIN_ROWS, fit_table
+from calibgraph.solver.linear_fit import MIN_ROWS, block_of, fit_camera
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -91,7 +91,8 @@ def time_offset(camera: Camera, table: Correspondences, motion_px: Array) -> Tim
     typical = float(np.median(np.linalg.norm(motion_px, axis=1)))
     if typical < MIN_MOTION_PX:
         return None
-    fit = fit_table(camera, table, motion_px.T[None])
+    rows = np.argsort(table.frame, kind="stable")
+    fit = fit_camera(camera, block_of(camera, table), motion_px[rows].T[None])
     if fit is None:
         return None
     free = fit.free(0)

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibgraph import Correspondences
+from calibgraph import Camera, Correspondences
 from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
-from calibgraph.solver.linear_fit import fit_table
+from calibgraph.solver.linear_fit import LinearFit, block_of, fit_camera
 from tests.conftest import make_camera, points_in_front
 
 
@@ -16,6 +16,11 @@ def table_of(
     return Correspondences.from_arrays(
         camera="front", frame=frame, pixels_px=pixels, points_lidar_m=points, **more
     )
+
+
+def fit_table(camera: Camera, table: Correspondences, fields: np.ndarray) -> LinearFit | None:
+    rows = np.argsort(table.frame, kind="stable")
+    return fit_camera(camera, block_of(camera, table), fields[:, :, rows])
 
 
 def test_the_fit_is_exact_without_noise() -> None:

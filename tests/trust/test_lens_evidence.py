@@ -19,21 +19,13 @@ from calibgraph.trust.frame_scores import WIDE, FrameScorer
 from calibgraph.trust.image_checks import evidence_checks
 from calibgraph.trust.image_evidence import ImageEvidence
 from calibgraph.trust.lens_evidence import LensEvidence, measure_lens
-from calibgraph.trust.lens_parameter import (
-    ASPECT_NUMBER,
-    FOCAL_NUMBER,
-    NAMES,
-    RADIAL_NUMBER,
-    SKEW_NUMBER,
-    X_NUMBER,
-    lens_fields_px,
-    lens_variable,
-)
+from calibgraph.trust.lens_parameter import NAMES, lens_fields_px, lens_variable
 from tests.conftest import SAMPLE, make_camera, points_in_front
 
 NAME = "front_left"
 
 
+FOCAL, RADIAL, CENTRE_X, _, ASPECT, SKEW = range(6)
 CALIBRATED = 0.002  # one standard deviation of a calibrated lens
 
 
@@ -78,20 +70,20 @@ def statuses(lens: LensEvidence) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("number", "error", "name"),
     [
-        (FOCAL_NUMBER, 0.03, "focal length"),
-        (RADIAL_NUMBER, -0.1, "distortion"),
-        (X_NUMBER, 0.04, "principal point"),
-        (ASPECT_NUMBER, 0.04, "aspect ratio"),
+        (FOCAL, 0.03, "focal length"),
+        (RADIAL, -0.1, "distortion"),
+        (CENTRE_X, 0.04, "principal point"),
+        (ASPECT, 0.04, "aspect ratio"),
     ],
 )
 def test_a_wrong_lens_is_named_and_measured(
     truth: Camera, *, number: int, error: float, name: str
 ) -> None:
     # A rotation about the y axis compensates for the principal point, as in a calibration.
-    turn = -error if number == X_NUMBER else 0.0
+    turn = -error if number == CENTRE_X else 0.0
     wrong = change_lens(truth, number, error)
     found = measure(apply_twist(wrong, np.array([0.0, turn, 0.0, 0.0, 0.0, 0.0])))
-    (value,) = CALIBRATED * found.parameters[NAMES.index(name)].values
+    (value,) = CALIBRATED * found.parameters[[*NAMES].index(name)].values
     assert value == pytest.approx(-error, abs=0.2 * abs(error) + 0.004)
     status = statuses(found)
     assert status[name] != "PASS"
@@ -101,7 +93,7 @@ def test_a_wrong_lens_is_named_and_measured(
 
 
 def test_frames_of_one_content_are_one_frame_which_shows_no_significance(truth: Camera) -> None:
-    camera = change_lens(truth, FOCAL_NUMBER, 0.03)
+    camera = change_lens(truth, FOCAL, 0.03)
     found, apart = measure(camera, stop=tuple(range(6))), measure(camera)
     assert found.gain == pytest.approx(apart.gain / math.sqrt(6))
     assert all(math.isnan(each.sigma) and each.probability == 0.0 for each in found.parameters)
@@ -138,4 +130,4 @@ def test_a_skew_moves_a_pixel_by_its_height_less_a_rotation() -> None:
     x, y = off[:, 0] / k.fx, off[:, 1] / k.fy
     turned = np.column_stack([k.fx * y, -k.fy * x])
     expected = CALIBRATED * (sheared - 0.5 * turned)
-    np.testing.assert_allclose(lens_fields_px(camera, points)[SKEW_NUMBER].T, expected, atol=1e-9)
+    np.testing.assert_allclose(lens_fields_px(camera, points)[SKEW].T, expected, atol=1e-9)
