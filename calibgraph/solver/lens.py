@@ -160,22 +160,15 @@ def _positive(matrix: Array) -> Array:
 
 def moved_lenses(lenses: Lenses, fit: LatentPoseFit | None) -> tuple[Lenses, float]:
     """Lenses where a fit has them, and the largest change of a value in standard deviations."""
-    found = {} if fit is None else lens_values(fit)
-    moved = {name: lenses[name].moved_to(values) for name, (values, _) in found.items()}
-    changes = [abs(v - lenses[n].values) / s for n, (v, s) in found.items()]
-    return {**lenses, **moved}, float(np.concatenate([*changes, [0.0]]).max())
-
-
-def lens_values(fit: LatentPoseFit) -> dict[str, tuple[Array, Array]]:
-    """Per camera whose lens is free, its (k,) values and their (k,) standard deviations."""
-    covariance = _marginal(fit, [*map(lens_key, fit.linear.model.lenses)])
-    found, first = {}, 0
-    for number, term in fit.linear.model.lenses.items():
-        rows = slice(first, first := first + len(term.variable.free))
-        sigmas = np.sqrt(np.diag(covariance)[rows])
-        values = fit.linear.values.atVector(lens_key(number))
-        found[fit.linear.model.cameras[number]] = values, sigmas
-    return found
+    if fit is None:
+        return lenses, 0.0
+    moved, largest = {**lenses}, 0.0
+    for number in fit.linear.model.lenses:
+        name, key = fit.linear.model.cameras[number], lens_key(number)
+        values, sigmas = fit.linear.values.atVector(key), np.sqrt(np.diag(_marginal(fit, [key])))
+        moved[name] = lenses[name].moved_to(values)
+        largest = max(largest, float((abs(values - lenses[name].values) / sigmas).max()))
+    return moved, largest
 
 
 def lens_estimates(fit: LatentPoseFit) -> dict[str, tuple[LensEstimate, ...]]:

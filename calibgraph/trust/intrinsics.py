@@ -10,6 +10,7 @@ from calibgraph.solver.linear_fit import fit_camera
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.lens_parameter import (
     RESIDUALS,
+    Free,
     LensParameter,
     check_parameter,
     lens_fields_px,
@@ -18,13 +19,12 @@ from calibgraph.trust.lens_parameter import (
 from calibgraph.trust.thresholds import limit, threshold
 
 _NUMBERS = {
-    "focal length": (0,),
-    "principal point": (2, 3),
-    "distortion": (1,),
-    "aspect ratio": (4,),
-    "skew": (5,),
+    "focal length": (Free.FOCAL,),
+    "principal point": (Free.CENTRE_X, Free.CENTRE_Y),
+    "distortion": (Free.RADIAL,),
+    "aspect ratio": (Free.ASPECT,),
+    "skew": (Free.SKEW,),
 }
-"""Of what is free, per name."""
 _MAX_MATCHES = 20_000  # evenly chosen: bounds the time
 
 
@@ -63,7 +63,7 @@ def _check_camera(evidence: Evidence, name: str) -> list[Check]:
     )
     checks = [check_parameter(each, RESIDUALS) for each in found]
     # A focal length that is wrong by one percent is easily overlooked.
-    percents = 100 * lens_variable(camera).free.sigmas[0]
-    moved_m = float(np.linalg.norm(fit.free(0).compensating[3:, 0])) / percents
+    percents = 100 * lens_variable(camera).free.sigmas[Free.FOCAL]
+    moved_m = float(np.linalg.norm(fit.free(Free.FOCAL).compensating[3:, 0])) / percents
     row = threshold("focal_sensitivity", solution.config.tolerance)
     return [*checks, row.check(100 * moved_m)]

@@ -23,13 +23,12 @@ from calibgraph.solver.camera_twist import apply_twist
 from calibgraph.solver.linear_fit import LinearFit, block_of, fit_camera
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
 from calibgraph.trust.lens_parameter import (
-    FREE,
     NAMES,
+    Free,
     LensParameter,
     lens_fields_px,
     lens_variable,
 )
-from factors.free_lens import CENTRE_X, CENTRE_Y
 
 Array = NDArray[np.float64]
 SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)
@@ -78,24 +77,26 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     frames = np.unique(scores.frame)
     copies = len(frames) / len(np.unique(places.merge_stationary(frames)))
     # Across the longer side of the image, a principal point cannot be told from a rotation.
-    along = FREE.index(CENTRE_X if camera.width_px >= camera.height_px else CENTRE_Y)
-    finer = 0, 1, along  # what a finer fit makes better; right shapes are nearer to zero without
-    searched = () if camera.model == "equirectangular" else (*finer, 4)  # its format determines it
+    along = Free.CENTRE_X if camera.width_px >= camera.height_px else Free.CENTRE_Y
+    finer = Free.FOCAL, Free.RADIAL, along  # right shapes are nearer to zero without a finer fit
+    is_free = camera.model != "equirectangular"  # else its format determines it
+    searched = (*finer, Free.ASPECT) if is_free else ()
     best, gain = _search(camera, scores, searched, seed)
     found = LensEvidence(gain=gain / math.sqrt(copies))  # chance agreement of copies repeats
-    rough = _fit_at_peaks(camera, scores, best, places) if searched else None
+    rough = _fit_at_peaks(camera, scores, best, places) if is_free else None
     if rough is None:
         return found
-    change, lens, moved = rough.free(*finer), lens_variable(camera), np.zeros(len(FREE))
+    change, lens, moved = rough.free(*finer), lens_variable(camera), np.zeros(len(Free))
     moved[[*finer]] = change.values
-    moved[1] = np.clip(moved[1], *np.array([-MAX_RADIAL, MAX_RADIAL]) / lens.free.sigmas[1])
+    most = MAX_RADIAL / lens.free.sigmas[Free.RADIAL]
+    moved[Free.RADIAL] = np.clip(moved[Free.RADIAL], -most, most)
     refined = lens.put_into(apply_twist(camera, change.twist), moved[:-1])
     again = scorer.score_together(images, refined, FINER)
     rest = _fit_at_peaks(refined, again, np.zeros(len(best)), places)
     if rest is None:
         return found
     fine, parameters = rest.counted_from(moved), []
-    for name, number in zip(NAMES, (*searched, 5), strict=True):
+    for name, number in zip(NAMES, (*searched, Free.SKEW), strict=True):
         fit, others = fine if number in finer else rough, [n for n in finer if n != number]
         parameters.append(LensParameter.of(name, camera, fit.free(*others, number), number))
     return replace(found, parameters=tuple(parameters))
@@ -131,7 +132,7 @@ def _search(
     )
     found = maximize_score(smooth, widths, seed=seed, prior=SEARCH_PRIOR)
     values = sum_scores(smooth, np.array([np.zeros(len(found)), found]))
-    best = np.zeros(6 + len(FREE))
+    best = np.zeros(6 + len(Free))
     best[columns] = found
     return best, float((values[1] - values[0]) / (smooth.chance_sigma + 1e-12))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,12 @@ from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, FOCAL
 
 Array = NDArray[np.float64]
 
-FREE = (FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT, "skew")
-"""What is free, by number: parameters of a lens, and the skew."""
+
+class Free(IntEnum):
+    """What is free, by number: parameters of a lens, and the skew."""
+
+    FOCAL, RADIAL, CENTRE_X, CENTRE_Y, ASPECT, SKEW = range(6)
+
 
 NAMES = {
     "focal length": ("focal", "a focal length {} % longer", "a focal length {} % shorter"),
@@ -51,6 +56,7 @@ KINDS = {
 """Kinds of the checks."""
 LENS_KINDS = frozenset(kind for kinds in KINDS.values() for kind in kinds.values())
 
+_NAMES = FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT
 _PARTS: tuple[LensPart, ...] = "focal", "aspect", "centre", "distortion"
 _SKEW_SIGMA = 0.002  # in parts of fx
 _ANYTHING = 1e6  # standard deviation of a parameter that is not determined
@@ -61,7 +67,7 @@ def lens_variable(camera: Camera) -> LensVariable:
     """The lens of a camera with the parameters that are checked, at its calibration."""
     all_of = LensVariable.of(camera, _PARTS, LensSigmas.calibrated(camera)).free
     sigmas = dict(zip(all_of.parameters, all_of.sigmas, strict=True))
-    free = FreeLens(camera.lens, FREE[:-1], tuple(sigmas[name] for name in FREE[:-1]))
+    free = FreeLens(camera.lens, _NAMES, tuple(sigmas[name] for name in _NAMES))
     return LensVariable(camera, free, np.zeros(len(free)))
 
 
@@ -69,9 +75,9 @@ def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
     """(6, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
     free, T, k = lens_variable(camera).free, camera.T_camera_lidar, camera.intrinsics_px
     points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    fields = np.empty((len(FREE), 2, len(points)))
+    fields = np.empty((len(Free), 2, len(points)))
     free.fill_columns(camera.lens, points, fields[:-1])
-    off_centre = fields[0] / free.sigmas[0]
+    off_centre = fields[Free.FOCAL] / free.sigmas[Free.FOCAL]
     fields[-1] = 0.5 * _SKEW_SIGMA * off_centre[::-1] * [[k.fx / k.fy], [k.fy / k.fx]]
     return fields
 

@@ -19,13 +19,13 @@ from calibgraph.trust.frame_scores import WIDE, FrameScorer
 from calibgraph.trust.image_checks import evidence_checks
 from calibgraph.trust.image_evidence import ImageEvidence
 from calibgraph.trust.lens_evidence import LensEvidence, measure_lens
-from calibgraph.trust.lens_parameter import NAMES, lens_fields_px, lens_variable
+from calibgraph.trust.lens_parameter import NAMES, Free, lens_fields_px, lens_variable
 from tests.conftest import SAMPLE, make_camera, points_in_front
 
 NAME = "front_left"
 
 
-FOCAL, RADIAL, CENTRE_X, _, ASPECT, SKEW = range(6)
+FOCAL, RADIAL, CENTRE_X, _, ASPECT, SKEW = Free
 CALIBRATED = 0.002  # one standard deviation of a calibrated lens
 
 
