@@ -20,7 +20,7 @@ from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.spread_kernel import median
 from calibgraph.solver.whitening import upper_root
 from calibgraph.solver.within_place import WEAK
-from factors import ProjectionBlock
+from factors import ProjectionBlock, unit_diagonal
 
 Array = NDArray[np.float64]
 
@@ -77,7 +77,8 @@ class LinearFit:
         """The fit of the pose and some unknowns, with their numbers; the others are zero."""
         rows = np.array([*range(6), *(6 + number for number in unknowns)])
         own, frames = self.hessian[np.ix_(rows, rows)], len(self.gradients)
-        inverse, pulls = np.linalg.inv(own), self.gradients[:, rows]
+        (scaled, units), pulls = unit_diagonal(own), self.gradients[:, rows]
+        inverse = np.linalg.inv(scaled) / np.outer(units, units)
         values = inverse @ (self.hessian @ self.values)[rows]
         scatter = with_pseudo_frames(pulls.T @ pulls, own, np.full(len(rows), float(frames)))
         scatter += _weak(len(rows)) if frames > 1 else np.nan
@@ -107,7 +108,7 @@ def fit_camera(
             independent.
 
     Returns:
-        The fit, or None of fewer than ``MIN_ROWS`` matches.
+        The fit, or None of fewer than ``MIN_ROWS`` matches, or where it has no derivative.
     """
     if len(block) < MIN_ROWS:
         return None
@@ -123,6 +124,8 @@ def fit_camera(
         values = np.linalg.solve(hessian, weighted @ errors)
         if np.abs((values - before) @ flat).max() < _CONVERGED * scale:
             break
+    if not np.isfinite(values).all():  # points where no derivative exists
+        return None
     left = errors - values @ flat
     pulls = (weighted * left).reshape(size, 2, -1).sum(axis=1)
     gradients = np.add.reduceat(pulls, block.frame_edges[:-1], axis=1).T
