@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -35,12 +36,31 @@ from factors.lens_kernels import PINHOLE, RADTAN
 
 Array = NDArray[np.float64]
 
-FOCAL_SIGMA, ASPECT_SIGMA, CENTRE_SIGMA_PX = 0.02, 0.002, 5.0
-"""Of the prior, where the rig states none: of a lens in doubt. A target leaves 0.2 % and 2 px."""
 
-RADIAL_SIGMA, TANGENTIAL_SHARE = 0.05, 0.1
-"""The same of a radial coefficient; and a tangential one's in parts of it."""
+class LensSigmas(NamedTuple):
+    """Prior standard deviations where the rig states none.
 
+    Of the logarithms of both focal lengths and of fx / fy, of each coordinate of the centre [px],
+    and of radial coefficients; tangential ones have ``TANGENTIAL_SHARE`` of these.
+    """
+
+    focal: float
+    aspect: float
+    centre_px: float
+    radial: float
+
+    @staticmethod
+    def calibrated(camera: Camera) -> LensSigmas:
+        """Of a lens that was calibrated with a target: 0.2 %; of 1000 px, a centre to 2 px."""
+        share = _CALIBRATED
+        return LensSigmas(share, share, share * camera.intrinsics_px.fx, share)
+
+
+IN_DOUBT = LensSigmas(0.02, 0.002, 5.0, 0.05)
+"""Of a lens that is estimated."""
+
+TANGENTIAL_SHARE = 0.1
+_CALIBRATED = 0.002
 _TAIL_SIGMAS = 2.0  # where the Cauchy loss of a prior bends
 _PLAIN = 2  # radial coefficients that are set free in a rig without distortion
 _EXACT = 1e-3  # prior standard deviations: less would lose digits
@@ -61,17 +81,20 @@ class LensVariable:
     values: Array
 
     @staticmethod
-    def of(camera: Camera, parts: Iterable[LensPart]) -> LensVariable:
+    def of(
+        camera: Camera, parts: Iterable[LensPart], default: LensSigmas = IN_DOUBT
+    ) -> LensVariable:
         """The lens of a camera, at its prior.
 
         Args:
             camera: of the rig, with the sigmas that it states.
             parts: which are free.
+            default: sigmas where the rig states none.
 
         Raises:
             ValueError: if its model has no such part.
         """
-        sigmas = _prior_sigmas(camera)
+        sigmas = _prior_sigmas(camera, default)
         chosen = {name: sigma for part in parts for name, sigma in sigmas[part].items()}
         free = FreeLens(camera.lens, tuple(chosen), tuple(chosen.values()))
         return LensVariable(camera, free, np.zeros(len(chosen)))
@@ -95,18 +118,18 @@ class LensVariable:
         )
 
 
-def _prior_sigmas(camera: Camera) -> dict[LensPart, dict[str, float]]:
+def _prior_sigmas(camera: Camera, default: LensSigmas) -> dict[LensPart, dict[str, float]]:
     """Per part of a lens, the prior standard deviation of each parameter."""
     stated, kind = camera.intrinsics_sigma_px, camera.lens.kind
-    focal = FOCAL_SIGMA
+    focal = default.focal
     if stated is not None and stated.focal is not None:
         focal = stated.focal / camera.intrinsics_px.fx
-    centre = CENTRE_SIGMA_PX if stated is None or stated.centre is None else stated.centre
-    radial = camera.distortion_sigma or RADIAL_SIGMA
+    centre = default.centre_px if stated is None or stated.centre is None else stated.centre
+    radial = camera.distortion_sigma or default.radial
     size = len(camera.distortion) or _PLAIN
     return {
         "focal": {FOCAL: focal},
-        "aspect": {ASPECT: ASPECT_SIGMA},
+        "aspect": {ASPECT: default.aspect},
         "centre": {CENTRE_X: centre, CENTRE_Y: centre},
         "distortion": {
             name: radial if name[0] == "k" else TANGENTIAL_SHARE * radial

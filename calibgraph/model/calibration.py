@@ -185,8 +185,10 @@ class Calibration:
     def not_included(self) -> str:
         """Sentence about errors that the bars leave out: relative poses show the clouds' scale."""
         scale = "" if self.rig.relative_poses else ", and of the clouds' scale,"
-        fixed = "other intrinsics" if self.lens else "intrinsics"
-        return f"errors of the {fixed}{scale} are not included"
+        fixed = "errors of the other intrinsics" if self.lens else "errors of the intrinsics"
+        if self.config.of == "mount" and not self.lens:
+            fixed += " beyond what a calibration with a target leaves"
+        return f"{fixed}{scale} are not included"
 
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.
