@@ -12,6 +12,7 @@ from factors.conditioning import (
     unit_diagonal,
 )
 from factors.epipolar import EpipolarBlock, epipolar_residual
+from factors.clock import Clock, displace
 from factors.free_lens import (
     FreeLens,
     FreeLensBlock,
@@ -47,6 +48,7 @@ __all__ = [
     "LOSSES",
     "BlockSums",
     "EpipolarBlock",
+    "Clock",
     "FreeLens",
     "FreeLensBlock",
     "Lens",
@@ -60,6 +62,7 @@ __all__ = [
     "displaced_between_factor",
     "epipolar_factor",
     "epipolar_residual",
+    "displace",
     "free_lens_factor",
     "linear_factor",
     "pair_block_factor",

@@ -20,6 +20,7 @@ from calibgraph.model.table_columns import (
     COORDINATES,
     INFORMATION,
     OPTIONAL_WHOLE,
+    TWIST,
     check_schema,
 )
 
@@ -227,6 +228,7 @@ def _from_plain_columns(table: pa.Table) -> Correspondences:
         if "confidence" in given
         else np.ones(len(table), np.float32),
         information_px=stack(INFORMATION) if INFORMATION[0] in given else None,
+        twist_per_s=stack(TWIST) if TWIST[0] in given else None,
         **{name: _whole(table, name) for name in OPTIONAL_WHOLE if name in given},
         metadata=_metadata_of(table.schema),
     )

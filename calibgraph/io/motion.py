@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import invert
+from factors import displace
 
 Array = NDArray[np.float64]
-
-_STILL_RAD = 1e-6  # of turn, below which the series are as exact
 
 
 @dataclass(frozen=True)
@@ -36,16 +35,8 @@ class ScanMotion:
 
     def correct(self, points_m: NDArray[np.floating], times_s: Array) -> Array:
         """(n, 3) where points, taken at times [s] after the stamp, would be seen at the instant."""
-        w, v = np.array(self.twist_per_s[:3]), np.array(self.twist_per_s[3:])
         points = points_m.astype(np.float64)
-        first, second, third = _integrals(times_s - self.to_s, float(np.linalg.norm(w)))
-        turned = np.cross(w, points)
-        turned_v = np.cross(w, v)
-        moved: Array = (
-            points + first * turned + second * np.cross(w, turned)
-            + (times_s - self.to_s)[:, None] * v + second * turned_v + third * np.cross(w, turned_v)
-        )  # fmt: skip
-        return moved
+        return displace(points, np.array(self.twist_per_s), times_s - self.to_s)
 
     def entry(self) -> dict[str, Any]:
         """As a result keeps it."""
@@ -55,16 +46,6 @@ class ScanMotion:
     def of_entry(entry: Mapping[str, Any]) -> ScanMotion:
         """Of what :meth:`entry` gave."""
         return ScanMotion(tuple(entry["twist_per_s"]), entry["to_s"])
-
-
-def _integrals(dt: Array, rate: float) -> tuple[Array, Array, Array]:
-    """(n, 1) sin(a) / r, (1 - cos a) / r^2 and (a - sin a) / r^3 of a = r dt."""
-    dt = dt[:, None]
-    if rate * np.abs(dt).max(initial=0.0) < _STILL_RAD:
-        return dt, dt**2 / 2, dt**3 / 6
-    angle = rate * dt
-    sine = np.sin(angle)
-    return sine / rate, (1 - np.cos(angle)) / rate**2, (angle - sine) / rate**3
 
 
 def twist_between(T_world_before: Array, T_world_after: Array, seconds: float) -> Array:

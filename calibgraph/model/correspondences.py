@@ -20,6 +20,7 @@ from calibgraph.model.table_columns import (
     INFORMATION,
     OPTIONAL_WHOLE,
     TABLE_FORMAT,
+    TWIST,
     rows_where,
     write_table,
 )
@@ -31,6 +32,7 @@ Array = NDArray[np.float64]
 
 MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
 _MAX_WHOLE = 2**63 - 1
+_MAX_TWIST = 1e3
 MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
 
 
@@ -50,6 +52,8 @@ class Correspondences:
             normal). None stands for the identity.
         stamp_ns: (n,) or None: time of the frame.
         point_index: (n,) or None: the point's row in its frame's cloud, -1 if it is none of them.
+        twist_per_s: (n, 6) or None: rotation [rad/s] and translation [m/s] of the LiDAR along its
+            axes, at the instant of the point.
         metadata: as the file has it: the matcher, its settings, its findings and the places.
         findings: the matcher's, read from the metadata.
         places: which frames share a place, read from the metadata.
@@ -68,6 +72,7 @@ class Correspondences:
     information_px: Array | None = None
     stamp_ns: NDArray[np.int64] | None = None
     point_index: NDArray[np.int64] | None = None
+    twist_per_s: Array | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
     findings: MatcherFindings = field(init=False)
     places: Places = field(init=False)
@@ -107,6 +112,7 @@ class Correspondences:
         information_px: ArrayLike | None = None,
         stamp_ns: ArrayLike | None = None,
         point_index: ArrayLike | None = None,
+        twist_per_s: ArrayLike | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> Correspondences:
         """Build a table from arrays; ``camera`` and ``frame`` may be one value for all rows.
@@ -135,6 +141,7 @@ class Correspondences:
             information_px=_optional(information_px, np.float64),
             stamp_ns=_optional(stamp_ns, np.int64),
             point_index=_optional(point_index, np.int64),
+            twist_per_s=_optional(twist_per_s, np.float64),
             metadata=metadata or {},
         )
 
@@ -219,6 +226,8 @@ class Correspondences:
         columns |= {name: column for name, column in optional.items() if column is not None}
         if self.information_px is not None:
             columns |= dict(zip(INFORMATION, self.information_px.T, strict=True))
+        if self.twist_per_s is not None:
+            columns |= dict(zip(TWIST, self.twist_per_s.T, strict=True))
         metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(self.metadata)}
         return pa.table(columns).replace_schema_metadata(metadata)
 
@@ -230,6 +239,10 @@ class Correspondences:
         self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
         if self.point_index is not None:
             self._require(self.point_index >= -1, "point_index", self.point_index, "be at least -1")
+        if self.twist_per_s is not None:
+            good = (np.abs(self.twist_per_s) < _MAX_TWIST).all(axis=1)
+            rule = f"be finite and below {_MAX_TWIST:g} rad/s and m/s"
+            self._require(good, "twist", self.twist_per_s, rule)
         if self.information_px is not None:
             i = self.information_px
             good = (np.abs(i) < MAX_INFORMATION).all(axis=1)
@@ -250,7 +263,7 @@ class Correspondences:
 
 _WIDTHS = {
     "camera_index": 1, "frame": 1, "pixels_px": 2, "points_lidar_m": 3, "confidence": 1,
-    "information_px": 3, "stamp_ns": 1, "point_index": 1,
+    "information_px": 3, "stamp_ns": 1, "point_index": 1, "twist_per_s": 6,
 }  # fmt: skip
 assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {
     "cameras", "metadata", "findings", "places",
@@ -290,7 +303,7 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
             np.tile([1.0, 0.0, 1.0], (len(t), 1)) if t.information_px is None else t.information_px
             for t in tables
         ])  # fmt: skip
-    for name in ("stamp_ns", "point_index"):
+    for name in ("stamp_ns", "point_index", "twist_per_s"):
         given = [getattr(table, name) for table in tables if len(table)]
         if given and all(column is not None for column in given):
             columns[name] = np.concatenate(given)

@@ -18,11 +18,12 @@ TABLE_FORMAT = "calibgraph-correspondences/1"
 
 COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
 INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
+TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_m_s", "vy_m_s", "vz_m_s")
 
 OPTIONAL_WHOLE = ("stamp_ns", "point_index")
 _WHOLE = ("frame", *OPTIONAL_WHOLE)
 _REQUIRED = ("camera", "frame", *COORDINATES)
-_COLUMNS = (*_REQUIRED, "confidence", *OPTIONAL_WHOLE, *INFORMATION)
+_COLUMNS = (*_REQUIRED, "confidence", *OPTIONAL_WHOLE, *INFORMATION, *TWIST)
 _TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
 
 
@@ -52,15 +53,16 @@ def check_schema(schema: pa.Schema) -> None:
     names = [name for name, _ in types]
     missing = [name for name in _REQUIRED if name not in names]
     unknown = [name for name in names if name not in _COLUMNS]
-    partial = [name for name in INFORMATION if name in names]
     if missing:
         raise CorrespondenceError(f"column {missing[0]!r} is missing; found {names}")
     if unknown:
         raise CorrespondenceError(f"unknown column {unknown[0]!r}; known are {', '.join(_COLUMNS)}")
     if len(set(names)) < len(names):
         raise CorrespondenceError(f"has a column twice: {names}; keep one")
-    if partial and len(partial) < len(INFORMATION):
-        raise CorrespondenceError(f"has only {partial} of the columns {list(INFORMATION)}")
+    for group in (INFORMATION, TWIST):
+        partial = [name for name in group if name in names]
+        if partial and len(partial) < len(group):
+            raise CorrespondenceError(f"has only {partial} of the columns {list(group)}")
     form = (schema.metadata or {}).get(b"format", TABLE_FORMAT.encode()).decode("utf-8", "replace")
     if form != TABLE_FORMAT:
         raise CorrespondenceError(f"has the format {form!r}, expected {TABLE_FORMAT!r}")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.calibration import Residuals
+from calibgraph.model.clock import at_pixels, motion_of
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
@@ -294,7 +295,10 @@ def camera_blocks(rig: Rig, table: Correspondences, config: Config) -> dict[str,
 
 
 def camera_block(camera: Camera, rows: Correspondences, config: Config) -> CameraBlock:
-    """The preprocessed correspondences of one camera."""
-    root = sqrt_information(rows, config)
-    block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px, root, config.loss)
+    """The preprocessed correspondences of one camera, their points at the times of the pixels."""
+    root, motion = sqrt_information(rows, config), motion_of(camera, rows)
+    rows = at_pixels(camera, rows)
+    block = ProjectionBlock(
+        camera.lens, rows.points_lidar_m, rows.pixels_px, root, config.loss, motion=motion
+    )
     return CameraBlock(block, rows.information_px, rows.frame)
