@@ -6,13 +6,13 @@ This package is a leaf: it imports numpy, numba and gtsam, and nothing of calibg
 
 from factors.block import ProjectionBlock, block_factor, to_runs
 from factors.block_sums import BlockSums, square_root
+from factors.clock import Clock, displace
 from factors.conditioning import (
     smallest_scaled_eigenvalue,
     smallest_scaled_eigenvalues,
     unit_diagonal,
 )
 from factors.epipolar import EpipolarBlock, epipolar_residual
-from factors.clock import Clock, displace
 from factors.free_lens import (
     FreeLens,
     FreeLensBlock,

@@ -40,6 +40,7 @@ Array = NDArray[np.float64]
 
 _CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
 _WORTH_SHARING = 2_000_000  # correspondences (7 ms): below, waiting for busy cores costs more
+_WIDTHS = {"points_lidar_m": 3, "pixels_px": 2, "sqrt_information": 3, "motion": 7}
 _NO_RESIDUALS, _NO_NORMS = np.empty((0, 2)), np.empty((0, 0))
 
 
@@ -79,14 +80,11 @@ class ProjectionBlock(RobustBlock):
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)
-        check_shape("points_lidar_m", self.points_lidar_m, (n, 3))
-        check_shape("pixels_px", self.pixels_px, (n, 2))
-        if self.sqrt_information is not None:
-            check_shape("sqrt_information", self.sqrt_information, (n, 3))
+        for name, width in _WIDTHS.items():
+            if getattr(self, name) is not None:
+                check_shape(name, getattr(self, name), (n, width))
         loss_id(self.loss)
         self._check_scale()
-        if self.motion is not None:
-            check_shape("motion", self.motion, (n, 7))
         columns = np.empty((5 if self.motion is None else 12, n))
         columns[:3], columns[3:5] = self.points_lidar_m.T, self.pixels_px.T
         if self.motion is not None:

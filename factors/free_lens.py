@@ -210,7 +210,10 @@ class FreeLensBlock:
             return
         twists = motion[:, :6] @ gtsam.Pose3(T_camera_lidar).AdjointMap().T
         by_time = (columns[:6] * twists.T[:, None]).sum(axis=0)
-        shares = {OFFSET: 1.0, READOUT: self.lens.clock.shares(self.block.pixels_px[:, 1])}
+        shares: dict[str, float | Array] = {
+            OFFSET: 1.0,
+            READOUT: self.lens.clock.shares(self.block.pixels_px[:, 1]),
+        }
         names = zip(self.lens.parameters, self.lens.sigmas, strict=True)
         for row, (name, sigma) in enumerate(names, start=6):
             if name in CLOCK:

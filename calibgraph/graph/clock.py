@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from calibgraph.model.config import LensPart
 from calibgraph.model.rig import Camera
 from factors import Clock
 from factors.free_lens import OFFSET, READOUT
@@ -20,11 +21,11 @@ OFFSET_SIGMA_S, READOUT_SIGMA_S = 0.05, 0.03
 """Of the prior, where the rig states none: half a turn of a LiDAR, and a usual read-out."""
 
 
-def clock_sigmas(camera: Camera) -> dict[str, float]:
+def clock_sigmas(camera: Camera) -> dict[LensPart, float]:
     """The prior standard deviation of each parameter [s]."""
     return {
-        OFFSET: camera.time_offset_sigma_s or OFFSET_SIGMA_S,
-        READOUT: camera.readout_sigma_s or READOUT_SIGMA_S,
+        "offset": camera.time_offset_sigma_s or OFFSET_SIGMA_S,
+        "readout": camera.readout_sigma_s or READOUT_SIGMA_S,
     }
 
 

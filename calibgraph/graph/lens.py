@@ -118,7 +118,7 @@ def _prior_sigmas(camera: Camera) -> dict[LensPart, dict[str, float]]:
             for name, number in COEFFICIENT_NUMBERS[kind].items()
             if kind not in (PINHOLE, RADTAN) or number < size
         },
-        **{part: {part: sigma} for part, sigma in clock_sigmas(camera).items()},
+        **{part: {str(part): sigma} for part, sigma in clock_sigmas(camera).items()},
     }
 
 
@@ -128,8 +128,10 @@ def lens_variables(rig: Rig, parts: Sequence[LensPart]) -> dict[str, LensVariabl
     Raises:
         ValueError: if there is none.
     """
-    of_clock = [part for part in parts if part in CLOCK]
-    chosen = {n: of_clock if c.lens.kind == EQUIRECTANGULAR else parts for n, c in rig.cameras.items()}
+    of_clock: list[LensPart] = [part for part in parts if part in CLOCK]
+    chosen: dict[str, Sequence[LensPart]] = {
+        n: of_clock if c.lens.kind == EQUIRECTANGULAR else parts for n, c in rig.cameras.items()
+    }
     if not any(chosen.values()):
         raise ValueError("equirectangular cameras have no lens to estimate")
     return {n: LensVariable.of(rig.cameras[n], own) for n, own in chosen.items() if own}

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file
-from calibgraph.model.correspondences import Correspondences, as_confidence
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import Places
 from calibgraph.model.table_columns import (
     COORDINATES,
     INFORMATION,
     OPTIONAL_WHOLE,
     TWIST,
+    as_confidence,
     check_schema,
 )
 

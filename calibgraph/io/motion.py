@@ -9,16 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.model.geometry import invert
 from factors import displace
 
 Array = NDArray[np.float64]
+
+_COARSE_M, _FINE_M = 1.0, 0.25
+_REACH_M = 4.0  # of the coarse registration: 40 m/s in 0.1 s
 
 
 @dataclass(frozen=True)
@@ -52,3 +57,28 @@ def twist_between(T_world_before: Array, T_world_after: Array, seconds: float) -
     """(6,) rotation [rad/s] and translation [m/s] per second, from two (4, 4) poses."""
     step = gtsam.Pose3(invert(T_world_before) @ T_world_after)
     return np.asarray(gtsam.Pose3.Logmap(step) / seconds, dtype=np.float64)
+
+
+def register(target_m: Array, source_m: Array, where: Path) -> Array:
+    """(4, 4) T_target_source of two scans, (n, 3) points each, coarse and then fine.
+
+    Raises:
+        DatasetError: if they do not fit.
+        CalibrationError: if small_gicp is missing.
+    """
+    try:
+        import small_gicp
+    except ImportError as error:
+        raise CalibrationError(
+            f"the motion by scans needs small_gicp: pip install 'calibgraph[motion]' ({error})"
+        ) from error
+    T = np.eye(4)
+    for size_m, reach_m in ((_COARSE_M, _REACH_M), (_FINE_M, _COARSE_M)):
+        found = small_gicp.align(
+            target_m, source_m, T,
+            downsampling_resolution=size_m, max_correspondence_distance=reach_m,
+        )  # fmt: skip
+        T = np.asarray(found.T_target_source)
+    if not found.converged:
+        raise DatasetError(f"{where}: its scan and that beside it do not fit; choose other frames")
+    return T

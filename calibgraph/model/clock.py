@@ -7,40 +7,16 @@ taken. Points of clouds and tables stay as they are recorded; they are moved whe
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from calibgraph.files import StrictNumbers
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.rig import Camera
 from factors import Clock, displace
 
-if TYPE_CHECKING:
-    from calibgraph.model.correspondences import Correspondences
-    from calibgraph.model.rig import Camera
-
 Array = NDArray[np.float64]
-
-Seconds = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]
-SecondsSigma = Annotated[float, Field(ge=1e-6, le=10)]
-
-
-class ImageTimes(StrictNumbers):
-    """When a camera takes its images, as far as it is known, and how well.
-
-    ``time_offset_s``: how long after the points of a frame the middle row is taken. ``readout_s``:
-    from the first row to the last, of a rolling shutter.
-    """
-
-    time_offset_s: Seconds | None = None
-    time_offset_sigma_s: SecondsSigma | None = None
-    readout_s: Seconds | None = None
-    readout_sigma_s: SecondsSigma | None = None
-
-
-IMAGE_TIMES = tuple(ImageTimes.model_fields)
 
 
 def clock_of(camera: Camera) -> Clock:

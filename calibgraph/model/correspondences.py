@@ -21,6 +21,7 @@ from calibgraph.model.table_columns import (
     OPTIONAL_WHOLE,
     TABLE_FORMAT,
     TWIST,
+    as_confidence,
     rows_where,
     write_table,
 )
@@ -32,7 +33,6 @@ Array = NDArray[np.float64]
 
 MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
 _MAX_WHOLE = 2**63 - 1
-_MAX_TWIST = 1e3
 MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
 
 
@@ -52,8 +52,7 @@ class Correspondences:
             normal). None stands for the identity.
         stamp_ns: (n,) or None: time of the frame.
         point_index: (n,) or None: the point's row in its frame's cloud, -1 if it is none of them.
-        twist_per_s: (n, 6) or None: rotation [rad/s] and translation [m/s] of the LiDAR along its
-            axes, at the instant of the point.
+        twist_per_s: (n, 6) or None: of the LiDAR in its axes, rotation [rad/s], translation [m/s].
         metadata: as the file has it: the matcher, its settings, its findings and the places.
         findings: the matcher's, read from the metadata.
         places: which frames share a place, read from the metadata.
@@ -224,25 +223,21 @@ class Correspondences:
         }
         optional = {name: getattr(self, name) for name in OPTIONAL_WHOLE}
         columns |= {name: column for name, column in optional.items() if column is not None}
-        if self.information_px is not None:
-            columns |= dict(zip(INFORMATION, self.information_px.T, strict=True))
-        if self.twist_per_s is not None:
-            columns |= dict(zip(TWIST, self.twist_per_s.T, strict=True))
+        for names, values in ((INFORMATION, self.information_px), (TWIST, self.twist_per_s)):
+            columns |= {} if values is None else dict(zip(names, values.T, strict=True))
         metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(self.metadata)}
         return pa.table(columns).replace_schema_metadata(metadata)
 
     def _check_values(self) -> None:
-        for what, values in (("pixel", self.pixels_px), ("point", self.points_lidar_m)):
-            good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
-            self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
+        columns = {"pixel": self.pixels_px, "point": self.points_lidar_m, "twist": self.twist_per_s}
+        for what, values in columns.items():
+            if values is not None:
+                good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
+                self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
         c = self.confidence
         self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
         if self.point_index is not None:
             self._require(self.point_index >= -1, "point_index", self.point_index, "be at least -1")
-        if self.twist_per_s is not None:
-            good = (np.abs(self.twist_per_s) < _MAX_TWIST).all(axis=1)
-            rule = f"be finite and below {_MAX_TWIST:g} rad/s and m/s"
-            self._require(good, "twist", self.twist_per_s, rule)
         if self.information_px is not None:
             i = self.information_px
             good = (np.abs(i) < MAX_INFORMATION).all(axis=1)
@@ -265,15 +260,8 @@ _WIDTHS = {
     "camera_index": 1, "frame": 1, "pixels_px": 2, "points_lidar_m": 3, "confidence": 1,
     "information_px": 3, "stamp_ns": 1, "point_index": 1, "twist_per_s": 6,
 }  # fmt: skip
-assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {
-    "cameras", "metadata", "findings", "places",
-}  # fmt: skip
-
-
-def as_confidence(values: ArrayLike) -> NDArray[np.float32]:
-    """Confidences in single precision; larger numbers become infinite, which is refused later."""
-    with np.errstate(over="ignore"):
-        return np.asarray(values, dtype=np.float32)
+_OTHERS = {"cameras", "metadata", "findings", "places"}
+assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - _OTHERS
 
 
 def _optional(values: ArrayLike | None, dtype: type) -> Any:

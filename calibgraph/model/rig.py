@@ -26,8 +26,8 @@ from pydantic import (
 
 from calibgraph.errors import RigError
 from calibgraph.files import StrictNumbers, write_yaml
-from calibgraph.model.clock import IMAGE_TIMES, ImageTimes
 from calibgraph.model.correspondences import MAX_COORDINATE
+from calibgraph.model.image_times import IMAGE_TIMES, ImageTimes
 from calibgraph.model.lens_names import find_lens_model
 from factors import Lens, LensModel
 from factors.lens import ORDERS

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import write_atomically
@@ -88,6 +88,12 @@ def _check_type(field: pa.Field) -> None:
         kind, right = "numbers", types.is_integer(field.type) or types.is_floating(field.type)
     if not right:
         raise CorrespondenceError(f"column {field.name!r} must hold {kind}, found {field.type}")
+
+
+def as_confidence(values: ArrayLike) -> NDArray[np.float32]:
+    """Confidences in single precision; larger numbers become infinite, which is refused later."""
+    with np.errstate(over="ignore"):
+        return np.asarray(values, dtype=np.float32)
 
 
 def rows_where(mask: NDArray[np.bool_]) -> NDArray[np.int64] | slice:
