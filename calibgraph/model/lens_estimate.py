@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 _PRIOR_SHARE = 0.9  # of the prior's standard deviation: above, the data have said nothing
+_TIED, _TIED_SHARE = 0.999, 0.5
+"""From this correlation with the pose on, half the prior: the prior of the pose narrows it, too."""
+
 _LEFT_SIGMAS = 2.0  # from the prior: beyond, they have
 
 
@@ -39,7 +42,8 @@ class LensEstimate:
     def is_determined(self) -> bool:
         """Whether the data have narrowed or left the prior."""
         left = abs(self.value - self.prior) > _LEFT_SIGMAS * self.sigma
-        return left or self.sigma < _PRIOR_SHARE * self.prior_sigma
+        share = _PRIOR_SHARE if self.correlation < _TIED else _TIED_SHARE
+        return left or self.sigma < share * self.prior_sigma
 
     def describe(self) -> str:
         """Whether the data determine it, and what it cannot be told from."""

@@ -184,10 +184,9 @@ class Camera(_Model, ImageTimes):
     @model_serializer(mode="wrap")
     def _leave_out_what_is_not_given(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         fields: dict[str, Any] = dump(self)
+        times_last = sorted(fields.items(), key=lambda field: field[0] in IMAGE_TIMES)
         return {
-            name: value
-            for name, value in fields.items()
-            if value is not None or name not in _LEFT_OUT
+            name: value for name, value in times_last if value is not None or name not in _LEFT_OUT
         }
 
     @model_validator(mode="after")
