@@ -103,7 +103,7 @@ def rows_of(folder: Path) -> Iterator[tuple[str, ...]]:
     for later in (0, 1):
         for estimate in ((), ("offset",)):
             result = calibrate(late_images(data, later), guess, config=Config(estimate=estimate))
-            errors = evaluate(result, data.rig).cameras.values()
+            errors = evaluate(result.rig, data.rig).cameras.values()
             found = [one for of in result.lens.values() for one in of]
             worst = max(found, key=lambda one: abs(one.value - later * INTERVAL_S), default=None)
             yield (

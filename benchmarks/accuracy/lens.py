@@ -110,11 +110,13 @@ def draw(part: str, error: float, seed: int) -> Drawn:
 
 
 def errors_of(found: Solution, truth: Rig) -> list[Array]:
+    """(6,) per camera, of its pose."""
     reference = truth.T_camera_lidar
     return [twist_between(T, reference[name]) for name, T in found.T_camera_lidar.items()]
 
 
 def nees_of(found: Solution, errors: list[Array]) -> list[float]:
+    """Per camera, the squared error in the metric of its covariance."""
     assert found.covariance is not None
     blocks = (found.covariance[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] for n in range(len(errors)))
     return [float(e @ np.linalg.solve(own, e)) for e, own in zip(errors, blocks, strict=True)]
@@ -165,6 +167,7 @@ def row_of(part: str, error: float, draws: int) -> tuple[str, ...]:
 
 
 def sizes_of(found: list[Drawn], when: str) -> tuple[str, str]:
+    """Medians over draws and cameras: degrees, centimetres."""
     errors = np.array([error for one in found for error in getattr(one, when)])
     turned, moved = (
         np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors, 2, axis=1)
@@ -180,7 +183,7 @@ def rows_of(folder: Path) -> Iterator[tuple[str, ...]]:
         guess = perturb(wrong, rotation_deg=1.0, translation_m=0.1, seed=1)
         for estimate in ((), (part,)):
             result = calibrate(data, guess, config=Config(estimate=estimate))
-            errors = evaluate(result, data.rig).cameras.values()
+            errors = evaluate(result.rig, data.rig).cameras.values()
             worst = max(
                 _lens_errors(result, data.rig, part), key=lambda pair: abs(pair[0]), default=None
             )
