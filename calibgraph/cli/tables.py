@@ -180,6 +180,9 @@ def print_evaluation(console: Console, errors: Evaluation, estimate: Path, refer
     console.print(evaluation_table(errors))
     if errors.deviations:
         console.print(deviation_table(errors))
+    for what, of in (("time offset", errors.time_offset_ms), ("read-out", errors.readout_ms)):
+        for name, value in of.items():
+            print_plain(console, f"{name}: {what} {value:+.1f} ms from the reference")
     for what, path in (("estimate", estimate), ("reference", reference)):
         print_plain(console, f"{what}: {path}")
     if errors.deviations:

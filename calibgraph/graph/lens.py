@@ -1,4 +1,4 @@
-"""The lens of a camera as a variable of the graph, shared by all its places.
+"""The lens and the clock of a camera as a variable of the graph, shared by all its places.
 
     prior    l_c at the lens of the rig, each parameter with a Cauchy loss
     matcher  l_c to s_c, the lens as the matches show it, displaced by the scan distortion and by
@@ -20,7 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.by_place import BlockByPlace
+from calibgraph.graph.clock import clock_sigmas, put_clock_into
 from calibgraph.graph.variables import DISTORTION, lens_key, seen_lens_key
+from calibgraph.model.clock import clock_of
 from calibgraph.model.config import LensPart
 from calibgraph.model.rig import Camera, Rig
 from factors import (
@@ -31,8 +33,8 @@ from factors import (
     linear_factor,
     robust_noise,
 )
-from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, COEFFICIENT_NUMBERS, FOCAL
-from factors.lens_kernels import PINHOLE, RADTAN
+from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
+from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE, RADTAN
 
 Array = NDArray[np.float64]
 
@@ -68,7 +70,7 @@ _EXACT = 1e-3  # prior standard deviations: less would lose digits
 
 @dataclass(frozen=True, eq=False)
 class LensVariable:
-    """One camera's lens.
+    """One camera's lens and clock.
 
     Attributes:
         camera: with the lens at the prior's mean.
@@ -96,7 +98,7 @@ class LensVariable:
         """
         sigmas = _prior_sigmas(camera, default)
         chosen = {name: sigma for part in parts for name, sigma in sigmas[part].items()}
-        free = FreeLens(camera.lens, tuple(chosen), tuple(chosen.values()))
+        free = FreeLens(camera.lens, tuple(chosen), tuple(chosen.values()), clock_of(camera))
         return LensVariable(camera, free, np.zeros(len(chosen)))
 
     def moved_to(self, values: Array) -> LensVariable:
@@ -104,7 +106,10 @@ class LensVariable:
         return replace(self, values=values)
 
     def put_into(self, camera: Camera, values: Array) -> Camera:
-        """A camera with the lens of (k,) values."""
+        """A camera with the lens and clock of (k,) values."""
+        camera = put_clock_into(camera, self.free.clock_at(values), self.free.parameters)
+        if not {*self.free.parameters} - {*CLOCK}:
+            return camera
         packed = self.free.at(values).packed
         intrinsics = dict(zip(("fx", "fy", "cx", "cy"), packed[:4].tolist(), strict=True))
         numbers = COEFFICIENT_NUMBERS[self.free.lens.kind]
@@ -136,19 +141,23 @@ def _prior_sigmas(camera: Camera, default: LensSigmas) -> dict[LensPart, dict[st
             for name, number in COEFFICIENT_NUMBERS[kind].items()
             if kind not in (PINHOLE, RADTAN) or number < size
         },
+        **{part: {str(part): sigma} for part, sigma in clock_sigmas(camera).items()},
     }
 
 
 def lens_variables(rig: Rig, parts: Sequence[LensPart]) -> dict[str, LensVariable]:
-    """Per camera but panoramas, whose format determines the lens, its variable.
+    """Per camera its variable; of panoramas, whose format determines the lens, the clock alone.
 
     Raises:
         ValueError: if there is none.
     """
-    lenses = {name: c for name, c in rig.cameras.items() if c.model != "equirectangular"}
-    if not lenses:
+    of_clock: list[LensPart] = [part for part in parts if part in CLOCK]
+    chosen: dict[str, Sequence[LensPart]] = {
+        n: of_clock if c.lens.kind == EQUIRECTANGULAR else parts for n, c in rig.cameras.items()
+    }
+    if not any(chosen.values()):
         raise ValueError("equirectangular cameras have no lens to estimate")
-    return {name: LensVariable.of(camera, parts) for name, camera in lenses.items()}
+    return {n: LensVariable.of(rig.cameras[n], own) for n, own in chosen.items() if own}
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError
-from calibgraph.io.frame import load_entry_cloud
+from calibgraph.io.frame import load_entry_cloud, twist_of_entry
 from calibgraph.io.images import load_image
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
 from calibgraph.report.frames import middle_frame
 from calibgraph.report.point_overlay import DEPTH_RANGE_M, depth_colours, draw_points
@@ -88,7 +89,9 @@ def _overlays(
     *,
     errors: BeforeAfter | None,
 ) -> Overlays:
-    cameras = result.initial_rig.cameras[name], result.rig.cameras[name]
+    twist = twist_of_entry(shown)
+    rigs = result.initial_rig, result.rig
+    cameras = [when_taken(rig.cameras[name], twist) for rig in rigs]
     image = load_image(Path(shown["images"][name]), cameras[1])
     budget = PICTURES_BYTES // (_PICTURES * len(result.rig.cameras))
     by_depth = [draw_by_depth(image, cloud, camera, budget) for camera in cameras]

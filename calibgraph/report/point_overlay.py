@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from calibgraph.errors import CalibrationError
 from calibgraph.files import write_atomically
 from calibgraph.io.frame import Frame
+from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.outputs import with_png_mark
 
@@ -58,7 +59,10 @@ def _write_overlays(
     for name, camera in rigs[0].cameras.items():
         image = frame.load_image(name, camera)
         panels = [
-            _titled(draw_points(image, cloud, rig.cameras[name]), title.replace("{name}", name))
+            _titled(
+                draw_points(image, cloud, when_taken(rig.cameras[name], frame.twist_per_s)),
+                title.replace("{name}", name),
+            )
             for rig, title in zip(rigs, titles, strict=True)
         ]
         paths.append(path.with_name(path.name.replace("{name}", name)))

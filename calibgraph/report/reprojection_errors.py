@@ -78,15 +78,14 @@ def errors_before_after(result: Calibration) -> dict[str, BeforeAfter]:
     # The last of several rounds of matching started near the result, not at the guess.
     start = result.rig if len(result.rounds) > 1 else result.initial_rig
     table = preprocess(start, result.correspondences, result.config).table
-    blocks = camera_blocks(start, table, result.config)
-    guess = result.initial_rig.T_camera_lidar
+    rigs = result.initial_rig, result.rig
+    ends = [(rig, camera_blocks(rig, table, result.config)) for rig in rigs]
     return {
         name: BeforeAfter(
-            _errors_at(guess[name], block, result.residuals[name].gate_px),
-            _errors_at(result.T_camera_lidar[name], block, result.residuals[name].gate_px),
+            *(_errors_at(rig.T_camera_lidar[name], of[name], measured.gate_px) for rig, of in ends)
         )
-        for name, block in blocks.items()
-        if name in result.residuals
+        for name, measured in result.residuals.items()
+        if name in ends[0][1]
     }
 
 

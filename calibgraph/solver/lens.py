@@ -28,7 +28,7 @@ from calibgraph.solver.elimination import LatentPoseFit, marginal_information
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import FreeLensBlock
-from factors.free_lens import ASPECT, FOCAL
+from factors.free_lens import ASPECT, FOCAL, OFFSET, READOUT
 
 Array = NDArray[np.float64]
 Lenses = Mapping[str, LensVariable]
@@ -39,6 +39,7 @@ lens."""
 
 _LENS: tuple[LensPart, ...] = "focal", "centre", "distortion"
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
+_UNITS = {FOCAL: "px", "centre_x": "px", "centre_y": "px", OFFSET: "s", READOUT: "s"}
 _WEAK_PRIOR = 0.01  # information: a lens that is ten sigmas off is hardly held back
 _MOST_STEPS, _MINIMAL = 20, 1e-4  # of Gauss-Newton; decrease of the cost by the last
 
@@ -197,7 +198,7 @@ def _estimate(
     most = int(np.argmax(correlation[row]))
     return LensEstimate(
         name=name,
-        unit="px" if name == FOCAL or name.startswith("centre") else "",
+        unit=_UNITS.get(name, ""),
         value=after,
         sigma=float(sigmas[row] * unit),
         prior=before,
@@ -209,9 +210,11 @@ def _estimate(
 
 def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
     """A parameter at some values, as people state it."""
-    camera = lens.put_into(lens.camera, values)
+    camera, clock = lens.put_into(lens.camera, values), lens.free.clock_at(values)
     k = camera.intrinsics_px
     known = {
+        OFFSET: clock.offset_s,
+        READOUT: clock.readout_s,
         FOCAL: float(np.sqrt(k.fx * k.fy)),
         ASPECT: k.fx / k.fy,
         "centre_x": k.cx,

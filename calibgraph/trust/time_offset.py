@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
+from calibgraph.model.clock import at_pixels
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.linear_fit import MIN_ROWS, block_of, fit_camera
@@ -64,7 +65,7 @@ def time_offsets(dataset: Dataset, rig: Rig, table: Correspondences) -> dict[str
     """
     found = {}
     for name, camera in rig.cameras.items():
-        rows = table.of_camera(name)
+        rows = at_pixels(camera, table.of_camera(name))
         motion = image_motion(dataset, name, camera, rows)
         offset = time_offset(camera, rows, motion)
         if offset is not None:

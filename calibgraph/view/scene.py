@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError
-from calibgraph.io.frame import load_entry_cloud
+from calibgraph.io.frame import load_entry_cloud, twist_of_entry
 from calibgraph.io.images import load_image
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
 from calibgraph.report.point_overlay import depth_colours
 
@@ -83,7 +84,7 @@ def read_frames(result: Calibration) -> Iterator[ViewFrame]:
             points_lidar_m=points,
             colours=_by_distance(points),
             images={
-                name: _view_image(Path(path), points, name, result)
+                name: _view_image(Path(path), points, name, result, twist=twist_of_entry(entry))
                 for name, path in entry["images"].items()
                 if name in result.rig.cameras
             },
@@ -91,12 +92,18 @@ def read_frames(result: Calibration) -> Iterator[ViewFrame]:
 
 
 def _view_image(
-    path: Path, points: NDArray[np.float32], name: str, result: Calibration
+    path: Path,
+    points: NDArray[np.float32],
+    name: str,
+    result: Calibration,
+    *,
+    twist: NDArray[np.float64] | None,
 ) -> ViewImage:
-    camera = result.rig.cameras[name]
+    rigs = result.initial_rig, result.rig
+    guess, camera = (when_taken(rig.cameras[name], twist) for rig in rigs)
     image = load_image(path, camera)
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    before = project_cloud(result.initial_rig.cameras[name], points)
+    before = project_cloud(guess, points)
     return ViewImage(data.tobytes(), before, project_cloud(camera, points))
 
 
