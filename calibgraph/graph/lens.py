@@ -31,7 +31,7 @@ from factors import (
     robust_noise,
 )
 from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, COEFFICIENT_NUMBERS, FOCAL
-from factors.lens_kernels import PINHOLE, RADTAN
+from factors.lens_kernels import PINHOLE
 
 Array = NDArray[np.float64]
 
@@ -111,7 +111,7 @@ def _prior_sigmas(camera: Camera) -> dict[LensPart, dict[str, float]]:
         "distortion": {
             name: radial if name[0] == "k" else TANGENTIAL_SHARE * radial
             for name, number in COEFFICIENT_NUMBERS[kind].items()
-            if kind not in (PINHOLE, RADTAN) or number < size
+            if kind != PINHOLE or number < size
         },
     }
 
