@@ -116,8 +116,8 @@ class SurfaceBlock(RobustBlock):
         self, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3
     ) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) residuals [px], not divided by sigma; (n,) whether B's lens can see the point."""
-        poses = (pose.matrix()[None] for pose in (T_lidar_a, T_lidar_b))
-        at = _Prediction.of(*poses, self.rays_a, self.planes_lidar_per_m)
+        T_a, T_b = T_lidar_a.matrix()[None], T_lidar_b.matrix()[None]
+        at = _Prediction.of(T_a, T_b, self.rays_a, self.planes_lidar_per_m)
         pixels, _ = self.lens_b.project(at.y)
         with np.errstate(divide="ignore", invalid="ignore"):  # a ray that meets no surface
             _, projectable = self.lens_b.project(at.y / at.w[:, None])
@@ -214,4 +214,6 @@ def _transpose(T: Array) -> Array:
 
 def _apply(R: Array, vectors: Array) -> Array:
     """Rotate (n, 3) vectors, each by its own of (n, 3, 3), or all by one of (1, 3, 3)."""
-    return vectors @ R[0].T if len(R) == 1 else np.einsum("nij,nj->ni", R, vectors)
+    if len(R) == 1:
+        return np.asarray(vectors @ R[0].T)
+    return np.asarray(np.einsum("nij,nj->ni", R, vectors))
