@@ -21,13 +21,13 @@ from factors.block_sums import BlockSums, square_root
 from factors.clock import Clock, displace
 from factors.compiled import compiled
 from factors.lens import Lens
-from factors.lens_kernels import EQUIRECTANGULAR, FISHEYE, OMNIDIRECTIONAL, PINHOLE, RADTAN
-from factors.loss import loss_and_weight, loss_id
+from factors.lens_kernels import EQUIRECTANGULAR, FISHEYE, OMNIDIRECTIONAL, PINHOLE
+from factors.loss import loss_id, losses_and_weights
 
 Array = NDArray[np.float64]
 
 COEFFICIENT_NUMBERS: Mapping[int, Mapping[str, int]] = {
-    **dict.fromkeys((PINHOLE, RADTAN), {"k1": 0, "k2": 1, "p1": 2, "p2": 3, "k3": 4}),
+    PINHOLE: {"k1": 0, "k2": 1, "p1": 2, "p2": 3, "k3": 4},
     FISHEYE: {"k1": 0, "k2": 1, "k3": 2, "k4": 3},
     OMNIDIRECTIONAL: {"k1": 1, "k2": 2, "p1": 3, "p2": 4},
     EQUIRECTANGULAR: {},
@@ -38,7 +38,7 @@ FOCAL, ASPECT, CENTRE_X, CENTRE_Y = "focal", "aspect", "centre_x", "centre_y"
 OFFSET, READOUT = CLOCK = "offset", "readout"
 
 _MAKERS: Mapping[int, tuple[Callable[..., Lens], int]] = {
-    **dict.fromkeys((PINHOLE, RADTAN), (Lens.pinhole, 8)),
+    PINHOLE: (Lens.pinhole, 8),
     FISHEYE: (Lens.fisheye, 4),
     OMNIDIRECTIONAL: (Lens.omnidirectional, 5),
 }
@@ -152,7 +152,7 @@ def _by_coefficient(lens: Lens, name: str, plane: Array, squared: Array) -> Arra
     if name == "p2":
         return np.stack([squared + 2 * a**2, 2 * a * b])
     over = np.ones_like(squared)
-    if lens.kind == RADTAN:
+    if lens.kind == PINHOLE:
         k4, k5, k6 = lens.packed[9:12]
         over += squared * (k4 + squared * (k5 + squared * k6))
     return np.asarray(plane * (squared ** int(name[1]) / over))
@@ -222,8 +222,7 @@ class FreeLensBlock:
     def loss(self, columns: Array) -> tuple[Array, Array]:
         """(n,) robust loss of the residuals of some columns, and its weight."""
         squares = np.square(columns[-1]).sum(axis=0)
-        losses: tuple[Array, Array] = _losses(loss_id(self.block.loss), self.block.scale, squares)
-        return losses
+        return losses_and_weights(loss_id(self.block.loss), self.block.scale, squares)
 
     def sums(self, T_camera_lidar: Array, values: Array) -> BlockSums:
         """H (6 + k, 6 + k), b and c of the whole block."""
@@ -236,15 +235,6 @@ class FreeLensBlock:
     def select(self, rows: NDArray[np.int64]) -> FreeLensBlock:
         """The block with only some correspondences."""
         return FreeLensBlock(self.block.select(rows), self.lens)
-
-
-@compiled()
-def _losses(loss, scale, squares):  # type: ignore[no-untyped-def]
-    """(n,) losses and (n,) weights of (n,) squared norms."""
-    found, weights = np.empty(len(squares)), np.empty(len(squares))
-    for i in range(len(squares)):
-        found[i], weights[i] = loss_and_weight(loss, scale, squares[i])
-    return found, weights
 
 
 def free_lens_factor(keys: Sequence[int], block: FreeLensBlock) -> gtsam.CustomFactor:

@@ -34,7 +34,7 @@ from factors import (
     robust_noise,
 )
 from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
-from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE, RADTAN
+from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
 
 Array = NDArray[np.float64]
 
@@ -139,7 +139,7 @@ def _prior_sigmas(camera: Camera, default: LensSigmas) -> dict[LensPart, dict[st
         "distortion": {
             name: radial if name[0] == "k" else TANGENTIAL_SHARE * radial
             for name, number in COEFFICIENT_NUMBERS[kind].items()
-            if kind not in (PINHOLE, RADTAN) or number < size
+            if kind != PINHOLE or number < size
         },
         **{part: {str(part): sigma} for part, sigma in clock_sigmas(camera).items()},
     }
