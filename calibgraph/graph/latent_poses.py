@@ -74,8 +74,8 @@ class LatentPoseModel:
         components: of the errors.
         of: the poses that are reported.
         lenses: those that are estimated, by the numbers of their cameras.
-        lens_errors: where mounts are reported, by the numbers of cameras with fixed lenses, (6, 6)
-            covariance of ``b_c`` about ``x_c``: of the pose that follows the errors of the lens.
+        lens_errors: where mounts are reported, by the numbers of cameras, (6, 6) covariance of
+            ``b_c`` about ``x_c``: of the pose that follows what is not estimated of the lens.
     """
 
     cameras: tuple[str, ...]

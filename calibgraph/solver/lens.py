@@ -23,7 +23,7 @@ from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens_estimate import LensEstimate
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.elimination import LatentPoseFit, marginal_information
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.within_place import WEAK, WithinPlace
@@ -86,21 +86,33 @@ def lens_term(
 
 
 def lens_errors(at: FittedObjective) -> dict[int, Array]:
-    """Per number of a camera whose lens is fixed, (6, 6) covariance of its mount by the lens.
+    """Per number of a camera, (6, 6) covariance of its mount by what is not estimated of its lens.
 
     Of the pose that fits the matches of a lens which errs as that of a calibrated camera, or as the
-    rig states; in the tangent of T_lidar_camera. Of a panorama the format determines the lens.
+    rig states, and of a clock whose errors the rig states; in the tangent of T_lidar_camera.
     """
     found = {}
     for name, block in at.projections.items():
         camera = at.objective.rig.cameras[name]
-        if name in at.objective.lenses or camera.model == "equirectangular":
-            continue
-        lens = LensVariable.of(camera, _LENS, LensSigmas.calibrated(camera))
-        sums = FreeLensBlock(block, lens.free).sums(at.T_camera_lidar[name], lens.values)
-        follows = np.linalg.solve(sums.hessian[:6, :6] + WEAK, sums.hessian[:6, 6:])
-        found[at.cameras.index(name)] = follows @ follows.T + EXACT**2 * np.eye(6)
+        lens = LensVariable.of(camera, _uncertain_parts(camera), LensSigmas.calibrated(camera))
+        estimated = at.objective.lenses[name].free.parameters if name in at.objective.lenses else ()
+        names = enumerate(lens.free.parameters, start=6)
+        rows = [row for row, parameter in names if parameter not in estimated]
+        if rows:
+            sums = FreeLensBlock(block, lens.free).sums(at.T_camera_lidar[name], lens.values)
+            follows = np.linalg.solve(sums.hessian[:6, :6] + WEAK, sums.hessian[:6, rows])
+            found[at.cameras.index(name)] = follows @ follows.T + EXACT**2 * np.eye(6)
     return found
+
+
+def _uncertain_parts(camera: Camera) -> list[LensPart]:
+    """Of a panorama the format determines the lens; of clocks nothing is usual."""
+    stated: dict[LensPart, float | None] = {
+        "offset": camera.time_offset_sigma_s,
+        "readout": camera.readout_sigma_s,
+    }
+    lens = () if camera.model == "equirectangular" else _LENS
+    return [*lens, *(part for part, sigma in stated.items() if sigma)]
 
 
 def _in_graph(hessians: Array, of_poses: Array, least: float, lens: LensVariable) -> Array:

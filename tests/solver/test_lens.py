@@ -130,6 +130,22 @@ def test_the_lens_is_part_of_an_alignment_and_an_error_of_a_mount(
         assert shares["uncertain lenses"] > 0.9
 
 
+def test_a_mount_errs_by_what_is_not_estimated_of_its_lens(
+    drawn: tuple[Rig, Correspondences],
+) -> None:
+    """The focal length moves it along the axis, the centre turns it."""
+    truth, table = drawn
+    fixed = solve_joint(truth, table, Config(of="mount"))
+    free = solve_joint(truth, table, Config(of="mount", estimate=("centre",)))
+    for number, name in enumerate(truth.cameras):
+        ahead = 6 * number + 5
+        assert free.covariance[ahead, ahead] == pytest.approx(
+            fixed.covariance[ahead, ahead], rel=0.1
+        )
+        shares = free.marginals.error_sources(free.covariance)[name].translation
+        assert shares["uncertain lenses"] > 0.9
+
+
 def test_the_covariance_of_a_mount_is_that_of_its_graph(
     drawn: tuple[Rig, Correspondences],
 ) -> None:
