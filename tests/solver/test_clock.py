@@ -72,6 +72,17 @@ def test_a_known_clock_is_as_good_as_none() -> None:
         assert np.abs(twist).max() < 1e-6  # exact but for the digits of the displacement
 
 
+def test_a_stated_error_of_the_clock_is_one_of_a_mount_and_no_other() -> None:
+    """10 ms at 10 m/s, which is 10 cm along the drive."""
+    truth, table = late(0.0, 0.0, twists=np.tile(STRAIGHT, (30, 1)))
+    doubted = with_times(truth, time_offset_sigma_s=0.01)
+    for of, added_m in (("mount", 0.1), ("alignment", 0.0)):
+        known, unknown = (solve_joint(rig, table, Config(of=of)) for rig in (truth, doubted))
+        assert known.covariance is not None and unknown.covariance is not None
+        added = np.diag(unknown.covariance - known.covariance).reshape(-1, 2, 3).sum(axis=2)
+        np.testing.assert_allclose(np.sqrt(np.abs(added[:, 1])), added_m, rtol=0.02, atol=1e-6)
+
+
 def test_a_saved_result_is_solved_again(tmp_path: Path) -> None:
     truth, table = late(0.03, 0.0)
     result = solve(truth, table, Config(estimate=("offset",)))
