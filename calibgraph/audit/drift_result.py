@@ -4,13 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from calibgraph.arrays import Array
 from calibgraph.audit.judgement import CAMERA_AXES
 from calibgraph.audit.result import LidarAudit, by_unit, freeze, lidar_summary
 
-Array = NDArray[np.float64]
 DriftStatus = Literal["OK", "CANNOT TELL", "CHANGED"]
 
 _ORDER: tuple[DriftStatus, ...] = ("OK", "CANNOT TELL", "CHANGED")

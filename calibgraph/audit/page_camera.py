@@ -5,14 +5,12 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.audit.result import Audit, CameraAudit
 from calibgraph.errors import CalibrationError
 from calibgraph.model.rig import Camera
 from calibgraph.report.page_overlays import PICTURES_BYTES, draw_by_depth, width_on_page
-
-Array = NDArray[np.float64]
 
 # The charts: lengths in units of the drawing, 380 wide, which is about its pixels on a phone.
 _LEFT, _RIGHT = 74.0, 284.0  # of the axis: names to its left, numbers to its right

@@ -10,9 +10,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import retract_all, to_T_camera_lidar, to_T_lidar_camera
-
-Array = NDArray[np.float64]
 
 _NOMINAL = 0  # key; those of the batches follow
 

@@ -9,9 +9,8 @@ each was moved, the information about the centre, and the second moments from wh
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from calibgraph.arrays import Array
 
 _EYE = np.eye(6)
 

@@ -9,14 +9,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.files import write_text
 from calibgraph.fleet.findings import find_changes
 from calibgraph.fleet.model import FleetModel, fit_fleet
 from calibgraph.fleet.observations import Words, newest_rows, observe
 from calibgraph.fleet.status import STATES, FleetStatus, assess_status
 from calibgraph.report.kit import load_template
-
-Array = NDArray[np.float64]
 
 _MILLIDEGREE, _TENTH_OF_MM = np.radians(1e-3), 1e-4
 _NOTHING = -32768  # in place of a deviation

@@ -3,15 +3,13 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import RigError
 from calibgraph.fleet.fit import Mount, Pooled
 from calibgraph.fleet.model import ModelFit
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import RelativePose, Rig
-
-Array = NDArray[np.float64]
 
 _LEAST_SIGMA = 1e-5  # of a relative pose in a rig file
 

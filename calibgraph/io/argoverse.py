@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
 from calibgraph.io.feather import read_feather
@@ -19,8 +20,6 @@ from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.rotations import pose_of_quaternion
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
-
-Array = NDArray[np.float64]
 
 VEHICLE = "egovehicle"
 _LIDAR, _CAMERAS = Path("sensors/lidar"), Path("sensors/cameras")

@@ -9,8 +9,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
 from calibgraph.io.frame_files import FrameFiles, files_by_stem, frames_by_stem
@@ -24,8 +24,6 @@ from calibgraph.io.kitti import (
     camera_of_projection,
 )
 from calibgraph.model.rig import Camera
-
-Array = NDArray[np.float64]
 
 _CALIBRATIONS = "calib"
 

@@ -4,16 +4,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.io.frame_files import FrameFiles, files_by_stem, frames_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
 from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.kitti import NumberLines, camera_of_projection, first_image_size
 from calibgraph.model.rig import Camera
-
-Array = NDArray[np.float64]
 
 _CLOUDS = "velodyne_points"
 _CAMERAS, _LIDAR = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"

@@ -15,9 +15,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import invert
-
-Array = NDArray[np.float64]
 
 _STILL_RAD = 1e-6  # of turn, below which the series are as exact
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
 from calibgraph.io.frame_files import FrameFiles
@@ -23,8 +23,6 @@ from calibgraph.io.nuscenes_tables import (
 )
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
-
-Array = NDArray[np.float64]
 
 _MATRIX_ROWS = 3
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import degrees_and_centimetres
 from calibgraph.model.metrics import PoseError, pose_error
@@ -77,7 +78,7 @@ def camera_section(
 
 
 def _sigmas(
-    result: Calibration, covariances: Mapping[str, plots.Array | None], name: str
+    result: Calibration, covariances: Mapping[str, Array | None], name: str
 ) -> Sigmas | None:
     covariance = covariances.get(name) if result.error_bar_holds(name) else None
     if covariance is None:

@@ -1,12 +1,10 @@
 """Correspondences by cells of the image: counts and mean residuals."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.rig import Camera
 from calibgraph.report.reprojection_errors import ReprojectionErrors
-
-Array = NDArray[np.float64]
 
 _MIN_PER_CELL = 3  # for a mean
 

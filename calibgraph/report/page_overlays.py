@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.frame import load_entry_cloud
 from calibgraph.io.images import load_image
@@ -21,7 +22,6 @@ from calibgraph.report.frames import middle_frame
 from calibgraph.report.point_overlay import DEPTH_RANGE_M, depth_colours, draw_points
 from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionErrors
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 PICTURES_BYTES = 3_000_000  # of all pictures together; base64 adds a third

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.images import load_image
 from calibgraph.model.calibration import Calibration
@@ -16,8 +16,6 @@ from calibgraph.model.verdict import Check
 from calibgraph.report.page_overlays import Scale, to_gradient, to_jpeg
 from calibgraph.report.pair_matches import RESIDUAL_LIMIT_PX, draw_matches, residual_colours
 from calibgraph.solver.camera_pairs import match_errors_px
-
-Array = NDArray[np.float64]
 
 _BYTES = 800_000  # of all pictures together
 _STOPS = 17  # of the scale's gradient

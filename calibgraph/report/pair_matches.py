@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from calibgraph.arrays import Array
+
 Image = NDArray[np.uint8]
 
 RESIDUAL_LIMIT_PX = 3.0

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.rig import Camera
 from calibgraph.report.figure import (
     add_legend,
@@ -22,7 +22,6 @@ from calibgraph.report.reprojection_errors import ReprojectionErrors
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Array = NDArray[np.float64]
 
 # Colours that the colour-blind can tell apart (Okabe and Ito, "Color universal design").
 _INLIER, _OUTLIER, _LINE = "#0072B2", "#D55E00", "#000000"

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.files import write_atomically
 from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.outputs import with_png_mark
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 DEPTH_RANGE_M = (2.0, 60.0)

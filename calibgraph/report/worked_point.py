@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import invert, point_in_lidar
 from calibgraph.model.rig import Camera
 from calibgraph.report.reprojection_errors import ReprojectionErrors
-
-Array = NDArray[np.float64]
 
 _DISTANCE_M = 10.0
 

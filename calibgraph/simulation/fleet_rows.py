@@ -7,9 +7,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import relative_transform, retract_all
-
-Array = NDArray[np.float64]
 
 CAMERAS = ("front", "front_left", "front_right", "left", "rear", "right")
 MODELS = ("compact", "van")

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
 from calibgraph.simulation.matcher_errors import MatcherErrors
 from calibgraph.simulation.visible_points import draw_visible_points
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 _STUCK_SIZE = 1.3  # the size of errors that the confidences of a stuck frame express

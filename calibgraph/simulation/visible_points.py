@@ -3,14 +3,13 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
 from calibgraph.solver.pnp import normalized
 from factors import unproject
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 _MAX_TRIES = 1000

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.frame import load_entry_cloud
 from calibgraph.io.images import load_image
@@ -15,7 +16,6 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Camera
 from calibgraph.report.point_overlay import depth_colours
 
-Array = NDArray[np.float64]
 Colours = NDArray[np.uint8]
 
 SECONDS_PER_FRAME = 1.0

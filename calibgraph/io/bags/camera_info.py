@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.io.lenses import (
     CameraLens,
     fitted_coefficients,
@@ -15,8 +15,6 @@ from calibgraph.io.lenses import (
 )
 from calibgraph.model.rig import Intrinsics
 from factors import LensModel
-
-Array = NDArray[np.float64]
 
 _AS_NONE = ("", "inverse_brown_conrady")
 """Models of drivers that state zeros for an image without distortion."""

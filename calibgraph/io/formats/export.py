@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.files import read_yaml, write_bytes, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
@@ -16,7 +17,7 @@ from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.io.formats.nuscenes import write_nuscenes
 from calibgraph.io.formats.opencv_yaml import write_opencv
 from calibgraph.io.formats.plain import write_json, write_npz
-from calibgraph.io.formats.rig_export import Array, RigExport, prepare_export
+from calibgraph.io.formats.rig_export import RigExport, prepare_export
 from calibgraph.io.formats.ros_transforms import (
     write_ros1,
     write_ros2,

@@ -3,14 +3,12 @@
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.formats.part import IMU, FrameLink
 from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.model.geometry import T_OPTICAL_LINK, invert
-
-Array = NDArray[np.float64]
 
 _LIDAR_WORDS = (
     "lidar", "velodyne", "ouster", "os_sensor", "hesai", "pandar", "livox", "rslidar", "robosense",

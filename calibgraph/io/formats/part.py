@@ -6,13 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from calibgraph.arrays import Array
 from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.io.lenses import CameraLens
-
-Array = NDArray[np.float64]
 
 ONLY_CAMERA = ""
 """Stands for the camera of a file that names none: the only one of all files."""

@@ -5,15 +5,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.geometry import invert, point_in_lidar, ros_pose_covariance
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.model.verdict import rig_verdict
-
-Array = NDArray[np.float64]
 
 EXPORT_MARK = "calibgraph export"
 CAMERA_FRAME = "{camera}_optical_frame"

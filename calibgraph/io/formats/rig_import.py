@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, FileError, RigError
 from calibgraph.files import checked_model
 from calibgraph.io.formats.frames import (
@@ -17,7 +18,7 @@ from calibgraph.io.formats.frames import (
     find_lidar_frame,
     tied_links,
 )
-from calibgraph.io.formats.part import ONLY_CAMERA, Array, Part, RelativeCamera
+from calibgraph.io.formats.part import ONLY_CAMERA, Part, RelativeCamera
 from calibgraph.io.formats.read_part import read_part
 from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import invert

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.objective import objective_graph
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import pose_rows
@@ -19,8 +19,6 @@ from calibgraph.service.pick.pairs import Pair, pixels_of, points_of, sigmas_of
 from calibgraph.solver.curvature import pose_hessian
 from calibgraph.solver.optimizer import optimize
 from factors import ProjectionBlock, unit_diagonal
-
-Array = NDArray[np.float64]
 
 PSEUDO_RESIDUALS = 8.0
 """Residuals of the stated sigma that are added to the measured ones: those of four pairs, so that

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc
 
+from calibgraph.arrays import Array
 from calibgraph.service.pick.joint import (
     PSEUDO_RESIDUALS,
     JointSolve,
@@ -14,8 +14,6 @@ from calibgraph.service.pick.joint import (
     whitened_residuals,
 )
 from calibgraph.service.pick.pairs import Pair, points_of, sigmas_of
-
-Array = NDArray[np.float64]
 
 FALSE_ALARMS = 0.01
 """Share of results without a wrong pair in which one is called suspicious."""

@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from calibgraph.arrays import Array
 from calibgraph.model.correspondences import MAX_COORDINATE, Correspondences
-
-Array = NDArray[np.float64]
 
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE, allow_inf_nan=False)]
 
