@@ -6,106 +6,88 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from calibgraph.arrays import Array
+from calibgraph.audit.judgement import CAMERA_AXES
 from calibgraph.audit.result import Audit, CameraAudit
+from calibgraph.audit.significance import DISPLAY
 from calibgraph.errors import CalibrationError
 from calibgraph.model.rig import Camera
 from calibgraph.report.page_overlays import PICTURES_BYTES, draw_by_depth, width_on_page
 
-# The charts: lengths in units of the drawing, 380 wide, which is about its pixels on a phone.
-_LEFT, _RIGHT = 74.0, 284.0  # of the axis: names to its left, numbers to its right
-_MIDDLE, _HALF = (_LEFT + _RIGHT) / 2, (_RIGHT - _LEFT) / 2
-_TOP, _ROW = 18.0, 30.0
+_MIDDLE, _HALF = 179.0, 105.0
+"""Of a chart's axis, in units of the drawing, 380 wide: about its pixels on a phone."""
 _MARGIN = 1.08  # of the axis beyond the largest value
 _MOST_TICKS = 2  # on each side
-_PARTS = (
-    ("rotation", "deg", slice(0, 3), 180 / np.pi, ("x (pitch)", "y (yaw)", "z (roll)")),
-    ("translation", "cm", slice(3, 6), 100.0, ("x (right)", "y (down)", "z (ahead)")),
-)
 
 
 @dataclass(frozen=True)
 class Bar:
-    """An axis of a camera, from the middle of the drawing to its deviation.
+    """An axis of a camera in degrees or centimetres; sigma and detectable are NaN if unknown.
 
-    Attributes:
-        name: of the axis.
-        y: of its middle.
-        x: of its left end.
-        width: of it.
-        error: ends of the error bar, one sigma to either side; None if unknown.
-        detectable: where the smallest detectable changes are; empty if unknown.
-        style: ``within``, ``beyond`` the tolerance, or ``unsure`` where the data cannot tell.
-        text: the deviation and its sigma.
+    The style is ``within``, ``beyond`` the tolerance, or ``unsure`` where the data cannot tell.
     """
 
     name: str
-    y: float
-    x: float
-    width: float
-    error: tuple[float, float] | None
-    detectable: tuple[float, ...]
+    deviation: float
+    sigma: float
+    detectable: float
     style: str
-    text: str
+
+    @property
+    def has_error(self) -> bool:
+        """Whether its error is known."""
+        return math.isfinite(self.sigma)
+
+    @property
+    def text(self) -> str:
+        """The deviation and its sigma."""
+        return f"{self.deviation:+z.2f}" + f" \u00b1 {self.sigma:.2f}" * self.has_error
 
 
 @dataclass(frozen=True)
 class Chart:
-    """The rotations or the translations of a camera.
-
-    Attributes:
-        title: rotation or translation, and the unit.
-        bars: three.
-        tolerance: left and right end of the band of the tolerance.
-        ticks: x and label of the axis' marks.
-        bottom: y of the axis.
-        left, right: its ends.
-        middle: the x of no deviation.
-    """
+    """The rotations or the translations of a camera, three bars, and what is tolerated."""
 
     title: str
     bars: tuple[Bar, ...]
-    tolerance: tuple[float, float]
-    ticks: tuple[tuple[float, str], ...]
-    bottom: float
-    left: float = _LEFT
-    right: float = _RIGHT
-    middle: float = _MIDDLE
+    tolerance: float
+
+    @property
+    def reach(self) -> float:
+        """The value at the ends of the axis."""
+        ends = [abs(bar.deviation) + np.nan_to_num(bar.sigma) for bar in self.bars]
+        limits = [bar.detectable for bar in self.bars]
+        return _MARGIN * float(np.nanmax([*ends, *limits, self.tolerance]))
+
+    def x(self, value: float) -> float:
+        """Where a value is in the drawing."""
+        return _MIDDLE + _HALF * value / self.reach
+
+    @property
+    def ticks(self) -> list[float]:
+        """Marks at round numbers, at most two on each side of the middle."""
+        smallest = self.reach / (_MOST_TICKS + 1)
+        decade = 10.0 ** math.floor(math.log10(smallest))
+        step = next(decade * m for m in (1, 2, 5, 10) if decade * m > smallest)
+        most = int(self.reach / step)
+        return [k * step for k in range(-most, most + 1)]
 
 
 def charts_of(camera: CameraAudit, tolerance_deg: float, tolerance_cm: float) -> tuple[Chart, ...]:
     """The rotations and the translations of a camera; none where nothing was measured."""
     if camera.deviation is None:
         return ()
-    return tuple(
-        _chart(camera, part, tolerance)
-        for part, tolerance in zip(_PARTS, (tolerance_deg, tolerance_cm), strict=True)
-    )
-
-
-def _chart(
-    camera: CameraAudit, part: tuple[str, str, slice, float, tuple[str, ...]], tolerance: float
-) -> Chart:
-    title, unit, rows, factor, names = part
-    values = np.stack(
-        [
-            np.full(3, np.nan) if twist is None else twist[rows] * factor
-            for twist in (camera.deviation, camera.sigma, camera.detectable)
-        ],
-        axis=1,
-    )  # of each axis: deviation, sigma, detectable
-    ends = np.abs(values[:, 0]) + np.nan_to_num(values[:, 1])
-    reach = _MARGIN * float(np.nanmax([*ends, *values[:, 2], tolerance]))
-    band = tolerance * _HALF / reach
-    return Chart(
-        title=f"{title} [{unit}]",
-        bars=tuple(
-            _bar(name, k, values[k], reach, style=_style(camera, values[k, 0], tolerance))
-            for k, name in enumerate(names)
-        ),
-        tolerance=(_MIDDLE - band, _MIDDLE + band),
-        ticks=_ticks(reach),
-        bottom=_TOP + _ROW * len(names),
+    twists = (camera.deviation, camera.sigma, camera.detectable)
+    rows = np.stack([np.full(6, np.nan) if t is None else t * DISPLAY for t in twists], axis=1)
+    tolerances = [tolerance_deg] * 3 + [tolerance_cm] * 3
+    bars = [
+        Bar(name, deviation, sigma, detectable, _style(camera, deviation, tolerance))
+        for name, (deviation, sigma, detectable), tolerance in zip(
+            CAMERA_AXES, rows.tolist(), tolerances, strict=True
+        )
+    ]
+    return (
+        Chart("rotation [deg]", tuple(bars[:3]), tolerance_deg),
+        Chart("translation [cm]", tuple(bars[3:]), tolerance_cm),
     )
 
 
@@ -113,31 +95,6 @@ def _style(camera: CameraAudit, deviation: float, tolerance: float) -> str:
     if camera.status == "CANNOT TELL":
         return "unsure"
     return "beyond" if abs(deviation) > tolerance else "within"
-
-
-def _bar(name: str, row: int, values: Array, reach: float, *, style: str) -> Bar:
-    """The bar of an axis."""
-    deviation, sigma, detectable = values * _HALF / reach
-    x, known = _MIDDLE + deviation, bool(np.isfinite(sigma))
-    return Bar(
-        name=name,
-        y=_TOP + _ROW * (row + 0.5),
-        x=min(x, _MIDDLE),
-        width=abs(deviation),
-        error=(x - sigma, x + sigma) if known else None,
-        detectable=(_MIDDLE - detectable, _MIDDLE + detectable) if known else (),
-        style=style,
-        text=f"{values[0]:+z.2f}" + (f" \u00b1 {values[1]:.2f}" if known else ""),
-    )
-
-
-def _ticks(reach: float) -> tuple[tuple[float, str], ...]:
-    """Marks at round numbers, at most two on each side of the middle."""
-    smallest = reach / (_MOST_TICKS + 1)
-    decade = 10.0 ** math.floor(math.log10(smallest))
-    step = next(decade * m for m in (1, 2, 5, 10) if decade * m > smallest)
-    marks = range(-int(reach / step), int(reach / step) + 1)
-    return tuple((_MIDDLE + k * step * _HALF / reach, f"{k * step:g}") for k in marks)
 
 
 @dataclass(frozen=True)

@@ -18,19 +18,15 @@ from typing import Annotated, Any, TextIO
 import typer
 
 from calibgraph.cli import outputs, remote
+from calibgraph.cli.audit import check, drift
 from calibgraph.cli.bag import bag
 from calibgraph.cli.calibrate import calibrate, match, solve
-from calibgraph.cli.check import check
-from calibgraph.cli.doctor import doctor
-from calibgraph.cli.drift import drift
 from calibgraph.cli.exchange import export, import_
-from calibgraph.cli.fleet import fleet
-from calibgraph.cli.fleet_report import fleet_model, fleet_report
+from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
 from calibgraph.cli.guess import guess, init
-from calibgraph.cli.inspect import evaluate, perturb, report, view
+from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
 from calibgraph.cli.learned import train, weights
-from calibgraph.cli.pick import pick
-from calibgraph.cli.serve import serve, token
+from calibgraph.cli.serve import pick, serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
 

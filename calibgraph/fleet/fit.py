@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.fleet.centers import Centers, measured_batches, solve_centers
-from calibgraph.fleet.deviations import Posterior, weigh
+from calibgraph.fleet.deviations import Centers, Posterior, measured_batches, solve_centers, weigh
 from calibgraph.fleet.observations import Observations
 from calibgraph.model.geometry import retract_all, twists_between
 

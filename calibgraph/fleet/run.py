@@ -7,11 +7,10 @@ from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field
 
 from calibgraph.errors import FileError
-from calibgraph.fleet.driver import Driver, Try
+from calibgraph.fleet.driver import Driver, Publisher, Try
 from calibgraph.fleet.engines import Engine, open_engine
 from calibgraph.fleet.execute import version_in
 from calibgraph.fleet.manifest import Job, Manifest, load_manifest
-from calibgraph.fleet.publisher import Publisher
 from calibgraph.fleet.rows import RowStore
 from calibgraph.fleet.shards import Shard
 from calibgraph.fleet.task import Limits, Outcome, release

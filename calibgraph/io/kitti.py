@@ -8,8 +8,8 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_text, require_file
+from calibgraph.io.frame_files import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.images import image_size
-from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.lenses import intrinsics_of_matrix
 from calibgraph.model.rig import Camera
 

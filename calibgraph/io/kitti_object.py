@@ -13,9 +13,15 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
-from calibgraph.io.frame_files import FrameFiles, files_by_stem, frames_by_stem
+from calibgraph.io.frame_files import (
+    FrameFiles,
+    IncompleteCamera,
+    RigRead,
+    files_by_stem,
+    frames_by_stem,
+    rig_of_complete,
+)
 from calibgraph.io.images import IMAGE_SUFFIXES, image_size
-from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.kitti import (
     CALIBRATION_NAME,
     CLOUD_FOLDER,

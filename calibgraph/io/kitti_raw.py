@@ -7,9 +7,15 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
-from calibgraph.io.frame_files import FrameFiles, files_by_stem, frames_by_stem
+from calibgraph.io.frame_files import (
+    FrameFiles,
+    IncompleteCamera,
+    RigRead,
+    files_by_stem,
+    frames_by_stem,
+    rig_of_complete,
+)
 from calibgraph.io.images import IMAGE_SUFFIXES
-from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.kitti import NumberLines, camera_of_projection, first_image_size
 from calibgraph.model.rig import Camera
 

@@ -8,8 +8,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
-from calibgraph.io.frame_files import FrameFiles
-from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
+from calibgraph.io.frame_files import FrameFiles, IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.lenses import intrinsics_of_matrix
 from calibgraph.io.nuscenes_tables import (
     LIDAR,

@@ -187,7 +187,7 @@ def _calibrate(task: JobTask, inputs: _Inputs, progress: Progress) -> JobOutcome
 
 def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) -> JobOutcome:
     from calibgraph.report.as_json import result_summary
-    from calibgraph.report.result_files import write_result
+    from calibgraph.report.html import write_result
 
     written = write_result(result, task.folder / WORK / FILES, data, with_report=with_report)
     _write_summary(task, result_summary(result, [Path(path.name) for path in written]))
@@ -247,7 +247,7 @@ def _progress(note: Note) -> Progress:
 def main() -> None:
     """The process: one job at a time."""
     import calibgraph.pipeline  # noqa: F401 - it takes seconds, which are not the first job's
-    import calibgraph.report.result_files  # noqa: F401
+    import calibgraph.report.html  # noqa: F401
 
     def answer(task: JobTask, note: Note) -> JobOutcome:
         with output_to(task.folder / LOG), memory_limit(task.memory_bytes):
