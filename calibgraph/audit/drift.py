@@ -7,8 +7,14 @@ from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.audit.common_pose import Deviations, Limits, compare, poses_of
-from calibgraph.audit.drift_inputs import Results, open_results
-from calibgraph.audit.drift_result import CameraDrift, Drift, DriftStatus, Trend
+from calibgraph.audit.drift_result import (
+    CameraDrift,
+    Drift,
+    DriftStatus,
+    Results,
+    Trend,
+    open_results,
+)
 from calibgraph.audit.judgement import (
     CAMERA_AXES,
     SINGLE_CAMERA,

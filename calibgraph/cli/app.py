@@ -19,11 +19,10 @@ import typer
 
 from calibgraph.cli import outputs, remote
 from calibgraph.cli.audit import check, drift
-from calibgraph.cli.bag import bag
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
-from calibgraph.cli.guess import guess, init
+from calibgraph.cli.guess import bag, guess, init
 from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
 from calibgraph.cli.learned import train, weights
 from calibgraph.cli.serve import pick, serve, token

@@ -40,7 +40,7 @@ def check(
     but the page, if one is wanted.
     """
     from calibgraph.audit import check
-    from calibgraph.audit.provenance import is_made_from
+    from calibgraph.audit.check import is_made_from
     from calibgraph.audit.result import audit_of
     from calibgraph.audit.significance import Tolerance
     from calibgraph.io.rigs import load_rig

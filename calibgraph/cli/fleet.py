@@ -72,8 +72,7 @@ def fleet(
     """
     import os
 
-    from calibgraph.fleet.run import run_fleet
-    from calibgraph.fleet.shards import shard_from
+    from calibgraph.fleet.run import run_fleet, shard_from
     from calibgraph.fleet.task import Limits
 
     part = shard_from(shard, os.environ)

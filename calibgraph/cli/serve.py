@@ -193,7 +193,7 @@ def pick(
     """
     require_service()
     from calibgraph.files import require_place_for_folder
-    from calibgraph.service.pick.app import loopback_socket, pick_server
+    from calibgraph.service.pick.router import loopback_socket, pick_server
     from calibgraph.service.pick.workspace import Workspace
 
     require_place_for_folder(out)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calibgraph.errors import DatasetError, FileError
-from calibgraph.io import argoverse, kitti, kitti_object, kitti_raw, nuscenes
+from calibgraph.io import argoverse, kitti, kitti_drives, nuscenes
 from calibgraph.io.clouds import CLOUD_SUFFIXES
 from calibgraph.io.frame_files import FrameFiles, RigRead, files_by_stem, frames_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
@@ -120,11 +120,11 @@ _FORMATS = (
         nuscenes.describe_motion,
     ),
     PublishedFormat(
-        kitti_raw.is_kitti_raw, kitti_raw.read_kitti_raw_rig, kitti_raw.kitti_raw_frames
+        kitti_drives.is_kitti_raw, kitti_drives.read_kitti_raw_rig, kitti_drives.kitti_raw_frames
     ),
     PublishedFormat(
-        kitti_object.is_kitti_object, kitti_object.read_kitti_object_rig,
-        kitti_object.kitti_object_frames, kitti_object.describe_calibrations,
+        kitti_drives.is_kitti_object, kitti_drives.read_kitti_object_rig,
+        kitti_drives.kitti_object_frames, kitti_drives.describe_calibrations,
     ),
     PublishedFormat(
         argoverse.is_argoverse, argoverse.read_argoverse_rig, argoverse.argoverse_frames,

@@ -18,22 +18,20 @@ from calibgraph.fleet.task import describe_failure
 from calibgraph.fleet.uris import fetch
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.service.archives import open_upload, table_suffix
-from calibgraph.service.job_task import (
+from calibgraph.service.places import require_inside
+from calibgraph.service.requests import (
     FILES,
     INPUT,
     LOG,
+    RIG,
     SUMMARY,
+    TABLE,
     WORK,
+    CalibrationSettings,
+    CheckSettings,
     JobOutcome,
     JobProgress,
     JobTask,
-)
-from calibgraph.service.places import require_inside
-from calibgraph.service.requests import (
-    RIG,
-    TABLE,
-    CalibrationSettings,
-    CheckSettings,
     SolveSettings,
     recording_name,
 )

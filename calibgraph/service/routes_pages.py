@@ -16,12 +16,10 @@ from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.report.kit import load_template
 from calibgraph.service.access import COOKIE, Caller, Gate
-from calibgraph.service.answers import utc
-from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.problems import Problem
-from calibgraph.service.requests import JobKind
-from calibgraph.service.routes_jobs import find_job
+from calibgraph.service.requests import FILES, RESULT, SUMMARY, JobKind
+from calibgraph.service.routes_jobs import find_job, utc
 from calibgraph.service.routes_service import require_docs
 from calibgraph.service.routes_trackers import ask_tracker, find_tracker
 from calibgraph.service.state import Service, State

@@ -12,14 +12,14 @@ from starlette.concurrency import run_in_threadpool
 from calibgraph.files import checked_model
 from calibgraph.model.config import config_from
 from calibgraph.service.access import Caller, Name, Reader, Submitter
-from calibgraph.service.answers import utc
+from calibgraph.service.database import TrackerRecord
 from calibgraph.service.jobs import new_id
 from calibgraph.service.problems import Problem, documented, reference
+from calibgraph.service.routes_jobs import utc
 from calibgraph.service.settings import MAX_JSON_BYTES
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import parse_json
 from calibgraph.service.tracker_request import ARROW, Action, TrackerRequest
-from calibgraph.service.tracker_table import TrackerRecord
 from calibgraph.yaml_text import yaml_text
 
 router = APIRouter(prefix="/v1/trackers")

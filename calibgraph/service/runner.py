@@ -14,10 +14,10 @@ from sqlalchemy.exc import SQLAlchemyError
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
 from calibgraph.service.folders import DataFolder, remove_folder
 from calibgraph.service.job_events import progress_of
-from calibgraph.service.job_task import INPUT, RESULT, WORK, JobOutcome, JobProgress, JobTask
 from calibgraph.service.jobs import FINISHED, MOST_STARTS, JobRecord, JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root
+from calibgraph.service.requests import INPUT, RESULT, WORK, JobOutcome, JobProgress, JobTask
 from calibgraph.service.settings import Settings
 
 log = logging.getLogger("calibgraph.service")

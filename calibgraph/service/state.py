@@ -7,7 +7,7 @@ from fastapi import Depends, Request
 from sqlalchemy import Engine
 
 from calibgraph.errors import CalibrationError
-from calibgraph.service.database import open_database
+from calibgraph.service.database import TrackerTable, open_database
 from calibgraph.service.folders import DataFolder, remove_folder
 from calibgraph.service.job_events import JobEvents
 from calibgraph.service.jobs import JobTable
@@ -17,7 +17,6 @@ from calibgraph.service.problems import Problem
 from calibgraph.service.room import Room
 from calibgraph.service.runner import Runner
 from calibgraph.service.settings import MAX_BODIES_BYTES, Settings
-from calibgraph.service.tracker_table import TrackerTable
 from calibgraph.service.trackers import Trackers
 
 _RETRY_AFTER = {"Retry-After": "5"}

@@ -11,7 +11,7 @@ import pytest
 
 import calibgraph
 from calibgraph import Audit, CameraAudit, LidarAudit
-from calibgraph.audit.page_camera import charts_of, measured_camera
+from calibgraph.audit.page import charts_of, measured_camera
 from calibgraph.audit.result import audit_of, audit_summary
 from calibgraph.model.geometry import twist_between
 from tests.audit.deployed import TRUTH

@@ -20,9 +20,9 @@ from calibgraph.io.formats.ros_transforms import (
     write_ros2,
     write_ros2_launch,
     write_tf2,
+    write_urdf,
 )
 from calibgraph.io.formats.undistorted import kitti_statement, write_kitti, write_nuscenes
-from calibgraph.io.formats.urdf import write_urdf
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import Calibration

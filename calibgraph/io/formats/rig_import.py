@@ -11,14 +11,16 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, FileError, RigError
 from calibgraph.files import checked_model
-from calibgraph.io.formats.frames import (
+from calibgraph.io.formats.part import (
     NO_LIDAR_IN_IMU,
+    ONLY_CAMERA,
     FrameTree,
+    Part,
+    RelativeCamera,
     find_camera_frame,
     find_lidar_frame,
     tied_links,
 )
-from calibgraph.io.formats.part import ONLY_CAMERA, Part, RelativeCamera
 from calibgraph.io.formats.read_part import read_part
 from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import invert
