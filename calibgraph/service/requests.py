@@ -10,6 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstr
 from calibgraph.fleet.task import ErrorKind
 from calibgraph.model.config import Config, Terms, config_from
 from calibgraph.service.places import Root
+from calibgraph.service.settings import Settings
 
 JobKind = Literal["calibration", "solve", "check"]
 KINDS: tuple[JobKind, ...] = ("calibration", "solve", "check")
@@ -208,16 +209,12 @@ FILES, SUMMARY = "files", "summary.json"
 
 @dataclass(frozen=True)
 class JobTask:
-    """A job for a process, with its limits; ``free_bytes`` of the disk stay free."""
+    """A job for a process, with the server's settings, which have its limits."""
 
     job: Job
     folder: Path
     roots: tuple[Root, ...]
-    memory_bytes: int
-    fetch_bytes: int
-    unpacked_bytes: int
-    free_bytes: int
-    timeout_s: float
+    settings: Settings
 
 
 @dataclass(frozen=True)

@@ -213,16 +213,8 @@ class Runner:
 
     def task(self, id: str) -> JobTask:
         """What the process of a job gets."""
-        settings = self._settings
         return JobTask(
-            job=self._table.request(id),
-            folder=self._folder.of_job(id),
-            roots=self._roots,
-            memory_bytes=settings.job_memory_bytes,
-            fetch_bytes=settings.fetch_bytes,
-            unpacked_bytes=settings.upload_bytes,
-            free_bytes=settings.free_bytes,
-            timeout_s=settings.job_timeout_s,
+            self._table.request(id), self._folder.of_job(id), self._roots, self._settings
         )
 
     def _note(self, id: str, progress: JobProgress) -> None:
