@@ -123,7 +123,6 @@ class Deviations:
     """How far each result of one camera is from the others.
 
     Attributes:
-        poses: of the camera.
         pool: (n,) the results whose mean each is compared with, itself excepted.
         agreeing: (n,) the largest part found that agrees.
         leave_one_out: deviation of each from that mean.

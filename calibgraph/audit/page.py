@@ -199,9 +199,6 @@ class Section:
     """One camera's values for the template.
 
     Attributes:
-        name: of the camera.
-        anchor: of its section in the page.
-        audit: of the camera.
         charts: rotations and translations; none where nothing was measured.
         pictures: None if they cannot be drawn.
         deployed, measured: the camera; None if it is not known, or nothing was measured.

@@ -32,7 +32,6 @@ class Finding:
         kind: a mount that moves in many vehicles, a batch that was changed, a date from which a
             batch is another one, or a drift against a column.
         model, camera, batch: where; batch is empty for all.
-        p_value: of the test alone.
         change: (6,) rotation [rad], translation [m], of a batch, at a date, or per unit of the
             column; NaN of a mount.
         sigma: (6,) of it.

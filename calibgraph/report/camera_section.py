@@ -147,9 +147,6 @@ class CameraSection:
     """What the template prints of one camera beside what the result has.
 
     Attributes:
-        name: of the camera.
-        anchor: of its section in the page.
-        verdict: of the camera.
         rows: its checks.
         moved: change from the guess.
         sigmas, bootstrap: None where there are none, or they do not hold.

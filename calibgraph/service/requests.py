@@ -40,7 +40,6 @@ class SolveSettings(_Strict):
 
     Attributes:
         config: settings of the solve, as in a ``--config`` file.
-        terms: of the objective.
         report: whether to write ``report.html``, which takes longer than a small solve.
     """
 
@@ -72,7 +71,6 @@ class CheckSettings(_Strict):
     Attributes:
         tolerance_deg, tolerance_cm: largest deviation per axis that is OK.
         frames: which, as ``--frames``.
-        seed: of everything random.
     """
 
     tolerance_deg: Tolerance = 0.5

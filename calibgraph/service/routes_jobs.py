@@ -47,15 +47,12 @@ class JobAnswer(BaseModel):
     """A job.
 
     Attributes:
-        id: of the job.
         kind: calibration, solve or check.
         state: queued, running, succeeded, failed or cancelled.
         created, started, finished: times (UTC); null if not yet.
-        progress: of a running job.
         verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
         cannot_tell: whether the data determine too little for another verdict: of a WARN that
             nothing odd was found behind, and of CANNOT TELL; null as long as there is none.
-        error: of a failed job.
         name, note: that were given with it.
     """
 
@@ -77,7 +74,6 @@ class JobList(BaseModel):
     """Jobs, the newest first.
 
     Attributes:
-        jobs: of this page.
         next: ``before`` of the next page; null on the last.
     """
 

@@ -57,7 +57,6 @@ class TrackerAnswer(BaseModel):
     """A tracker.
 
     Attributes:
-        id: of the tracker.
         name: that it was given.
         created: time (UTC), ISO 8601.
     """
@@ -88,7 +87,6 @@ class TrackerState(BaseModel):
         frame: last frame that was taken in; null if none.
         verdict: of the estimate: PASS, WARN or FAIL.
         cannot_tell: whether it is WARN because the data determine too little.
-        reasons: of the verdict.
         summary: the verdict in few words, as ``--json`` prints it: reasons, actions, others.
         cameras: per camera, as in a result.
         events: the last ones.

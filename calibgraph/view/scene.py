@@ -47,7 +47,6 @@ class ViewFrame:
 
     Attributes:
         number: of the frame in its dataset.
-        name: of the frame.
         time_s: when it is shown.
         points_lidar_m: (n, 3) float32 in the LiDAR frame.
         colours: (n, 3) RGB by distance from the LiDAR.

@@ -27,7 +27,6 @@ class StatedLens:
 
     Attributes:
         frame: the frame of the camera, z forward and y down, as the message names it.
-        lens: of the images.
         R_image_frame: (3, 3) from the frame to the axes of the image, which rectification turns.
         baseline_m: (3,) by P's fourth column, the origin of the first camera's frame in the axes of
             this image; zero for a camera that is no second one of a pair.

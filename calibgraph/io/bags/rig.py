@@ -48,7 +48,6 @@ class BagRig:
     """What a bag holds about its rig; extrinsics may be missing.
 
     Attributes:
-        path: of the bag.
         lidar: the LiDAR's frame.
         cameras: by name.
         transforms: of the bag and those beside it.

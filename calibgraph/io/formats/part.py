@@ -46,7 +46,6 @@ class Part:
     """Lenses, extrinsics and frames of one file; any of them may be missing.
 
     Attributes:
-        path: of the file.
         lenses: by camera.
         T_camera_lidar: (4, 4) by camera.
         relative_poses: between cameras, measured independently of T_camera_lidar.

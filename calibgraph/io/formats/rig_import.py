@@ -76,7 +76,6 @@ class RigParts:
     """What files of other programs hold about a rig together; extrinsics may be missing.
 
     Attributes:
-        path: of the first file, for errors.
         lidar: name of the LiDAR.
         lenses: by camera.
         T_camera_lidar: (4, 4) of the cameras that have one.
