@@ -13,7 +13,6 @@ from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
 from calibgraph.service.access import Reader, Submitter
-from calibgraph.service.job_events import progress_of, wait_for
 from calibgraph.service.jobs import JobRecord, JobState
 from calibgraph.service.problems import Problem, documented, reference
 from calibgraph.service.requests import (
@@ -114,6 +113,7 @@ _PATHS: dict[JobKind, str] = {
 _LONGEST_WAIT_S = 60.0
 _MOST_LOG = 2**20
 _KEEP_ALIVE_S = 15.0
+_LONGEST_PAUSE_S = 0.5
 _NO_CACHE = {"X-Accel-Buffering": "no"}
 
 JobId = Annotated[str, "id of a job"]
@@ -194,14 +194,18 @@ async def get_job(
     wait_s: Annotated[float, Query(ge=0, le=_LONGEST_WAIT_S)] = 0.0,
 ) -> JobAnswer:
     """A job; with ``wait_s`` the answer waits until it is finished, not longer than that."""
-    end = time.monotonic() + wait_s
-    with state.events.listen(id) as changed:
-        while True:
-            record = await run_in_threadpool(find_job, state, caller, id)
-            left_s = end - time.monotonic()
-            if record.is_finished or left_s <= 0 or state.is_stopping:
-                return job_answer(record, state.runner.step(id))
-            await wait_for(changed, left_s)
+    start = time.monotonic()
+    while True:
+        record = await run_in_threadpool(find_job, state, caller, id)
+        waited_s = time.monotonic() - start
+        if record.is_finished or waited_s >= wait_s or state.is_stopping:
+            return job_answer(record, state.runner.step(id))
+        await asyncio.sleep(min(_pause_s(waited_s), wait_s - waited_s))
+
+
+def _pause_s(waited_s: float) -> float:
+    """Until a job is looked at again: short ones are seen at once, long ones cost little."""
+    return min(_LONGEST_PAUSE_S, 0.02 + waited_s / 10)
 
 
 @router.get(
@@ -218,23 +222,22 @@ async def job_events(id: JobId, state: State, caller: Reader) -> Response:
 
 
 async def _events(state: Service, caller: Reader, id: str) -> AsyncIterator[str]:
-    sent, last_s = "", time.monotonic()
-    with state.events.listen(id, progress_of(id)) as changed:
-        while not state.is_stopping:
-            record = await run_in_threadpool(state.jobs.get, id, caller)
-            if record is None:
-                return
-            text = json.dumps(job_answer(record, state.runner.step(id)).model_dump(mode="json"))
-            if text != sent:
-                yield f"event: {record.state}\ndata: {text}\n\n"
-                sent, last_s = text, time.monotonic()
-            elif time.monotonic() - last_s > _KEEP_ALIVE_S:
-                yield ": still here\n\n"
-                last_s = time.monotonic()
-            if record.is_finished:
-                return
-            await wait_for(changed, _KEEP_ALIVE_S)
-            await asyncio.sleep(0.05)  # steps come faster than anyone reads them
+    sent, start = "", time.monotonic()
+    last_s = start
+    while not state.is_stopping:
+        record = await run_in_threadpool(state.jobs.get, id, caller)
+        if record is None:
+            return
+        text = json.dumps(job_answer(record, state.runner.step(id)).model_dump(mode="json"))
+        if text != sent:
+            yield f"event: {record.state}\ndata: {text}\n\n"
+            sent, last_s = text, time.monotonic()
+        elif time.monotonic() - last_s > _KEEP_ALIVE_S:
+            yield ": still here\n\n"
+            last_s = time.monotonic()
+        if record.is_finished:
+            return
+        await asyncio.sleep(_pause_s(time.monotonic() - start))
 
 
 @router.get(

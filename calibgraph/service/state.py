@@ -7,7 +7,6 @@ from fastapi import Depends, Request
 from calibgraph.errors import CalibrationError
 from calibgraph.service.database import TrackerTable, open_database
 from calibgraph.service.folders import DataFolder, remove_folder
-from calibgraph.service.job_events import JobEvents
 from calibgraph.service.jobs import JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import open_roots
@@ -35,16 +34,8 @@ class Service:
         except CalibrationError:
             self.folder.close()
             raise
-        self.engine, self.events = engine, JobEvents()
-        self.jobs, self.tracker_table = JobTable(engine), TrackerTable(engine)
-        self.runner = Runner(
-            self.jobs,
-            self.folder,
-            settings,
-            self.roots,
-            metrics=metrics,
-            notify=self.events.notify,
-        )
+        self.engine, self.jobs, self.tracker_table = engine, JobTable(engine), TrackerTable(engine)
+        self.runner = Runner(self.jobs, self.folder, settings, self.roots, metrics=metrics)
         self.trackers = Trackers(self.folder, settings)
         self.disk = Room(self.folder.free_bytes, settings.free_bytes, 507)
         self.memory = Room(lambda: MAX_BODIES_BYTES - self.memory.arrived_bytes, 0, 429)
@@ -55,14 +46,12 @@ class Service:
         for left in self.folder.trackers.iterdir():
             if left.name not in known:  # a server was killed while it made or removed it
                 remove_folder(left)
-        self.events.open()
         self.runner.start()
 
     def begin_stop(self) -> None:
         """Accept nothing more, and let those go who wait."""
         self.is_stopping = True
         self.runner.begin_stop()
-        self.events.notify()
 
     def stop(self) -> None:
         """End the jobs and trackers, and release the data folder."""
