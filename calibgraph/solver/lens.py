@@ -237,8 +237,6 @@ def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
 
 def _marginal(fit: LatentPoseFit, kept: list[int]) -> Array:
     """The covariance of some variables."""
-    if not kept:
-        return np.zeros((0, 0))
     model = fit.linear.model
     keys = model.place_keys + model.shared_keys
     return np.asarray(np.linalg.inv(marginal_information(fit.linear.graph, keys, kept)))
