@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from factors.block import ProjectionBlock
 from factors.block_sums import BlockSums, square_root
 from factors.clock import Clock, displace
-from factors.compiled import compiled
 from factors.lens import Lens
 from factors.lens_kernels import EQUIRECTANGULAR, FISHEYE, OMNIDIRECTIONAL, PINHOLE
 from factors.loss import loss_id, losses_and_weights
