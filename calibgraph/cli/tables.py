@@ -12,8 +12,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from calibgraph.arrays import Array
 from calibgraph.cli.terminal import print_plain
-from calibgraph.model.calibration import FRAMES_SENTENCE, Array, Calibration
+from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.geometry import degrees_and_centimetres
 from calibgraph.model.metrics import Evaluation, PoseError, pose_error
 from calibgraph.model.summary import Summary

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import DatasetError, FileError
-from calibgraph.io.cloud_notes import describe_cloud
-from calibgraph.io.clouds import check_points, cloud_of_array
+from calibgraph.io.clouds import check_points, cloud_of_array, describe_cloud
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.io.point_fields import RawCloud

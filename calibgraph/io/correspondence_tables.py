@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file
 from calibgraph.model.correspondences import Correspondences
@@ -28,7 +29,6 @@ from calibgraph.model.table_columns import (
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Array = NDArray[np.float64]
 
 _PART_ROWS = 2**18
 _MOST_NAME_BYTES = 400  # 100 letters of 4 bytes

@@ -19,12 +19,11 @@ from calibgraph.io.bags.frames import BagFrame, frames_of_bag
 from calibgraph.io.bags.messages import CLOUDS, Bag
 from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
-from calibgraph.io.cloud_notes import read_cloud_notes
-from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
+from calibgraph.io.clouds import read_cloud_notes
+from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, published_format
 from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import DrivenFrame, Frame, MovingFrame, twist_by_scans
-from calibgraph.io.incomplete import RigRead
-from calibgraph.io.published import published_format
+from calibgraph.io.frame_files import RigRead
 from calibgraph.io.rigs import read_rig
 from calibgraph.model.rig import Rig
 

@@ -16,11 +16,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.model.geometry import invert
 from factors import displace
-
-Array = NDArray[np.float64]
 
 _COARSE_M, _FINE_M = 1.0, 0.25
 _REACH_M = 4.0  # of the coarse registration: 40 m/s in 0.1 s

@@ -11,8 +11,8 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.files import sha256, write_yaml
 from calibgraph.model import geometry, result_files
 from calibgraph.model.camera_matches import CameraMatches
@@ -25,8 +25,6 @@ from calibgraph.model.summary import Summary, summarize
 from calibgraph.model.verdict import Verdict, rig_verdict
 from calibgraph.model.versions import package_versions
 from calibgraph.outputs import require_writable
-
-Array = NDArray[np.float64]
 
 FRAMES_SENTENCE = "p_camera = T_camera_lidar * p_lidar"
 TANGENT_SENTENCE = (

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import KEYS, Places
@@ -29,7 +30,6 @@ from calibgraph.model.table_columns import (
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Array = NDArray[np.float64]
 
 MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
 _MAX_WHOLE = 2**63 - 1

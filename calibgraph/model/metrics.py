@@ -6,15 +6,13 @@ from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
+from calibgraph.arrays import Array
 from calibgraph.errors import RigError
 from calibgraph.model.geometry import angle_deg, relative_transform, twist_between
 from calibgraph.model.rig import Camera, Rig
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from pydantic import (
     model_validator,
 )
 
+from calibgraph.arrays import Array
 from calibgraph.errors import RigError
 from calibgraph.files import StrictNumbers, write_yaml
 from calibgraph.model.correspondences import MAX_COORDINATE
@@ -31,8 +32,6 @@ from calibgraph.model.image_times import IMAGE_TIMES, ImageTimes
 from calibgraph.model.lens_names import find_lens_model
 from factors import Lens, LensModel
 from factors.lens import ORDERS
-
-Array = NDArray[np.float64]
 
 RIG_FORMAT: Literal["calibgraph-rig/1"] = "calibgraph-rig/1"
 

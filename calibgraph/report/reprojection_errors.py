@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.frame import load_entry_cloud, twist_of_entry
 from calibgraph.io.images import load_image
@@ -16,7 +17,6 @@ from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
 from calibgraph.report.point_overlay import depth_colours
 
-Array = NDArray[np.float64]
 Colours = NDArray[np.uint8]
 
 SECONDS_PER_FRAME = 1.0
@@ -48,7 +48,6 @@ class ViewFrame:
 
     Attributes:
         number: of the frame in its dataset.
-        name: of the frame.
         time_s: when it is shown.
         points_lidar_m: (n, 3) float32 in the LiDAR frame.
         colours: (n, 3) RGB by distance from the LiDAR.

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags.frames import BagFrame
 from calibgraph.io.bags.messages import Bag, Drive, read_message
@@ -26,7 +26,6 @@ from calibgraph.io.bags.transforms import (
 from calibgraph.io.motion import ScanMotion, register, twist_between
 from calibgraph.model.geometry import transform
 
-Array = NDArray[np.float64]
 MotionOf = Callable[[BagFrame], ScanMotion]
 
 _ODOMETRY_TYPE = "nav_msgs/msg/Odometry"

@@ -11,9 +11,13 @@ from pydantic import ConfigDict, Field
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.documents import commented_yaml
-from calibgraph.io.formats.lenses import carried_coefficients, no_place_for
 from calibgraph.io.formats.part import IMU, FrameLink, Part, RelativeCamera
-from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
+from calibgraph.io.formats.rig_export import (
+    COVARIANCE_SENTENCE,
+    RigExport,
+    carried_coefficients,
+    no_place_for,
+)
 from calibgraph.io.lenses import (
     CameraLens,
     listed_coefficients,
