@@ -85,9 +85,7 @@ CAUSES: dict[str, Cause] = {
         {"z_score": "Check the guess, the intrinsics, and that images and clouds belong together.",
          "displaced_z_score": "", "frames_best": "", "rematch_rotation": "",
          "rematch_translation": "", "matching again": "", "last_round_rotation": _FROM_RESULT,
-         "last_round_translation": _FROM_RESULT,
-         "score_gain": "Check the intrinsics and the time stamps: with either wrong, a pose nearby "
-         "fits better."},
+         "last_round_translation": _FROM_RESULT},
     ),
     "matches": Cause(
         "wrong correspondences",

@@ -109,8 +109,7 @@ def evidence_checks(found: ImageEvidence, names: Mapping[int, str]) -> tuple[Che
     mispaired = found.frames_best <= threshold("frames_best").fail
     if found.displaced_z_score < limit("lens_z_score") or mispaired:
         return displaced, frames  # at a wrong extrinsic the lens cannot be measured
-    lens = _lens_checks(found)
-    return displaced, frames, *lens, *_gain_checks(found, lens)
+    return displaced, frames, *_lens_checks(found)
 
 
 def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
@@ -126,13 +125,6 @@ def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
 def _lens_checks(found: ImageEvidence) -> tuple[Check, ...]:
     """Whether another lens fits the images better."""
     return tuple(check_parameter(each, IMAGES) for each in found.lens)
-
-
-def _gain_checks(found: ImageEvidence, lens: Sequence[Check]) -> tuple[Check, ...]:
-    """Whether an extrinsic nearby is better; not checked if a wrong lens is the cause."""
-    if any(check.status != "PASS" for check in lens):
-        return ()
-    return (threshold("score_gain").check(found.gain),)
 
 
 def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:

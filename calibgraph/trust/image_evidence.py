@@ -42,9 +42,7 @@ class ImageEvidence:
 
     Attributes:
         groups: groups of windows that were scored; with fewer than MIN_GROUPS all else is NaN.
-        lens: how the lens that fits best differs; see
-            :class:`calibgraph.trust.lens_evidence.LensEvidence`.
-        gain: see :class:`calibgraph.trust.lens_evidence.LensEvidence`.
+        lens: how the lens that fits best differs; none where images do not determine it.
         displaced_z_score: score at the result less the mean score of the displaced poses, in
             standard deviations of the latter.
         frames_best: share of the frames whose score is highest at the result.
@@ -56,7 +54,6 @@ class ImageEvidence:
 
     groups: int
     lens: tuple[LensParameter, ...] = ()
-    gain: float = math.nan
     displaced_z_score: float = math.nan
     frames_best: float = math.nan
     frames_lost: tuple[int, ...] = ()
@@ -105,11 +102,9 @@ def _measure_camera(
     groups = len(scores.weights)
     if groups < MIN_GROUPS:
         return ImageEvidence(groups)
-    lens = measure_lens(scorer, images, camera, scores, seed=seed, places=places)
     return ImageEvidence(
         groups,
-        lens=lens.parameters,
-        gain=lens.gain,
+        lens=measure_lens(scorer, images, camera, scores, seed=seed, places=places),
         **_compare_with_displaced(scores),
         **_compare_with_neighbours(scorer, images, camera),
     )

@@ -6,14 +6,13 @@ along the longer side of the image.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.matching.structure.consensus import maximize_score, sum_scores
+from calibgraph.matching.structure.consensus import maximize_score
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.error_components import error_components
@@ -41,20 +40,6 @@ SEARCH_PRIOR = 1.0  # weak: the estimate is to be unbiased
 SEARCH_BLUR_STEPS = 1.0  # of the score grids, for the search only
 
 
-@dataclass(frozen=True)
-class LensEvidence:
-    """The lens that fits the images best.
-
-    Attributes:
-        parameters: those of ``NAMES``; none where images do not determine them.
-        gain: of the summed score at the best pose nearby with its own lens over that at the result,
-            in standard deviations of chance agreement.
-    """
-
-    parameters: tuple[LensParameter, ...] = ()
-    gain: float = math.nan
-
-
 def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     scorer: FrameScorer,
     images: Images,
@@ -63,8 +48,8 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     *,
     seed: int,
     places: Places = NOWHERE,
-) -> LensEvidence:
-    """Find the lens that fits the images best, with the pose free.
+) -> tuple[LensParameter, ...]:
+    """The lens that fits the images best, with the pose free; empty where images do not tell.
 
     Args:
         scorer: of the frames.
@@ -74,18 +59,16 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
         seed: of the search.
         places: which frames share one.
     """
-    frames = np.unique(scores.frame)
-    copies = len(frames) / len(np.unique(places.merge_stationary(frames)))
+    if camera.model == "equirectangular":
+        return ()  # its format determines it
     # Across the longer side of the image, a principal point cannot be told from a rotation.
     along = Free.CENTRE_X if camera.width_px >= camera.height_px else Free.CENTRE_Y
     finer = Free.FOCAL, Free.RADIAL, along  # right shapes are nearer to zero without a finer fit
-    is_free = camera.model != "equirectangular"  # else its format determines it
-    searched = (*finer, Free.ASPECT) if is_free else ()
-    best, gain = _search(camera, scores, searched, seed)
-    found = LensEvidence(gain=gain / math.sqrt(copies))  # chance agreement of copies repeats
-    rough = _fit_at_peaks(camera, scores, best, places) if is_free else None
+    searched = *finer, Free.ASPECT
+    best = _search(camera, scores, searched, seed)
+    rough = _fit_at_peaks(camera, scores, best, places)
     if rough is None:
-        return found
+        return ()
     change, lens, moved = rough.free(*finer), lens_variable(camera), np.zeros(len(Free))
     moved[[*finer]] = change.values
     most = MAX_RADIAL / lens.free.sigmas[Free.RADIAL]
@@ -94,12 +77,12 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     again = scorer.score_together(images, refined, FINER)
     rest = _fit_at_peaks(refined, again, np.zeros(len(best)), places)
     if rest is None:
-        return found
+        return ()
     fine, parameters = rest.counted_from(moved), []
     for name, number in zip(NAMES, (*searched, Free.SKEW), strict=True):
         fit, others = fine if number in finer else rough, [n for n in finer if n != number]
         parameters.append(LensParameter.of(name, camera, fit.free(*others, number), number))
-    return replace(found, parameters=tuple(parameters))
+    return tuple(parameters)
 
 
 def _extend(scores: ShiftScores, camera: Camera) -> ShiftScores:
@@ -109,10 +92,8 @@ def _extend(scores: ShiftScores, camera: Camera) -> ShiftScores:
     return replace(scores, jacobian=jacobian)
 
 
-def _search(
-    camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: int
-) -> tuple[Array, float]:
-    """The best twist and lens, (12,), and its gain over the result.
+def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: int) -> Array:
+    """The best twist and lens, (12,).
 
     Args:
         camera: at the result.
@@ -120,21 +101,18 @@ def _search(
         lens: numbers of its parameters that are searched. A skew moves pixels too little for it.
         seed: of the search.
     """
-    columns, widths = [*range(6), *(6 + number for number in lens)], SEARCH_POSE
-    if lens:
-        units = np.array([1.0, 1.0, camera.intrinsics_px.fx, 1.0]) * SEARCH_LENS
-        widths = np.append(widths, units / np.array(lens_variable(camera).free.sigmas)[[*lens]])
-        scores = _extend(scores, camera)
+    columns, extended = [*range(6), *(6 + number for number in lens)], _extend(scores, camera)
+    units = np.array([1.0, 1.0, camera.intrinsics_px.fx, 1.0]) * SEARCH_LENS
+    sigmas = np.array(lens_variable(camera).free.sigmas)[[*lens]]
     smooth = replace(
-        scores,
+        extended,
         grids=np.stack([cv2.GaussianBlur(g, (0, 0), SEARCH_BLUR_STEPS) for g in scores.grids]),
-        jacobian=np.ascontiguousarray(scores.jacobian[:, :, columns]),
+        jacobian=np.ascontiguousarray(extended.jacobian[:, :, columns]),
     )
-    found = maximize_score(smooth, widths, seed=seed, prior=SEARCH_PRIOR)
-    values = sum_scores(smooth, np.array([np.zeros(len(found)), found]))
+    widths = np.append(SEARCH_POSE, units / sigmas)
     best = np.zeros(6 + len(Free))
-    best[columns] = found
-    return best, float((values[1] - values[0]) / (smooth.chance_sigma + 1e-12))
+    best[columns] = maximize_score(smooth, widths, seed=seed, prior=SEARCH_PRIOR)
+    return best
 
 
 def _fit_at_peaks(

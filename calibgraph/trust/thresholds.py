@@ -169,12 +169,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("frames_best", "frames whose score is highest at the result", "at least", 0.8, 0.5,
               "share", "In how many frames is no displaced extrinsic better?",
               f"{_RECORDED}: right 100 %, mispaired images up to 67 %, mostly 50 %."),
-    Threshold("score_gain", "score gain of the best extrinsic nearby", "at most", 1.0, 6.0,
-              "sigma", "Does an extrinsic nearby fit the images better, by how many standard "
-              "deviations of chance agreement?",
-              f"{_RECORDED}: right up to 0.65; one 0.35 deg off 1.0; KITTI 08: right up to 3.5. "
-              "Local optima next to the right one 11 to 32.",
-              "a slightly different pose fits the images better; often the lens is the cause"),
     Threshold("own_clouds", "score with the own clouds above that with neighbouring ones",
               "at least", -0.05, -0.2, "share", "Do images and clouds belong together?",
               "KITTI 00: own clouds +0.4 and more, clouds one frame off -0.4 and less; about zero "
