@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +27,6 @@ from calibgraph.tracking.place_shift import agrees_at_its_place
 from calibgraph.tracking.posterior import sums_of_frame
 from calibgraph.tracking.start import count_residuals
 from calibgraph.tracking.state import State
-from calibgraph.tracking.window import Window
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
@@ -56,22 +56,21 @@ def blocks_by_camera(state: State, rig: Rig, table: Correspondences) -> dict[int
 
 
 def inliers_at(
-    state: State, window: Window, blocks: Mapping[int, CameraBlock]
+    state: State, T_lidar_camera: Sequence[gtsam.Pose3], blocks: Mapping[int, CameraBlock]
 ) -> dict[int, NDArray[np.bool_]]:
-    """Per camera which matches are within the gate at the window's estimate, if enough are."""
+    """Per camera which matches are within the gate at an estimate, if enough are."""
     inliers = {}
     for camera, block in blocks.items():
-        T_camera_lidar = to_T_camera_lidar(window.T_lidar_camera(camera))
+        T_camera_lidar = to_T_camera_lidar(T_lidar_camera[camera])
         rows = block.at(T_camera_lidar).inliers(state.cameras[camera].scale)
         if np.count_nonzero(rows) >= MIN_MATCHES:
             inliers[camera] = rows
     return inliers
 
 
-def with_estimates(state: State, window: Window) -> State:
-    """The state with the window's estimates of the last epoch."""
-    estimates = tuple(window.T_lidar_camera(camera) for camera in range(len(state.names)))
-    last = replace(state.epochs[-1], T_lidar_camera=estimates)
+def with_estimates(state: State, T_lidar_camera: tuple[gtsam.Pose3, ...]) -> State:
+    """The state with these estimates of the last epoch."""
+    last = replace(state.epochs[-1], T_lidar_camera=T_lidar_camera)
     return replace(state, epochs=(*state.epochs[:-1], last))
 
 

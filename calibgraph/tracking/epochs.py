@@ -17,6 +17,7 @@ from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, inliers_of
 from calibgraph.tracking.place_shift import shift_between
 from calibgraph.tracking.place_sums import sums_by_place
+from calibgraph.tracking.posterior import sums_of_matches
 from calibgraph.tracking.regate import regate
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.tracking.sums import Sums, step_between
@@ -25,19 +26,12 @@ from factors import to_runs
 Array = NDArray[np.float64]
 
 
-def close_epoch(
-    state: State, estimates: Sequence[tuple[gtsam.Pose3, ...]]
-) -> tuple[State, list[Event]]:
+def close_epoch(state: State) -> tuple[State, list[Event]]:
     """The state with its open epoch closed and a new one begun.
 
-    Args:
-        state: before.
-        estimates: the newest T_lidar_camera estimates, per live epoch and camera.
+    A camera that drifts keeps the estimate of each epoch; any other has the newest in all of them.
     """
-    epochs = tuple(
-        replace(epoch, T_lidar_camera=of_epoch)
-        for epoch, of_epoch in zip(state.epochs, estimates, strict=True)
-    )
+    epochs = tuple(_at_newest(state, epoch) for epoch in state.epochs)
     state = replace(state, epochs=epochs)
     if len(epochs) > state.config.tracking.live_epochs:
         state = _summarize_oldest(state)
@@ -53,6 +47,12 @@ def close_epoch(
     epochs = state.epochs
     epochs = (*epochs[:-1], _with_distortion(state, epochs[-1]), Epoch.empty(state.T_lidar_camera))
     return report_drift(replace(state, epochs=epochs))
+
+
+def _at_newest(state: State, epoch: Epoch) -> Epoch:
+    estimates = zip(state.cameras, epoch.T_lidar_camera, state.T_lidar_camera, strict=True)
+    poses = tuple(own if one.summary.walk else newest for one, own, newest in estimates)
+    return replace(epoch, T_lidar_camera=poses)
 
 
 def _with_distortion(state: State, epoch: Epoch) -> Epoch:
@@ -127,12 +127,10 @@ def _at_places(state: State, epoch: Epoch) -> list[LiveFrame]:
 
 
 def _ungated(state: State, epoch: Epoch, camera: int) -> Sums:
-    """Hessian and gradient at the reference of all matches of a camera in an epoch."""
-    pose = epoch.T_lidar_camera[camera]
+    """All matches of a camera in an epoch, whatever the gate."""
     raw = merge([frame.raw[camera] for frame in epoch.frames if camera in frame.raw])
-    here = raw.with_scale(state.cameras[camera].scale).sums(pose)
-    sums = replace(Sums.zeros(), hessian=here.hessian, gradient=here.gradient)
-    return sums.shift_reference(step_between(pose, state.references[camera]))
+    scale, pose = state.cameras[camera].scale, epoch.T_lidar_camera[camera]
+    return sums_of_matches(raw, scale, pose, state.references[camera])
 
 
 def _with_places(state: State, parts: Mapping[str, Sums], drifted: Sequence[bool]) -> State:

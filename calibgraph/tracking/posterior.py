@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.graph.objective import join
+from calibgraph.graph.variables import camera_key
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.solver.camera_block import BlockResiduals
-from calibgraph.solver.curvature import robust_hessian
+from calibgraph.solver.camera_block import BlockResiduals, CameraBlock
+from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.live_frames import Epoch
@@ -19,6 +22,8 @@ from calibgraph.tracking.sums import Sums, step_between
 from factors import ProjectionBlock
 
 Array = NDArray[np.float64]
+
+_STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away
 
 
 def sums_of_frame(
@@ -47,6 +52,42 @@ def sums_of_frame(
         np.array(1.0),
         np.array(float(len(block))),
     )
+
+
+def equation_5(
+    priors: gtsam.NonlinearFactorGraph, references: Sequence[gtsam.Pose3], sums: Sums
+) -> gtsam.NonlinearFactorGraph:
+    """Eq. 5 of the paper: priors, and (n,) sums of all matches as a quadratic per camera."""
+    graph, at = join(priors), gtsam.Values()
+    for camera, reference in enumerate(references):
+        own, key = sums[camera], camera_key(camera)
+        if own.hessian.any():
+            at.insert(key, reference)
+            hessian = convex_hessian(own.hessian, own.reweighted)
+            factor = gtsam.HessianFactor(key, hessian, -own.gradient, 0.0)
+            graph.add(gtsam.LinearContainerFactor(factor, at))
+    return graph
+
+
+def minimum(
+    graph: gtsam.NonlinearFactorGraph, start: Sequence[gtsam.Pose3]
+) -> tuple[gtsam.Pose3, ...]:
+    """T_lidar_camera of all cameras at the minimum of :func:`equation_5`, by Gauss-Newton."""
+    values, keys = gtsam.Values(), range(len(start))
+    for camera in keys:
+        values.insert(camera_key(camera), start[camera])
+    for _ in range(_STEPS):
+        values = values.retract(graph.linearize(values).optimize())
+    return tuple(values.atPose3(camera_key(camera)) for camera in keys)
+
+
+def sums_of_matches(
+    block: CameraBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3, reference: gtsam.Pose3
+) -> Sums:
+    """Hessian by their weights, and gradient at a reference, of matches in and out of the gate."""
+    here = block.with_scale(scale).sums(T_lidar_camera)
+    sums = replace(Sums.zeros(), hessian=here.hessian, gradient=here.gradient)
+    return sums.shift_reference(step_between(T_lidar_camera, reference))
 
 
 def true_hessian(residuals: BlockResiduals, block: ProjectionBlock, scale: ResidualScale) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,6 +37,7 @@ from calibgraph.tracking.frame_order import (
     with_place,
 )
 from calibgraph.tracking.live_frames import LiveFrame
+from calibgraph.tracking.posterior import equation_5, minimum, sums_of_matches
 from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import start_cameras
@@ -48,8 +50,8 @@ from calibgraph.tracking.state_bytes import (
     save_state_file,
 )
 from calibgraph.tracking.step_detection import detect_small_step, detect_step
+from calibgraph.tracking.sums import Sums
 from calibgraph.tracking.update import Update, make_update, rig_at
-from calibgraph.tracking.window import Window
 
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
 
@@ -121,8 +123,8 @@ class IncrementalCalibrator:
         reported.
         """
         if self.config.preset != "auto":
-            return self._window.graph
-        return latent_pose_graph(self._assess().fit.linear.model)
+            return self._equation_5()
+        return latent_pose_graph(self._assess().window.model)
 
     def update(
         self, table: Correspondences, *, frame: int | None = None, place: str | int | None = None
@@ -202,7 +204,8 @@ class IncrementalCalibrator:
         """Assess the estimates, once: the sums over closed epochs are at hand."""
         state = self._state
         if self._assessed is None or self._assessed[0] is not state:
-            self._assessed = state, assess(state, self._closed)
+            before = self._assessed and self._assessed[1].window
+            self._assessed = state, assess(state, self._closed, before)
         return self._assessed[1]
 
     def _at(self, estimates: tuple[gtsam.Pose3, ...]) -> Rig:
@@ -254,23 +257,38 @@ class IncrementalCalibrator:
         self._rebuild(closed)
 
     def _rebuild(self, closed: ClosedPlaces | None = None) -> None:
-        """Set up iSAM2 anew, after anything but a frame has changed the state."""
-        self._closed = closed or ClosedPlaces.of(self._state)
-        self._window = Window(self._state)
-        self._state = with_estimates(self._state, self._window)
+        """Start from the state anew, after anything but a frame has changed it."""
+        self._closed, self._assessed = closed or ClosedPlaces.of(self._state), None
+        self._state = with_estimates(self._state, self._minimum())
+
+    def _equation_5(self, more: Mapping[int, Sums] | None = None) -> gtsam.NonlinearFactorGraph:
+        """Eq. 5 of the paper with the sums of all frames, and more of some cameras."""
+        sums = self._closed.posterior + self._state.epochs[-1].sums
+        for camera, own in (more or {}).items():
+            sums = sums.replace_at(camera, sums[camera] + own)
+        return equation_5(self._closed.priors, self._state.references, sums)
+
+    def _minimum(self, more: Mapping[int, Sums] | None = None) -> tuple[gtsam.Pose3, ...]:
+        """Where it has its minimum."""
+        return minimum(self._equation_5(more), self._state.T_lidar_camera)
 
     def _absorb(self, agreeing: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
-        """The two passes: add the blocks, gate them at the new estimate, replace them."""
+        """The two passes: gate the blocks at the minimum with all their matches, and add them."""
         if not agreeing:
             return {}
-        scales = {camera: self._state.cameras[camera].scale for camera in agreeing}
-        self._window.fit({c: block.with_scale(scales[c]) for c, block in agreeing.items()})
-        inliers = inliers_at(self._state, self._window, agreeing)
-        used = {c: agreeing[c].select(rows) for c, rows in inliers.items()}
-        self._window.refit({c: block.with_scale(scales[c]) for c, block in used.items()})
-        self._state = with_estimates(self._state, self._window)
-        self._state = absorb(self._state, agreeing, inliers)
-        return used
+        state = self._state
+        everything = {
+            camera: sums_of_matches(
+                block, state.cameras[camera].scale,
+                state.T_lidar_camera[camera], state.references[camera],
+            )
+            for camera, block in agreeing.items()
+        }  # fmt: skip
+        state = with_estimates(state, self._minimum(everything))
+        inliers = inliers_at(state, state.T_lidar_camera, agreeing)
+        self._state = absorb(state, agreeing, inliers)
+        self._state = with_estimates(self._state, self._minimum())
+        return {camera: agreeing[camera].select(rows) for camera, rows in inliers.items()}
 
     def _restart_after_step(self) -> list[Event]:
         """Restart what has moved so far that frames disagree with the estimate."""
@@ -282,11 +300,11 @@ class IncrementalCalibrator:
         return list(events)
 
     def _close_epoch(self) -> list[Event]:
-        """Summarize the oldest live epoch, test for a small step, set up iSAM2 anew."""
+        """Summarize the oldest live epoch, test for a small step, begin another."""
         state = self._state
         if self._assessed is not None:
             state = replace(state, optimum=self._assessed[1].newest(state.optimum))
-        self._state, events = close_epoch(state, self._window.T_lidar_camera_by_epoch())
+        self._state, events = close_epoch(state)
         detected = detect_small_step(self._state)
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
