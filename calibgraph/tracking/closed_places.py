@@ -6,7 +6,7 @@ their robust loss has at the optimum of the last one: within 0.02 sigma that is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -46,7 +46,7 @@ from calibgraph.tracking.place_model import (
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
 from calibgraph.tracking.posterior import closed_posterior, split_halves
 from calibgraph.tracking.state import State
-from calibgraph.tracking.sums import Sums
+from calibgraph.tracking.sums import Sums, equation_5
 from calibgraph.tracking.window import Window
 
 Array = NDArray[np.float64]
@@ -137,6 +137,15 @@ class ClosedPlaces:
     def marginals(self) -> list[gtsam.GaussianFactorGraph]:
         """Per place, on what all places share."""
         return marginals_of_places(self.fit)
+
+    def equation_5(
+        self, state: State, more: Mapping[int, Sums] | None = None
+    ) -> gtsam.NonlinearFactorGraph:
+        """Eq. 5 of the paper with the sums of all frames, and more of some cameras."""
+        sums = self.posterior + state.epochs[-1].sums
+        for camera, own in (more or {}).items():
+            sums = sums.replace_at(camera, sums[camera] + own)
+        return equation_5(self.priors, state.references, sums)
 
     def shows_ratios(self, state: State) -> bool:
         """Whether anything is measured twice."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +18,10 @@ from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.shared_error import with_common_error
 from calibgraph.tracking.absorption import (
     absorb,
+    at_minimum,
     blocks_by_camera,
     count_absent,
-    inliers_at,
     select_agreeing,
-    with_estimates,
     with_open_frame,
 )
 from calibgraph.tracking.assessment import Assessment, assess, to_calibration
@@ -35,10 +33,9 @@ from calibgraph.tracking.frame_order import (
     number_and_stamp,
     with_metadata_per_frame,
     with_place,
+    without_repeats,
 )
 from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.posterior import equation_5, minimum, sums_of_matches
-from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
@@ -50,7 +47,6 @@ from calibgraph.tracking.state_bytes import (
     save_state_file,
 )
 from calibgraph.tracking.step_detection import detect_small_step, detect_step
-from calibgraph.tracking.sums import Sums
 from calibgraph.tracking.update import Update, make_update, rig_at
 
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
@@ -123,7 +119,7 @@ class IncrementalCalibrator:
         reported.
         """
         if self.config.preset != "auto":
-            return self._equation_5()
+            return self._closed.equation_5(self._state)
         return latent_pose_graph(self._assess().window.model)
 
     def update(
@@ -180,8 +176,8 @@ class IncrementalCalibrator:
 
     def _take(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
-        self._state, agreeing = select_agreeing(self._state, blocks)
-        used = self._absorb(agreeing)
+        self._state, agreeing = select_agreeing(self._state, self._closed, blocks)
+        self._state, used = absorb(self._state, self._closed, agreeing)
         self._state, events = start_cameras(self._state, table, blocks)
         if events:
             self._rebuild()
@@ -259,36 +255,7 @@ class IncrementalCalibrator:
     def _rebuild(self, closed: ClosedPlaces | None = None) -> None:
         """Start from the state anew, after anything but a frame has changed it."""
         self._closed, self._assessed = closed or ClosedPlaces.of(self._state), None
-        self._state = with_estimates(self._state, self._minimum())
-
-    def _equation_5(self, more: Mapping[int, Sums] | None = None) -> gtsam.NonlinearFactorGraph:
-        """Eq. 5 of the paper with the sums of all frames, and more of some cameras."""
-        sums = self._closed.posterior + self._state.epochs[-1].sums
-        for camera, own in (more or {}).items():
-            sums = sums.replace_at(camera, sums[camera] + own)
-        return equation_5(self._closed.priors, self._state.references, sums)
-
-    def _minimum(self, more: Mapping[int, Sums] | None = None) -> tuple[gtsam.Pose3, ...]:
-        """Where it has its minimum."""
-        return minimum(self._equation_5(more), self._state.T_lidar_camera)
-
-    def _absorb(self, agreeing: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
-        """The two passes: gate the blocks at the minimum with all their matches, and add them."""
-        if not agreeing:
-            return {}
-        state = self._state
-        everything = {
-            camera: sums_of_matches(
-                block, state.cameras[camera].scale,
-                state.T_lidar_camera[camera], state.references[camera],
-            )
-            for camera, block in agreeing.items()
-        }  # fmt: skip
-        state = with_estimates(state, self._minimum(everything))
-        inliers = inliers_at(state, state.T_lidar_camera, agreeing)
-        self._state = absorb(state, agreeing, inliers)
-        self._state = with_estimates(self._state, self._minimum())
-        return {camera: agreeing[camera].select(rows) for camera, rows in inliers.items()}
+        self._state = at_minimum(self._state, self._closed)
 
     def _restart_after_step(self) -> list[Event]:
         """Restart what has moved so far that frames disagree with the estimate."""
