@@ -27,7 +27,6 @@ class Output:
     """A file that a command writes.
 
     Attributes:
-        path: of the file.
         by: the commands that write such files, in a message.
         marks: the program's files hold one of them; without marks no file is replaced.
         suffixes: the endings that its name may have, if not any.

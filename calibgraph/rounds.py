@@ -28,6 +28,7 @@ from calibgraph.matching.run import (
     RoundSummary,
     round_in_words,
     summarize_round,
+    with_motion,
 )
 from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.model.config import Config, Terms
@@ -89,7 +90,7 @@ def match_in_rounds(
     for index in indices:
         with watch("match"):
             table = full.match(data, estimate, round_index=index, progress=progress)
-            table = table.with_findings(start.findings).with_places(places)
+            table = with_motion(table, data).with_findings(start.findings).with_places(places)
         with watch("solve"):
             solution = _solve(data, guess, (estimate, table), config, terms=terms)
         rounds.append(summarize_round(table, estimate, solution.solved_rig))
@@ -249,7 +250,7 @@ def _from_displaced_start(
             round_index=index,
             progress=lambda what, done, total: progress("matching again", done, total),
         )
-        table = table.with_places(places)
+        table = with_motion(table, run.dataset).with_places(places)
         solution = solve_joint(estimate.with_lenses_of(run.guess), table, config, terms)
         last = _LastRound(table, solution, summarize_round(table, estimate, solution.solved_rig))
         estimate = solution.solved_rig

@@ -6,6 +6,7 @@ This package is a leaf: it imports numpy, numba and gtsam, and nothing of calibg
 
 from factors.block import ProjectionBlock, block_factor, to_runs
 from factors.block_sums import BlockSums, square_root
+from factors.clock import Clock, displace
 from factors.conditioning import (
     smallest_scaled_eigenvalue,
     smallest_scaled_eigenvalues,
@@ -47,6 +48,7 @@ __all__ = [
     "LOSSES",
     "BlockSums",
     "EpipolarBlock",
+    "Clock",
     "FreeLens",
     "FreeLensBlock",
     "Lens",
@@ -60,6 +62,7 @@ __all__ = [
     "displaced_between_factor",
     "epipolar_factor",
     "epipolar_residual",
+    "displace",
     "free_lens_factor",
     "linear_factor",
     "pair_block_factor",

@@ -40,6 +40,7 @@ Array = NDArray[np.float64]
 
 _CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
 _WORTH_SHARING = 2_000_000  # correspondences (7 ms): below, waiting for busy cores costs more
+_WIDTHS = {"points_lidar_m": 3, "pixels_px": 2, "sqrt_information": 3, "motion": 7}
 _NO_RESIDUALS, _NO_NORMS = np.empty((0, 2)), np.empty((0, 0))
 
 
@@ -57,6 +58,8 @@ class ProjectionBlock(RobustBlock):
         scale: norm of a whitened residual, divided by sigma, at which the loss bends (the paper's
             delta).
         sigma: divides all whitened residuals.
+        motion: (n, 7) or None: the twist of the LiDAR, rotation [rad/s] and translation [m/s], and
+            how long after its scan the points are where they are here [s].
 
     Raises:
         ValueError: on wrong shapes, values that are not finite, an unknown loss, a scale or sigma
@@ -70,20 +73,22 @@ class ProjectionBlock(RobustBlock):
     loss: str = "cauchy"
     scale: float = 4.0
     sigma: float = 1.0
-    _columns: Array = field(init=False, repr=False)  # (5, n) x y z u v, contiguous by row
+    motion: Array | None = None
+    _columns: Array = field(init=False, repr=False)  # (5, n) x y z u v, or (12, n) with the motion
     _whitening: Array = field(init=False, repr=False)  # (3, n), (1, n) or (0, n), see the kernel
     _chunks: NDArray[np.int64] = field(init=False, repr=False)  # (c, 2) runs of all, see _CHUNK
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)
-        check_shape("points_lidar_m", self.points_lidar_m, (n, 3))
-        check_shape("pixels_px", self.pixels_px, (n, 2))
-        if self.sqrt_information is not None:
-            check_shape("sqrt_information", self.sqrt_information, (n, 3))
+        for name, width in _WIDTHS.items():
+            if getattr(self, name) is not None:
+                check_shape(name, getattr(self, name), (n, width))
         loss_id(self.loss)
         self._check_scale()
-        columns = np.empty((5, n))
-        columns[:3], columns[3:] = self.points_lidar_m.T, self.pixels_px.T
+        columns = np.empty((5 if self.motion is None else 12, n))
+        columns[:3], columns[3:5] = self.points_lidar_m.T, self.pixels_px.T
+        if self.motion is not None:
+            columns[5:] = self.motion.T
         self._initialize(columns, *rows_of_root(self.sqrt_information))
 
     def _initialize(self, columns: Array, root: Array | None, rows: int) -> None:
@@ -93,7 +98,8 @@ class ProjectionBlock(RobustBlock):
             _whitening=np.empty((0, columns.shape[1])) if root is None else root[:rows],
             _chunks=_cut(columns.shape[1]),
             points_lidar_m=columns[:3].T,
-            pixels_px=columns[3:].T,
+            pixels_px=columns[3:5].T,
+            motion=columns[5:].T if len(columns) > 5 else None,  # noqa: PLR2004
             sqrt_information=None if root is None else root.T,
         )
 

@@ -1,15 +1,16 @@
-"""A lens with free parameters, and the block factor on a pose and that lens.
+"""A lens and a clock with free parameters, and the block factor on a pose and these.
 
 With k free parameters l, the lossless block factor of ``factors.block`` has 6 + k columns: a
 derivative of the pixels by each parameter stands beside those by the pose. Every model here maps to
 u = fx a + cx, v = fy b + cy, and (a, b) is linear in the coefficients that may be free, so that all
-derivatives are products of known numbers.
+derivatives are products of known numbers. A later image shows points that have moved on: its
+derivatives are those by the pose, times the twist of the LiDAR.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -17,15 +18,15 @@ from numpy.typing import NDArray
 
 from factors.block import ProjectionBlock
 from factors.block_sums import BlockSums, square_root
-from factors.compiled import compiled
+from factors.clock import Clock, displace
 from factors.lens import Lens
-from factors.lens_kernels import EQUIRECTANGULAR, FISHEYE, OMNIDIRECTIONAL, PINHOLE, RADTAN
-from factors.loss import loss_and_weight, loss_id
+from factors.lens_kernels import EQUIRECTANGULAR, FISHEYE, OMNIDIRECTIONAL, PINHOLE
+from factors.loss import loss_id, losses_and_weights
 
 Array = NDArray[np.float64]
 
 COEFFICIENT_NUMBERS: Mapping[int, Mapping[str, int]] = {
-    **dict.fromkeys((PINHOLE, RADTAN), {"k1": 0, "k2": 1, "p1": 2, "p2": 3, "k3": 4}),
+    PINHOLE: {"k1": 0, "k2": 1, "p1": 2, "p2": 3, "k3": 4},
     FISHEYE: {"k1": 0, "k2": 1, "k3": 2, "k4": 3},
     OMNIDIRECTIONAL: {"k1": 1, "k2": 2, "p1": 3, "p2": 4},
     EQUIRECTANGULAR: {},
@@ -33,9 +34,10 @@ COEFFICIENT_NUMBERS: Mapping[int, Mapping[str, int]] = {
 """By the kind of lens, the distortion coefficients that may be free, and their places."""
 
 FOCAL, ASPECT, CENTRE_X, CENTRE_Y = "focal", "aspect", "centre_x", "centre_y"
+OFFSET, READOUT = CLOCK = "offset", "readout"
 
 _MAKERS: Mapping[int, tuple[Callable[..., Lens], int]] = {
-    **dict.fromkeys((PINHOLE, RADTAN), (Lens.pinhole, 8)),
+    PINHOLE: (Lens.pinhole, 8),
     FISHEYE: (Lens.fisheye, 4),
     OMNIDIRECTIONAL: (Lens.omnidirectional, 5),
 }
@@ -43,14 +45,15 @@ _MAKERS: Mapping[int, tuple[Callable[..., Lens], int]] = {
 
 @dataclass(frozen=True, eq=False)
 class FreeLens:
-    """A lens and its free parameters, each in standard deviations of its prior.
+    """A lens, a clock and their free parameters, each in standard deviations of its prior.
 
     Attributes:
         lens: at the mean of the prior, where all values are zero.
         parameters: (k,) names: ``focal`` [of the logarithm of both focal lengths], ``aspect`` [of
-            the logarithm of fx / fy], ``centre_x`` and ``centre_y`` [px], and distortion
-            coefficients as in ``COEFFICIENT_NUMBERS``.
+            the logarithm of fx / fy], ``centre_x`` and ``centre_y`` [px], distortion coefficients
+            as in ``COEFFICIENT_NUMBERS``, and ``offset`` and ``readout`` [s] of the clock.
         sigmas: (k,) their standard deviations.
+        clock: at the mean of the prior.
 
     Raises:
         ValueError: if the kind of lens has no such parameter.
@@ -59,19 +62,23 @@ class FreeLens:
     lens: Lens
     parameters: tuple[str, ...]
     sigmas: tuple[float, ...]
+    clock: Clock = Clock()
 
     def __post_init__(self) -> None:
         known = [FOCAL, ASPECT, CENTRE_X, CENTRE_Y, *COEFFICIENT_NUMBERS[self.lens.kind]]
-        unknown = [name for name in self.parameters if name not in known]
-        if unknown or self.lens.kind == EQUIRECTANGULAR:
-            raise ValueError(f"this lens has no free {', '.join(unknown or self.parameters)}")
+        known = [] if self.lens.kind == EQUIRECTANGULAR else known
+        unknown = [name for name in self.parameters if name not in (*known, *CLOCK)]
+        if unknown:
+            raise ValueError(f"this lens has no free {', '.join(unknown)}")
 
     def __len__(self) -> int:
         return len(self.parameters)
 
     def at(self, values: Array) -> Lens:
         """The lens of (k,) values."""
-        steps = dict(zip(self.parameters, np.multiply(values, self.sigmas).tolist(), strict=True))
+        steps = self._steps(values)
+        if steps.keys() <= {*CLOCK}:
+            return self.lens
         packed, half = self.lens.packed.copy(), 0.5 * steps.get(ASPECT, 0.0)
         packed[:2] *= np.exp(steps.get(FOCAL, 0.0) + np.array([half, -half]))
         packed[2:4] += steps.get(CENTRE_X, 0.0), steps.get(CENTRE_Y, 0.0)
@@ -81,17 +88,30 @@ class FreeLens:
         named = dict(zip(("fx", "fy", "cx", "cy"), packed.tolist(), strict=False))
         return make(**named, distortion=packed[4 : 4 + size].tolist())
 
+    def clock_at(self, values: Array) -> Clock:
+        """The clock of (k,) values."""
+        steps, clock = self._steps(values), self.clock
+        return replace(
+            clock,
+            offset_s=clock.offset_s + steps.get(OFFSET, 0.0),
+            readout_s=clock.readout_s + steps.get(READOUT, 0.0),
+        )
+
+    def _steps(self, values: Array) -> dict[str, float]:
+        """By name, the differences from the mean of the prior."""
+        return dict(zip(self.parameters, np.multiply(values, self.sigmas).tolist(), strict=True))
+
     def coefficient(self, name: str, values: Array) -> float:
         """A distortion coefficient of the lens of (k,) values."""
         return float(self.at(values).packed[4 + COEFFICIENT_NUMBERS[self.lens.kind][name]])
 
     def fill_columns(self, lens: Lens, points_camera_m: Array, columns: Array) -> None:
-        """Derivatives of the pixels of some points by the values.
+        """Derivatives of the pixels of some points by the values of the lens.
 
         Args:
             lens: at the values.
             points_camera_m: (n, 3).
-            columns: (k, 2, n), filled; zero where a point is not projectable.
+            columns: (k, 2, n), filled; zero where a point is not projectable, and of the clock.
         """
         pixels, projectable = lens.project(points_camera_m)
         off_centre = pixels.T - lens.packed[2:4, None]
@@ -100,6 +120,7 @@ class FreeLens:
             ASPECT: off_centre * [[0.5], [-0.5]],
             CENTRE_X: np.array([[1.0], [0.0]]),
             CENTRE_Y: np.array([[0.0], [1.0]]),
+            **dict.fromkeys(CLOCK, np.zeros((1, 1))),
         }
         plane, squared = _on_plane(lens, points_camera_m.T)
         for row, (name, sigma) in enumerate(zip(self.parameters, self.sigmas, strict=True)):
@@ -130,7 +151,7 @@ def _by_coefficient(lens: Lens, name: str, plane: Array, squared: Array) -> Arra
     if name == "p2":
         return np.stack([squared + 2 * a**2, 2 * a * b])
     over = np.ones_like(squared)
-    if lens.kind == RADTAN:
+    if lens.kind == PINHOLE:
         k4, k5, k6 = lens.packed[9:12]
         over += squared * (k4 + squared * (k5 + squared * k6))
     return np.asarray(plane * (squared ** int(name[1]) / over))
@@ -141,7 +162,8 @@ class FreeLensBlock:
     """The correspondences of one camera whose lens has free parameters.
 
     Attributes:
-        block: with its loss; its own lens takes no part.
+        block: with its loss; its own lens takes no part. Without its motion, the clock is not
+            observable.
         lens: of the camera.
     """
 
@@ -159,10 +181,12 @@ class FreeLensBlock:
         """
         block, lens = self.block, self.lens.at(values)
         columns = np.empty((7 + len(self.lens), 2, len(block)))
-        pixels = lens.fill_twist_columns(T_camera_lidar, block.points_lidar_m, columns[:6])
+        points = self._points_lidar_m(values)
+        pixels = lens.fill_twist_columns(T_camera_lidar, points, columns[:6])
         columns[:6] *= -1.0  # T_lidar_camera exp(xi) is exp(-xi) T_camera_lidar
-        points = block.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+        points = points @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
         self.lens.fill_columns(lens, points, columns[6:-1])
+        self._fill_clock_columns(T_camera_lidar, columns)
         columns[-1] = lens.subtract(pixels.T, block.pixels_px).T
         if block.sqrt_information is not None:
             s00, s01, s11 = block.sqrt_information.T
@@ -170,11 +194,34 @@ class FreeLensBlock:
             columns[:, 1] *= s11
         return np.asarray(columns / block.sigma)
 
+    def _points_lidar_m(self, values: Array) -> Array:
+        """(n, 3) where the points are when their pixels are taken."""
+        block = self.block
+        if block.motion is None:
+            return block.points_lidar_m
+        times_s = self.lens.clock_at(values).times_s(block.pixels_px[:, 1])
+        return displace(block.points_lidar_m, block.motion[:, :6], block.motion[:, 6] - times_s)
+
+    def _fill_clock_columns(self, T_camera_lidar: Array, columns: Array) -> None:
+        """Derivatives by the clock: a camera that waits has moved by the twist of the LiDAR."""
+        motion = self.block.motion
+        if motion is None or not {*CLOCK} & {*self.lens.parameters}:
+            return
+        twists = motion[:, :6] @ gtsam.Pose3(T_camera_lidar).AdjointMap().T
+        by_time = (columns[:6] * twists.T[:, None]).sum(axis=0)
+        shares: dict[str, float | Array] = {
+            OFFSET: 1.0,
+            READOUT: self.lens.clock.shares(self.block.pixels_px[:, 1]),
+        }
+        names = zip(self.lens.parameters, self.lens.sigmas, strict=True)
+        for row, (name, sigma) in enumerate(names, start=6):
+            if name in CLOCK:
+                columns[row] = by_time * (sigma * shares[name])
+
     def loss(self, columns: Array) -> tuple[Array, Array]:
         """(n,) robust loss of the residuals of some columns, and its weight."""
         squares = np.square(columns[-1]).sum(axis=0)
-        losses: tuple[Array, Array] = _losses(loss_id(self.block.loss), self.block.scale, squares)
-        return losses
+        return losses_and_weights(loss_id(self.block.loss), self.block.scale, squares)
 
     def sums(self, T_camera_lidar: Array, values: Array) -> BlockSums:
         """H (6 + k, 6 + k), b and c of the whole block."""
@@ -187,15 +234,6 @@ class FreeLensBlock:
     def select(self, rows: NDArray[np.int64]) -> FreeLensBlock:
         """The block with only some correspondences."""
         return FreeLensBlock(self.block.select(rows), self.lens)
-
-
-@compiled()
-def _losses(loss, scale, squares):  # type: ignore[no-untyped-def]
-    """(n,) losses and (n,) weights of (n,) squared norms."""
-    found, weights = np.empty(len(squares)), np.empty(len(squares))
-    for i in range(len(squares)):
-        found[i], weights[i] = loss_and_weight(loss, scale, squares[i])
-    return found, weights
 
 
 def free_lens_factor(keys: Sequence[int], block: FreeLensBlock) -> gtsam.CustomFactor:

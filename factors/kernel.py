@@ -15,8 +15,8 @@ import numpy as np
 from numba import prange
 from numba.core.errors import NumbaWarning
 
-from factors.compiled import compiled
-from factors.kernel_projection import project, project_radtan, project_rays
+from factors.compiled import compiled, kernel_part
+from factors.kernel_projection import project, project_pinhole, project_rays
 from factors.kernel_sums import (
     apply_weights,
     scale_residuals,
@@ -27,11 +27,7 @@ from factors.kernel_sums import (
     weigh,
     whiten,
 )
-from factors.lens_kernels import (
-    PINHOLE,
-    RADTAN,
-    is_projectable,
-)
+from factors.lens_kernels import LIMIT, PINHOLE, is_projectable
 from factors.tile import FAST, MATRICES, ROWS, RU, RV, TILE, X, Y, Z
 
 # Open3D brings an older libtbb than numba uses; numba then takes another library, as good.
@@ -60,17 +56,17 @@ def accumulate(kind: int, *, shared: bool = False) -> Any:
             sums, tile = out[i], np.empty((ROWS, TILE))
             for start in range(runs[i, 0], runs[i, 1], TILE):
                 n = min(TILE, runs[i, 1] - start)
-                rays = fast = False
+                rays = False
                 if kind == PINHOLE:
-                    if whitening.shape[0] < MATRICES:
+                    if lens[LIMIT] == math.inf and whitening.shape[0] < MATRICES:
                         rays = project_rays(lens, T, columns, start, n, tile)
-                elif kind == RADTAN:
-                    fast = project_radtan(lens, T, columns, start, n, tile)
+                    if not rays:
+                        project_pinhole(lens, T, columns, start, n, tile)
+                else:
+                    project(kind, lens, T, columns, start, n, tile)
                 if rays:
                     scale_residuals(whitening, start, n, tile)
                 else:
-                    if not fast:
-                        project(kind, lens, T, columns, start, n, tile)
                     whiten(whitening, start, n, tile)
                 sums[27] += weigh(loss, scale, n, tile)
                 if wanted == COST:
@@ -108,10 +104,11 @@ def evaluate(kind: int, *, shared: bool = False) -> Any:
                 n = min(TILE, runs[i, 1] - start)
                 fast = False
                 if kind == PINHOLE:
-                    fast = project_rays(lens, T, columns, start, n, tile)
-                elif kind == RADTAN:
-                    fast = project_radtan(lens, T, columns, start, n, tile)
-                if not fast:
+                    if lens[LIMIT] == math.inf:
+                        fast = project_rays(lens, T, columns, start, n, tile)
+                    if not fast:
+                        fast = project_pinhole(lens, T, columns, start, n, tile)
+                else:
                     project(kind, lens, T, columns, start, n, tile)
                 for k in range(n):
                     valid[start + k] = fast or is_projectable(
@@ -130,7 +127,7 @@ def evaluate(kind: int, *, shared: bool = False) -> Any:
     return evaluate_runs
 
 
-@compiled(fastmath=FAST)
+@kernel_part(fastmath=FAST)
 def fill_norms(whitening, start, n, tile, factor, norms):  # type: ignore[no-untyped-def]
     """Fill in the norms of a tile's residuals times a factor, plain and whitened."""
     ru, rv = tile[RU], tile[RV]

@@ -5,14 +5,17 @@ the rows that are taken out before a loop, and Python's exception on a division 
 ``error_model="numpy"``.
 """
 
-from factors.compiled import compiled
-from factors.lens_kernels import MIN_DEPTH_M, project_one, subtract_columns
+from factors.compiled import compiled, kernel_part
+from factors.lens_kernels import MIN_DEPTH_M, PINHOLE, project_one, subtract_columns
 from factors.tile import FAST, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z
 
 
-@compiled(fastmath=FAST)
+@kernel_part(fastmath=FAST)
 def project_rays(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
-    """Residuals of a pinhole, x/z, y/z and 1/z. False, if a point is too near for these to hold."""
+    """Residuals of an undistorted pinhole, x/z, y/z and 1/z.
+
+    False, if a point is too near for these to hold.
+    """
     xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
     us, vs = columns[3][start:], columns[4][start:]
     ru, rv, ra, rb, rw = tile[RU], tile[RV], tile[A], tile[B], tile[W]
@@ -34,10 +37,28 @@ def project_rays(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-d
 
 
 @compiled(inline="always")
-def project_radtan(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
-    """``project`` for radial-tangential distortion, without branches, as ``lens._radtan_inside``.
+def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
+    """Residuals, their derivatives by the point, and the point in the camera frame."""
+    xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
+    us, vs = columns[3][start:], columns[4][start:]
+    ru, rv = tile[RU], tile[RV]
+    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
+    rx, ry, rz = tile[X], tile[Y], tile[Z]
+    for i in range(n):
+        px, py, pz = xs[i], ys[i], zs[i]
+        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        u, v, ux[i], uy[i], uz[i], vx[i], vy[i], vz[i] = project_one(kind, lens, x, y, z)
+        ru[i], rv[i] = subtract_columns(kind, lens, u, us[i]), v - vs[i]
+        rx[i], ry[i], rz[i] = x, y, z
 
-    False, if a point lies outside the domain in which that holds.
+
+@kernel_part(fastmath=FAST)
+def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
+    """``project`` for a pinhole: without branches, if no point lies outside the lens' domain.
+
+    Then the formulas are those of ``lens_kernels._radtan_inside``. False, if a point does.
     """
     xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
     us, vs = columns[3][start:], columns[4][start:]
@@ -73,22 +94,6 @@ def project_radtan(lens, T, columns, start, n, tile):  # type: ignore[no-untyped
         ux[i], uy[i], uz[i] = fxw * by_a, fxw * cross, -fxw * (by_a * a + cross * b)
         vx[i], vy[i], vz[i] = fyw * cross, fyw * by_b, -fyw * (cross * a + by_b * b)
         rx[i], ry[i], rz[i] = x, y, z
+    if outside > 0.0:
+        project(PINHOLE, lens, T, columns, start, n, tile)
     return outside == 0.0
-
-
-@compiled(inline="always")
-def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
-    """Residuals, their derivatives by the point, and the point in the camera frame."""
-    xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
-    us, vs = columns[3][start:], columns[4][start:]
-    ru, rv = tile[RU], tile[RV]
-    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
-    rx, ry, rz = tile[X], tile[Y], tile[Z]
-    for i in range(n):
-        px, py, pz = xs[i], ys[i], zs[i]
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        u, v, ux[i], uy[i], uz[i], vx[i], vy[i], vz[i] = project_one(kind, lens, x, y, z)
-        ru[i], rv[i] = subtract_columns(kind, lens, u, us[i]), v - vs[i]
-        rx[i], ry[i], rz[i] = x, y, z

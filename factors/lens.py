@@ -26,7 +26,6 @@ from factors.lens_kernels import (
     FISHEYE,
     OMNIDIRECTIONAL,
     PINHOLE,
-    RADTAN,
     is_projectable,
     project_one,
 )
@@ -57,7 +56,7 @@ class Lens:
     """A lens, packed for the kernels. Build it with one of its static methods.
 
     Attributes:
-        kind: of ``lens_kernels``: PINHOLE, RADTAN, FISHEYE, OMNIDIRECTIONAL or EQUIRECTANGULAR.
+        kind: of ``lens_kernels``: PINHOLE, FISHEYE, OMNIDIRECTIONAL or EQUIRECTANGULAR.
         packed: (13,) fx fy cx cy [px], eight distortion coefficients in the order of ``ORDERS``,
             then zeros, and the limit of the injective domain: a normalised radius (pinhole) or a
             field angle [rad] (fisheye, omnidirectional).
@@ -77,8 +76,7 @@ class Lens:
         """
         coefficients = _checked(fx, fy, distortion, "pinhole")
         limit = _radtan_limit(tuple(coefficients.tolist()))
-        kind = RADTAN if np.any(coefficients) else PINHOLE
-        return Lens(kind, np.array([fx, fy, cx, cy, *coefficients, limit], dtype=np.float64))
+        return Lens(PINHOLE, np.array([fx, fy, cx, cy, *coefficients, limit], dtype=np.float64))
 
     @staticmethod
     def fisheye(*, fx: float, fy: float, cx: float, cy: float, distortion: Sequence[float]) -> Lens:

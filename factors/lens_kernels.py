@@ -2,7 +2,7 @@
 
 import math
 
-from factors.compiled import compiled
+from factors.compiled import compiled, kernel_part
 from factors.wide_lenses import (
     MIN_POLAR_SHARE,
     project_equirectangular,
@@ -12,8 +12,9 @@ from factors.wide_lenses import (
 MIN_DEPTH_M = 0.05
 """Points with a smaller z are not projectable by a pinhole."""
 
-PINHOLE, RADTAN, FISHEYE, OMNIDIRECTIONAL, EQUIRECTANGULAR = range(5)
-_LIMIT = 12  # index of the domain's limit in the packed parameters
+PINHOLE, FISHEYE, OMNIDIRECTIONAL, EQUIRECTANGULAR = range(4)
+LIMIT = 12
+"""Index of the domain's limit in the packed parameters; infinite if a pinhole is undistorted."""
 
 
 @compiled(inline="always")
@@ -37,11 +38,7 @@ def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     in_front = z > MIN_DEPTH_M
     w = 1.0 / (z if in_front else MIN_DEPTH_M)
     a, b = x * w, y * w
-    if kind == PINHOLE:
-        da_a, da_b, db_a, db_b = 1.0, 0.0, 0.0, 1.0
-        p, q = a, b
-    else:
-        p, q, da_a, da_b, db_a, db_b = _radtan(lens, a, b)
+    p, q, da_a, da_b, db_a, db_b = _radtan(lens, a, b)
     fx, fy = lens[0], lens[1]
     wz = w if in_front else 0.0
     return (
@@ -56,10 +53,10 @@ def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled()
+@kernel_part()
 def _radtan(lens, a, b):  # type: ignore[no-untyped-def]
     """Distorted normalised point and its 2x2 Jacobian (row major), continued past the limit."""
-    limit = lens[12]
+    limit = lens[LIMIT]
     r2 = a * a + b * b
     if r2 <= limit * limit:
         return _radtan_inside(lens, a, b)
@@ -78,7 +75,7 @@ def _radtan(lens, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled()
+@kernel_part()
 def _radtan_inside(lens, a, b):  # type: ignore[no-untyped-def]
     k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
     k4, k5, k6 = lens[9], lens[10], lens[11]
@@ -99,7 +96,7 @@ def _radtan_inside(lens, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled()
+@kernel_part()
 def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
     """Kannala-Brandt; the angle from atan2, so that fields of view over 180 degrees are seen."""
     fx, fy = lens[0], lens[1]
@@ -141,7 +138,7 @@ def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
 def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Whether a point of the camera frame lies inside the lens' injective domain."""
     if kind in (FISHEYE, OMNIDIRECTIONAL):
-        return x * x + y * y + z * z > 0.0 and math.atan2(math.hypot(x, y), z) < lens[_LIMIT]
+        return x * x + y * y + z * z > 0.0 and math.atan2(math.hypot(x, y), z) < lens[LIMIT]
     if kind == EQUIRECTANGULAR:
         return math.hypot(x, z) > MIN_POLAR_SHARE * abs(y)
     return is_in_cone(lens, x, y, z)
@@ -150,7 +147,7 @@ def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
 @compiled(inline="always")
 def is_in_cone(lens, x, y, z):  # type: ignore[no-untyped-def]
     """Like :func:`is_projectable`, for a lens that looks ahead."""
-    return (z > MIN_DEPTH_M) & (x * x + y * y <= (lens[_LIMIT] * z) ** 2)
+    return (z > MIN_DEPTH_M) & (x * x + y * y <= (lens[LIMIT] * z) ** 2)
 
 
 @compiled(inline="always")

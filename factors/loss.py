@@ -10,8 +10,12 @@ import math
 from typing import Literal, get_args
 
 import gtsam
+import numpy as np
+from numpy.typing import NDArray
 
 from factors.compiled import compiled
+
+Array = NDArray[np.float64]
 
 LossName = Literal["l2", "huber", "cauchy", "geman_mcclure", "tukey"]
 LOSSES: tuple[LossName, ...] = get_args(LossName)
@@ -52,6 +56,19 @@ def loss_and_weight(loss, scale, s):  # type: ignore[no-untyped-def]
         return k / 3.0, 0.0
     w = 1.0 - s / k
     return k / 3.0 * (1.0 - w * w * w), w * w
+
+
+def losses_and_weights(loss: int, scale: float, squares: Array) -> tuple[Array, Array]:
+    """(n,) losses and (n,) weights of (n,) squared residuals, see :func:`loss_and_weight`."""
+    found = np.empty((2, len(squares)))
+    _fill_losses(loss, scale, squares, found)
+    return found[0], found[1]
+
+
+@compiled()
+def _fill_losses(loss, scale, squares, found):  # type: ignore[no-untyped-def]
+    for i in range(len(squares)):
+        found[0, i], found[1, i] = loss_and_weight(loss, scale, squares[i])
 
 
 def robust_noise(

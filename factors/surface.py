@@ -15,20 +15,16 @@ longer meets the plane passes smoothly through infinity.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.block_arrays import RobustBlock, contiguous
+from factors.block_arrays import RobustBlock
 from factors.block_sums import BlockSums
-from factors.compiled import compiled
 from factors.lens import Lens
-from factors.lens_kernels import is_projectable, project_one, subtract_columns
-from factors.loss import loss_and_weight, loss_id
-from factors.tile import FAST
+from factors.loss import loss_id, losses_and_weights
 
 Array = NDArray[np.float64]
 
@@ -93,27 +89,42 @@ class SurfaceBlock(RobustBlock):
 
     def run_sums(self, T_lidar_a: Array, T_lidar_b: Array, edges: NDArray[np.int64]) -> BlockSums:
         """As :meth:`frame_sums`, with (r, 4, 4) poses of each run, or (1, 4, 4) of all."""
-        # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
-        sums = _accumulate(self.lens_b.kind)(
-            self.lens_b.packed, contiguous(T_lidar_a), contiguous(T_lidar_b),
-            self.rays_a, self.planes_lidar_per_m, self.pixels_b_px, loss_id(self.loss),
-            self.scale * self.sigma, edges,
-        )  # fmt: skip
-        sums /= self.sigma**2
-        return BlockSums(sums[:, :12], sums[:, 12], sums[:, 13, 0])
+        run = np.repeat(np.arange(len(edges) - 1), np.diff(edges))
+        poses = [T if len(T) == 1 else T[run] for T in (T_lidar_a, T_lidar_b)]
+        some = self if len(run) == len(self) else self.select(np.arange(edges[0], edges[-1]))
+        rows, cost = some._linearize(*poses)
+        starts = edges - edges[0]
+        sums = np.array([part.T @ part for part in np.split(rows, 2 * starts[1:-1])])
+        costs = np.array([part.sum() for part in np.split(cost, starts[1:-1])])
+        return BlockSums(sums[:, :12, :12], sums[:, :12, 12], costs)
+
+    def _linearize(self, T_lidar_a: Array, T_lidar_b: Array) -> tuple[Array, Array]:
+        """(2 n, 13) Jacobian and residuals, times the root of the loss' weight; (n,) losses.
+
+        At (n, 4, 4) poses of each feature, or (1, 4, 4).
+        """
+        at = _Prediction.of(T_lidar_a, T_lidar_b, self.rays_a, self.planes_lidar_per_m)
+        pixels, by_point = self.lens_b.project_with_jacobian(at.y)
+        residuals = self.lens_b.subtract(pixels, self.pixels_b_px) / self.sigma
+        squares = np.square(residuals).sum(axis=1)
+        loss, weight = losses_and_weights(loss_id(self.loss), self.scale, squares)
+        rows = np.concatenate([at.by_poses(by_point) / self.sigma, residuals[:, :, None]], axis=2)
+        rows *= np.sqrt(weight)[:, None, None]
+        return rows.reshape(-1, 13), loss
 
     def residuals(
         self, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3
     ) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) residuals [px], not divided by sigma; (n,) whether B's lens can see the point."""
-        residuals, projectable = _residuals(self.lens_b.kind)(
-            self.lens_b.packed, contiguous(T_lidar_a.matrix()),
-            contiguous(T_lidar_b.matrix()), self.rays_a, self.planes_lidar_per_m, self.pixels_b_px,
-        )  # fmt: skip
-        return residuals, projectable
+        T_a, T_b = T_lidar_a.matrix()[None], T_lidar_b.matrix()[None]
+        at = _Prediction.of(T_a, T_b, self.rays_a, self.planes_lidar_per_m)
+        pixels, _ = self.lens_b.project(at.y)
+        with np.errstate(divide="ignore", invalid="ignore"):  # a ray that meets no surface
+            _, projectable = self.lens_b.project(at.y / at.w[:, None])
+        return self.lens_b.subtract(pixels, self.pixels_b_px), projectable & (at.w > 0.0)
 
 
-_TILE = 64  # features whose derivatives are held at once, in the first-level cache
+_LEAST_K = 1e-9  # in place of less: A's centre is on the plane
 _WIDTHS = {"rays_a": 3, "planes_lidar_per_m": 3, "pixels_b_px": 2}
 
 
@@ -157,129 +168,52 @@ def _skew(v: Array) -> Array:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-@compiled(inline="always")
-def _dot(a, b):  # type: ignore[no-untyped-def]
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+@dataclass(frozen=True, eq=False)
+class _Prediction:
+    """Features of A in B's frame: see the module. With g = R_a^T q.
+
+    Attributes:
+        rays_a, y, g, t: (n, 3) f, y, g and R_b^T (c_a - c_b); t also (1, 3).
+        R_b_a: (n, 3, 3) or (1, 3, 3).
+        w, k: (n,).
+    """
+
+    rays_a: Array
+    y: Array
+    g: Array
+    t: Array
+    R_b_a: Array
+    w: Array
+    k: Array
+
+    @staticmethod
+    def of(T_lidar_a: Array, T_lidar_b: Array, rays_a: Array, planes: Array) -> _Prediction:
+        """At (n, 4, 4) poses of each feature, or (1, 4, 4)."""
+        R_a, c_a, to_b = T_lidar_a[:, :3, :3], T_lidar_a[:, :3, 3], _transpose(T_lidar_b)
+        g = _apply(_transpose(T_lidar_a), planes)
+        k = 1.0 - (planes * c_a).sum(axis=1)
+        k = np.where(np.abs(k) < _LEAST_K, _LEAST_K, k)
+        w = (g * rays_a).sum(axis=1) / k
+        R_b_a, t = to_b @ R_a, _apply(to_b, c_a - T_lidar_b[:, :3, 3])
+        return _Prediction(rays_a, _apply(R_b_a, rays_a) + w[:, None] * t, g, t, R_b_a, w, k)
+
+    def by_poses(self, by_point: Array) -> Array:
+        """(n, 2, 12) derivatives of pixels by both poses, from (n, 2, 3) by y."""
+        rays, w = self.rays_a[:, None], self.w[:, None, None]
+        g = (self.g / self.k[:, None])[:, None]
+        of_axes = by_point @ self.R_b_a  # of A
+        along = by_point @ self.t[:, :, None]
+        turn = np.cross(rays, of_axes) + along * np.cross(rays, g)
+        parts = turn, w * (of_axes + along * g), np.cross(by_point, self.y[:, None]), -w * by_point
+        return np.concatenate(parts, axis=2)
 
 
-@compiled(inline="always")
-def _fill_relative(T_a, T_b, R_b_a, t):  # type: ignore[no-untyped-def]
-    """R_b_a and A's centre in B's frame, from T_lidar_a and T_lidar_b."""
-    for i in range(3):
-        t[i] = 0.0
-        for k in range(3):
-            t[i] += T_b[k, i] * (T_a[k, 3] - T_b[k, 3])
-        for j in range(3):
-            R_b_a[i, j] = T_b[0, i] * T_a[0, j] + T_b[1, i] * T_a[1, j] + T_b[2, i] * T_a[2, j]
+def _transpose(T: Array) -> Array:
+    return T[:, :3, :3].transpose(0, 2, 1)
 
 
-@compiled(inline="always")
-def _predict(T_a, R_b_a, t, ray, plane, y, g):  # type: ignore[no-untyped-def]
-    """Fill in y and g = R_a^T q; return w and k."""
-    for i in range(3):
-        g[i] = T_a[0, i] * plane[0] + T_a[1, i] * plane[1] + T_a[2, i] * plane[2]
-    k = 1.0 - (plane[0] * T_a[0, 3] + plane[1] * T_a[1, 3] + plane[2] * T_a[2, 3])
-    if abs(k) < 1e-9:  # noqa: PLR2004 - A's centre is on the plane
-        k = 1e-9
-    w = _dot(g, ray) / k
-    for i in range(3):
-        y[i] = _dot(R_b_a[i], ray) + w * t[i]
-    return w, k
-
-
-@compiled(inline="always")
-def _fill_jacobian(R_b_a, t, ray, g, y, w, k, projection, jacobian, n):  # type: ignore[no-untyped-def]
-    """Derivatives of a pixel by both poses, into column n of (2, 12, TILE)."""
-    g0, g1, g2 = g[0] / k, g[1] / k, g[2] / k
-    turn0 = ray[1] * g2 - ray[2] * g1
-    turn1 = ray[2] * g0 - ray[0] * g2
-    turn2 = ray[0] * g1 - ray[1] * g0
-    for row in range(2):
-        d0, d1, d2 = projection[2 + 3 * row], projection[3 + 3 * row], projection[4 + 3 * row]
-        e0 = d0 * R_b_a[0, 0] + d1 * R_b_a[1, 0] + d2 * R_b_a[2, 0]  # d y by A's axes
-        e1 = d0 * R_b_a[0, 1] + d1 * R_b_a[1, 1] + d2 * R_b_a[2, 1]
-        e2 = d0 * R_b_a[0, 2] + d1 * R_b_a[1, 2] + d2 * R_b_a[2, 2]
-        along = d0 * t[0] + d1 * t[1] + d2 * t[2]
-        j = jacobian[row]
-        j[0, n] = ray[1] * e2 - ray[2] * e1 + along * turn0
-        j[1, n] = ray[2] * e0 - ray[0] * e2 + along * turn1
-        j[2, n] = ray[0] * e1 - ray[1] * e0 + along * turn2
-        j[3, n] = w * (e0 + along * g0)
-        j[4, n] = w * (e1 + along * g1)
-        j[5, n] = w * (e2 + along * g2)
-        j[6, n] = d1 * y[2] - d2 * y[1]
-        j[7, n] = d2 * y[0] - d0 * y[2]
-        j[8, n] = d0 * y[1] - d1 * y[0]
-        j[9, n], j[10, n], j[11, n] = -w * d0, -w * d1, -w * d2
-
-
-@compiled(fastmath=FAST)
-def _add_products(jacobian, residual, psi, count, weighted, sums):  # type: ignore[no-untyped-def]
-    """Add J^T psi J and J^T psi r of a tile to (14, 12) sums, the upper triangle alone."""
-    for i in range(12):
-        ju, jv, wu, wv = jacobian[0, i], jacobian[1, i], weighted[0], weighted[1]
-        slope = 0.0
-        for n in range(count):
-            wu[n], wv[n] = psi[n] * ju[n], psi[n] * jv[n]
-            slope += wu[n] * residual[0, n] + wv[n] * residual[1, n]
-        sums[12, i] += slope
-        for j in range(i, 12):
-            ku, kv, total = jacobian[0, j], jacobian[1, j], 0.0
-            for n in range(count):
-                total += wu[n] * ku[n] + wv[n] * kv[n]
-            sums[i, j] += total
-
-
-@cache
-def _accumulate(kind: int) -> Any:
-    @compiled()
-    def run(  # type: ignore[no-untyped-def]  # noqa: PLR0913, PLR0917
-        lens, T_lidar_a, T_lidar_b, rays, planes, pixels, loss, scale, edges
-    ):
-        """(runs, 14, 12) sums over runs of features: H, b, and c first in the last row."""
-        out = np.zeros((len(edges) - 1, 14, 12))
-        y, g, R_b_a, t = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
-        jacobian, residual = np.empty((2, 12, _TILE)), np.empty((2, _TILE))
-        psi, weighted = np.empty(_TILE), np.empty((2, _TILE))
-        for run in range(len(edges) - 1):
-            T_a = T_lidar_a[min(np.int64(run), len(T_lidar_a) - 1)]
-            T_b = T_lidar_b[min(np.int64(run), len(T_lidar_b) - 1)]
-            _fill_relative(T_a, T_b, R_b_a, t)
-            sums = out[run]
-            for start in range(edges[run], edges[run + 1], _TILE):
-                count = min(_TILE, edges[run + 1] - start)
-                for n in range(count):
-                    row = start + n
-                    w, k = _predict(T_a, R_b_a, t, rays[row], planes[row], y, g)
-                    projection = project_one(kind, lens, y[0], y[1], y[2])
-                    _fill_jacobian(R_b_a, t, rays[row], g, y, w, k, projection, jacobian, n)
-                    u = subtract_columns(kind, lens, projection[0], pixels[row, 0])
-                    v = projection[1] - pixels[row, 1]
-                    rho, psi[n] = loss_and_weight(loss, scale, u * u + v * v)
-                    residual[0, n], residual[1, n] = u, v
-                    sums[13, 0] += rho
-                _add_products(jacobian, residual, psi, count, weighted, sums)
-            for i in range(12):
-                for j in range(i):
-                    sums[i, j] = sums[j, i]
-        return out
-
-    return run
-
-
-@cache
-def _residuals(kind: int) -> Any:
-    @compiled()
-    def run(lens, T_a, T_b, rays, planes, pixels):  # type: ignore[no-untyped-def]
-        residuals, valid = np.empty((len(rays), 2)), np.empty(len(rays), np.bool_)
-        y, g, R_b_a, t = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
-        _fill_relative(T_a, T_b, R_b_a, t)
-        for n in range(len(rays)):
-            w, _ = _predict(T_a, R_b_a, t, rays[n], planes[n], y, g)
-            projection = project_one(kind, lens, y[0], y[1], y[2])
-            residuals[n, 0] = subtract_columns(kind, lens, projection[0], pixels[n, 0])
-            residuals[n, 1] = projection[1] - pixels[n, 1]
-            valid[n] = w > 0.0 and is_projectable(kind, lens, y[0] / w, y[1] / w, y[2] / w)
-        return residuals, valid
-
-    return run
+def _apply(R: Array, vectors: Array) -> Array:
+    """Rotate (n, 3) vectors, each by its own of (n, 3, 3), or all by one of (1, 3, 3)."""
+    if len(R) == 1:
+        return np.asarray(vectors @ R[0].T)
+    return np.asarray(np.einsum("nij,nj->ni", R, vectors))

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from calibgraph import Camera, IncrementalCalibrator, Intrinsics, MatcherErrors, Rig, perturb
-from calibgraph.simulation.drive_matches import simulate_drive
+from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.tracking.history import History
 
 FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])

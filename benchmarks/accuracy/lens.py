@@ -104,17 +104,19 @@ def draw(part: str, error: float, seed: int) -> Drawn:
         }
         wrong = truth.model_copy(update={"cameras": cameras})
     before, after = (solve_joint(wrong, table, one) for one in (Config(), config))
-    errors = _errors(after, truth)
+    errors = errors_of(after, truth)
     off, sigmas = zip(*_lens_errors(after, truth, part), strict=True)
-    return Drawn(_errors(before, truth), errors, _nees(after, errors), [*off], [*sigmas])
+    return Drawn(errors_of(before, truth), errors, nees_of(after, errors), [*off], [*sigmas])
 
 
-def _errors(found: Solution, truth: Rig) -> list[Array]:
+def errors_of(found: Solution, truth: Rig) -> list[Array]:
+    """(6,) per camera, of its pose."""
     reference = truth.T_camera_lidar
     return [twist_between(T, reference[name]) for name, T in found.T_camera_lidar.items()]
 
 
-def _nees(found: Solution, errors: list[Array]) -> list[float]:
+def nees_of(found: Solution, errors: list[Array]) -> list[float]:
+    """Per camera, the squared error in the metric of its covariance."""
     assert found.covariance is not None
     blocks = (found.covariance[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] for n in range(len(errors)))
     return [float(e @ np.linalg.solve(own, e)) for e, own in zip(errors, blocks, strict=True)]
@@ -155,7 +157,7 @@ def main() -> None:
 def row_of(part: str, error: float, draws: int) -> tuple[str, ...]:
     """One case over all draws."""
     found = [draw(part, error, seed) for seed in range(draws)]
-    cells = [cell for when in ("before", "after") for cell in _sizes(found, when)]
+    cells = [cell for when in ("before", "after") for cell in sizes_of(found, when)]
     nees = np.mean([value for one in found for value in one.nees]) / 6
     off, sigmas = (
         np.concatenate([getattr(one, key) for one in found]) for key in ("off", "sigmas")
@@ -164,7 +166,8 @@ def row_of(part: str, error: float, draws: int) -> tuple[str, ...]:
     return (part, f"{error:g}", *cells, f"{nees:.2f}", *(f"{value:.2g}" for value in lens))
 
 
-def _sizes(found: list[Drawn], when: str) -> tuple[str, str]:
+def sizes_of(found: list[Drawn], when: str) -> tuple[str, str]:
+    """Medians over draws and cameras: degrees, centimetres."""
     errors = np.array([error for one in found for error in getattr(one, when)])
     turned, moved = (
         np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors, 2, axis=1)
@@ -180,7 +183,7 @@ def rows_of(folder: Path) -> Iterator[tuple[str, ...]]:
         guess = perturb(wrong, rotation_deg=1.0, translation_m=0.1, seed=1)
         for estimate in ((), (part,)):
             result = calibrate(data, guess, config=Config(estimate=estimate))
-            errors = evaluate(result, data.rig).cameras.values()
+            errors = evaluate(result.rig, data.rig).cameras.values()
             worst = max(
                 _lens_errors(result, data.rig, part), key=lambda pair: abs(pair[0]), default=None
             )

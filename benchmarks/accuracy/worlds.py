@@ -20,7 +20,7 @@ from calibgraph import (
     concatenate,
     perturb,
 )
-from calibgraph.simulation.drive_matches import simulate_drive
+from calibgraph.simulation.correspondences import simulate_drive
 
 Rng = np.random.Generator
 

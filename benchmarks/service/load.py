@@ -25,7 +25,7 @@ from benchmarks.service.server import SETTINGS, Problem, Server, make_problems
 from benchmarks.service.tracker_load import track
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import load_rig, solve
-from calibgraph.report.result_files import write_result
+from calibgraph.report.html import write_result
 
 PROBLEMS = 50
 RETRY_S = 1.0

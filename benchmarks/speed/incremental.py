@@ -26,7 +26,7 @@ from calibgraph.graph.objective import pose_key, prior_graph
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.simulation.drive_matches import simulate_drive
+from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.optimizer import to_values
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS

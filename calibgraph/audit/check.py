@@ -1,6 +1,9 @@
 """``check``: is the calibration that is deployed still right?"""
 
 from collections.abc import Callable, Collection
+from pathlib import Path
+
+from pydantic import BaseModel
 
 from calibgraph.audit.judgement import (
     SEARCHES_FARTHER,
@@ -12,12 +15,15 @@ from calibgraph.audit.matching import Matching, match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
 from calibgraph.audit.significance import Tolerance
 from calibgraph.errors import CorrespondenceError
+from calibgraph.files import checked_model, read_yaml
 from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.frame import hash_source
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.config import Config
+from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 from calibgraph.model.rig import Rig
 from calibgraph.model.versions import package_versions
 from calibgraph.overlaps import refine_with_camera_pairs
@@ -171,3 +177,26 @@ def _doubt_by_z_score(z_score: float | None) -> str:
         f"images and clouds agree too little (z-score {z_score:.1f}, {row.warn:g} needed): "
         f"{SEARCHES_FARTHER}; else record sharp images of more structure, and check the intrinsics"
     )
+
+
+class _Inputs(BaseModel):
+    """The inputs of a result, as its file names them."""
+
+    inputs: dict[str, str] = {}
+
+
+def is_made_from(rig: Path, data: Dataset) -> bool:
+    """Whether a cloud of the recording is one that the calibration was made from.
+
+    Only clouds with the name of one of its inputs are read.
+
+    Raises:
+        FileError: if the result is malformed, or a cloud cannot be read.
+    """
+    path = rig / CALIBRATION_FILE if rig.is_dir() else rig
+    if not is_calibration_file(path):
+        return False
+    inputs = checked_model(_Inputs, read_yaml(path), path).inputs
+    names = {Path(source).name for source in inputs}
+    clouds = (frame.cloud_path for frame in data.frames if frame.cloud_path.name in names)
+    return any(hash_source(cloud) in inputs.values() for cloud in clouds)

@@ -17,10 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from calibgraph.arrays import Array, Mask
 from calibgraph.model.geometry import twists_between
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +123,6 @@ class Deviations:
     """How far each result of one camera is from the others.
 
     Attributes:
-        poses: of the camera.
         pool: (n,) the results whose mean each is compared with, itself excepted.
         agreeing: (n,) the largest part found that agrees.
         leave_one_out: deviation of each from that mean.

@@ -3,12 +3,18 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from calibgraph.arrays import Array
 from calibgraph.audit.common_pose import Deviations, Limits, compare, poses_of
-from calibgraph.audit.drift_inputs import Results, open_results
-from calibgraph.audit.drift_result import CameraDrift, Drift, DriftStatus, Trend
+from calibgraph.audit.drift_result import (
+    CameraDrift,
+    Drift,
+    DriftStatus,
+    Results,
+    Trend,
+    open_results,
+)
 from calibgraph.audit.judgement import (
     CAMERA_AXES,
     SINGLE_CAMERA,
@@ -23,8 +29,6 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import pose_rows
 from calibgraph.model.verdict import COMMON_ERROR
 from calibgraph.solver.covariance import PSEUDO_FRAMES
-
-Array = NDArray[np.float64]
 
 FALSE_ALARM_RATE = 0.01
 """Probability of a significant axis in one call, over all cameras, results and trends."""

@@ -19,9 +19,9 @@ smallest detectable changes are below the tolerance. Else the data cannot tell.
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, ndtri
 
+from calibgraph.arrays import Array, Mask
 from calibgraph.audit.result import AuditStatus, CameraAudit, LidarAudit
 from calibgraph.audit.significance import (
     DISPLAY,
@@ -38,9 +38,6 @@ from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
 from calibgraph.tracking.cause import Steps, find_cause
 from calibgraph.trust.evidence import Evidence
 from factors import pose_sigmas
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 CAMERA_AXES = ("x (pitch)", "y (yaw)", "z (roll)", "x (right)", "y (down)", "z (ahead)")
 LIDAR_AXES = ("x", "y", "z", "x", "y", "z")

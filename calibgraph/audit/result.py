@@ -7,13 +7,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Rig
 
-Array = NDArray[np.float64]
 AuditStatus = Literal["OK", "CANNOT TELL", "WRONG"]
 
 _ORDER: tuple[AuditStatus, ...] = ("OK", "CANNOT TELL", "WRONG")

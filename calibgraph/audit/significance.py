@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtri, stdtrit
 
-Array = NDArray[np.float64]
+from calibgraph.arrays import Array
 
 FALSE_ALARM_RATE = 1e-3
 """Probability of a significant axis on a rig, of all its cameras, that has not changed."""

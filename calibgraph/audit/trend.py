@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from calibgraph.arrays import Array
 
 _NONE = 1e-9  # relative eigenvalue of the information about a slope that is rounding
 

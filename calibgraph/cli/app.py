@@ -7,6 +7,7 @@ CHANGED (``drift``), 2 bad input (one line), 3 the data cannot tell (both), 130 
 
 from __future__ import annotations
 
+import gc
 import inspect
 import os
 import sys
@@ -18,23 +19,21 @@ from typing import Annotated, Any, TextIO
 import typer
 
 from calibgraph.cli import outputs, remote
-from calibgraph.cli.bag import bag
+from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve
-from calibgraph.cli.check import check
-from calibgraph.cli.doctor import doctor
-from calibgraph.cli.drift import drift
 from calibgraph.cli.exchange import export, import_
-from calibgraph.cli.fleet import fleet
-from calibgraph.cli.fleet_report import fleet_model, fleet_report
-from calibgraph.cli.guess import guess, init
-from calibgraph.cli.inspect import evaluate, perturb, report, view
+from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
+from calibgraph.cli.guess import bag, guess, init
+from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
 from calibgraph.cli.learned import train, weights
-from calibgraph.cli.pick import pick
-from calibgraph.cli.serve import serve, token
+from calibgraph.cli.serve import pick, serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
 
 _INTERRUPTED = 130
+_COLLECT_AFTER = 100_000, 20, 20
+"""Objects and passes between collections. With Python's own numbers, a fifth of the time in which
+kernels are compiled goes into searches of objects that all live."""
 _WEIGHTS_SUFFIXES = (".tar", ".pt", ".pth", ".safetensors")
 _UsageError: type[Exception] = typer.BadParameter.__base__ or Exception
 _PLAIN: Any = {"add_completion": False, "pretty_exceptions_enable": False}
@@ -127,6 +126,7 @@ def main() -> None:
     """Run the command line; errors in the data become one line on stderr and exit code 2."""
     from calibgraph.errors import CalibrationError
 
+    gc.set_threshold(*_COLLECT_AFTER)
     sys.argv[1:] = _repeat_weights_option(sys.argv[1:])
     try:
         _require_utf8(sys.argv[1:])
@@ -164,31 +164,10 @@ def _require_utf8(arguments: list[str]) -> None:
             raise CalibrationError(message) from error
 
 
-class _Commands(typer.core.TyperGroup):
-    """Commands by name and help; the options of one are read when it is called, 30 ms for all."""
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        name, _, rest = super().resolve_command(ctx, args)
-        return name, _command_of(name), rest
-
-
 @cache
-def _parser() -> typer.core.TyperGroup:
-    """The command line without the options of its commands, once per process."""
-    frame = typer.Typer(cls=_Commands, help=app.info.help, no_args_is_help=True, **_PLAIN)
-    frame.callback()(_options)
-    group = typer.main.get_group(frame)
-    for info in app.registered_commands:
-        group.commands[str(info.name)] = typer.core.TyperCommand(info.name, help=info.help)
-    return group
-
-
-@cache
-def _command_of(name: str | None) -> Any:
-    """A command with its options, read from its signature once per process."""
-    alone = typer.Typer(**_PLAIN)
-    alone.registered_commands = [info for info in app.registered_commands if info.name == name]
-    return typer.main.get_command(alone)
+def _parser() -> Any:
+    """The command line, once per process."""
+    return typer.main.get_command(app)
 
 
 def _run_app() -> int:

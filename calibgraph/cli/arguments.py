@@ -30,14 +30,20 @@ def checked_arguments() -> Iterator[None]:
 
 
 def dataset_from(
-    folders: list[Path], rig: Path | None, frames: str | None, bag: BagOptions | None = None
+    folders: list[Path],
+    rig: Path | None,
+    frames: str | None,
+    bag: BagOptions | None = None,
+    *,
+    interval_s: float | None = None,
 ) -> Dataset:
     """The dataset in these folders; of bags, a line each is printed."""
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
 
     with checked_arguments(), progress_bar("reading"):
-        data = load_dataset(folders, load_rig(rig) if rig else None, frames=frames, bag=bag)
+        known = load_rig(rig) if rig else None
+        data = load_dataset(folders, known, frames=frames, bag=bag, interval_s=interval_s)
     for note in data.notes:
         print_plain(terminal(), note)
     return data

@@ -36,7 +36,7 @@ def calibrate(
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
     from calibgraph.pipeline import calibrate
-    from calibgraph.report.result_files import write_result
+    from calibgraph.report.html import write_result
 
     with checked_arguments():
         given = {
@@ -126,7 +126,7 @@ def solve(
     from calibgraph.io.correspondence_tables import table_files
     from calibgraph.io.rigs import load_rig
     from calibgraph.pipeline import solve
-    from calibgraph.report.result_files import write_result
+    from calibgraph.report.html import write_result
 
     with checked_arguments():
         given = {

@@ -28,6 +28,7 @@ class MatchingOptions:
     rig: options.RigOption = None
     matcher: options.MatcherOption = "structure"
     frames: options.FramesOption = None
+    interval_s: options.IntervalOption = None
     time_limit_s: options.TimeLimitOption = None
     search_deg: options.SearchDegOption = None
     search_m: options.SearchMetresOption = None
@@ -57,7 +58,7 @@ class MatchingOptions:
             return None
         from calibgraph.model.config import LensPart
 
-        of_lens = {*get_args(LensPart), "lens"}.issuperset(self.estimate.split(","))
+        of_lens = {*get_args(LensPart), "lens", "clock"}.issuperset(self.estimate.split(","))
         return self.estimate if of_lens or self.matcher != "cmrnext" else None
 
     def find_matcher(self, *, seed: int, lens_too: bool = False) -> Matcher:
@@ -67,7 +68,7 @@ class MatchingOptions:
             seed: of everything random.
             lens_too: whether ``--estimate`` may name parts of the lens.
         """
-        own = ("rig", "matcher", "frames", "time_limit_s", "weights", *_OF_BAGS)
+        own = ("rig", "matcher", "frames", "interval_s", "time_limit_s", "weights", *_OF_BAGS)
         others = {name: value for name, value in vars(self).items() if name not in own}
         if self.lens_parts is not None and lens_too:
             del others["estimate"]
@@ -77,7 +78,7 @@ class MatchingOptions:
     def load_dataset(self, folders: list[Path]) -> Dataset:
         """The chosen frames of these folders."""
         bag = bag_options_from(**{name: getattr(self, name) for name in _OF_BAGS})
-        return dataset_from(folders, self.rig, self.frames, bag)
+        return dataset_from(folders, self.rig, self.frames, bag, interval_s=self.interval_s)
 
 
 def with_matching_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -71,8 +71,9 @@ NetworkEstimateOption = Annotated[
     typer.Option(
         "--estimate",
         metavar="PART,...|frame|joint",
-        help="Parts of each camera's lens that calibrate estimates too: focal, aspect, centre, "
-        "distortion, or lens for all but aspect; or where a network of cmrnext starts: at each "
+        help="Parts of each camera's lens and clock that calibrate estimates too: focal, aspect, "
+        "centre, distortion, or lens for all but aspect; offset of the image to its cloud, readout "
+        "of a rolling shutter, or clock for both; or where a network of cmrnext starts: at each "
         "frame's own pose from the previous one (default), or at the joint solve.",
     ),
 ]
@@ -122,6 +123,14 @@ FramesOption = Annotated[
         metavar="A:B:STEP",
         help="Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7. (default: "
         "all; of more than 30 the matcher structure takes 30: spread, clear ones)",
+    ),
+]
+IntervalOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        help="Time between neighbouring clouds of a folder: the motion of the LiDAR is found by "
+        "their registration. For --estimate offset or readout. (default: unknown)",
     ),
 ]
 _BAGS = "ROS bags"
@@ -190,8 +199,9 @@ EstimateOption = Annotated[
     str | None,
     typer.Option(
         metavar="PART,...",
-        help="Estimate each camera's lens too: focal, aspect, centre, distortion, or lens for all "
-        "but aspect. The rig may state how well it is known.",
+        help="Estimate each camera's lens and clock too: focal, aspect, centre, distortion, or "
+        "lens for all but aspect; offset, readout, or clock for both. The rig may state how well "
+        "they are known.",
     ),
 ]
 TermsOption = Annotated[

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
@@ -21,10 +21,7 @@ if TYPE_CHECKING:
 
 SERVER: ContextVar[str | None] = ContextVar("SERVER", default=None)
 """The option ``--server`` of this call."""
-
 COMMANDS = ("calibrate", "solve", "check")
-
-Inputs = Mapping[str, Sequence[Path]]
 
 
 def require_known(command: str | None) -> None:
@@ -36,66 +33,64 @@ def require_known(command: str | None) -> None:
 
 
 @contextmanager
-def _client() -> Iterator[Client]:
+def _done(
+    kind: str, rig: Path | None, inputs: Mapping[str, Sequence[Path]], settings: Mapping[str, Any]
+) -> Iterator[tuple[Client, str]]:
+    """A job with its result, and the client to fetch it; Ctrl-C cancels it.
+
+    The rig is sent as a rig file: any rig can be read from the path.
+    """
     from calibgraph.errors import CalibrationError
+    from calibgraph.files import write_yaml
+    from calibgraph.io.rigs import load_rig
 
     try:
         from calibgraph.client import Client
     except ImportError as error:
         text = "--server: httpx is not installed; pip install 'calibgraph[client]'"
         raise CalibrationError(text) from error
-    with Client(SERVER.get() or "") as client:
-        yield client
+    with Client(SERVER.get() or "") as client, tempfile.TemporaryDirectory() as folder:
+        if rig is not None:
+            inputs = {**inputs, "rig": [Path(folder) / "rig.yaml"]}
+            write_yaml(inputs["rig"][0], load_rig(rig).model_dump(mode="json"))
+        with progress_bar("sending") as progress:
+            id = client.submit(kind, inputs, settings).id
+            try:
+                client.wait(id, progress)
+            except KeyboardInterrupt:
+                client.cancel(id)
+                raise
+        yield client, id
 
 
-def _run(client: Client, kind: str, inputs: Inputs, settings: Mapping[str, Any]) -> str:
-    """Ask for a job and wait for its result; Ctrl-C cancels it. Its id."""
-    with progress_bar("sending") as progress:
-        id = client.submit(kind, inputs, settings).id
-        try:
-            client.wait(id, progress)
-        except KeyboardInterrupt:
-            client.cancel(id)
-            raise
-    return id
+def _fetch(
+    client: Client, id: str, out: Path, change: Callable[[Calibration], Calibration]
+) -> tuple[Calibration, list[Path]]:
+    """Write the result's files, with the paths of this machine; the result, and the files."""
+    from calibgraph.io.calibrations import load_calibration
 
-
-@contextmanager
-def _rig_file(rig: Path) -> Iterator[Path]:
-    """A rig file to send: any rig can be read from the path."""
-    from calibgraph.files import write_yaml
-    from calibgraph.io.rigs import load_rig
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "rig.yaml"
-        write_yaml(path, load_rig(rig).model_dump(mode="json"))
-        yield path
+    names = client.result(id)["files"]
+    client.download(id, out)
+    result = change(load_calibration(out))
+    result.save(out)
+    return result, [out / name for name in names]
 
 
 def solve(
     rig: Path, table: Path, config: Config, terms: str, out: Path
 ) -> tuple[Calibration, list[Path]]:
-    """Solve a table on the server; see :func:`calibgraph.solve`.
-
-    Returns:
-        The result, and the files written into ``out``.
-    """
+    """Solve a table on the server; the result, and the files written into ``out``."""
     from calibgraph.files import sha256
 
     settings = {"config": config.model_dump(mode="json"), "terms": terms}
-    with _client() as client, _rig_file(rig) as rig_file:
-        id = _run(client, "solve", {"rig": [rig_file], "correspondences": [table]}, settings)
+    with _done("solve", rig, {"correspondences": [table]}, settings) as (client, id):
         return _fetch(client, id, out, lambda r: r.with_inputs({str(table): sha256(table)}))
 
 
 def calibrate(
     data: Dataset, matching: MatchingOptions, config: Config, terms: str, out: Path
 ) -> tuple[Calibration, list[Path]]:
-    """Calibrate a dataset on the server; see :func:`calibgraph.calibrate`.
-
-    Returns:
-        The result, and the files written into ``out``.
-    """
+    """Calibrate a dataset on the server; the result, and the files written into ``out``."""
     settings = {
         **_search_of(matching),
         "config": config.model_dump(mode="json"),
@@ -106,11 +101,7 @@ def calibrate(
     inputs = {"recording": list(data.folders)}
     if matching.matcher != "structure":
         inputs["correspondences"] = [Path(matching.matcher)]
-    with _client() as client, tempfile.TemporaryDirectory() as folder:
-        if matching.rig is not None:
-            with _rig_file(matching.rig) as rig_file:
-                inputs["rig"] = [rig_file.rename(Path(folder) / "rig.yaml")]
-        id = _run(client, "calibration", inputs, settings)
+    with _done("calibration", matching.rig, inputs, settings) as (client, id):
         return _fetch(client, id, out, lambda result: _here(result, data))
 
 
@@ -136,29 +127,15 @@ def _here(result: Calibration, data: Dataset) -> Calibration:
     from calibgraph.pipeline import hash_inputs
 
     frames = {frame.index: frame for frame in (*data.recorded, *data.frames)}
-    numbers = [entry["frame"] for entry in result.frames]
-    used = replace(data, frames=tuple(frames[number] for number in numbers))
+    used = replace(data, frames=tuple(frames[entry["frame"]] for entry in result.frames))
     entries = tuple(frame.entry() for frame in used.frames)
     return replace(result, frames=entries).with_inputs(hash_inputs(used))
-
-
-def _fetch(client: Client, id: str, out: Path, change: Any) -> tuple[Calibration, list[Path]]:
-    """Write the result's files, with the paths of this machine; the result, and the files."""
-    from calibgraph.io.calibrations import load_calibration
-
-    names = client.result(id)["files"]
-    client.download(id, out)
-    result = change(load_calibration(out))
-    result.save(out)
-    return result, [out / name for name in names]
 
 
 def check(
     rig: Path, data: Dataset, frames: str | None, settings: Mapping[str, Any]
 ) -> Mapping[str, Any]:
     """Check a deployed calibration on the server; the summary of the audit."""
-    inputs: dict[str, list[Path]] = {"recording": list(data.folders)}
-    with _client() as client, _rig_file(rig) as rig_file:
-        inputs["rig"] = [rig_file]
-        id = _run(client, "check", inputs, {**settings, "frames": frames})
+    inputs = {"recording": list(data.folders)}
+    with _done("check", rig, inputs, {**settings, "frames": frames}) as (client, id):
         return client.result(id)

@@ -12,8 +12,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from calibgraph.arrays import Array
 from calibgraph.cli.terminal import print_plain
-from calibgraph.model.calibration import FRAMES_SENTENCE, Array, Calibration
+from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.geometry import degrees_and_centimetres
 from calibgraph.model.metrics import Evaluation, PoseError, pose_error
 from calibgraph.model.summary import Summary
@@ -180,6 +181,9 @@ def print_evaluation(console: Console, errors: Evaluation, estimate: Path, refer
     console.print(evaluation_table(errors))
     if errors.deviations:
         console.print(deviation_table(errors))
+    for what, of in (("time offset", errors.time_offset_ms), ("read-out", errors.readout_ms)):
+        for name, value in of.items():
+            print_plain(console, f"{name}: {what} {value:+.1f} ms from the reference")
     for what, path in (("estimate", estimate), ("reference", reference)):
         print_plain(console, f"{what}: {path}")
     if errors.deviations:

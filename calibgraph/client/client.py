@@ -44,7 +44,6 @@ class RemoteJob:
     """A job of a server.
 
     Attributes:
-        id: of the job.
         kind: calibration, solve or check.
         state: queued, running, succeeded, failed or cancelled.
         stage, done, total: how far it is, while it runs.

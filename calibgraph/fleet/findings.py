@@ -10,15 +10,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, false_discovery_control, fisher_exact
 
+from calibgraph.arrays import Array
 from calibgraph.audit.trend import fit_slope
 from calibgraph.fleet.fit import Mount, Pooled
 from calibgraph.fleet.model import FALSE_DISCOVERIES, FleetModel, ModelFit
 from calibgraph.model.geometry import twists_between
 
-Array = NDArray[np.float64]
 Kind = Literal["mount", "batch", "date", "drift"]
 
 _MIN_ON_A_SIDE = 3
@@ -33,7 +32,6 @@ class Finding:
         kind: a mount that moves in many vehicles, a batch that was changed, a date from which a
             batch is another one, or a drift against a column.
         model, camera, batch: where; batch is empty for all.
-        p_value: of the test alone.
         change: (6,) rotation [rad], translation [m], of a batch, at a date, or per unit of the
             column; NaN of a mount.
         sigma: (6,) of it.

@@ -8,12 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.fleet.centers import Centers, measured_batches, solve_centers
-from calibgraph.fleet.deviations import Posterior, weigh
+from calibgraph.arrays import Array
+from calibgraph.fleet.deviations import Centers, Posterior, measured_batches, solve_centers, weigh
 from calibgraph.fleet.observations import Observations
 from calibgraph.model.geometry import retract_all, twists_between
-
-Array = NDArray[np.float64]
 
 MIN_VEHICLES = 8
 """Measured vehicles from which a camera's spread is learnt: six axes need more than six."""

@@ -36,8 +36,6 @@ class Settings(BaseModel):
     """Settings of one job.
 
     Attributes:
-        config: of the solve.
-        terms: of the objective.
         frames: of a recording, as of ``--frames``.
         search_deg, search_m: how far off the guess may be; None: the matcher's default.
     """
@@ -59,7 +57,6 @@ class Job:
         vehicle: its name.
         recordings: URIs: of one table of correspondences, or of folders of one rig.
         rig: URI of the guess; None: the one that lies with the recording.
-        settings: of the calibration.
         row: number of the manifest's row.
     """
 

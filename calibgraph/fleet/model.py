@@ -7,10 +7,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.fleet.fit import Mount, Pooled, fit_mounts
 from calibgraph.fleet.observations import Observations, concatenate, relative_observations
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.model.geometry import adjoints, relative_transform
 
-Array = NDArray[np.float64]
 Words = NDArray[np.str_]
 
 NAMES = ("vehicle", "camera", "model", "batch")

@@ -41,6 +41,7 @@ from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
     aligned_key,
+    body_key,
     camera_key,
     cloud_at_key,
     lens_key,
@@ -73,6 +74,8 @@ class LatentPoseModel:
         components: of the errors.
         of: the poses that are reported.
         lenses: those that are estimated, by the numbers of their cameras.
+        lens_errors: where mounts are reported, by the numbers of cameras with fixed lenses, (6, 6)
+            covariance of ``b_c`` about ``x_c``: of the pose that follows the errors of the lens.
     """
 
     cameras: tuple[str, ...]
@@ -82,6 +85,7 @@ class LatentPoseModel:
     components: VarianceComponents
     of: Reported = "alignment"
     lenses: Mapping[int, LensTerm] = field(default_factory=dict)
+    lens_errors: Mapping[int, Array] = field(default_factory=dict)
 
     @property
     def places(self) -> int:
@@ -105,9 +109,11 @@ class LatentPoseModel:
     @cached_property
     def reported_keys(self) -> list[int]:
         """Keys of the poses that are reported, in the order of the cameras."""
-        aligned = self.aligned if self.of == "alignment" else {}
+        key, differing = (aligned_key, [*self.aligned])
+        if self.of == "mount":
+            key, differing = body_key, [*self.lens_errors]
         numbers = range(len(self.cameras))
-        return [aligned_key(n) if n in aligned else camera_key(n) for n in numbers]
+        return [key(n) if n in differing else camera_key(n) for n in numbers]
 
     @property
     def matched(self) -> list[int]:
@@ -163,7 +169,8 @@ class LatentPoseModel:
         distortion = [DISTORTION] if self.is_distorted else []
         lenses = [key(number) for key in (seen_lens_key, lens_key) for number in self.lenses]
         shown = [*map(matched_key, self.matched), *map(paired_key, self.paired)]
-        poses = [*self.camera_keys, *map(aligned_key, self.aligned)]
+        bodies = map(body_key, self.lens_errors)
+        poses = [*self.camera_keys, *map(aligned_key, self.aligned), *bodies]
         others = [key for key in poses if key not in self.reported_keys]
         return [CLOUD, *shown, *others, *lenses, *distortion, *self.reported_keys]
 
@@ -223,6 +230,9 @@ def _shared_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
         else:
             shifts = term.shifts(number, is_distorted=model.is_distorted)
             graph.add(displaced_between_factor(*edge, shifts, noise))
+    for number, covariance in model.lens_errors.items():
+        edge = camera_key(number), body_key(number)
+        graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), _noise(covariance)))
     for number in model.paired:
         edge = camera_key(number), paired_key(number)
         graph.add(_displaced(model, edge, parts.pair_distortion_jacobian[number], parts.pairs))

@@ -1,4 +1,4 @@
-"""The lens of a camera as a variable of the graph, shared by all its places.
+"""The lens and the clock of a camera as a variable of the graph, shared by all its places.
 
     prior    l_c at the lens of the rig, each parameter with a Cauchy loss
     matcher  l_c to s_c, the lens as the matches show it, displaced by the scan distortion and by
@@ -13,13 +13,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.by_place import BlockByPlace
+from calibgraph.graph.clock import clock_sigmas, put_clock_into
 from calibgraph.graph.variables import DISTORTION, lens_key, seen_lens_key
+from calibgraph.model.clock import clock_of
 from calibgraph.model.config import LensPart
 from calibgraph.model.rig import Camera, Rig
 from factors import (
@@ -30,17 +33,36 @@ from factors import (
     linear_factor,
     robust_noise,
 )
-from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, COEFFICIENT_NUMBERS, FOCAL
-from factors.lens_kernels import PINHOLE, RADTAN
+from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
+from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
 
 Array = NDArray[np.float64]
 
-FOCAL_SIGMA, ASPECT_SIGMA, CENTRE_SIGMA_PX = 0.02, 0.002, 5.0
-"""Of the prior, where the rig states none: of a lens in doubt. A target leaves 0.2 % and 2 px."""
 
-RADIAL_SIGMA, TANGENTIAL_SHARE = 0.05, 0.1
-"""The same of a radial coefficient; and a tangential one's in parts of it."""
+class LensSigmas(NamedTuple):
+    """Prior standard deviations where the rig states none.
 
+    Of the logarithms of both focal lengths and of fx / fy, of each coordinate of the centre [px],
+    and of radial coefficients; tangential ones have ``TANGENTIAL_SHARE`` of these.
+    """
+
+    focal: float
+    aspect: float
+    centre_px: float
+    radial: float
+
+    @staticmethod
+    def calibrated(camera: Camera) -> LensSigmas:
+        """Of a lens that was calibrated with a target: 0.2 %; of 1000 px, a centre to 2 px."""
+        share = _CALIBRATED
+        return LensSigmas(share, share, share * camera.intrinsics_px.fx, share)
+
+
+IN_DOUBT = LensSigmas(0.02, 0.002, 5.0, 0.05)
+"""Of a lens that is estimated."""
+
+TANGENTIAL_SHARE = 0.1
+_CALIBRATED = 0.002
 _TAIL_SIGMAS = 2.0  # where the Cauchy loss of a prior bends
 _PLAIN = 2  # radial coefficients that are set free in a rig without distortion
 _EXACT = 1e-3  # prior standard deviations: less would lose digits
@@ -48,7 +70,7 @@ _EXACT = 1e-3  # prior standard deviations: less would lose digits
 
 @dataclass(frozen=True, eq=False)
 class LensVariable:
-    """One camera's lens.
+    """One camera's lens and clock.
 
     Attributes:
         camera: with the lens at the prior's mean.
@@ -61,19 +83,22 @@ class LensVariable:
     values: Array
 
     @staticmethod
-    def of(camera: Camera, parts: Iterable[LensPart]) -> LensVariable:
+    def of(
+        camera: Camera, parts: Iterable[LensPart], default: LensSigmas = IN_DOUBT
+    ) -> LensVariable:
         """The lens of a camera, at its prior.
 
         Args:
             camera: of the rig, with the sigmas that it states.
             parts: which are free.
+            default: sigmas where the rig states none.
 
         Raises:
             ValueError: if its model has no such part.
         """
-        sigmas = _prior_sigmas(camera)
+        sigmas = _prior_sigmas(camera, default)
         chosen = {name: sigma for part in parts for name, sigma in sigmas[part].items()}
-        free = FreeLens(camera.lens, tuple(chosen), tuple(chosen.values()))
+        free = FreeLens(camera.lens, tuple(chosen), tuple(chosen.values()), clock_of(camera))
         return LensVariable(camera, free, np.zeros(len(chosen)))
 
     def moved_to(self, values: Array) -> LensVariable:
@@ -81,7 +106,10 @@ class LensVariable:
         return replace(self, values=values)
 
     def put_into(self, camera: Camera, values: Array) -> Camera:
-        """A camera with the lens of (k,) values."""
+        """A camera with the lens and clock of (k,) values."""
+        camera = put_clock_into(camera, self.free.clock_at(values), self.free.parameters)
+        if not {*self.free.parameters} - {*CLOCK}:
+            return camera
         packed = self.free.at(values).packed
         intrinsics = dict(zip(("fx", "fy", "cx", "cy"), packed[:4].tolist(), strict=True))
         numbers = COEFFICIENT_NUMBERS[self.free.lens.kind]
@@ -95,37 +123,41 @@ class LensVariable:
         )
 
 
-def _prior_sigmas(camera: Camera) -> dict[LensPart, dict[str, float]]:
+def _prior_sigmas(camera: Camera, default: LensSigmas) -> dict[LensPart, dict[str, float]]:
     """Per part of a lens, the prior standard deviation of each parameter."""
     stated, kind = camera.intrinsics_sigma_px, camera.lens.kind
-    focal = FOCAL_SIGMA
+    focal = default.focal
     if stated is not None and stated.focal is not None:
         focal = stated.focal / camera.intrinsics_px.fx
-    centre = CENTRE_SIGMA_PX if stated is None or stated.centre is None else stated.centre
-    radial = camera.distortion_sigma or RADIAL_SIGMA
+    centre = default.centre_px if stated is None or stated.centre is None else stated.centre
+    radial = camera.distortion_sigma or default.radial
     size = len(camera.distortion) or _PLAIN
     return {
         "focal": {FOCAL: focal},
-        "aspect": {ASPECT: ASPECT_SIGMA},
+        "aspect": {ASPECT: default.aspect},
         "centre": {CENTRE_X: centre, CENTRE_Y: centre},
         "distortion": {
             name: radial if name[0] == "k" else TANGENTIAL_SHARE * radial
             for name, number in COEFFICIENT_NUMBERS[kind].items()
-            if kind not in (PINHOLE, RADTAN) or number < size
+            if kind != PINHOLE or number < size
         },
+        **{part: {str(part): sigma} for part, sigma in clock_sigmas(camera).items()},
     }
 
 
 def lens_variables(rig: Rig, parts: Sequence[LensPart]) -> dict[str, LensVariable]:
-    """Per camera but panoramas, whose format determines the lens, its variable.
+    """Per camera its variable; of panoramas, whose format determines the lens, the clock alone.
 
     Raises:
         ValueError: if there is none.
     """
-    lenses = {name: c for name, c in rig.cameras.items() if c.model != "equirectangular"}
-    if not lenses:
+    of_clock: list[LensPart] = [part for part in parts if part in CLOCK]
+    chosen: dict[str, Sequence[LensPart]] = {
+        n: of_clock if c.lens.kind == EQUIRECTANGULAR else parts for n, c in rig.cameras.items()
+    }
+    if not any(chosen.values()):
         raise ValueError("equirectangular cameras have no lens to estimate")
-    return {name: LensVariable.of(camera, parts) for name, camera in lenses.items()}
+    return {n: LensVariable.of(rig.cameras[n], own) for n, own in chosen.items() if own}
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 x_c   the mount of camera c: ``T_lidar_camera`` of the two sensors as bodies
 d     the scan distortion, in standard deviations of its prior
 y_c   the alignment of camera c: where the points, as the LiDAR delivers them, meet its image
+b_c   the mount of camera c if its lens errs as that of a calibrated one, where mounts are reported
 m_c   camera c as its matches show it at every place
 n_c   camera c as its pairs with other cameras show it
 o     the cloud as it is displaced at every place
@@ -33,6 +34,11 @@ def camera_key(camera: int) -> int:
 def aligned_key(camera: int) -> int:
     """Key of ``y_c``."""
     return int(gtsam.symbol("y", camera))
+
+
+def body_key(camera: int) -> int:
+    """Key of ``b_c``."""
+    return int(gtsam.symbol("b", camera))
 
 
 def matched_key(camera: int) -> int:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, RigError
 from calibgraph.guessing.heading_search import FoundCamera, search_headings
 from calibgraph.guessing.mounting import GRAMMAR, Mounting, check_forward, parse_mounting
@@ -20,7 +20,6 @@ from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, no_progress
 
-Array = NDArray[np.float64]
 Source = Literal["words", "pair", "file", "search"]
 
 FILE_DEG, FILE_M = 3.0, 0.05

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.guessing.mounting import Forward, Mounting
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.acceptance import least_z_score
@@ -18,8 +18,6 @@ from calibgraph.matching.structure.pose_search import PoseSearch, SearchRange
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress, no_progress
-
-Array = NDArray[np.float64]
 
 HEADINGS_DEG = tuple(range(0, 360, 30))
 RANGE = SearchRange(float(np.radians(20.0)), 1.5)

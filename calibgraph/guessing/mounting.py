@@ -6,14 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.errors import RigError
 from calibgraph.model.geometry import T_OPTICAL_LINK, invert, transform
 
-Array = NDArray[np.float64]
 Forward = Literal["+x", "-x", "+y", "-y"]
 
 HEADINGS: Mapping[str, float] = {

@@ -11,11 +11,10 @@ from calibgraph.files import write_text
 from calibgraph.guessing.mounting import check_forward, parse_mounting
 from calibgraph.io.bags import is_bag
 from calibgraph.io.clouds import CLOUD_SUFFIXES
-from calibgraph.io.dataset_folders import folder_layout
+from calibgraph.io.dataset_folders import folder_layout, published_format
 from calibgraph.io.frame_files import files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES, image_size
 from calibgraph.io.kitti import CALIBRATION_NAME
-from calibgraph.io.published import published_format
 from calibgraph.io.rigs import FILL_IN, RIG_FILE
 from calibgraph.io.videos import PICTURE_SUFFIX, load_picture
 from calibgraph.model.rig import RIG_FORMAT

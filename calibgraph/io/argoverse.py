@@ -10,17 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
 from calibgraph.io.feather import read_feather
-from calibgraph.io.frame_files import FrameFiles, files_by_stem
+from calibgraph.io.frame_files import (
+    FrameFiles,
+    IncompleteCamera,
+    RigRead,
+    files_by_stem,
+    rig_of_complete,
+)
 from calibgraph.io.images import IMAGE_SUFFIXES
-from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.rotations import pose_of_quaternion
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
-
-Array = NDArray[np.float64]
 
 VEHICLE = "egovehicle"
 _LIDAR, _CAMERAS = Path("sensors/lidar"), Path("sensors/cameras")

@@ -3,7 +3,7 @@
 import hashlib
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import DatasetError, FileError
-from calibgraph.io.cloud_notes import describe_cloud
-from calibgraph.io.clouds import check_points, cloud_of_array
+from calibgraph.io.clouds import check_points, cloud_of_array, describe_cloud
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.io.point_fields import RawCloud
@@ -28,6 +27,12 @@ class ArrayFrame(Frame):
 
     cloud: NDArray[np.float32]
     images: Mapping[str, NDArray[np.uint8]]
+    twist: NDArray[np.float64] | None = None
+
+    @property
+    def twist_per_s(self) -> NDArray[np.float64] | None:
+        """(6,) of the LiDAR, if it is given."""
+        return self.twist
 
     def load_cloud(self) -> NDArray[np.float32]:
         """(n, 4) x y z [m], intensity."""
@@ -48,6 +53,8 @@ def dataset_from_arrays(
     rig: Rig,
     clouds: Sequence[ArrayLike],
     images: Mapping[str, Sequence[ArrayLike]],
+    *,
+    twists_per_s: ArrayLike | None = None,
 ) -> Dataset:
     """A dataset of arrays, to be calibrated without files. Images are not copied if they fit.
 
@@ -56,6 +63,8 @@ def dataset_from_arrays(
         clouds: per frame (n, 3) x y z or (n, 4) x y z intensity [m] in the LiDAR frame, or an array
             with such named fields; finite but for rows of NaN or zeros without a return.
         images: per camera and frame, (height, width, 3) BGR or (height, width) gray, uint8.
+        twists_per_s: per frame, (6,) rotation [rad/s] and translation [m/s] of the LiDAR along its
+            axes, if it moves and a time offset or read-out is to be estimated or known.
 
     Raises:
         DatasetError: if cameras, frames, shapes or values do not fit together.
@@ -74,12 +83,19 @@ def dataset_from_arrays(
             )
     if not frames:
         raise DatasetError("no frame given")
+    twists = None if twists_per_s is None else np.asarray(twists_per_s, dtype=np.float64)
+    if twists is not None and not (twists.shape == (frames, 6) and np.isfinite(twists).all()):
+        raise DatasetError(f"twists_per_s: expected ({frames}, 6) finite numbers, one row a frame")
     root = Path("arrays") / uuid.uuid4().hex[:8]  # caches tell frames apart by their paths
     first = _cloud(clouds[0], 0)
     return Dataset(
         rig=rig,
         frames=tuple(
-            _frame(root, number, rig, clouds=clouds, images=images) for number in range(frames)
+            replace(
+                _frame(root, number, rig, clouds=clouds, images=images),
+                twist=None if twists is None else twists[number],
+            )
+            for number in range(frames)
         ),
         folders=(root,),
         notes=tuple(describe_cloud("clouds[0]", first)),

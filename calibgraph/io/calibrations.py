@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AliasChoices, BaseModel, BeforeValidator, Field, StrictBool
 
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, holds_truth_value, read_yaml, sha256
 from calibgraph.io.camera_match_tables import load_camera_matches
@@ -27,7 +27,6 @@ from calibgraph.model.result_files import (
 from calibgraph.model.rig import Finite, Rig, rigid_transform
 from calibgraph.model.verdict import Check, ErrorProbability, Status, Verdict
 
-Array = NDArray[np.float64]
 Table = TypeVar("Table")
 
 _POSE = 6  # numbers of one

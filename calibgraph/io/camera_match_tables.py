@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file
 from calibgraph.io.correspondence_tables import read_arrow, require_no_nulls, require_short_names
@@ -23,8 +23,6 @@ from calibgraph.model.camera_matches import (
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-Array = NDArray[np.float64]
 
 
 def load_camera_matches(path: Path | str) -> CameraMatches:

@@ -12,21 +12,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file
-from calibgraph.model.correspondences import Correspondences, as_confidence
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import Places
 from calibgraph.model.table_columns import (
     COORDINATES,
     INFORMATION,
     OPTIONAL_WHOLE,
+    TWIST,
+    as_confidence,
     check_schema,
 )
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Array = NDArray[np.float64]
 
 _PART_ROWS = 2**18
 _MOST_NAME_BYTES = 400  # 100 letters of 4 bytes
@@ -227,6 +229,7 @@ def _from_plain_columns(table: pa.Table) -> Correspondences:
         if "confidence" in given
         else np.ones(len(table), np.float32),
         information_px=stack(INFORMATION) if INFORMATION[0] in given else None,
+        twist_per_s=stack(TWIST) if TWIST[0] in given else None,
         **{name: _whole(table, name) for name in OPTIONAL_WHOLE if name in given},
         metadata=_metadata_of(table.schema),
     )

@@ -19,12 +19,11 @@ from calibgraph.io.bags.frames import BagFrame, frames_of_bag
 from calibgraph.io.bags.messages import CLOUDS, Bag
 from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
-from calibgraph.io.cloud_notes import read_cloud_notes
-from calibgraph.io.dataset_folders import folder_layout, frames_of_folder
+from calibgraph.io.clouds import read_cloud_notes
+from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, published_format
 from calibgraph.io.formats.describe import describe_rig
-from calibgraph.io.frame import Frame, MovingFrame
-from calibgraph.io.incomplete import RigRead
-from calibgraph.io.published import published_format
+from calibgraph.io.frame import DrivenFrame, Frame, MovingFrame, twist_by_scans
+from calibgraph.io.frame_files import RigRead
 from calibgraph.io.rigs import read_rig
 from calibgraph.model.rig import Rig
 
@@ -92,6 +91,7 @@ def load_dataset(
     *,
     frames: str | None = None,
     bag: BagOptions | None = None,
+    interval_s: float | None = None,
 ) -> Dataset:
     """Find the frames of a dataset, a published data set, a bag, or several of one rig.
 
@@ -101,13 +101,17 @@ def load_dataset(
         frames: which to keep, see :meth:`Dataset.select`; all if None. Those left out may lack
             images.
         bag: how ROS bags are read.
+        interval_s: between neighbouring clouds of folders, all of one drive: the motion of the
+            LiDAR is then found by registration of neighbours, where it is needed.
 
     Raises:
         FileError, DatasetError: if a folder is missing, frames do not pair up, or the folders'
             rigs differ.
         ValueError: if ``frames`` selects nothing, or is no selection; or if ``bag`` is given
-            without a bag.
+            without a bag, or ``interval_s`` is not positive.
     """
+    if interval_s is not None and not interval_s > 0:
+        raise ValueError(f"interval_s must be positive, found {interval_s}")
     if isinstance(folders, (str, Path)):
         folders = [folders]
     paths = tuple(Path(folder) for folder in folders)
@@ -122,7 +126,7 @@ def load_dataset(
         if is_bag(path):
             data = _with_bag(data, path, prefix, bag)
         else:
-            data = _with_folder(data, path, prefix, complete=frames is None)
+            data = _with_folder(data, path, prefix, frames is None, interval_s=interval_s)
     if data.recorded == data.frames:
         data = replace(data, recorded=())
     data = data if frames is None else _complete(data.select(frames))
@@ -142,7 +146,9 @@ def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -
     return Dataset(rig=first, frames=(), folders=paths, notes=tuple(dict.fromkeys(notes)))
 
 
-def _with_folder(data: Dataset, path: Path, prefix: str, *, complete: bool) -> Dataset:
+def _with_folder(
+    data: Dataset, path: Path, prefix: str, complete: bool, *, interval_s: float | None
+) -> Dataset:
     """The dataset with the frames of a folder; of complete ones if not all are needed."""
     start = _next_index(data)
     found = tuple(
@@ -151,10 +157,24 @@ def _with_folder(data: Dataset, path: Path, prefix: str, *, complete: bool) -> D
             frames_of_folder(path, list(data.rig.cameras), complete=complete)
         )
     )
+    if interval_s is not None:
+        found = _driven(found, interval_s)
     published = published_format(path)
     if published is not None and (note := published.describe(path)):
         data = replace(data, notes=(*data.notes, note))
     return _with(data, found, found)
+
+
+def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
+    """Frames of one drive, whose motion is that between neighbours."""
+    driven = []
+    for place, one in enumerate(frames):
+        beside = [*frames[max(place - 1, 0) : place], *frames[place + 1 : place + 2]]
+        find = partial(twist_by_scans, one, beside, interval_s)
+        driven.append(
+            DrivenFrame(one.index, one.name, one.cloud_path, one.image_paths, find_twist=find)
+        )
+    return tuple(driven)
 
 
 def _with_bag(data: Dataset, path: Path, prefix: str, options: BagOptions) -> Dataset:

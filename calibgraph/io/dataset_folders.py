@@ -1,15 +1,17 @@
-"""Dataset folders: the cloud and the images of every frame, by the format of the folder."""
+"""Dataset folders: the cloud and the images of every frame, by the format of the folder.
 
-from collections.abc import Mapping, Sequence
+Folders of published data sets hold their own rig; each of their formats is one entry here.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from calibgraph.errors import DatasetError, FileError
-from calibgraph.io import kitti
+from calibgraph.io import argoverse, kitti, kitti_drives, nuscenes
 from calibgraph.io.clouds import CLOUD_SUFFIXES
-from calibgraph.io.frame_files import FrameFiles, files_by_stem, frames_by_stem
+from calibgraph.io.frame_files import FrameFiles, RigRead, files_by_stem, frames_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
-from calibgraph.io.published import published_format
 from calibgraph.io.videos import VIDEO_SUFFIXES, pictures_of_video
 
 
@@ -100,3 +102,37 @@ def _require_pairs(folder: Path, camera: str, clouds: set[str], images: set[str]
         camera=camera,
         frame=lonely[0],
     )
+
+
+@dataclass(frozen=True)
+class PublishedFormat:
+    """How a data set is read; ``describe`` gives a line for the log, or an empty text."""
+
+    is_one: Callable[[Path], bool]
+    read_rig: Callable[[Path], RigRead]
+    frames: Callable[[Path, Sequence[str]], list[FrameFiles]]
+    describe: Callable[[Path], str] = lambda _: ""
+
+
+_FORMATS = (
+    PublishedFormat(
+        nuscenes.is_nuscenes, nuscenes.read_nuscenes_rig, nuscenes.nuscenes_frames,
+        nuscenes.describe_motion,
+    ),
+    PublishedFormat(
+        kitti_drives.is_kitti_raw, kitti_drives.read_kitti_raw_rig, kitti_drives.kitti_raw_frames
+    ),
+    PublishedFormat(
+        kitti_drives.is_kitti_object, kitti_drives.read_kitti_object_rig,
+        kitti_drives.kitti_object_frames, kitti_drives.describe_calibrations,
+    ),
+    PublishedFormat(
+        argoverse.is_argoverse, argoverse.read_argoverse_rig, argoverse.argoverse_frames,
+        argoverse.describe_motion,
+    ),
+)  # fmt: skip
+
+
+def published_format(path: Path | str) -> PublishedFormat | None:
+    """The format of a folder of a published data set, or of its scene; None of others."""
+    return next((each for each in _FORMATS if each.is_one(Path(path))), None)

@@ -1,6 +1,6 @@
 """A frame: one cloud and the images taken with it; the cloud as recorded, or without motion."""
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.errors import DatasetError
 from calibgraph.files import sha256
 from calibgraph.io.bags import MESSAGE_SUFFIX, hash_message
 from calibgraph.io.clouds import load_cloud
 from calibgraph.io.images import load_image
-from calibgraph.io.motion import ScanMotion
+from calibgraph.io.motion import ScanMotion, register, twist_between
 from calibgraph.io.videos import PICTURE_SUFFIX, hash_picture
 from calibgraph.model.rig import Camera
 
@@ -31,6 +32,7 @@ class Sized(Protocol):
         ...
 
 
+Array = NDArray[np.float64]
 Derived = TypeVar("Derived", bound=Sized)
 
 
@@ -59,6 +61,11 @@ class Frame:
     def is_corrected(self) -> bool:
         """Whether its cloud is corrected for motion."""
         return False
+
+    @property
+    def twist_per_s(self) -> Array | None:
+        """(6,) of the LiDAR: rotation [rad/s], translation [m/s]; None if it is unknown."""
+        return None if self.motion is None else np.array(self.motion.twist_per_s)
 
     def load_cloud(self) -> NDArray[np.float32]:
         """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`."""
@@ -125,10 +132,62 @@ class MovingFrame(Frame):
         return {**super().entry(), _MOTION: self.motion.entry()}
 
 
+@dataclass(frozen=True, eq=False)
+class DrivenFrame(Frame):
+    """A frame whose cloud is as recorded, of a LiDAR with a known motion.
+
+    Attributes:
+        find_twist: computes (6,) the twist; called once, when it is needed.
+    """
+
+    find_twist: Callable[[], Array]
+
+    @cached_property
+    def twist_per_s(self) -> Array:
+        """(6,) rotation [rad/s] and translation [m/s]."""
+        return self.find_twist()
+
+    def entry(self) -> dict[str, Any]:
+        """The frame's number, files and motion, as a result keeps them."""
+        motion = ScanMotion(tuple(self.twist_per_s.tolist()), 0.0)
+        return {**super().entry(), _MOTION: motion.entry()}
+
+
+def twist_by_scans(frame: Frame, beside: Sequence[Frame], interval_s: float) -> Array:
+    """(6,) mean twist between a frame's scan and those before and after, by registration.
+
+    Args:
+        frame: whose twist is wanted.
+        beside: the frames before and after in the recording, or one of them.
+        interval_s: between neighbours.
+
+    Raises:
+        DatasetError: if there is none, or scans do not fit.
+    """
+    if not beside:
+        raise DatasetError(f"{frame.cloud_path}: no scan beside it, of which its motion follows")
+    clouds = [one.load_cloud()[:, :3].astype(np.float64) for one in (frame, *beside)]
+    twists = [
+        twist_between(
+            np.eye(4),
+            register(clouds[0], cloud, frame.cloud_path),
+            (one.index - frame.index) * interval_s,
+        )
+        for one, cloud in zip(beside, clouds[1:], strict=True)
+    ]
+    return np.asarray(np.mean(twists, axis=0))
+
+
 def load_entry_cloud(entry: Mapping[str, Any]) -> NDArray[np.float32]:
     """(n, 4) the cloud that a result's entry of a frame names, corrected as it was."""
     motion = entry.get(_MOTION)
     return load_cloud(entry["cloud"], None if motion is None else ScanMotion.of_entry(motion))
+
+
+def twist_of_entry(entry: Mapping[str, Any]) -> Array | None:
+    """(6,) of the LiDAR in the frame of a result's entry; None if it is unknown."""
+    motion = entry.get(_MOTION)
+    return None if motion is None else np.array(motion["twist_per_s"], dtype=np.float64)
 
 
 def hash_source(path: Path) -> str:

@@ -1,11 +1,13 @@
-"""The files of frames: one cloud, and the images taken with it."""
+"""What readers of data sets return: the files of frames, and the rig of the complete cameras."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from calibgraph.errors import FileError
-from calibgraph.files import is_utf8, require_file
+from calibgraph.files import checked_model, is_utf8, require_file
+from calibgraph.model.rig import Camera, Rig
 
 _PCD = ".pcd"  # NAME.pcd.bin is a cloud of nuScenes
 
@@ -49,3 +51,31 @@ def frames_by_stem(
         FrameFiles(stem, cloud, {name: of[stem] for name, of in images.items() if stem in of})
         for stem, cloud in clouds.items()
     ]
+
+
+class IncompleteCamera(FileError):
+    """A camera without its lens, its pose or its images; what is there but wrong is no such."""
+
+
+class RigRead(NamedTuple):
+    """The complete cameras of a data set, and what was left out or assumed, a line each."""
+
+    rig: Rig
+    notes: tuple[str, ...] = ()
+
+
+def rig_of_complete(
+    lidar: str, names: Iterable[str], read: Callable[[str], Camera], path: Path
+) -> RigRead:
+    """The rig of the cameras that have all parts."""
+    cameras: dict[str, Camera] = {}
+    missing: dict[str, IncompleteCamera] = {}
+    for name in names:
+        try:
+            cameras[name] = read(name)
+        except IncompleteCamera as error:
+            missing[name] = error
+    if missing and not cameras:
+        raise next(iter(missing.values()))
+    notes = tuple(f"{error}: camera {name!r} is left out" for name, error in missing.items())
+    return RigRead(checked_model(Rig, {"lidar": lidar, "cameras": cameras}, path), notes)

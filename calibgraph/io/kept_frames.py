@@ -43,6 +43,11 @@ class KeptFrame(Frame):
         """Whether its cloud is corrected for motion."""
         return self.frame.is_corrected
 
+    @property
+    def twist_per_s(self) -> NDArray[np.float64] | None:
+        """(6,) of the LiDAR."""
+        return self.frame.twist_per_s
+
     def load_cloud(self) -> Cloud:
         """(n, 4) x y z [m], intensity."""
         return self.derive("cloud", lambda: mmap_copy(self.frame.load_cloud()))

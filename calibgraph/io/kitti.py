@@ -4,16 +4,14 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_text, require_file
+from calibgraph.io.frame_files import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.images import image_size
-from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.lenses import intrinsics_of_matrix
 from calibgraph.model.rig import Camera
-
-Array = NDArray[np.float64]
 
 CALIBRATION_NAME = "calib.txt"
 CLOUD_FOLDER = "velodyne"

@@ -43,12 +43,14 @@ class CameraLens:
         size_px: width and height; None if the file has none.
         intrinsics_px: (0, 0) is the centre of the top-left pixel.
         distortion: in OpenCV's order.
+        time_offset_s: of its images to the clouds, if the file has it.
     """
 
     model: LensModel
     size_px: tuple[int, int] | None
     intrinsics_px: Intrinsics
     distortion: tuple[float, ...]
+    time_offset_s: float | None = None
 
     def fields(self) -> dict[str, Any]:
         """The fields of :class:`calibgraph.Camera` without the extrinsic."""
@@ -59,6 +61,7 @@ class CameraLens:
             "height_px": height_px,
             "intrinsics_px": self.intrinsics_px,
             "distortion": self.distortion,
+            "time_offset_s": self.time_offset_s,
         }
 
 

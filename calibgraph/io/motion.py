@@ -9,17 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
+from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.model.geometry import invert
+from factors import displace
 
-Array = NDArray[np.float64]
-
-_STILL_RAD = 1e-6  # of turn, below which the series are as exact
+_COARSE_M, _FINE_M = 1.0, 0.25
+_REACH_M = 4.0  # of the coarse registration: 40 m/s in 0.1 s
 
 
 @dataclass(frozen=True)
@@ -36,16 +39,8 @@ class ScanMotion:
 
     def correct(self, points_m: NDArray[np.floating], times_s: Array) -> Array:
         """(n, 3) where points, taken at times [s] after the stamp, would be seen at the instant."""
-        w, v = np.array(self.twist_per_s[:3]), np.array(self.twist_per_s[3:])
         points = points_m.astype(np.float64)
-        first, second, third = _integrals(times_s - self.to_s, float(np.linalg.norm(w)))
-        turned = np.cross(w, points)
-        turned_v = np.cross(w, v)
-        moved: Array = (
-            points + first * turned + second * np.cross(w, turned)
-            + (times_s - self.to_s)[:, None] * v + second * turned_v + third * np.cross(w, turned_v)
-        )  # fmt: skip
-        return moved
+        return displace(points, np.array(self.twist_per_s), times_s - self.to_s)
 
     def entry(self) -> dict[str, Any]:
         """As a result keeps it."""
@@ -57,17 +52,32 @@ class ScanMotion:
         return ScanMotion(tuple(entry["twist_per_s"]), entry["to_s"])
 
 
-def _integrals(dt: Array, rate: float) -> tuple[Array, Array, Array]:
-    """(n, 1) sin(a) / r, (1 - cos a) / r^2 and (a - sin a) / r^3 of a = r dt."""
-    dt = dt[:, None]
-    if rate * np.abs(dt).max(initial=0.0) < _STILL_RAD:
-        return dt, dt**2 / 2, dt**3 / 6
-    angle = rate * dt
-    sine = np.sin(angle)
-    return sine / rate, (1 - np.cos(angle)) / rate**2, (angle - sine) / rate**3
-
-
 def twist_between(T_world_before: Array, T_world_after: Array, seconds: float) -> Array:
     """(6,) rotation [rad/s] and translation [m/s] per second, from two (4, 4) poses."""
     step = gtsam.Pose3(invert(T_world_before) @ T_world_after)
     return np.asarray(gtsam.Pose3.Logmap(step) / seconds, dtype=np.float64)
+
+
+def register(target_m: Array, source_m: Array, where: Path) -> Array:
+    """(4, 4) T_target_source of two scans, (n, 3) points each, coarse and then fine.
+
+    Raises:
+        DatasetError: if they do not fit.
+        CalibrationError: if small_gicp is missing.
+    """
+    try:
+        import small_gicp
+    except ImportError as error:
+        raise CalibrationError(
+            f"the motion by scans needs small_gicp: pip install 'calibgraph[motion]' ({error})"
+        ) from error
+    T = np.eye(4)
+    for size_m, reach_m in ((_COARSE_M, _REACH_M), (_FINE_M, _COARSE_M)):
+        found = small_gicp.align(
+            target_m, source_m, T,
+            downsampling_resolution=size_m, max_correspondence_distance=reach_m,
+        )  # fmt: skip
+        T = np.asarray(found.T_target_source)
+    if not found.converged:
+        raise DatasetError(f"{where}: its scan and that beside it do not fit; choose other frames")
+    return T

@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
-from calibgraph.io.frame_files import FrameFiles
-from calibgraph.io.incomplete import IncompleteCamera, RigRead, rig_of_complete
+from calibgraph.io.frame_files import FrameFiles, IncompleteCamera, RigRead, rig_of_complete
 from calibgraph.io.lenses import intrinsics_of_matrix
 from calibgraph.io.nuscenes_tables import (
     LIDAR,
@@ -23,8 +22,6 @@ from calibgraph.io.nuscenes_tables import (
 )
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
-
-Array = NDArray[np.float64]
 
 _MATRIX_ROWS = 3
 

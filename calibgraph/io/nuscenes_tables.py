@@ -12,16 +12,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_text
 from calibgraph.io.rotations import pose_of_quaternion
 from calibgraph.model.rig import Finite
 
-Array = NDArray[np.float64]
 Record = TypeVar("Record", bound="_Record")
 
 LIDAR = "LIDAR_TOP"

@@ -9,9 +9,9 @@ from calibgraph.files import checked_model, read_json, read_yaml
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
-from calibgraph.io.incomplete import RigRead
+from calibgraph.io.dataset_folders import published_format
+from calibgraph.io.frame_files import RigRead
 from calibgraph.io.kitti import CALIBRATION_NAME, read_kitti_rig
-from calibgraph.io.published import published_format
 from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import RIG_FORMAT, Camera, Rig
 

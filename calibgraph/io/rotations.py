@@ -4,14 +4,11 @@ import math
 from collections.abc import Sequence
 
 import gtsam
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import ROUNDING
-
-Array = NDArray[np.float64]
 
 _TURN_RAD = 2 * math.pi + ROUNDING
 

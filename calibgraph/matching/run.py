@@ -1,7 +1,7 @@
 """The result of matching and solving in rounds: the input of the checks on images."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,6 +63,16 @@ class MatchingRun:
     out_of_time: bool = False
     warnings: tuple[str, ...] = ()
     rematch: Rematch | None = None
+
+
+def with_motion(table: Correspondences, data: Dataset) -> Correspondences:
+    """The table with the motion of the LiDAR in each frame, where it is known of all of them."""
+    twists = {frame.index: frame.twist_per_s for frame in data.frames}
+    known = {number: twist for number, twist in twists.items() if twist is not None}
+    if table.twist_per_s is not None or not {*table.frame.tolist()} <= known.keys():
+        return table
+    of_rows = np.array([known[number] for number in table.frame.tolist()]).reshape(-1, 6)
+    return replace(table, twist_per_s=of_rows)
 
 
 def summarize_round(table: Correspondences, before: Rig, after: Rig) -> RoundSummary:

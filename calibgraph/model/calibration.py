@@ -11,8 +11,8 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.files import sha256, write_yaml
 from calibgraph.model import geometry, result_files
 from calibgraph.model.camera_matches import CameraMatches
@@ -25,8 +25,6 @@ from calibgraph.model.summary import Summary, summarize
 from calibgraph.model.verdict import Verdict, rig_verdict
 from calibgraph.model.versions import package_versions
 from calibgraph.outputs import require_writable
-
-Array = NDArray[np.float64]
 
 FRAMES_SENTENCE = "p_camera = T_camera_lidar * p_lidar"
 TANGENT_SENTENCE = (
@@ -185,8 +183,10 @@ class Calibration:
     def not_included(self) -> str:
         """Sentence about errors that the bars leave out: relative poses show the clouds' scale."""
         scale = "" if self.rig.relative_poses else ", and of the clouds' scale,"
-        fixed = "other intrinsics" if self.lens else "intrinsics"
-        return f"errors of the {fixed}{scale} are not included"
+        fixed = "errors of the other intrinsics" if self.lens else "errors of the intrinsics"
+        if self.config.of == "mount" and not self.lens:
+            fixed += " beyond what a calibration with a target leaves"
+        return f"{fixed}{scale} are not included"
 
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import MAX_COORDINATE
 from calibgraph.model.table_columns import write_table
@@ -19,7 +20,6 @@ from calibgraph.model.table_columns import write_table
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Array = NDArray[np.float64]
 
 FORMAT = "calibgraph-camera-matches/1"
 NAMES = ("camera_a", "camera_b")

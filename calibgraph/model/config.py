@@ -17,7 +17,7 @@ TERMS: tuple[Terms, ...] = get_args(Terms)
 Stage1Source = Literal["pnp", "rig"]
 PresetName = Literal["kitti", "walkley", "auto"]
 Reported = Literal["alignment", "mount"]
-LensPart = Literal["focal", "aspect", "centre", "distortion"]
+LensPart = Literal["focal", "aspect", "centre", "distortion", "offset", "readout"]
 
 Pixels = Annotated[float, Field(ge=1e-6, le=1e6)]
 Weight = Annotated[float, Field(ge=0, le=1e12)]
@@ -59,11 +59,11 @@ def _not_one(draws: int) -> int:
 
 
 def _lens_parts(value: Any) -> Any:
-    """The names of parts, also with commas between them; ``lens`` stands for three."""
+    """The names of parts, also with commas between them; ``lens`` and ``clock`` stand for more."""
     names = value.split(",") if isinstance(value, str) else value
     if not isinstance(names, list | tuple):
         return names
-    whole = {"lens": ("focal", "centre", "distortion")}
+    whole = {"lens": ("focal", "centre", "distortion"), "clock": ("offset", "readout")}
     return tuple(dict.fromkeys(part for name in names for part in whole.get(name, (name,))))
 
 
@@ -101,7 +101,8 @@ class Config(StrictNumbers):
             them, meet the images; or ``mount``, where the sensors are, with a wider error bar.
         estimate: parts of each lens that are estimated with the extrinsics, by ``calibrate`` and
             ``solve``: ``focal``, ``aspect`` (fx over fy), ``centre``, ``distortion``; ``lens`` is
-            focal, centre and distortion.
+            focal, centre and distortion. Also ``offset``, how long after its cloud an image is
+            taken, and ``readout`` of a rolling shutter; ``clock`` is both.
         seed: of everything random.
         tracking: of the recalibration while driving.
     """

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import KEYS, Places
@@ -20,6 +21,8 @@ from calibgraph.model.table_columns import (
     INFORMATION,
     OPTIONAL_WHOLE,
     TABLE_FORMAT,
+    TWIST,
+    as_confidence,
     rows_where,
     write_table,
 )
@@ -27,7 +30,6 @@ from calibgraph.model.table_columns import (
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Array = NDArray[np.float64]
 
 MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
 _MAX_WHOLE = 2**63 - 1
@@ -50,6 +52,7 @@ class Correspondences:
             normal). None stands for the identity.
         stamp_ns: (n,) or None: time of the frame.
         point_index: (n,) or None: the point's row in its frame's cloud, -1 if it is none of them.
+        twist_per_s: (n, 6) or None: of the LiDAR in its axes, rotation [rad/s], translation [m/s].
         metadata: as the file has it: the matcher, its settings, its findings and the places.
         findings: the matcher's, read from the metadata.
         places: which frames share a place, read from the metadata.
@@ -68,6 +71,7 @@ class Correspondences:
     information_px: Array | None = None
     stamp_ns: NDArray[np.int64] | None = None
     point_index: NDArray[np.int64] | None = None
+    twist_per_s: Array | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
     findings: MatcherFindings = field(init=False)
     places: Places = field(init=False)
@@ -107,6 +111,7 @@ class Correspondences:
         information_px: ArrayLike | None = None,
         stamp_ns: ArrayLike | None = None,
         point_index: ArrayLike | None = None,
+        twist_per_s: ArrayLike | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> Correspondences:
         """Build a table from arrays; ``camera`` and ``frame`` may be one value for all rows.
@@ -135,6 +140,7 @@ class Correspondences:
             information_px=_optional(information_px, np.float64),
             stamp_ns=_optional(stamp_ns, np.int64),
             point_index=_optional(point_index, np.int64),
+            twist_per_s=_optional(twist_per_s, np.float64),
             metadata=metadata or {},
         )
 
@@ -217,15 +223,17 @@ class Correspondences:
         }
         optional = {name: getattr(self, name) for name in OPTIONAL_WHOLE}
         columns |= {name: column for name, column in optional.items() if column is not None}
-        if self.information_px is not None:
-            columns |= dict(zip(INFORMATION, self.information_px.T, strict=True))
+        for names, values in ((INFORMATION, self.information_px), (TWIST, self.twist_per_s)):
+            columns |= {} if values is None else dict(zip(names, values.T, strict=True))
         metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(self.metadata)}
         return pa.table(columns).replace_schema_metadata(metadata)
 
     def _check_values(self) -> None:
-        for what, values in (("pixel", self.pixels_px), ("point", self.points_lidar_m)):
-            good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
-            self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
+        columns = {"pixel": self.pixels_px, "point": self.points_lidar_m, "twist": self.twist_per_s}
+        for what, values in columns.items():
+            if values is not None:
+                good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
+                self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
         c = self.confidence
         self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
         if self.point_index is not None:
@@ -250,17 +258,10 @@ class Correspondences:
 
 _WIDTHS = {
     "camera_index": 1, "frame": 1, "pixels_px": 2, "points_lidar_m": 3, "confidence": 1,
-    "information_px": 3, "stamp_ns": 1, "point_index": 1,
+    "information_px": 3, "stamp_ns": 1, "point_index": 1, "twist_per_s": 6,
 }  # fmt: skip
-assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - {
-    "cameras", "metadata", "findings", "places",
-}  # fmt: skip
-
-
-def as_confidence(values: ArrayLike) -> NDArray[np.float32]:
-    """Confidences in single precision; larger numbers become infinite, which is refused later."""
-    with np.errstate(over="ignore"):
-        return np.asarray(values, dtype=np.float32)
+_OTHERS = {"cameras", "metadata", "findings", "places"}
+assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - _OTHERS
 
 
 def _optional(values: ArrayLike | None, dtype: type) -> Any:
@@ -290,7 +291,7 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
             np.tile([1.0, 0.0, 1.0], (len(t), 1)) if t.information_px is None else t.information_px
             for t in tables
         ])  # fmt: skip
-    for name in ("stamp_ns", "point_index"):
+    for name in ("stamp_ns", "point_index", "twist_per_s"):
         given = [getattr(table, name) for table in tables if len(table)]
         if given and all(column is not None for column in given):
             columns[name] = np.concatenate(given)

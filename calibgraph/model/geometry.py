@@ -11,12 +11,11 @@ from itertools import combinations
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.pose_kernel import exponential_times, logarithms
-
-Array = NDArray[np.float64]
 
 
 def transform(rotation: Rotation | ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Array:

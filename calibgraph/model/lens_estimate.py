@@ -1,4 +1,4 @@
-"""Parameters of a lens that were estimated together with the extrinsics."""
+"""Parameters of a lens and a clock that were estimated together with the extrinsics."""
 
 from __future__ import annotations
 
@@ -7,17 +7,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 _PRIOR_SHARE = 0.9  # of the prior's standard deviation: above, the data have said nothing
+_TIED, _TIED_SHARE = 0.999, 0.5
+"""From this correlation with the pose on, half the prior: the prior of the pose narrows it, too."""
+
 _LEFT_SIGMAS = 2.0  # from the prior: beyond, they have
 
 
 @dataclass(frozen=True)
 class LensEstimate:
-    """One parameter of a camera's lens.
+    """One parameter of a camera's lens or clock.
 
     Attributes:
-        name: ``focal`` (the root of fx fy), ``aspect`` (fx / fy), ``centre_x``, ``centre_y`` or a
-            distortion coefficient.
-        unit: ``px`` or empty.
+        name: ``focal`` (the root of fx fy), ``aspect`` (fx / fy), ``centre_x``, ``centre_y``, a
+            distortion coefficient, or ``offset`` and ``readout`` of the clock.
+        unit: ``px``, ``s`` or empty.
         value: the estimate.
         sigma: its standard deviation: the marginal of the graph.
         prior: what the rig states.
@@ -39,12 +42,16 @@ class LensEstimate:
     def is_determined(self) -> bool:
         """Whether the data have narrowed or left the prior."""
         left = abs(self.value - self.prior) > _LEFT_SIGMAS * self.sigma
-        return left or self.sigma < _PRIOR_SHARE * self.prior_sigma
+        share = _PRIOR_SHARE if self.correlation < _TIED else _TIED_SHARE
+        return left or self.sigma < share * self.prior_sigma
 
     def describe(self) -> str:
         """Whether the data determine it, and what it cannot be told from."""
         pair = f"with {self.direction} {self.correlation:.2f}"
-        return pair if self.is_determined else f"not determined by these data; {pair}"
+        if self.is_determined:
+            return pair
+        needed = "; record turns and changes of speed" if self.name in ("offset", "readout") else ""
+        return f"not determined by these data{needed}; {pair}"
 
 
 def change_of_lens(

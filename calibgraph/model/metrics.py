@@ -6,15 +6,13 @@ from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
+from calibgraph.arrays import Array
 from calibgraph.errors import RigError
 from calibgraph.model.geometry import angle_deg, relative_transform, twist_between
 from calibgraph.model.rig import Camera, Rig
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -63,12 +61,15 @@ class Evaluation:
 
     The pair ``"A->B"`` is T_B_A = T_B_lidar T_A_lidar^-1, which maps coordinates in A to
     coordinates in B; its errors are along the axes of B. ``deviations`` are of the cameras whose
-    reference has a covariance.
+    reference has a covariance. ``time_offset_ms`` and ``readout_ms`` are differences of the cameras
+    of which both rigs state them.
     """
 
     cameras: dict[str, PoseError]
     pairs: dict[str, PoseError]
     deviations: dict[str, Deviation] = field(default_factory=dict)
+    time_offset_ms: dict[str, float] = field(default_factory=dict)
+    readout_ms: dict[str, float] = field(default_factory=dict)
 
     def to_mapping(self) -> dict[str, Any]:
         """As plain numbers, for JSON."""
@@ -76,6 +77,8 @@ class Evaluation:
             "cameras": {name: asdict(error) for name, error in self.cameras.items()},
             "pairs": {name: asdict(error) for name, error in self.pairs.items()},
             "deviations": {name: asdict(found) for name, found in self.deviations.items()},
+            "time_offset_ms": self.time_offset_ms,
+            "readout_ms": self.readout_ms,
         }
 
 
@@ -115,7 +118,16 @@ def evaluate(
         for name in found
         if reference.cameras[name].covariance is not None
     }
-    return Evaluation(cameras, pairs, deviations)
+    clocks = (_later_ms(estimate, reference, key) for key in ("time_offset_s", "readout_s"))
+    return Evaluation(cameras, pairs, deviations, *clocks)
+
+
+def _later_ms(estimate: Rig, reference: Rig, key: str) -> dict[str, float]:
+    """Difference of a time, of the cameras of which both rigs state it."""
+    both = {
+        n: [getattr(rig.cameras[n], key) for rig in (estimate, reference)] for n in estimate.cameras
+    }
+    return {n: 1e3 * (one - other) for n, (one, other) in both.items() if None not in (one, other)}
 
 
 def deviation(estimate: Array, reference: Camera, covariance: Array | None) -> Deviation:

@@ -4,13 +4,11 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 
 def perturb(

@@ -4,11 +4,9 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.rig import Camera, Rig
-
-Array = NDArray[np.float64]
 
 MAX_DISTANCE_M = 20.0
 """Between a camera and its LiDAR, or two cameras: longer than a lorry."""

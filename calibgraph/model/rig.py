@@ -24,14 +24,14 @@ from pydantic import (
     model_validator,
 )
 
+from calibgraph.arrays import Array
 from calibgraph.errors import RigError
 from calibgraph.files import StrictNumbers, write_yaml
 from calibgraph.model.correspondences import MAX_COORDINATE
+from calibgraph.model.image_times import IMAGE_TIMES, ImageTimes
 from calibgraph.model.lens_names import find_lens_model
 from factors import Lens, LensModel
 from factors.lens import ORDERS
-
-Array = NDArray[np.float64]
 
 RIG_FORMAT: Literal["calibgraph-rig/1"] = "calibgraph-rig/1"
 
@@ -137,7 +137,10 @@ class _Model(StrictNumbers):
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
 
-_LEFT_OUT = "covariance", "frame_id", "intrinsics_sigma_px", "distortion_sigma"  # where None
+_LEFT_OUT = "covariance", "frame_id", "intrinsics_sigma_px", "distortion_sigma", *IMAGE_TIMES
+"""Of a camera, where they are None."""
+
+_LENS = "intrinsics_px", "distortion", "time_offset_s", "readout_s"
 
 
 class Intrinsics(_Model):
@@ -156,7 +159,7 @@ class IntrinsicsSigma(_Model):
     centre: Positive | None = None
 
 
-class Camera(_Model):
+class Camera(_Model, ImageTimes):
     """One camera: its lens, its image size, and its extrinsic: a guess, or the reference.
 
     ``intrinsics_sigma_px`` and ``distortion_sigma`` (of radial coefficients) are how well the lens
@@ -180,10 +183,9 @@ class Camera(_Model):
     @model_serializer(mode="wrap")
     def _leave_out_what_is_not_given(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         fields: dict[str, Any] = dump(self)
+        times_last = sorted(fields.items(), key=lambda field: field[0] in IMAGE_TIMES)
         return {
-            name: value
-            for name, value in fields.items()
-            if value is not None or name not in _LEFT_OUT
+            name: value for name, value in times_last if value is not None or name not in _LEFT_OUT
         }
 
     @model_validator(mode="after")
@@ -286,11 +288,8 @@ class Rig(_Model):
         return self.model_copy(update={"cameras": cameras})
 
     def with_lenses_of(self, other: Rig) -> Rig:
-        """The same extrinsics with the lenses of a rig of the same cameras."""
-        lenses = {
-            name: {key: getattr(camera, key) for key in ("intrinsics_px", "distortion")}
-            for name, camera in other.cameras.items()
-        }
+        """The same extrinsics with the lenses and clocks of a rig of the same cameras."""
+        lenses = {n: {key: getattr(c, key) for key in _LENS} for n, c in other.cameras.items()}
         cameras = {n: camera.model_copy(update=lenses[n]) for n, camera in self.cameras.items()}
         return self if cameras == self.cameras else self.model_copy(update={"cameras": cameras})
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import write_atomically
@@ -18,11 +18,12 @@ TABLE_FORMAT = "calibgraph-correspondences/1"
 
 COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
 INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
+TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_m_s", "vy_m_s", "vz_m_s")
 
 OPTIONAL_WHOLE = ("stamp_ns", "point_index")
 _WHOLE = ("frame", *OPTIONAL_WHOLE)
 _REQUIRED = ("camera", "frame", *COORDINATES)
-_COLUMNS = (*_REQUIRED, "confidence", *OPTIONAL_WHOLE, *INFORMATION)
+_COLUMNS = (*_REQUIRED, "confidence", *OPTIONAL_WHOLE, *INFORMATION, *TWIST)
 _TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
 
 
@@ -52,15 +53,16 @@ def check_schema(schema: pa.Schema) -> None:
     names = [name for name, _ in types]
     missing = [name for name in _REQUIRED if name not in names]
     unknown = [name for name in names if name not in _COLUMNS]
-    partial = [name for name in INFORMATION if name in names]
     if missing:
         raise CorrespondenceError(f"column {missing[0]!r} is missing; found {names}")
     if unknown:
         raise CorrespondenceError(f"unknown column {unknown[0]!r}; known are {', '.join(_COLUMNS)}")
     if len(set(names)) < len(names):
         raise CorrespondenceError(f"has a column twice: {names}; keep one")
-    if partial and len(partial) < len(INFORMATION):
-        raise CorrespondenceError(f"has only {partial} of the columns {list(INFORMATION)}")
+    for group in (INFORMATION, TWIST):
+        partial = [name for name in group if name in names]
+        if partial and len(partial) < len(group):
+            raise CorrespondenceError(f"has only {partial} of the columns {list(group)}")
     form = (schema.metadata or {}).get(b"format", TABLE_FORMAT.encode()).decode("utf-8", "replace")
     if form != TABLE_FORMAT:
         raise CorrespondenceError(f"has the format {form!r}, expected {TABLE_FORMAT!r}")
@@ -86,6 +88,12 @@ def _check_type(field: pa.Field) -> None:
         kind, right = "numbers", types.is_integer(field.type) or types.is_floating(field.type)
     if not right:
         raise CorrespondenceError(f"column {field.name!r} must hold {kind}, found {field.type}")
+
+
+def as_confidence(values: ArrayLike) -> NDArray[np.float32]:
+    """Confidences in single precision; larger numbers become infinite, which is refused later."""
+    with np.errstate(over="ignore"):
+        return np.asarray(values, dtype=np.float32)
 
 
 def rows_where(mask: NDArray[np.bool_]) -> NDArray[np.int64] | slice:

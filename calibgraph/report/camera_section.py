@@ -1,17 +1,142 @@
-"""The page's section about one camera, with its diagrams."""
+"""The page's section about one camera: its checks as rows of a table, its diagrams, one point."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.geometry import degrees_and_centimetres
+from calibgraph.model.geometry import degrees_and_centimetres, invert, point_in_lidar
 from calibgraph.model.metrics import PoseError, pose_error
-from calibgraph.model.verdict import Verdict
+from calibgraph.model.rig import Camera
+from calibgraph.model.threshold import Direction, beside, in_unit, is_reachable
+from calibgraph.model.verdict import Check, Verdict
 from calibgraph.report import plots
-from calibgraph.report.check_table import CheckRow, check_rows
 from calibgraph.report.page_overlays import Overlays, width_on_page
-from calibgraph.report.reprojection_errors import BeforeAfter
-from calibgraph.report.worked_point import WorkedPoint, worked_point
+from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionErrors
+
+_WORST_FIRST = ("FAIL", "WARN", "PASS")
+
+
+@dataclass(frozen=True)
+class CheckRow:
+    """One check with its value and its thresholds, as text; empty where there is none."""
+
+    check: Check
+    found: str
+    warn: str
+    fail: str
+
+
+def check_rows(checks: Sequence[Check]) -> tuple[CheckRow, ...]:
+    """The rows of a camera's checks, the worst first."""
+    return tuple(check_row(check) for check in sorted(checks, key=_severity))
+
+
+def _severity(check: Check) -> int:
+    return _WORST_FIRST.index(check.status)
+
+
+def check_row(check: Check) -> CheckRow:
+    """A check with its thresholds; their order gives the side on which values are bad.
+
+    A status that the value does not give, since it depends on more, has none.
+    """
+    if check.value is None:
+        return CheckRow(check, "", "", "")
+    if check.warn is None or check.fail is None or not check.is_graded:
+        return CheckRow(check, in_unit(check.value, check.unit), "", "")
+    side: Direction = "at least" if check.warn > check.fail else "at most"
+    warn, fail = (_threshold(side, limit, check.unit) for limit in (check.warn, check.fail))
+    found = beside(check.value, check.fail if check.status == "FAIL" else check.warn, check.unit)
+    return CheckRow(check, found, warn, fail)
+
+
+def _threshold(side: Direction, limit: float, unit: str) -> str:
+    """When a value is bad; empty if no value can be."""
+    sign = ">" if side == "at most" else "<"
+    return f"{sign} {in_unit(limit, unit)}" if is_reachable(limit, unit, side) else ""
+
+
+_DISTANCE_M = 10.0
+
+
+@dataclass(frozen=True)
+class WorkedPoint:
+    """One point from the LiDAR frame to the pixel, as text."""
+
+    matrix: str
+    pose: str
+    inverse: str
+    steps: str
+    origin: str
+
+
+def worked_point(camera: Camera, errors: ReprojectionErrors | None) -> WorkedPoint:
+    """Project the used correspondence nearest to 10 m, or a point on the optical axis."""
+    T = camera.T_camera_lidar
+    used = None if errors is None else errors.select(errors.is_inlier)
+    if used is None or not len(used.frame):
+        point = point_in_lidar(T, np.array([0.0, 0.0, _DISTANCE_M]))
+        origin, matched = "a point 10 m ahead on the optical axis", ""
+    else:
+        row = int(np.argmin(np.abs(used.distances_m - _DISTANCE_M)))
+        point, pixel = used.points_lidar_m[row], used.pixels_px[row]
+        origin = f"a correspondence of frame {used.frame[row]}"
+        matched = (
+            f"\nmatched pixel            = ({pixel[0]:.2f}, {pixel[1]:.2f}) px, "
+            f"residual {used.sizes_px[row]:.2f} px"
+        )
+    steps = _steps(camera, point) + matched
+    return WorkedPoint(matrix_text(T), pose_text(T), pose_text(invert(T)), steps, origin)
+
+
+def _steps(camera: Camera, point: Array) -> str:
+    T = camera.T_camera_lidar
+    rotated = T[:3, :3] @ point
+    p_camera = rotated + T[:3, 3]
+    pixel = camera.lens.project(p_camera[None])[0][0]
+    return (
+        f"p_lidar                  = {_vector(point)} m\n"
+        f"R p_lidar                = {_vector(rotated)} m\n"
+        f"p_camera = R p_lidar + t  = {_vector(p_camera)} m\n"
+        f"{_lens_steps(camera, p_camera)}\n"
+        f"projected pixel (u, v)   = ({pixel[0]:.2f}, {pixel[1]:.2f}) px"
+    )
+
+
+def _lens_steps(camera: Camera, p_camera: Array) -> str:
+    """From p_camera to the pixel: the formula if the lens has no distortion, else its name."""
+    k = camera.intrinsics_px
+    if camera.model == "pinhole" and not any(camera.distortion):
+        x, y, z = p_camera
+        return (
+            f"u = fx x/z + cx          = {k.fx:.3f} * {x:.3f} / {z:.3f} + {k.cx:.3f}\n"
+            f"v = fy y/z + cy          = {k.fy:.3f} * {y:.3f} / {z:.3f} + {k.cy:.3f}"
+        )
+    coefficients = ", ".join(f"{c:g}" for c in camera.distortion)
+    return f"lens: {camera.model}, distortion {coefficients}"
+
+
+def _vector(values: Array) -> str:
+    return f"({', '.join(f'{value:.3f}' for value in values)})"
+
+
+def matrix_text(T: Array) -> str:
+    """The rows of a matrix, a line each."""
+    return "\n".join(" ".join(f"{value: .6f}" for value in row) for row in T)
+
+
+def pose_text(T: Array) -> str:
+    """Translation and quaternion of a transform, with their order and unit."""
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    return (
+        f"translation x y z   = {' '.join(f'{v:.6f}' for v in T[:3, 3])} m\n"
+        f"quaternion  x y z w = {x:.6f} {y:.6f} {z:.6f} {w:.6f}"
+    )
+
 
 Sigmas = tuple[list[float], list[float]]
 """Standard deviations of rotation [deg] and translation [cm], per axis."""
@@ -22,9 +147,6 @@ class CameraSection:
     """What the template prints of one camera beside what the result has.
 
     Attributes:
-        name: of the camera.
-        anchor: of its section in the page.
-        verdict: of the camera.
         rows: its checks.
         moved: change from the guess.
         sigmas, bootstrap: None where there are none, or they do not hold.
@@ -77,7 +199,7 @@ def camera_section(
 
 
 def _sigmas(
-    result: Calibration, covariances: Mapping[str, plots.Array | None], name: str
+    result: Calibration, covariances: Mapping[str, Array | None], name: str
 ) -> Sigmas | None:
     covariance = covariances.get(name) if result.error_bar_holds(name) else None
     if covariance is None:

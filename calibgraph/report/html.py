@@ -1,4 +1,4 @@
-"""The page: the template, filled with all of a result."""
+"""The page: the template, filled with all of a result; and the files of a result in its folder."""
 
 import shlex
 from pathlib import Path
@@ -6,13 +6,22 @@ from pathlib import Path
 import yaml
 
 from calibgraph.files import write_text
+from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
+from calibgraph.model.result_files import (
+    CAMERA_MATCHES_FILE,
+    CORRESPONDENCES_FILE,
+    OVERLAYS,
+    REPORT_FILE,
+    outputs_of_result,
+)
 from calibgraph.report.camera_section import camera_section
 from calibgraph.report.frames import recording_name
 from calibgraph.report.kit import load_template
 from calibgraph.report.page_overlays import draw_overlays
 from calibgraph.report.page_pairs import match_scale, pair_sections
+from calibgraph.report.point_overlay import write_overlays
 from calibgraph.report.reprojection_errors import errors_before_after
 
 
@@ -75,3 +84,27 @@ def _export_command(result: Calibration) -> str:
     if len(usable) < len(result.rig.cameras):
         words += [word for name in usable for word in ("--camera", name)]
     return shlex.join(words)
+
+
+def write_result(
+    result: Calibration, folder: Path, data: Dataset | None = None, *, with_report: bool = True
+) -> list[Path]:
+    """Write a result: of images with an overlay picture per camera.
+
+    Returns:
+        The files to name to the user.
+    """
+    stale = [output.path for output in outputs_of_result(folder) if output.is_ours]
+    written = [result.save(folder)]
+    if data is not None:
+        middle = data.frames[len(data.frames) // 2]
+        mark = "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
+        if result.camera_matches is not None:
+            written.append(folder / CAMERA_MATCHES_FILE)
+        written.insert(1, folder / CORRESPONDENCES_FILE)
+        written += write_overlays(middle, result.initial_rig, result.rig, folder, mark=mark)
+    if with_report:
+        written.append(write_report(result, folder / REPORT_FILE))
+    for path in {path for path in stale if path.match(OVERLAYS)} - {*written}:
+        path.unlink()  # of a camera that this result does not have
+    return written

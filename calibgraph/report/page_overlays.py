@@ -12,16 +12,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.io.frame import load_entry_cloud
+from calibgraph.io.frame import load_entry_cloud, twist_of_entry
 from calibgraph.io.images import load_image
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
 from calibgraph.report.frames import middle_frame
-from calibgraph.report.point_overlay import DEPTH_RANGE_M, depth_colours, draw_points
+from calibgraph.report.point_overlay import DEPTH_RANGE_M, depth_colours, draw_points, shrink
 from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionErrors
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 PICTURES_BYTES = 3_000_000  # of all pictures together; base64 adds a third
@@ -88,7 +89,9 @@ def _overlays(
     *,
     errors: BeforeAfter | None,
 ) -> Overlays:
-    cameras = result.initial_rig.cameras[name], result.rig.cameras[name]
+    twist = twist_of_entry(shown)
+    rigs = result.initial_rig, result.rig
+    cameras = [when_taken(rig.cameras[name], twist) for rig in rigs]
     image = load_image(Path(shown["images"][name]), cameras[1])
     budget = PICTURES_BYTES // (_PICTURES * len(result.rig.cameras))
     by_depth = [draw_by_depth(image, cloud, camera, budget) for camera in cameras]
@@ -111,7 +114,7 @@ def draw_by_depth(image: Image, cloud: Array, camera: Camera, budget: int) -> st
         camera: lens and extrinsic.
         budget: most bytes of the JPEG.
     """
-    drawn = _shrink(draw_points(image, cloud, camera), _SIZES[0][0])
+    drawn = shrink(draw_points(image, cloud, camera), _SIZES[0][0])
     return to_jpeg(drawn, budget)
 
 
@@ -122,7 +125,7 @@ def width_on_page(camera: Camera) -> int:
 
 def _by_residual(image: Image, errors: ReprojectionErrors, budget: int) -> str:
     """Projected points on the darkened image, each with a line to its matched pixel."""
-    small = _shrink(image, _SIZES[0][0])
+    small = shrink(image, _SIZES[0][0])
     factor = small.shape[1] / image.shape[1]
     drawn = np.asarray(small * _DARKENED, dtype=np.uint8)
     ends = np.stack([errors.projected_px, errors.projected_px - errors.vectors_px], axis=1)
@@ -179,20 +182,11 @@ def to_gradient(stops: Image) -> str:
     return ", ".join(f"#{r:02x}{g:02x}{b:02x}" for b, g, r in stops.tolist())
 
 
-def _shrink(image: Image, max_width: int) -> Image:
-    """The image, scaled down to a width of at most ``width`` pixels."""
-    factor = max_width / image.shape[1]
-    if factor >= 1:
-        return image
-    size = (max_width, max(1, round(image.shape[0] * factor)))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
 def to_jpeg(image: Image, budget: int) -> str:
     """A data URI of the largest and best JPEG of at most ``budget`` bytes."""
     data = b""
     for width, quality in _SIZES:
-        small = _shrink(image, width)
+        small = shrink(image, width)
         encoded, buffer = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
         if not encoded:
             raise CalibrationError(f"an image of shape {small.shape} cannot be encoded as JPEG")

@@ -6,17 +6,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.files import write_atomically
 from calibgraph.io.frame import Frame
+from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.outputs import with_png_mark
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 DEPTH_RANGE_M = (2.0, 60.0)
-_MAX_WIDTH_PX = 1280
+_MAX_WIDTH_PX = 1280  # of a file, so that those of many cameras stay small
 _BAR_PX = 34
 _COVERED_SHARE = 0.2  # of the image, covered by points
 _MAX_DOT_PX = 7
@@ -58,11 +59,14 @@ def _write_overlays(
     for name, camera in rigs[0].cameras.items():
         image = frame.load_image(name, camera)
         panels = [
-            _titled(draw_points(image, cloud, rig.cameras[name]), title.replace("{name}", name))
+            _titled(
+                draw_points(image, cloud, when_taken(rig.cameras[name], frame.twist_per_s)),
+                title.replace("{name}", name),
+            )
             for rig, title in zip(rigs, titles, strict=True)
         ]
         paths.append(path.with_name(path.name.replace("{name}", name)))
-        picture = _shrink(np.vstack([*panels, _depth_bar(image.shape[1])]))
+        picture = shrink(np.vstack([*panels, _depth_bar(image.shape[1])]), _MAX_WIDTH_PX)
         write_image(paths[-1], picture, command=command)
     return paths
 
@@ -147,10 +151,10 @@ def _depth_bar(width: int) -> Image:
     return bar
 
 
-def _shrink(image: Image) -> Image:
-    """The image, at most _MAX_WIDTH_PX wide, so that the files of many cameras stay small."""
-    factor = _MAX_WIDTH_PX / image.shape[1]
+def shrink(image: Image, max_width_px: int) -> Image:
+    """The image, scaled down to at most this width."""
+    factor = max_width_px / image.shape[1]
     if factor >= 1:
         return image
-    size = (_MAX_WIDTH_PX, round(image.shape[0] * factor))
+    size = (max_width_px, max(1, round(image.shape[0] * factor)))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

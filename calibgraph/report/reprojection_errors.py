@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,15 +77,14 @@ def errors_before_after(result: Calibration) -> dict[str, BeforeAfter]:
     # The last of several rounds of matching started near the result, not at the guess.
     start = result.rig if len(result.rounds) > 1 else result.initial_rig
     table = preprocess(start, result.correspondences, result.config).table
-    blocks = camera_blocks(start, table, result.config)
-    guess = result.initial_rig.T_camera_lidar
+    rigs = result.initial_rig, result.rig
+    ends = [(rig, camera_blocks(rig, table, result.config)) for rig in rigs]
     return {
         name: BeforeAfter(
-            _errors_at(guess[name], block, result.residuals[name].gate_px),
-            _errors_at(result.T_camera_lidar[name], block, result.residuals[name].gate_px),
+            *(_errors_at(rig.T_camera_lidar[name], of[name], measured.gate_px) for rig, of in ends)
         )
-        for name, block in blocks.items()
-        if name in result.residuals
+        for name, measured in result.residuals.items()
+        if name in ends[0][1]
     }
 
 

@@ -21,7 +21,7 @@ from calibgraph.service.problems import ProblemDetails, add_problem_handlers, ad
 from calibgraph.service.request_guard import LOCAL_NAMES, RequestGuard
 from calibgraph.service.requests import REQUESTS, SETTINGS_OF
 from calibgraph.service.settings import Settings
-from calibgraph.service.state import Service, open_service
+from calibgraph.service.state import Service
 
 STATIC_FOLDER = Path(__file__).parent / "static"
 
@@ -50,7 +50,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.gate = Gate(None if settings.tokens is None else load_tokens(settings.tokens))
     app.state.settings = settings = _with_shares(settings, len(app.state.gate.tenants))
     app.state.metrics = metrics = Metrics()
-    app.state.service = open_service(settings, metrics)
+    app.state.service = Service(settings, metrics)
     app.add_middleware(RequestGuard, hosts=_hosts(settings), observe=metrics.observe_request)
     app.mount(
         "/static",

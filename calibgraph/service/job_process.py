@@ -18,22 +18,20 @@ from calibgraph.fleet.task import describe_failure
 from calibgraph.fleet.uris import fetch
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.service.archives import open_upload, table_suffix
-from calibgraph.service.job_task import (
+from calibgraph.service.places import require_inside
+from calibgraph.service.requests import (
     FILES,
     INPUT,
     LOG,
+    RIG,
     SUMMARY,
+    TABLE,
     WORK,
+    CalibrationSettings,
+    CheckSettings,
     JobOutcome,
     JobProgress,
     JobTask,
-)
-from calibgraph.service.places import require_inside
-from calibgraph.service.requests import (
-    RIG,
-    TABLE,
-    CalibrationSettings,
-    CheckSettings,
     SolveSettings,
     recording_name,
 )
@@ -100,13 +98,13 @@ def _found(task: JobTask, name: str) -> Path | None:
     return (
         path
         if path.is_dir() and not _is_partial(path)
-        else open_upload(_restored(path), _room(task, task.unpacked_bytes))
+        else open_upload(_restored(path), _room(task, task.settings.upload_bytes))
     )
 
 
 def _room(task: JobTask, most_bytes: int) -> int:
     """How much of the disk an input may take: half of the free space is left to others."""
-    free = shutil.disk_usage(task.folder).free - task.free_bytes
+    free = shutil.disk_usage(task.folder).free - task.settings.free_bytes
     return max(0, min(most_bytes, free // 2))
 
 
@@ -131,7 +129,7 @@ def _link(task: JobTask, uri: str, name: str) -> Path:
     shutil.rmtree(copies, ignore_errors=True)
     copies.mkdir()
     try:
-        found = fetch(uri, copies, _room(task, task.fetch_bytes))
+        found = fetch(uri, copies, _room(task, task.settings.fetch_bytes))
     except (CalibrationError, OSError, MemoryError):
         raise
     except Exception as error:  # of any store's client
@@ -172,7 +170,7 @@ def _calibrate(task: JobTask, inputs: _Inputs, progress: Progress) -> JobOutcome
     if settings.frames is not None:
         options["most_frames"] = None
     matcher = StructureMatcher(seed=settings.config.seed, **options) if table is None else table
-    most_s = task.timeout_s / 2  # the rest is for the checks and the report
+    most_s = task.settings.job_timeout_s / 2  # the rest is for the checks and the report
     result = calibrate(
         data,
         matcher=matcher,
@@ -187,7 +185,7 @@ def _calibrate(task: JobTask, inputs: _Inputs, progress: Progress) -> JobOutcome
 
 def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) -> JobOutcome:
     from calibgraph.report.as_json import result_summary
-    from calibgraph.report.result_files import write_result
+    from calibgraph.report.html import write_result
 
     written = write_result(result, task.folder / WORK / FILES, data, with_report=with_report)
     _write_summary(task, result_summary(result, [Path(path.name) for path in written]))
@@ -247,10 +245,10 @@ def _progress(note: Note) -> Progress:
 def main() -> None:
     """The process: one job at a time."""
     import calibgraph.pipeline  # noqa: F401 - it takes seconds, which are not the first job's
-    import calibgraph.report.result_files  # noqa: F401
+    import calibgraph.report.html  # noqa: F401
 
     def answer(task: JobTask, note: Note) -> JobOutcome:
-        with output_to(task.folder / LOG), memory_limit(task.memory_bytes):
+        with output_to(task.folder / LOG), memory_limit(task.settings.job_memory_bytes):
             return run_job(task, note)
 
     answer_requests(answer)

@@ -29,8 +29,6 @@ class ProblemDetails(BaseModel):
 
     Attributes:
         type: ``about:blank``: the status names the kind of problem.
-        title: of the status.
-        status: of the answer.
         detail: what is wrong, and what to do, in one line.
     """
 

@@ -1,11 +1,16 @@
-"""What jobs are asked for: the bodies of requests, checked."""
+"""What jobs are asked for, checked; what their process gets and returns; names in their folder."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
+from calibgraph.fleet.task import ErrorKind
 from calibgraph.model.config import Config, Terms, config_from
+from calibgraph.service.places import Root
+from calibgraph.service.settings import Settings
 
 JobKind = Literal["calibration", "solve", "check"]
 KINDS: tuple[JobKind, ...] = ("calibration", "solve", "check")
@@ -35,7 +40,6 @@ class SolveSettings(_Strict):
 
     Attributes:
         config: settings of the solve, as in a ``--config`` file.
-        terms: of the objective.
         report: whether to write ``report.html``, which takes longer than a small solve.
     """
 
@@ -67,7 +71,6 @@ class CheckSettings(_Strict):
     Attributes:
         tolerance_deg, tolerance_cm: largest deviation per axis that is OK.
         frames: which, as ``--frames``.
-        seed: of everything random.
     """
 
     tolerance_deg: Tolerance = 0.5
@@ -194,3 +197,44 @@ def job_of(request: AnyRequest, kind: JobKind) -> Job:
 def recording_name(index: int) -> str:
     """The name of a recording in a job's folder."""
     return f"{RECORDING}_{index}" if index else RECORDING
+
+
+INPUT, WORK, RESULT, LOG = "input", "work", "result", "log.txt"
+"""In a job's folder: its input, its result while it is written, its result, its log."""
+FILES, SUMMARY = "files", "summary.json"
+"""In the result: the files that the command writes, and the summary that it prints."""
+
+
+@dataclass(frozen=True)
+class JobTask:
+    """A job for a process, with the server's settings, which have its limits."""
+
+    job: Job
+    folder: Path
+    roots: tuple[Root, ...]
+    settings: Settings
+
+
+@dataclass(frozen=True)
+class JobOutcome:
+    """How a job ended: the verdict of its result, or why it failed, in one line."""
+
+    verdict: str | None = None
+    cannot_tell: bool | None = None
+    error_kind: ErrorKind | None = None
+    error: str | None = None
+
+
+class JobProgress(BaseModel):
+    """How far a running job is.
+
+    Attributes:
+        stage: what it does.
+        done, total: steps of the stage.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    stage: str
+    done: int
+    total: int

@@ -1,32 +1,109 @@
-"""Routes of jobs: ask for one, follow it, cancel it."""
+"""Routes of jobs: ask for one, follow it, cancel it; and what they answer."""
 
 import asyncio
 import json
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
+from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
 from calibgraph.service.access import Reader, Submitter
-from calibgraph.service.answers import JobAnswer, JobList, job_answer
-from calibgraph.service.job_events import progress_of, wait_for
-from calibgraph.service.job_task import LOG
-from calibgraph.service.jobs import JobRecord
+from calibgraph.service.jobs import JobRecord, JobState
 from calibgraph.service.problems import Problem, documented, reference
 from calibgraph.service.requests import (
     ABOUT,
     ALLOWED,
     KINDS,
+    LOG,
     REQUESTS,
     REQUIRED,
     SETTINGS_OF,
     JobKind,
+    JobProgress,
 )
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import SETTINGS, submit
+
+
+class JobError(BaseModel):
+    """Why a job failed.
+
+    Attributes:
+        kind: bad input, io, out of memory, timeout, worker died or internal error.
+        detail: what is wrong, and what to do, in one line.
+    """
+
+    kind: str
+    detail: str
+
+
+class JobAnswer(BaseModel):
+    """A job.
+
+    Attributes:
+        kind: calibration, solve or check.
+        state: queued, running, succeeded, failed or cancelled.
+        created, started, finished: times (UTC); null if not yet.
+        verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
+        cannot_tell: whether the data determine too little for another verdict: of a WARN that
+            nothing odd was found behind, and of CANNOT TELL; null as long as there is none.
+        name, note: that were given with it.
+    """
+
+    id: str
+    kind: JobKind
+    state: JobState
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+    progress: JobProgress | None
+    verdict: str | None
+    cannot_tell: bool | None
+    error: JobError | None
+    name: str
+    note: str
+
+
+class JobList(BaseModel):
+    """Jobs, the newest first.
+
+    Attributes:
+        next: ``before`` of the next page; null on the last.
+    """
+
+    jobs: list[JobAnswer]
+    next: int | None
+
+
+def job_answer(record: JobRecord, progress: JobProgress | None) -> JobAnswer:
+    """A job as an answer."""
+    return JobAnswer(
+        id=record.id,
+        kind=record.kind,
+        state=record.state,
+        created=utc(record.created_s),
+        started=None if record.started_s is None else utc(record.started_s),
+        finished=None if record.finished_s is None else utc(record.finished_s),
+        progress=progress if record.state == "running" else None,
+        verdict=record.verdict,
+        cannot_tell=record.cannot_tell,
+        error=JobError(kind=record.error_kind or "internal error", detail=record.error)
+        if record.error is not None
+        else None,
+        name=record.name or "",
+        note=record.note or "",
+    )
+
+
+def utc(time_s: float) -> datetime:
+    """A time since 1970."""
+    return datetime.fromtimestamp(time_s, UTC)
+
 
 router = APIRouter(prefix="/v1")
 
@@ -36,6 +113,7 @@ _PATHS: dict[JobKind, str] = {
 _LONGEST_WAIT_S = 60.0
 _MOST_LOG = 2**20
 _KEEP_ALIVE_S = 15.0
+_LONGEST_PAUSE_S = 0.5
 _NO_CACHE = {"X-Accel-Buffering": "no"}
 
 JobId = Annotated[str, "id of a job"]
@@ -116,14 +194,18 @@ async def get_job(
     wait_s: Annotated[float, Query(ge=0, le=_LONGEST_WAIT_S)] = 0.0,
 ) -> JobAnswer:
     """A job; with ``wait_s`` the answer waits until it is finished, not longer than that."""
-    end = time.monotonic() + wait_s
-    with state.events.listen(id) as changed:
-        while True:
-            record = await run_in_threadpool(find_job, state, caller, id)
-            left_s = end - time.monotonic()
-            if record.is_finished or left_s <= 0 or state.is_stopping:
-                return job_answer(record, state.runner.step(id))
-            await wait_for(changed, left_s)
+    start = time.monotonic()
+    while True:
+        record = await run_in_threadpool(find_job, state, caller, id)
+        waited_s = time.monotonic() - start
+        if record.is_finished or waited_s >= wait_s or state.is_stopping:
+            return job_answer(record, state.runner.step(id))
+        await asyncio.sleep(min(_pause_s(waited_s), wait_s - waited_s))
+
+
+def _pause_s(waited_s: float) -> float:
+    """Until a job is looked at again: short ones are seen at once, long ones cost little."""
+    return min(_LONGEST_PAUSE_S, 0.02 + waited_s / 10)
 
 
 @router.get(
@@ -140,23 +222,22 @@ async def job_events(id: JobId, state: State, caller: Reader) -> Response:
 
 
 async def _events(state: Service, caller: Reader, id: str) -> AsyncIterator[str]:
-    sent, last_s = "", time.monotonic()
-    with state.events.listen(id, progress_of(id)) as changed:
-        while not state.is_stopping:
-            record = await run_in_threadpool(state.jobs.get, id, caller)
-            if record is None:
-                return
-            text = json.dumps(job_answer(record, state.runner.step(id)).model_dump(mode="json"))
-            if text != sent:
-                yield f"event: {record.state}\ndata: {text}\n\n"
-                sent, last_s = text, time.monotonic()
-            elif time.monotonic() - last_s > _KEEP_ALIVE_S:
-                yield ": still here\n\n"
-                last_s = time.monotonic()
-            if record.is_finished:
-                return
-            await wait_for(changed, _KEEP_ALIVE_S)
-            await asyncio.sleep(0.05)  # steps come faster than anyone reads them
+    sent, start = "", time.monotonic()
+    last_s = start
+    while not state.is_stopping:
+        record = await run_in_threadpool(state.jobs.get, id, caller)
+        if record is None:
+            return
+        text = json.dumps(job_answer(record, state.runner.step(id)).model_dump(mode="json"))
+        if text != sent:
+            yield f"event: {record.state}\ndata: {text}\n\n"
+            sent, last_s = text, time.monotonic()
+        elif time.monotonic() - last_s > _KEEP_ALIVE_S:
+            yield ": still here\n\n"
+            last_s = time.monotonic()
+        if record.is_finished:
+            return
+        await asyncio.sleep(_pause_s(time.monotonic() - start))
 
 
 @router.get(

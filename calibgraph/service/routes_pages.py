@@ -1,7 +1,9 @@
 """Pages for people: jobs with their verdicts, a job, trackers with their drift; sign in."""
 
 import json
+from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import parse_qs
 
@@ -12,13 +14,12 @@ from starlette.concurrency import run_in_threadpool
 from calibgraph.errors import CalibrationError
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.result_files import REPORT_FILE
-from calibgraph.service import pages
+from calibgraph.report.kit import load_template
 from calibgraph.service.access import COOKIE, Caller, Gate
-from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.problems import Problem
-from calibgraph.service.requests import JobKind
-from calibgraph.service.routes_jobs import find_job
+from calibgraph.service.requests import FILES, RESULT, SUMMARY, JobKind
+from calibgraph.service.routes_jobs import find_job, utc
 from calibgraph.service.routes_service import require_docs
 from calibgraph.service.routes_trackers import ask_tracker, find_tracker
 from calibgraph.service.state import Service, State
@@ -47,7 +48,7 @@ def _page(request: Request, template: str, status: int = 200, **content: object)
     can_sign_out = not gate.is_open and COOKIE in request.cookies
     has_docs = request.app.state.settings.api_docs != "off"
     fixed = {"can_sign_out": can_sign_out, "has_docs": has_docs}
-    return HTMLResponse(pages.render(template, **fixed, **content), status)
+    return HTMLResponse(render(template, **fixed, **content), status)
 
 
 @router.get("/")
@@ -69,14 +70,14 @@ def job_page(id: str, request: Request, state: State, caller: Visitor) -> Respon
     """A job: how far it is, or its verdict, its cameras and its files."""
     record = find_job(state, caller, id)
     folder = state.folder.of_job(id) / RESULT
-    summary = pages.read_summary(folder / SUMMARY) if record.state == "succeeded" else {}
+    summary = read_summary(folder / SUMMARY) if record.state == "succeeded" else {}
     return _page(
         request,
         "job.html.j2",
         job=record,
         step=state.runner.step(id),
-        actions=pages.actions_of(summary),
-        reasons=pages.reasons_of(summary),
+        actions=actions_of(summary),
+        reasons=reasons_of(summary),
         cameras=summary.get("cameras", {}),
         page=_explanation(state, record),
         links=_links(record),
@@ -197,3 +198,52 @@ async def sign_out() -> Response:
     answer = RedirectResponse("/sign-in", 303)
     answer.delete_cookie(COOKIE, httponly=True, samesite="strict")
     return answer
+
+
+_MINUTE_S = 60
+
+
+def render(template: str, **content: object) -> str:
+    """A page of ``pages/``; all text in it is escaped."""
+    in_words = {"minute_of": minute_of, "duration_of": duration_of}
+    page = load_template(template, "calibgraph.service", "pages")
+    return page.render(**in_words, **content)
+
+
+def minute_of(time_s: float) -> str:
+    """A time since 1970 in words."""
+    return f"{utc(time_s):%Y-%m-%d %H:%M} UTC"
+
+
+def duration_of(seconds: float) -> str:
+    """A duration in words."""
+    if seconds < _MINUTE_S:
+        return f"{max(seconds, 0):.1f} s"
+    return f"{seconds // _MINUTE_S:.0f} min {seconds % _MINUTE_S:.0f} s"
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """The summary of a result; an empty one if it has expired meanwhile."""
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def reasons_of(summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Why a result is not PASS, or what a check found: status, cameras and text of each."""
+    if "summary" in summary:
+        found: list[Mapping[str, Any]] = summary["summary"]["reasons"]
+        return found
+    cameras: Mapping[str, Mapping[str, Any]] = summary.get("cameras", {})
+    return [
+        {"status": camera["status"], "cameras": [name], "text": camera["reason"]}
+        for name, camera in cameras.items()
+    ]
+
+
+def actions_of(summary: Mapping[str, Any]) -> list[str]:
+    """What to do about a result."""
+    actions: list[str] = summary.get("summary", {}).get("actions", [])
+    return actions

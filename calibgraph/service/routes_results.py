@@ -13,8 +13,8 @@ from calibgraph.io.formats.export import export_calibration
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.result_files import CALIBRATION_FILE, REPORT_FILE
 from calibgraph.service.access import Reader
-from calibgraph.service.job_task import FILES, RESULT, SUMMARY
 from calibgraph.service.problems import Problem, documented
+from calibgraph.service.requests import FILES, RESULT, SUMMARY
 from calibgraph.service.routes_jobs import JobId, find_job
 from calibgraph.service.state import Service, State
 

@@ -12,14 +12,14 @@ from starlette.concurrency import run_in_threadpool
 from calibgraph.files import checked_model
 from calibgraph.model.config import config_from
 from calibgraph.service.access import Caller, Name, Reader, Submitter
-from calibgraph.service.answers import utc
+from calibgraph.service.database import TrackerRecord
 from calibgraph.service.jobs import new_id
 from calibgraph.service.problems import Problem, documented, reference
+from calibgraph.service.routes_jobs import utc
 from calibgraph.service.settings import MAX_JSON_BYTES
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import parse_json
 from calibgraph.service.tracker_request import ARROW, Action, TrackerRequest
-from calibgraph.service.tracker_table import TrackerRecord
 from calibgraph.yaml_text import yaml_text
 
 router = APIRouter(prefix="/v1/trackers")
@@ -57,7 +57,6 @@ class TrackerAnswer(BaseModel):
     """A tracker.
 
     Attributes:
-        id: of the tracker.
         name: that it was given.
         created: time (UTC), ISO 8601.
     """
@@ -88,7 +87,6 @@ class TrackerState(BaseModel):
         frame: last frame that was taken in; null if none.
         verdict: of the estimate: PASS, WARN or FAIL.
         cannot_tell: whether it is WARN because the data determine too little.
-        reasons: of the verdict.
         summary: the verdict in few words, as ``--json`` prints it: reasons, actions, others.
         cameras: per camera, as in a result.
         events: the last ones.

@@ -5,19 +5,18 @@ import shutil
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 
 from sqlalchemy.exc import SQLAlchemyError
 
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
 from calibgraph.service.folders import DataFolder, remove_folder
-from calibgraph.service.job_events import progress_of
-from calibgraph.service.job_task import INPUT, RESULT, WORK, JobOutcome, JobProgress, JobTask
 from calibgraph.service.jobs import FINISHED, MOST_STARTS, JobRecord, JobTable
 from calibgraph.service.metrics import Metrics
 from calibgraph.service.places import Root
+from calibgraph.service.requests import INPUT, RESULT, WORK, JobOutcome, JobProgress, JobTask
 from calibgraph.service.settings import Settings
 
 log = logging.getLogger("calibgraph.service")
@@ -50,17 +49,15 @@ class Runner:
         roots: tuple[Root, ...],
         *,
         metrics: Metrics,
-        notify: Callable[[str], None],
     ) -> None:
         self._table, self._folder, self._settings = table, folder, settings
-        self._roots, self._metrics, self._notify = roots, metrics, notify
+        self._roots, self._metrics = roots, metrics
         self._steps: dict[str, JobProgress] = {}
         self._deaths: Counter[str] = Counter()
         self._slots = [_Slot() for _ in range(settings.jobs_at_once)]
         self._threads: list[threading.Thread] = []
-        self._wake, self._taking = threading.Condition(), threading.Lock()
-        self._waiting = 0
-        self._is_stopping = False
+        self._taking, self._added = threading.Lock(), threading.Event()
+        self._is_stopping = threading.Event()
 
     def start(self) -> None:
         """Put back what an earlier server left running, and begin."""
@@ -76,9 +73,7 @@ class Runner:
 
     def wake(self) -> None:
         """Look for jobs: one was added."""
-        with self._wake:
-            self._waiting += 1
-            self._wake.notify()
+        self._added.set()
 
     def step(self, id: str) -> JobProgress | None:
         """How far a running job is."""
@@ -98,14 +93,12 @@ class Runner:
                 slot.child.kill()
         if not running:
             self._discard_input(id)
-        self._notify(id)
         return True
 
     def begin_stop(self) -> None:
         """Start no more jobs."""
-        with self._wake:
-            self._is_stopping = True
-            self._wake.notify_all()
+        self._is_stopping.set()
+        self._added.set()
 
     def stop(self, grace_s: float) -> None:
         """Give running jobs some time to end, then let them wait for the next server."""
@@ -122,13 +115,14 @@ class Runner:
 
     def _work(self, slot: _Slot) -> None:
         """A thread: one job after the other."""
-        while not self._is_stopping:
+        while not self._is_stopping.is_set():
             try:
                 with suppress(ChildEndedError):  # no job dies while libraries load
                     slot.child.start()
+                self._added.clear()
                 record = self._take(slot)
                 if record is None:
-                    self._wait()
+                    self._added.wait(_LOOK_EVERY_S)
                 else:
                     self._run(slot, record)
             except Exception:  # of the database, of the disk
@@ -143,14 +137,8 @@ class Runner:
             with suppress(SQLAlchemyError), self._taking:
                 self._table.put_back(slot.job)
                 slot.job = None
-            if self._is_stopping:
+            if self._is_stopping.is_set():
                 break
-
-    def _wait(self) -> None:
-        with self._wake:
-            if not self._waiting and not self._is_stopping:
-                self._wake.wait(_LOOK_EVERY_S)
-            self._waiting = max(0, self._waiting - 1)
 
     def _take(self, slot: _Slot) -> JobRecord | None:
         with self._taking:
@@ -162,7 +150,6 @@ class Runner:
     def _run(self, slot: _Slot, record: JobRecord) -> None:
         """Run a job and write down how it ended."""
         start = time.perf_counter()
-        self._notify(record.id)
         outcome = self._ask(slot, record)
         if outcome is None:  # the server stops, or the process died: it waits again
             self._table.put_back(record.id)
@@ -184,7 +171,6 @@ class Runner:
         state = "put back" if outcome is None else "failed" if outcome.error_kind else "succeeded"
         self._metrics.jobs.labels(record.kind, state).inc()
         self._metrics.job_s.labels(record.kind).observe(time.perf_counter() - start)
-        self._notify(record.id)
 
     def _ask(self, slot: _Slot, record: JobRecord) -> JobOutcome | None:
         """What the child answers; None if the job is to wait again."""
@@ -195,7 +181,7 @@ class Runner:
             if current is None or current.state != "running":  # cancelled meanwhile
                 return JobOutcome(error_kind="bad input", error="cancelled")
             outcome: JobOutcome = slot.child.ask(
-                self.task(record.id), limit_s, lambda note: self._note(record.id, note)
+                self.task(record.id), limit_s, partial(self._steps.__setitem__, record.id)
             )
             self._renew(slot, failed=outcome.error_kind is not None)
             return outcome
@@ -203,7 +189,7 @@ class Runner:
             return JobOutcome(error_kind="timeout", error=f"{error}; give fewer frames")
         except ChildEndedError as error:
             slot.child.stop()
-            if self._is_stopping:
+            if self._is_stopping.is_set():
                 return None
             log.warning("job %s: %s", record.id, error)
             self._deaths[record.id] += 1  # a killed server is not the job's fault
@@ -213,21 +199,9 @@ class Runner:
 
     def task(self, id: str) -> JobTask:
         """What the process of a job gets."""
-        settings = self._settings
         return JobTask(
-            job=self._table.request(id),
-            folder=self._folder.of_job(id),
-            roots=self._roots,
-            memory_bytes=settings.job_memory_bytes,
-            fetch_bytes=settings.fetch_bytes,
-            unpacked_bytes=settings.upload_bytes,
-            free_bytes=settings.free_bytes,
-            timeout_s=settings.job_timeout_s,
+            self._table.request(id), self._folder.of_job(id), self._roots, self._settings
         )
-
-    def _note(self, id: str, progress: JobProgress) -> None:
-        self._steps[id] = progress
-        self._notify(progress_of(id))
 
     def _renew(self, slot: _Slot, *, failed: bool) -> None:
         """End a process that has run many jobs, or one that failed: it may be in disorder."""
@@ -252,14 +226,11 @@ class Runner:
 
     def _expire(self) -> None:
         """A thread: remove the jobs whose results have been kept for long enough."""
-        while not self._is_stopping:
+        while not self._is_stopping.wait(_EXPIRE_EVERY_S):
             try:
                 self.remove_expired()
             except (SQLAlchemyError, OSError):
                 log.exception("expired jobs cannot be removed")
-            end = time.monotonic() + _EXPIRE_EVERY_S
-            while not self._is_stopping and time.monotonic() < end:
-                time.sleep(0.1)
 
     def remove_expired(self) -> None:
         """Remove the jobs whose results have been kept for long enough, and their folders."""

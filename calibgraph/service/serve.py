@@ -95,7 +95,7 @@ def _allow_many_connections() -> None:
 class Server(uvicorn.Server):
     """A server of uvicorn with limits on connections.
 
-    It wakes requests that wait as soon as a signal comes: uvicorn would wait for them.
+    Requests that wait for a job end as soon as a signal comes: uvicorn would wait for them.
     """
 
     def __init__(
@@ -133,5 +133,4 @@ class Server(uvicorn.Server):
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Begin to stop."""
         self._service.is_stopping = True
-        self._service.events.notify()
         super().handle_exit(sig, frame)

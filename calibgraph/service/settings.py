@@ -44,7 +44,6 @@ class Settings(BaseModel):
         free_bytes: of the disk; with less, nothing is accepted.
         keep_s: how long the results of finished jobs are kept.
         tracker_processes: that hold the trackers; 0 for no trackers.
-        most_trackers: of a tenant.
         tracker_memory_bytes: that a process with trackers may allocate.
         frames_bytes: most bytes of one request with frames.
         grace_s: how long jobs may run on when the server is told to stop.

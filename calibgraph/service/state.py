@@ -1,48 +1,43 @@
 """What the routes of a server share."""
 
-from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Request
-from sqlalchemy import Engine
 
 from calibgraph.errors import CalibrationError
-from calibgraph.service.database import open_database
+from calibgraph.service.database import TrackerTable, open_database
 from calibgraph.service.folders import DataFolder, remove_folder
-from calibgraph.service.job_events import JobEvents
 from calibgraph.service.jobs import JobTable
 from calibgraph.service.metrics import Metrics
-from calibgraph.service.places import Root, open_roots
+from calibgraph.service.places import open_roots
 from calibgraph.service.problems import Problem
 from calibgraph.service.room import Room
 from calibgraph.service.runner import Runner
 from calibgraph.service.settings import MAX_BODIES_BYTES, Settings
-from calibgraph.service.tracker_table import TrackerTable
 from calibgraph.service.trackers import Trackers
 
 _RETRY_AFTER = {"Retry-After": "5"}
 
 
-@dataclass
 class Service:
-    """The parts of a server."""
+    """The parts of a server.
 
-    settings: Settings
-    folder: DataFolder
-    engine: Engine
-    jobs: JobTable
-    runner: Runner
-    tracker_table: TrackerTable
-    trackers: Trackers
-    roots: tuple[Root, ...]
-    metrics: Metrics
-    events: JobEvents
-    disk: Room = field(init=False)
-    memory: Room = field(init=False)
-    is_stopping: bool = field(default=False)
+    Raises:
+        CalibrationError: if the data folder, the database or a root cannot be used.
+    """
 
-    def __post_init__(self) -> None:
-        self.disk = Room(self.folder.free_bytes, self.settings.free_bytes, 507)
+    def __init__(self, settings: Settings, metrics: Metrics) -> None:
+        self.settings, self.metrics, self.is_stopping = settings, metrics, False
+        self.roots, self.folder = open_roots(settings.roots), DataFolder(settings.data)
+        try:
+            engine = open_database(self.folder.path, settings.database, self.folder.owner)
+        except CalibrationError:
+            self.folder.close()
+            raise
+        self.engine, self.jobs, self.tracker_table = engine, JobTable(engine), TrackerTable(engine)
+        self.runner = Runner(self.jobs, self.folder, settings, self.roots, metrics=metrics)
+        self.trackers = Trackers(self.folder, settings)
+        self.disk = Room(self.folder.free_bytes, settings.free_bytes, 507)
         self.memory = Room(lambda: MAX_BODIES_BYTES - self.memory.arrived_bytes, 0, 429)
 
     def start(self) -> None:
@@ -51,14 +46,12 @@ class Service:
         for left in self.folder.trackers.iterdir():
             if left.name not in known:  # a server was killed while it made or removed it
                 remove_folder(left)
-        self.events.open()
         self.runner.start()
 
     def begin_stop(self) -> None:
         """Accept nothing more, and let those go who wait."""
         self.is_stopping = True
         self.runner.begin_stop()
-        self.events.notify()
 
     def stop(self) -> None:
         """End the jobs and trackers, and release the data folder."""
@@ -80,41 +73,9 @@ class Service:
             raise Problem(507, "the server's disk is almost full; try again later")
 
 
-def open_service(settings: Settings, metrics: Metrics) -> Service:
-    """The parts of a server with these settings.
-
-    Raises:
-        CalibrationError: if the data folder, the database or a root cannot be used.
-    """
-    roots = open_roots(settings.roots)
-    folder = DataFolder(settings.data)
-    try:
-        engine = open_database(folder.path, settings.database, folder.owner)
-    except CalibrationError:
-        folder.close()
-        raise
-    table, events = JobTable(engine), JobEvents()
-    return Service(
-        settings=settings,
-        folder=folder,
-        engine=engine,
-        jobs=table,
-        runner=Runner(table, folder, settings, roots, metrics=metrics, notify=events.notify),
-        tracker_table=TrackerTable(engine),
-        trackers=Trackers(folder, settings),
-        roots=roots,
-        metrics=metrics,
-        events=events,
-    )
-
-
-def _service_of(request: Request) -> Service:
+async def _service(request: Request) -> Service:
     service: Service = request.app.state.service
     return service
-
-
-async def _service(request: Request) -> Service:
-    return _service_of(request)
 
 
 State = Annotated[Service, Depends(_service)]

@@ -14,13 +14,14 @@ from starlette.concurrency import run_in_threadpool
 from calibgraph.files import describe
 from calibgraph.service.access import Caller
 from calibgraph.service.folders import sync_tree
-from calibgraph.service.job_task import INPUT, LOG
 from calibgraph.service.jobs import JobRecord, OtherRequestError, new_id
 from calibgraph.service.places import require_inside
 from calibgraph.service.problems import Problem
 from calibgraph.service.requests import (
     ABOUT,
     ALLOWED,
+    INPUT,
+    LOG,
     MAX_RECORDINGS,
     RECORDING,
     REQUESTS,

@@ -1,15 +1,18 @@
 """Simulated fleets with known deviations: rows as `calibgraph fleet` writes them."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from pyarrow import csv
 
+from calibgraph import MatcherErrors, perturb, simulate_correspondences
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import relative_transform, retract_all
-
-Array = NDArray[np.float64]
+from calibgraph.simulation.rigs import rig_of
 
 CAMERAS = ("front", "front_left", "front_right", "left", "rear", "right")
 MODELS = ("compact", "van")
@@ -159,3 +162,40 @@ def errors_of(T_camera_lidar: Array, truth: Array) -> Array:
     R = relative_transform(T_camera_lidar, truth)[:, :3, :3]
     cosine = (np.trace(R, axis1=1, axis2=2) - 1) / 2
     return np.asarray(np.arccos(np.clip(cosine, -1, 1)), np.float64)
+
+
+def write_fleet(
+    folder: Path, vehicles: int, *, frames: int = 6, matches: int = 60, rig: str = "kitti"
+) -> Path:
+    """Write the tables of a fleet, each of its own rig, and their manifest.
+
+    Args:
+        folder: for all files.
+        vehicles: how many.
+        frames: of each table.
+        matches: per camera and frame.
+        rig: name of the nominal one, from which each vehicle is 0.3 degrees and 2 cm off.
+
+    Returns:
+        The manifest, CSV.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    nominal = rig_of(rig)
+    nominal.save(folder / "nominal.yaml")
+    names = [f"car-{number:05d}" for number in range(vehicles)]
+    for seed, name in enumerate(names):
+        truth = perturb(nominal, rotation_deg=0.3, translation_m=0.02, seed=seed)
+        errors = MatcherErrors(noise_px=1.0, outlier_share=0.1)
+        table = simulate_correspondences(
+            truth, frames=frames, matches=matches, errors=errors, seed=seed
+        )
+        table.save(folder / f"{name}.parquet")
+    columns = {
+        "vehicle": names,
+        "recording": [f"{name}.parquet" for name in names],
+        "rig": ["nominal.yaml"] * vehicles,
+        "batch": [f"{seed % 3}" for seed in range(vehicles)],
+        "mileage_km": [1000.0 * seed for seed in range(vehicles)],
+    }
+    csv.write_csv(pa.table(columns), folder / "fleet.csv")
+    return folder / "fleet.csv"

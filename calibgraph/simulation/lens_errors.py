@@ -2,14 +2,12 @@
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from calibgraph.arrays import Array
 from calibgraph.model.config import LensPart
 from calibgraph.model.rig import Camera, Intrinsics, Rig
 from calibgraph.simulation.cameras import pixel_directions
-
-Array = NDArray[np.float64]
 
 _FOCAL, _ASPECT, _CENTRE, _CORNER = 1e-3, 2e-4, 5e-4, 3e-4
 _GRID_PX, _DEPTHS_M = (16, 12), (5.0, 10.0, 20.0, 40.0)

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.simulation.scan_errors import ScanErrors, bias_of_range, cast_beams
 from calibgraph.simulation.world import World, find_albedos
 
-Array = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 _REFERENCE_M = 100.0

@@ -7,10 +7,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.simulation.paints import Albedo, Paint
 from calibgraph.simulation.solids import UV_AXES, Solid
-
-Array = NDArray[np.float64]
 
 _SIDES = 20
 _SPLITS, _LEAF_SPLITS = 3, 4

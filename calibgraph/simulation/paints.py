@@ -7,11 +7,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from factors.compiled import compiled
 
-Array = NDArray[np.float64]
 Albedo = tuple[float, ...]
 
 KERB_Y_M, LANE_M = 5.8, 3.5

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.objective import pose_key
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.error_components import error_components
@@ -20,7 +20,6 @@ from calibgraph.solver.optimizer import optimize
 from calibgraph.solver.scan_distortion import distortions_at
 from factors import ProjectionBlock, block_factor
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 FRAMES = 3

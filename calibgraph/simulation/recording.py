@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import (
     require_place_for_folder,
@@ -34,8 +35,6 @@ from calibgraph.simulation.street import (
 )
 from calibgraph.simulation.surroundings import SURROUNDINGS
 from calibgraph.simulation.world import World, build_world
-
-Array = NDArray[np.float64]
 
 MAX_STREET_M = 2000
 """Longer streets take gigabytes of memory."""

@@ -3,14 +3,13 @@
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera, Intrinsics, Rig
 from factors import LensModel
 
-Array = NDArray[np.float64]
 Cameras = dict[str, Camera]
 Views = Mapping[str, tuple[Array | tuple[float, ...], tuple[float, ...]]]
 """By camera, its position in the LiDAR's frame [m], and yaw, pitch and roll [deg]."""

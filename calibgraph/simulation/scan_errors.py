@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.simulation.world import Hits, World, cast
-
-Array = NDArray[np.float64]
 
 _PARTS = 7  # rays of a wide beam: its middle, and a ring at 0.7 of its radius
 _RING = 0.7

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.simulation.paints import (
     BARK,
     BOARD,
@@ -28,8 +28,6 @@ from calibgraph.simulation.paints import (
     Albedo,
     Paint,
 )  # fmt: skip
-
-Array = NDArray[np.float64]
 
 STRETCH_M = 11.4
 UNIT_X, UNIT_Y, UNIT_Z = np.eye(3)

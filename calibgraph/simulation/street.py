@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.simulation.mesh import Mesh, join_meshes, mesh_of_solid, ribbon
 from calibgraph.simulation.paints import (
     ASPHALT,
@@ -51,7 +51,6 @@ from calibgraph.simulation.solids import (
     place,
 )  # fmt: skip
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 LANE_Y_M = -LANE_M / 2

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.simulation.mesh import Mesh, join_meshes, mesh_of_solid, ribbon
 from calibgraph.simulation.paints import (
     ASPHALT,
@@ -39,7 +39,6 @@ from calibgraph.simulation.street import (
     place_along,
 )
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 Profile = Iterable[tuple[float, float]]
 """Distances to the left of the line, in widths of the street, and heights [m]."""

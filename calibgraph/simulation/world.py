@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.simulation.mesh import Mesh
 from calibgraph.simulation.paints import paint_one
 from factors.compiled import compiled
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 _SUNLIGHT, _SKYLIGHT = (0.98, 1.05, 1.10), (0.50, 0.45, 0.40)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.calibration import Residuals
+from calibgraph.model.clock import at_pixels, motion_of
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
@@ -285,16 +286,14 @@ def merge(parts: Sequence[CameraBlock]) -> CameraBlock:
 
 def camera_blocks(rig: Rig, table: Correspondences, config: Config) -> dict[str, CameraBlock]:
     """The preprocessed correspondences of every camera that has enough to be solved from."""
-    rows = {name: table.of_camera(name) for name in rig.cameras}
-    return {
-        name: camera_block(camera, rows[name], config)
-        for name, camera in rig.cameras.items()
-        if len(rows[name]) >= MIN_MATCHES
-    }
+    cameras = rig.cameras.items()
+    blocks = {name: camera_block(camera, table.of_camera(name), config) for name, camera in cameras}
+    return {name: block for name, block in blocks.items() if len(block) >= MIN_MATCHES}
 
 
 def camera_block(camera: Camera, rows: Correspondences, config: Config) -> CameraBlock:
-    """The preprocessed correspondences of one camera."""
-    root = sqrt_information(rows, config)
-    block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px, root, config.loss)
+    """The preprocessed correspondences of one camera, their points at the times of the pixels."""
+    root, motion = sqrt_information(rows, config), motion_of(camera, rows)
+    points = at_pixels(camera, rows).points_lidar_m
+    block = ProjectionBlock(camera.lens, points, rows.pixels_px, root, config.loss, motion=motion)
     return CameraBlock(block, rows.information_px, rows.frame)

@@ -22,6 +22,7 @@ from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
     aligned_key,
+    body_key,
     camera_key,
     cloud_at_key,
     matched_at_key,
@@ -183,8 +184,8 @@ class LatentPoseFit:
 
     @cached_property
     def of_mount(self) -> LatentPoseFit:
-        """The same optimum; the mounts are reported."""
-        return self.with_model(replace(self.linear.model, of="mount"))
+        """The same optimum; the mounts are reported, with the lenses as the rig has them."""
+        return self.with_model(replace(self.linear.model, of="mount", lens_errors={}))
 
     @cached_property
     def distortion(self) -> tuple[Array, Array]:
@@ -251,6 +252,8 @@ def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) ->
         values.insert(camera_key(number), pose)
     for number in model.aligned:
         values.insert(aligned_key(number), poses[number])
+    for number in model.lens_errors:
+        values.insert(body_key(number), poses[number])
     for number in model.matched:
         values.insert(matched_key(number), poses[number])
     for number in model.paired:

@@ -22,7 +22,7 @@ from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.data_by_place import block_by_place, pairs_by_place
 from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
 from calibgraph.solver.fitted import FittedObjective
-from calibgraph.solver.lens import lens_term, weak_information
+from calibgraph.solver.lens import lens_errors, lens_term, weak_information
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum
 from calibgraph.solver.prior_components import common_error, variance_components
@@ -251,7 +251,10 @@ def error_model(
     graph = join(inliers.pose_graph, held_graph(cameras, at.T_camera_lidar, at.held))
     features = pairs_by_place(pairs, places)
     of = inliers.config.of
-    return LatentPoseModel(cameras, blocks, features, graph, components, of, lenses)
+    errors = lens_errors(at) if of == "mount" else {}
+    return LatentPoseModel(
+        cameras, blocks, features, graph, components, of, lenses=lenses, lens_errors=errors
+    )
 
 
 def held_graph(

@@ -15,17 +15,20 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from calibgraph.graph.by_place import BlockByPlace
-from calibgraph.graph.lens import FreeLensByPlace, LensTerm, LensVariable
+from calibgraph.graph.components import EXACT
+from calibgraph.graph.lens import FreeLensByPlace, LensSigmas, LensTerm, LensVariable
 from calibgraph.graph.variables import lens_key
+from calibgraph.model.config import LensPart
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.solver.elimination import LatentPoseFit, marginal_information
+from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import FreeLensBlock
-from factors.free_lens import ASPECT, FOCAL
+from factors.free_lens import ASPECT, FOCAL, OFFSET, READOUT
 
 Array = NDArray[np.float64]
 Lenses = Mapping[str, LensVariable]
@@ -34,7 +37,9 @@ MATCH_SHARE = 0.01
 """So much of a match's variance is taken to be shared by all: less cannot be told from a wrong
 lens."""
 
+_LENS: tuple[LensPart, ...] = "focal", "centre", "distortion"
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
+_UNITS = {FOCAL: "px", "centre_x": "px", "centre_y": "px", OFFSET: "s", READOUT: "s"}
 _WEAK_PRIOR = 0.01  # information: a lens that is ten sigmas off is hardly held back
 _MOST_STEPS, _MINIMAL = 20, 1e-4  # of Gauss-Newton; decrease of the cost by the last
 
@@ -78,6 +83,24 @@ def lens_term(
     excess = _positive((whole - _in_graph(hessians, of_poses, within.least, lens))[6:, 6:])
     compensating = np.asarray(-np.linalg.solve(hessian[:6, :6], hessian[:6, 6:]))
     return LensTerm(lens, excess, np.zeros((len(excess), 0)), compensating)
+
+
+def lens_errors(at: FittedObjective) -> dict[int, Array]:
+    """Per number of a camera whose lens is fixed, (6, 6) covariance of its mount by the lens.
+
+    Of the pose that fits the matches of a lens which errs as that of a calibrated camera, or as the
+    rig states; in the tangent of T_lidar_camera. Of a panorama the format determines the lens.
+    """
+    found = {}
+    for name, block in at.projections.items():
+        camera = at.objective.rig.cameras[name]
+        if name in at.objective.lenses or camera.model == "equirectangular":
+            continue
+        lens = LensVariable.of(camera, _LENS, LensSigmas.calibrated(camera))
+        sums = FreeLensBlock(block, lens.free).sums(at.T_camera_lidar[name], lens.values)
+        follows = np.linalg.solve(sums.hessian[:6, :6] + WEAK, sums.hessian[:6, 6:])
+        found[at.cameras.index(name)] = follows @ follows.T + EXACT**2 * np.eye(6)
+    return found
 
 
 def _in_graph(hessians: Array, of_poses: Array, least: float, lens: LensVariable) -> Array:
@@ -138,22 +161,15 @@ def _positive(matrix: Array) -> Array:
 
 def moved_lenses(lenses: Lenses, fit: LatentPoseFit | None) -> tuple[Lenses, float]:
     """Lenses where a fit has them, and the largest change of a value in standard deviations."""
-    found = {} if fit is None else lens_values(fit)
-    moved = {name: lenses[name].moved_to(values) for name, (values, _) in found.items()}
-    changes = [abs(v - lenses[n].values) / s for n, (v, s) in found.items()]
-    return {**lenses, **moved}, float(np.concatenate([*changes, [0.0]]).max())
-
-
-def lens_values(fit: LatentPoseFit) -> dict[str, tuple[Array, Array]]:
-    """Per camera whose lens is free, its (k,) values and their (k,) standard deviations."""
-    covariance = _marginal(fit, [*map(lens_key, fit.linear.model.lenses)])
-    found, first = {}, 0
-    for number, term in fit.linear.model.lenses.items():
-        rows = slice(first, first := first + len(term.variable.free))
-        sigmas = np.sqrt(np.diag(covariance)[rows])
-        values = fit.linear.values.atVector(lens_key(number))
-        found[fit.linear.model.cameras[number]] = values, sigmas
-    return found
+    if fit is None:
+        return lenses, 0.0
+    moved, largest = {**lenses}, 0.0
+    for number in fit.linear.model.lenses:
+        name, key = fit.linear.model.cameras[number], lens_key(number)
+        values, sigmas = fit.linear.values.atVector(key), np.sqrt(np.diag(_marginal(fit, [key])))
+        moved[name] = lenses[name].moved_to(values)
+        largest = max(largest, float((abs(values - lenses[name].values) / sigmas).max()))
+    return moved, largest
 
 
 def lens_estimates(fit: LatentPoseFit) -> dict[str, tuple[LensEstimate, ...]]:
@@ -182,7 +198,7 @@ def _estimate(
     most = int(np.argmax(correlation[row]))
     return LensEstimate(
         name=name,
-        unit="px" if name == FOCAL or name.startswith("centre") else "",
+        unit=_UNITS.get(name, ""),
         value=after,
         sigma=float(sigmas[row] * unit),
         prior=before,
@@ -194,9 +210,11 @@ def _estimate(
 
 def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
     """A parameter at some values, as people state it."""
-    camera = lens.put_into(lens.camera, values)
+    camera, clock = lens.put_into(lens.camera, values), lens.free.clock_at(values)
     k = camera.intrinsics_px
     known = {
+        OFFSET: clock.offset_s,
+        READOUT: clock.readout_s,
         FOCAL: float(np.sqrt(k.fx * k.fy)),
         ASPECT: k.fx / k.fy,
         "centre_x": k.cx,

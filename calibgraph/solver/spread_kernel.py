@@ -13,7 +13,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from factors.block_arrays import contiguous
-from factors.compiled import compiled
+from factors.compiled import compiled, kernel_part
 
 Array = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def _spreads(*, shared: bool) -> Any:
     return run
 
 
-@compiled()
+@kernel_part()
 def _spread(values, raw, start, cut, rounds):  # type: ignore[no-untyped-def]
     bits: Any = np.int64(0)
     for least, some in _BITS:
@@ -116,7 +116,7 @@ def _fill_bins(values, raw, bits, work, edges):  # type: ignore[no-untyped-def]
             place[b] += 1
 
 
-@compiled()
+@kernel_part()
 def _quantile_below(work, edges, bits, limit, share):  # type: ignore[no-untyped-def]
     """The quantile of the values up to a limit, interpolated; NaN without any."""
     last = edges[-1] - 1

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.model.clock import at_pixels
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import transform, twists_between
@@ -71,7 +72,7 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
         named = [name for name in rig.cameras if name in table.cameras]
         return {name: CameraStage1(rig.cameras[name].T_camera_lidar) for name in named}
     cameras = [*rig.cameras.values()]
-    rows = [table.of_camera(name) for name in rig.cameras]
+    rows = [at_pixels(camera, table.of_camera(name)) for name, camera in rig.cameras.items()]
     common = map_on_cores(partial(_from_common_pose, config=config), cameras, rows)
     left = [[*np.flatnonzero(~frames.found).tolist()] for frames in common]
     searched = map_on_cores(

@@ -11,6 +11,7 @@ from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.places import PlaceFinder
 from calibgraph.matching.protocol import FullMatcher
+from calibgraph.matching.run import with_motion
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
@@ -103,8 +104,9 @@ def _matched(alone: Dataset, matcher: FullMatcher, config: Config, rig: Rig) -> 
     settings = config.changed(stage1=matcher.stage1)
     for index in coarse:
         table = matcher.match(alone, rig, round_index=index, progress=no_progress)
-        rig = _refined(rig, table, settings)
-    return matcher.match(alone, rig, round_index=last, progress=no_progress)
+        rig = _refined(rig, with_motion(table, alone), settings)
+    table = matcher.match(alone, rig, round_index=last, progress=no_progress)
+    return with_motion(table, alone)
 
 
 def tracking_rounds(matcher: FullMatcher) -> tuple[int, ...]:

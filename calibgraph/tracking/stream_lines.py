@@ -35,9 +35,9 @@ from pydantic import (
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import describe
-from calibgraph.model.correspondences import Correspondences, as_confidence, concatenate
+from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.table_columns import COORDINATES, INFORMATION
+from calibgraph.model.table_columns import COORDINATES, INFORMATION, as_confidence
 from calibgraph.tracking.frame_order import LONGEST_PLACE, with_place
 from calibgraph.tracking.stream_tables import Item, StreamFrame, refused
 

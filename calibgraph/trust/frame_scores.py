@@ -18,6 +18,7 @@ from calibgraph.matching.structure.shift_scores import (
     concatenate_scores,
     score_frame,
 )
+from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
 
 Images = Sequence[NDArray[np.uint8]]
@@ -63,5 +64,5 @@ class FrameScorer:
         if other is None:
             return None
         most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
-        cloud = self._cache.cloud(other)
+        cloud, camera = self._cache.cloud(other), when_taken(camera, other.twist_per_s)
         return score_frame(gray, cloud, camera, level, frame=frame.index, max_windows=most)

@@ -14,7 +14,7 @@ from calibgraph.model.verdict import Check
 from calibgraph.progress import Progress
 from calibgraph.trust.evidence import Checks
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
-from calibgraph.trust.lens_parameter import IMAGES, LensParameter, check_parameter
+from calibgraph.trust.lens_parameter import IMAGES, check_parameter
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import limit, threshold
 from calibgraph.trust.time_offset import TimeOffset, time_offsets
@@ -125,23 +125,7 @@ def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
 
 def _lens_checks(found: ImageEvidence) -> tuple[Check, ...]:
     """Whether another lens fits the images better."""
-    return tuple(check_parameter(each, IMAGES, _better(each)) for each in found.lens)
-
-
-def _better(found: LensParameter) -> str:
-    """The lens that fits the images best, in words."""
-    (change,) = found.values
-    if found.name == "focal length":
-        longer = "longer" if change > 0 else "shorter"
-        return f"a focal length {abs(math.expm1(change)):.1%} {longer}"
-    if found.name == "distortion":
-        return f"a first radial coefficient {change:+.2f} from the rig's"
-    if found.name == "principal point":
-        return f"a principal point {change:+.1%} of a focal length from the rig's"
-    if found.name == "aspect ratio":
-        larger = "larger" if change > 0 else "smaller"
-        return f"a ratio fx / fy {abs(math.expm1(change)):.1%} {larger}"
-    return f"a skew of {change:+.1%} of fx, which a rig cannot have,"
+    return tuple(check_parameter(each, IMAGES) for each in found.lens)
 
 
 def _gain_checks(found: ImageEvidence, lens: Sequence[Check]) -> tuple[Check, ...]:

@@ -1,9 +1,7 @@
-"""Whether another lens fits the images better, with the pose free.
+"""Whether another lens fits the images better, with the pose free: a search, then two fits.
 
-A change of the lens is (5,): what is added to the logarithm of the focal length, to the first
-radial coefficient, to the principal point along the longer side of the image (in focal lengths),
-to the logarithm of fx / fy, and to the skew (in parts of fx; half of it is a rotation about the
-axis). Across that side, a principal point cannot be told from a rotation.
+The lens is that of :mod:`calibgraph.trust.lens_parameter`; of the principal point, the coordinate
+along the longer side of the image.
 """
 
 from __future__ import annotations
@@ -21,16 +19,24 @@ from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.error_components import error_components
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera
-from calibgraph.solver.augmented_fit import AugmentedFit, fit_augmented
 from calibgraph.solver.camera_twist import apply_twist
+from calibgraph.solver.linear_fit import LinearFit, block_of, fit_camera
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
-from calibgraph.trust.lens_parameter import NAMES, LensParameter
+from calibgraph.trust.lens_parameter import (
+    NAMES,
+    Free,
+    LensParameter,
+    lens_fields_px,
+    lens_variable,
+)
 
 Array = NDArray[np.float64]
-SEARCH_M = 0.5  # a focal length wrong by 5 % displaces a result by up to this
-SEARCH_LENS = (0.08, 0.15, 0.04, 0.08)  # half-widths of the change of the lens
+SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)
+"""Half-widths of a search; a focal length wrong by 5 % displaces a result by up to 0.5 m."""
+SEARCH_LENS = 0.08, 0.15, 0.04, 0.08
+"""The same of the logarithm of the focal length, of k1, of the principal point in focal
+lengths, of the logarithm of fx / fy."""
 MAX_RADIAL = 0.3
-_TO_CENTRE, _TO_ASPECT = 3, 4  # numbers of the lens that are searched: the first so many
 SEARCH_PRIOR = 1.0  # weak: the estimate is to be unbiased
 SEARCH_BLUR_STEPS = 1.0  # of the score grids, for the search only
 
@@ -40,7 +46,7 @@ class LensEvidence:
     """The lens that fits the images best.
 
     Attributes:
-        parameters: those of ``NAMES``, changed as above; none where images do not determine them.
+        parameters: those of ``NAMES``; none where images do not determine them.
         gain: of the summed score at the best pose nearby with its own lens over that at the result,
             in standard deviations of chance agreement.
     """
@@ -58,7 +64,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     seed: int,
     places: Places = NOWHERE,
 ) -> LensEvidence:
-    """Find the lens that fits the images best, with the pose free: a search, then two fits.
+    """Find the lens that fits the images best, with the pose free.
 
     Args:
         scorer: of the frames.
@@ -70,116 +76,76 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     """
     frames = np.unique(scores.frame)
     copies = len(frames) / len(np.unique(places.merge_stationary(frames)))
-    searched = 0 if camera.model == "equirectangular" else _TO_CENTRE  # the format determines it
+    # Across the longer side of the image, a principal point cannot be told from a rotation.
+    along = Free.CENTRE_X if camera.width_px >= camera.height_px else Free.CENTRE_Y
+    finer = Free.FOCAL, Free.RADIAL, along  # right shapes are nearer to zero without a finer fit
+    is_free = camera.model != "equirectangular"  # else its format determines it
+    searched = (*finer, Free.ASPECT) if is_free else ()
     best, gain = _search(camera, scores, searched, seed)
-    gain /= math.sqrt(copies)  # chance agreement of copies repeats
-    if not searched:  # the pose alone is free
-        return LensEvidence(gain=gain)
-    shape = _shape(camera, scores, seed, places)
-    rough = _fit_at_peaks(camera, scores, best, places)
+    found = LensEvidence(gain=gain / math.sqrt(copies))  # chance agreement of copies repeats
+    rough = _fit_at_peaks(camera, scores, best, places) if is_free else None
     if rough is None:
-        return LensEvidence(gain=gain)
-    refined = change_lens(apply_twist(camera, rough.twist), np.append(rough.values, 0.0))
-    finer = scorer.score_together(images, refined, FINER)
-    fine = _fit_at_peaks(refined, finer, np.zeros(9), places)
-    if fine is None:
-        return LensEvidence(gain=gain)
-    together = replace(fine, values=rough.values + fine.values)
-    found = [_parameter(name, together, number) for number, name in enumerate(NAMES[:_TO_CENTRE])]
-    return LensEvidence((*found, *shape), gain)
+        return found
+    change, lens, moved = rough.free(*finer), lens_variable(camera), np.zeros(len(Free))
+    moved[[*finer]] = change.values
+    most = MAX_RADIAL / lens.free.sigmas[Free.RADIAL]
+    moved[Free.RADIAL] = np.clip(moved[Free.RADIAL], -most, most)
+    refined = lens.put_into(apply_twist(camera, change.twist), moved[:-1])
+    again = scorer.score_together(images, refined, FINER)
+    rest = _fit_at_peaks(refined, again, np.zeros(len(best)), places)
+    if rest is None:
+        return found
+    fine, parameters = rest.counted_from(moved), []
+    for name, number in zip(NAMES, (*searched, Free.SKEW), strict=True):
+        fit, others = fine if number in finer else rough, [n for n in finer if n != number]
+        parameters.append(LensParameter.of(name, camera, fit.free(*others, number), number))
+    return replace(found, parameters=tuple(parameters))
 
 
-def _parameter(name: str, fit: AugmentedFit, number: int) -> LensParameter:
-    value, sigma = fit.values[number : number + 1], fit.sigmas[number : number + 1]
-    return LensParameter(name, value, sigma, np.ones(1), fit.compensating[:, number] * value)
+def _extend(scores: ShiftScores, camera: Camera) -> ShiftScores:
+    """The scores, with the derivatives of the shifts in steps by the lens, too."""
+    fields = lens_fields_px(camera, scores.points_lidar_m).transpose(2, 1, 0)
+    jacobian = np.concatenate([scores.jacobian, fields * scores.steps_per_px[:, None]], axis=2)
+    return replace(scores, jacobian=jacobian)
 
 
-def _search(camera: Camera, scores: ShiftScores, lens: int, seed: int) -> tuple[Array, float]:
-    """The best twist and change of the lens, (6 + lens,), and its gain over a free pose alone."""
-    half_widths = np.array([WIDE.rotation_rad] * 3 + [SEARCH_M] * 3 + [*SEARCH_LENS[:lens]])
+def _search(
+    camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: int
+) -> tuple[Array, float]:
+    """The best twist and lens, (12,), and its gain over the result.
+
+    Args:
+        camera: at the result.
+        scores: there.
+        lens: numbers of its parameters that are searched. A skew moves pixels too little for it.
+        seed: of the search.
+    """
+    columns, widths = [*range(6), *(6 + number for number in lens)], SEARCH_POSE
+    if lens:
+        units = np.array([1.0, 1.0, camera.intrinsics_px.fx, 1.0]) * SEARCH_LENS
+        widths = np.append(widths, units / np.array(lens_variable(camera).free.sigmas)[[*lens]])
+        scores = _extend(scores, camera)
     smooth = replace(
         scores,
         grids=np.stack([cv2.GaussianBlur(g, (0, 0), SEARCH_BLUR_STEPS) for g in scores.grids]),
-        jacobian=_jacobian_with_lens(scores, camera, lens),
+        jacobian=np.ascontiguousarray(scores.jacobian[:, :, columns]),
     )
-    best = maximize_score(smooth, half_widths, seed=seed, prior=SEARCH_PRIOR)
-    values = sum_scores(smooth, np.array([np.zeros(len(best)), best]))
+    found = maximize_score(smooth, widths, seed=seed, prior=SEARCH_PRIOR)
+    values = sum_scores(smooth, np.array([np.zeros(len(found)), found]))
+    best = np.zeros(6 + len(Free))
+    best[columns] = found
     return best, float((values[1] - values[0]) / (smooth.chance_sigma + 1e-12))
-
-
-def _shape(camera: Camera, scores: ShiftScores, seed: int, places: Places) -> list[LensParameter]:
-    """Changes of the logarithm of fx / fy and of the skew.
-
-    Measured apart from the others, which they would make less certain, and without a finer fit: on
-    KITTI right ones are then nearer to zero. A skew moves pixels too little to be searched for.
-    """
-    best, _ = _search(camera, scores, _TO_ASPECT, seed)
-    starts = (best, np.append(best, 0.0))
-    fits = [_fit_at_peaks(camera, scores, start, places) for start in starts]
-    return [
-        _parameter(name, fit, len(fit.values) - 1)
-        for name, fit in zip(NAMES[_TO_CENTRE:], fits, strict=True)
-        if fit is not None
-    ]
-
-
-def lens_jacobian_px(camera: Camera, points_lidar_m: Array) -> Array:
-    """(n, 2, 5) derivatives of the pixels of points (n, 3) by a change of the lens [px]."""
-    T, k = camera.T_camera_lidar, camera.intrinsics_px
-    pixels, _ = camera.lens.project(points_lidar_m @ T[:3, :3].T + T[:3, 3])
-    focal = np.array([k.fx, k.fy])
-    off_centre = pixels - np.array([k.cx, k.cy])
-    radius = np.linalg.norm(off_centre / focal, axis=1, keepdims=True)
-    centre = np.broadcast_to(focal * _longer_side(camera), off_centre.shape)
-    aspect = off_centre * [0.5, -0.5]
-    skew = 0.5 * off_centre[:, ::-1] * (focal / focal[::-1])
-    return np.stack([off_centre, radius**2 * off_centre, centre, aspect, skew], axis=2)
-
-
-def change_lens(camera: Camera, change: Array) -> Camera:
-    """The camera with its lens changed by (4,), see above: no lens of a rig has a skew."""
-    k = camera.intrinsics_px
-    of_x, of_y = np.exp(change[0] + change[3] * np.array([0.5, -0.5])).tolist()
-    shift = change[2] * _longer_side(camera)
-    distortion = [*camera.distortion, *[0.0] * (4 - len(camera.distortion))]
-    first_radial = int(camera.model == "omnidirectional")  # after xi
-    distortion[first_radial] += float(np.clip(change[1], -MAX_RADIAL, MAX_RADIAL))
-    values = {key: getattr(camera, key) for key in type(camera).model_fields}
-    values["intrinsics_px"] = k.model_copy(
-        update={
-            "fx": k.fx * of_x,
-            "fy": k.fy * of_y,
-            "cx": k.cx + shift[0] * k.fx,
-            "cy": k.cy + shift[1] * k.fy,
-        }
-    )
-    return Camera(**{**values, "distortion": tuple(distortion)})
 
 
 def _fit_at_peaks(
     camera: Camera, scores: ShiftScores, start: Array, places: Places
-) -> AugmentedFit | None:
-    """Fit pose and lens to the groups' peaks next to a start, (9,) to (11,)."""
+) -> LinearFit | None:
+    """Fit pose and lens to the groups' peaks next to a start, (12,)."""
     if not len(scores.weights):
         return None
-    lens = len(start) - 6
-    extended = replace(scores, jacobian=_jacobian_with_lens(scores, camera, lens))
-    table = extract_correspondences(extended, start, "camera")
-    table = replace(table, frame=places.merge_stationary(table.frame))
-    jacobian_px = lens_jacobian_px(camera, table.points_lidar_m)[:, :, :lens]
+    table = extract_correspondences(_extend(scores, camera), start, "camera")
+    block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
     variance = error_components().matchers["structure"].place_variance
-    shared = variance * places.frames_per_place(np.unique(table.frame))
-    return fit_augmented(camera, table, jacobian_px, shared_variance=shared)
-
-
-def _jacobian_with_lens(scores: ShiftScores, camera: Camera, lens: int) -> Array:
-    """(g, 2, 6 + lens) derivatives of the shifts in steps by the twist and by the lens."""
-    by_lens = (
-        lens_jacobian_px(camera, scores.points_lidar_m)[:, :, :lens] * scores.steps_per_px[:, None]
-    )
-    return np.concatenate([scores.jacobian, by_lens], axis=2)
-
-
-def _longer_side(camera: Camera) -> Array:
-    """(2,) unit vector along the longer side of the image."""
-    return np.array([1.0, 0.0] if camera.width_px >= camera.height_px else [0.0, 1.0])
+    shared = variance * places.frames_per_place(block.frame_numbers)
+    fields = lens_fields_px(camera, block.block.points_lidar_m)
+    return fit_camera(camera, block, fields, shared_variance=shared)

@@ -1,44 +1,85 @@
-"""The probability that a lens parameter is wrong, by an estimate of it."""
+"""The probability that a lens parameter is wrong, by the posterior of a free lens.
+
+A parameter is in standard deviations of a lens that was calibrated with a target, or of those that
+the rig states. Half of a skew, which no lens of a rig has, is a rotation about the axis; the other
+half is a field of displacements of its own.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit, ndtr
 
+from calibgraph.graph.lens import LensSigmas, LensVariable
+from calibgraph.model.config import LensPart
+from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Check, Status
+from calibgraph.solver.linear_fit import Freed
 from calibgraph.trust.thresholds import limit, threshold
+from factors import FreeLens
+from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, FOCAL
 
 Array = NDArray[np.float64]
 
-NAMES = ("focal length", "distortion", "principal point", "aspect ratio", "skew")
-SHAPES = NAMES[3:]
-"""Those that no lens has wrong by much."""
 
-ESTIMATED_AS = {
-    "focal length": "focal",
-    "distortion": "distortion",
-    "principal point": "centre",
-    "aspect ratio": "aspect",
+class Free(IntEnum):
+    """What is free, by number: parameters of a lens, and the skew."""
+
+    FOCAL, RADIAL, CENTRE_X, CENTRE_Y, ASPECT, SKEW = range(6)
+
+
+NAMES = {
+    "focal length": ("focal", "a focal length {} % longer", "a focal length {} % shorter"),
+    "distortion": ("distortion", "a k1 larger by {}", "a k1 smaller by {}"),
+    "principal point": ("centre", "a principal point off by ({}) px", ""),
+    "aspect ratio": ("aspect", "a ratio fx / fy {} % larger", "a ratio fx / fy {} % smaller"),
+    "skew": (None, "a skew of {} % of fx", "a skew of -{} % of fx"),
 }
-"""Parts of the lens that ``--estimate`` names; it has no skew."""
+"""Parameters that are judged: what ``--estimate`` calls them, and a lens with more or less."""
+
+SHAPES = "aspect ratio", "skew"
+"""Those that no lens has wrong by much."""
 
 RESIDUALS, IMAGES = "residuals over the image", "images"
 """What an estimate is by."""
 
 KINDS = {
-    RESIDUALS: {name: f"lens_{name.replace(' ', '_')}" for name in NAMES},
-    IMAGES: {name: name.replace(" ", "_") for name in NAMES},
+    by: {name: prefix + name.replace(" ", "_") for name in NAMES}
+    for by, prefix in ((RESIDUALS, "lens_"), (IMAGES, ""))
 }
 """Kinds of the checks."""
 LENS_KINDS = frozenset(kind for kinds in KINDS.values() for kind in kinds.values())
 
+_NAMES = FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT
+_PARTS: tuple[LensPart, ...] = "focal", "aspect", "centre", "distortion"
+_SKEW_SIGMA = 0.002  # in parts of fx
 _ANYTHING = 1e6  # standard deviation of a parameter that is not determined
 _MOST_SIGMAS = 1e6  # enough for any probability
+
+
+def lens_variable(camera: Camera) -> LensVariable:
+    """The lens of a camera with the parameters that are checked, at its calibration."""
+    all_of = LensVariable.of(camera, _PARTS, LensSigmas.calibrated(camera)).free
+    sigmas = dict(zip(all_of.parameters, all_of.sigmas, strict=True))
+    free = FreeLens(camera.lens, _NAMES, tuple(sigmas[name] for name in _NAMES))
+    return LensVariable(camera, free, np.zeros(len(free)))
+
+
+def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
+    """(6, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
+    free, T, k = lens_variable(camera).free, camera.T_camera_lidar, camera.intrinsics_px
+    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    fields = np.empty((len(Free), 2, len(points)))
+    free.fill_columns(camera.lens, points, fields[:-1])
+    off_centre = fields[Free.FOCAL] / free.sigmas[Free.FOCAL]
+    fields[-1] = 0.5 * _SKEW_SIGMA * off_centre[::-1] * [[k.fx / k.fy], [k.fy / k.fx]]
+    return fields
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,49 +87,43 @@ class LensParameter:
     """An estimate of one lens parameter together with the extrinsic.
 
     Attributes:
-        name: "focal length", "principal point", "distortion", "aspect ratio" or "skew".
-        values: (k,) estimates: relative change of the focal length; shift of the principal point
-            [px]; relative radial displacement at one focal length from the centre; relative change
-            of fx / fy (of images: of its logarithm, as of the focal length's); change of the skew,
-            in parts of fx.
-        sigmas: (k,) their standard deviations, frames as clusters.
-        unit: (k,) of the values, for ``size`` and ``sigma``: the focal lengths [px] of a principal
-            point, else one.
+        name: one of ``NAMES``.
+        values: (m,) change, in standard deviations of a calibrated lens.
+        sigmas: (m,) their standard deviations, frames as clusters.
         twist: (6,) rotation [rad] and translation [m] by which the camera moves.
+        units: (m,) of the values: relative, pixels, or of k1.
     """
 
     name: str
     values: Array
     sigmas: Array
-    unit: Array
     twist: Array
+    units: Array
+
+    @staticmethod
+    def of(name: str, camera: Camera, freed: Freed, *numbers: int) -> LensParameter:
+        """Of a fit whose last unknowns have these numbers; others may be free beside them."""
+        units = np.array([*lens_variable(camera).free.sigmas, _SKEW_SIGMA])[[*numbers]]
+        values, sigmas = (each[-len(numbers) :] for each in (freed.values, freed.sigmas))
+        twist = freed.compensating[:, -len(numbers) :] @ values
+        return LensParameter(name, values, sigmas, twist, units)
 
     @property
-    def moved_deg(self) -> float:
-        """How far the camera turns."""
-        return float(np.degrees(np.linalg.norm(self.twist[:3])))
-
-    @property
-    def moved_cm(self) -> float:
-        """How far the camera's centre moves."""
-        return 100 * float(np.linalg.norm(self.twist[3:]))
+    def moved(self) -> tuple[float, float]:
+        """How far the camera turns [deg] and its centre moves [cm]."""
+        turned, shifted = np.linalg.norm(self.twist.reshape(2, 3), axis=1)
+        return float(np.degrees(turned)), 100 * float(shifted)
 
     @property
     def size(self) -> float:
-        """The length of the values: relative, or in focal lengths."""
-        return float(np.linalg.norm(self.values / self.unit))
+        """The length of the values."""
+        return float(np.linalg.norm(self.values))
 
     @property
     def sigma(self) -> float:
         """Its standard deviation."""
-        along = self.values / self.unit / max(self.size, np.finfo(float).tiny)
-        of_size = float(np.linalg.norm(along * self.sigmas / self.unit))
-        return max(of_size, np.finfo(float).tiny)
-
-    @property
-    def significance(self) -> str:
-        """The size in its standard deviations, in words."""
-        return "unknown" if math.isnan(self.sigma) else f"{self.size / self.sigma:.2g}"
+        along = self.values / max(self.size, np.finfo(float).tiny)
+        return max(float(np.linalg.norm(along * self.sigmas)), np.finfo(float).tiny)
 
     @property
     def probability(self) -> float:
@@ -101,71 +136,55 @@ class LensParameter:
         """
         if not self.sigma < _ANYTHING:
             return 0.0
-        moves = max(self.moved_deg / TOLERANCE[0], self.moved_cm / TOLERANCE[1])
+        moves = max(moved / most for moved, most in zip(self.moved, TOLERANCE, strict=True))
         tolerated = self.size / moves if moves else math.inf
-        usual = _Posterior(self.size, self.sigma, limit("lens_usual"))
-        wrong = _Posterior(self.size, self.sigma, limit("lens_wrong"))
-        share = limit("lens_wrong_share")
-        is_wrong = float(expit(logit(share) + wrong.log_evidence - usual.log_evidence))
-        after, before = (1.0, 1.0) if self.name in SHAPES else wrong.beyond(tolerated)
-        if_wrong = max(is_wrong * after - share * before, 0.0)
-        after, before = usual.beyond(tolerated)
-        return if_wrong + (1 - is_wrong) * max(after - before, 0.0)
+        spreads, share = np.array([1.0, limit("lens_wrong")]), limit("lens_wrong_share")
+        total = np.hypot(self.sigma, spreads)
+        evidence = -(np.minimum(self.size / total, _MOST_SIGMAS) ** 2) / 2 - np.log(total)
+        is_wrong = float(expit(logit(share) + evidence[1] - evidence[0]))
+        gain = spreads / total
+        after = _share_beyond(tolerated, gain**2 * self.size, gain * self.sigma)
+        before = _share_beyond(tolerated, 0.0, spreads)
+        if self.name in SHAPES:
+            after[1] = before[1] = 1.0
+        if_wrong = max(is_wrong * after[1] - share * before[1], 0.0)
+        return float(if_wrong + (1 - is_wrong) * max(after[0] - before[0], 0.0))
+
+    def describe(self) -> str:
+        """The lens that would be right, in words."""
+        _, more, less = NAMES[self.name]
+        units = 100 * self.units if "%" in more else self.units
+        values = units * (np.abs(self.values) if less else self.values)
+        numbers = ", ".join(map(_with_sigma, values, units * self.sigmas))
+        return (less if less and self.values[0] < 0 else more).format(numbers)
 
 
-@dataclass(frozen=True)
-class _Posterior:
-    """Of a normally distributed number with mean zero that was measured.
-
-    Attributes:
-        measured: its measurement.
-        sigma: of the measurement's error.
-        spread: of the number.
-    """
-
-    measured: float
-    sigma: float
-    spread: float
-
-    @property
-    def total(self) -> float:
-        """Standard deviation of the measurement."""
-        return math.hypot(self.sigma, self.spread)
-
-    @property
-    def log_evidence(self) -> float:
-        """Of the measurement, up to a constant."""
-        sigmas = min(self.measured / self.total, _MOST_SIGMAS)
-        return -(sigmas**2) / 2 - math.log(self.total)
-
-    def beyond(self, size: float) -> tuple[float, float]:
-        """The probabilities that the number is larger than this, with and without measurement."""
-        gain = self.spread / self.total
-        mean, deviation = gain**2 * self.measured, gain * self.sigma
-        after = ndtr((mean - size) / deviation) + ndtr((-mean - size) / deviation)
-        return float(after), float(2 * ndtr(-size / self.spread))
+def _share_beyond(size: float, mean: Array | float, sigma: Array) -> Array:
+    """The probability that normally distributed numbers are larger than a size."""
+    return np.asarray(ndtr((mean - size) / sigma) + ndtr((-mean - size) / sigma))
 
 
-def check_parameter(found: LensParameter, by: str, better: str) -> Check:
+def _with_sigma(value: float, sigma: float) -> str:
+    """A number with its standard deviation, in two digits of that."""
+    if not 0 < sigma < math.inf:
+        return f"{value:.2g} +- unknown"
+    decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    return f"{value:.{decimals}f} +- {sigma:.{decimals}f}"
+
+
+def check_parameter(found: LensParameter, by: str) -> Check:
     """Whether a lens parameter is wrong: the value of the check is the probability.
 
     Args:
         found: its estimate.
         by: RESIDUALS or IMAGES.
-        better: the lens that would be right, in words.
     """
-    row, probability = threshold("lens"), found.probability
-    status = row.grade(probability)
-    text = (
-        f"by the {by}, {better} ({found.significance} sigma) would move the camera by "
-        f"{found.moved_deg:.2g} deg, {found.moved_cm:.2g} cm"
-    )
+    row, probability, (deg, cm) = threshold("lens"), found.probability, found.moved
+    status, (part, *_) = row.grade(probability), NAMES[found.name]
+    text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
     if status != "PASS":
-        text += f"; {row.advice}"
-        if found.name in ESTIMATED_AS:
-            text += f"; or run with --estimate {ESTIMATED_AS[found.name]}"
-    name = f"{found.name} by the {by}: {row.name}"
-    check = row.describe(probability, status, text, name=name)
+        text += f": {row.advice}" + (f"; or run with --estimate {part}" if part else "")
+    check = row.describe(probability, status, text, name=f"{found.name} by the {by}: {row.name}")
     return replace(check, kind=KINDS[by][found.name])
 
 

@@ -146,8 +146,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("lens", "probability of a wrong one", "at most", 0.005, 0.2, "share",
               "Is focal length, principal point, distortion, fx / fy or skew wrong, so that the "
               "camera is off by more than 0.5 deg or 10 cm?",
-              "The verdict's own cuts. By an estimate of each together with the extrinsic, once "
-              "from the residuals and once from the images, and by `lens_usual` etc.",
+              "The verdict's own cuts. By the posterior of a free lens, once from the residuals "
+              "and once from the images, and by `lens_wrong` etc.",
               "check the intrinsics, the image size, and that images are not undistorted twice, "
               "cropped, scaled or sheared"),
     Threshold("focal_sensitivity", "motion of the camera per 1 % of the focal length",
@@ -221,9 +221,9 @@ class Limit:
 LIMITS: tuple[Limit, ...] = (
     Limit("pull_sigmas", 4.0, "sigma",
           "A pull within this of what a camera's own solution leaves open is zero."),
-    Limit("lens_usual", 0.002, "", "The usual error of a lens parameter, before residuals are "
-          "looked at: relative, or in focal lengths."),
-    Limit("lens_wrong", 0.04, "", "The error of one that is wrong."),
+    Limit("lens_wrong", 20.0, "sigma", "The error of a wrong lens parameter, in standard "
+          "deviations of a calibrated one: 0.2 % of the focal length, fx / fy and the skew, "
+          "0.002 focal lengths of the principal point, 0.002 of k1, or as the rig states."),
     Limit("lens_wrong_share", 0.01, "share", "So many are taken for wrong."),
     Limit("lens_match_share", MATCH_SHARE, "share", "So much of a match's variance is taken to be "
           "shared by all: less cannot be told from a wrong lens."),

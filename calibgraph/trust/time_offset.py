@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
+from calibgraph.model.clock import at_pixels
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.augmented_fit import MIN_ROWS, fit_augmented
+from calibgraph.solver.linear_fit import MIN_ROWS, block_of, fit_camera
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -64,7 +65,7 @@ def time_offsets(dataset: Dataset, rig: Rig, table: Correspondences) -> dict[str
     """
     found = {}
     for name, camera in rig.cameras.items():
-        rows = table.of_camera(name)
+        rows = at_pixels(camera, table.of_camera(name))
         motion = image_motion(dataset, name, camera, rows)
         offset = time_offset(camera, rows, motion)
         if offset is not None:
@@ -91,11 +92,13 @@ def time_offset(camera: Camera, table: Correspondences, motion_px: Array) -> Tim
     typical = float(np.median(np.linalg.norm(motion_px, axis=1)))
     if typical < MIN_MOTION_PX:
         return None
-    fit = fit_augmented(camera, table, motion_px[:, :, None])
+    rows = np.argsort(table.frame, kind="stable")
+    fit = fit_camera(camera, block_of(camera, table), motion_px[rows].T[None])
     if fit is None:
         return None
-    sigma = float(np.hypot(fit.sigmas[0], SYSTEMATIC_PX / (fit.independent_shares[0] * typical)))
-    return TimeOffset(float(fit.values[0]), sigma, frames, typical)
+    free = fit.free(0)
+    sigma = float(np.hypot(free.sigmas[0], SYSTEMATIC_PX / (free.independent_shares[0] * typical)))
+    return TimeOffset(float(free.values[0]), sigma, frames, typical)
 
 
 def image_motion(dataset: Dataset, name: str, camera: Camera, table: Correspondences) -> Array:

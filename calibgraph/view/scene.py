@@ -8,14 +8,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.io.frame import load_entry_cloud
+from calibgraph.io.frame import load_entry_cloud, twist_of_entry
 from calibgraph.io.images import load_image
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
 from calibgraph.report.point_overlay import depth_colours
 
-Array = NDArray[np.float64]
 Colours = NDArray[np.uint8]
 
 SECONDS_PER_FRAME = 1.0
@@ -47,7 +48,6 @@ class ViewFrame:
 
     Attributes:
         number: of the frame in its dataset.
-        name: of the frame.
         time_s: when it is shown.
         points_lidar_m: (n, 3) float32 in the LiDAR frame.
         colours: (n, 3) RGB by distance from the LiDAR.
@@ -83,7 +83,7 @@ def read_frames(result: Calibration) -> Iterator[ViewFrame]:
             points_lidar_m=points,
             colours=_by_distance(points),
             images={
-                name: _view_image(Path(path), points, name, result)
+                name: _view_image(Path(path), points, name, result, twist=twist_of_entry(entry))
                 for name, path in entry["images"].items()
                 if name in result.rig.cameras
             },
@@ -91,12 +91,18 @@ def read_frames(result: Calibration) -> Iterator[ViewFrame]:
 
 
 def _view_image(
-    path: Path, points: NDArray[np.float32], name: str, result: Calibration
+    path: Path,
+    points: NDArray[np.float32],
+    name: str,
+    result: Calibration,
+    *,
+    twist: NDArray[np.float64] | None,
 ) -> ViewImage:
-    camera = result.rig.cameras[name]
+    rigs = result.initial_rig, result.rig
+    guess, camera = (when_taken(rig.cameras[name], twist) for rig in rigs)
     image = load_image(path, camera)
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    before = project_cloud(result.initial_rig.cameras[name], points)
+    before = project_cloud(guess, points)
     return ViewImage(data.tobytes(), before, project_cloud(camera, points))
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import calibgraph
 from calibgraph import Audit, CameraAudit, LidarAudit
-from calibgraph.audit.page_camera import charts_of, measured_camera
+from calibgraph.audit.page import charts_of, measured_camera
 from calibgraph.audit.result import audit_of, audit_summary
 from calibgraph.model.geometry import twist_between
 from tests.audit.deployed import TRUTH
@@ -121,16 +121,17 @@ def test_the_measured_camera_deviates_as_was_measured() -> None:
 @pytest.mark.parametrize("tolerance", [1e-3, 0.5, 7.0, 300.0])
 def test_bars_are_to_scale_and_inside_the_axis(tolerance: float) -> None:
     for chart in charts_of(WRONG, tolerance, tolerance):
-        half = chart.tolerance[1] - chart.middle
+        half = chart.x(tolerance) - chart.x(0)
         unit = 180 / np.pi if chart.title.startswith("rotation") else 100.0
         rows = DEVIATION[:3] if chart.title.startswith("rotation") else DEVIATION[3:]
         for bar, value in zip(chart.bars, rows * unit, strict=True):
-            assert bar.width == pytest.approx(abs(value) * half / tolerance)
-            assert bar.error is not None
-            ends = (bar.x, bar.x + bar.width, *bar.error, *bar.detectable)
-            assert chart.left < min(ends) and max(ends) < chart.right
+            assert chart.x(bar.deviation) - chart.x(0) == pytest.approx(value * half / tolerance)
+            assert bar.has_error
+            ends = (bar.deviation - bar.sigma, bar.deviation + bar.sigma, bar.detectable)
+            assert all(chart.x(-chart.reach) < chart.x(end) < chart.x(chart.reach) for end in ends)
         assert 3 <= len(chart.ticks) <= 5
-        assert all(chart.left <= x <= chart.right for x, _ in chart.ticks)
+        assert max(chart.ticks) <= chart.reach
+        assert chart.x(-chart.reach) == pytest.approx(74) and chart.x(chart.reach) == 284
     assert charts_of(NOTHING, tolerance, tolerance) == ()
 
 

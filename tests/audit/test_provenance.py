@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from calibgraph import load_dataset, load_rig
-from calibgraph.audit.provenance import is_made_from
+from calibgraph.audit.check import is_made_from
 from tests.conftest import SAMPLE, CommandRun
 
 

@@ -169,12 +169,3 @@ def test_help_imports_nothing_heavy() -> None:
         "simulate", "weights", "train", "track",
     ):  # fmt: skip
         assert command in done.stdout
-
-
-def test_only_the_command_that_is_called_has_its_options_read(call: Call) -> None:
-    app._command_of.cache_clear()
-    assert call("--help")[0] == 0
-    assert app._command_of.cache_info().currsize == 0
-    code, out, _ = call("solve", "--help")
-    assert code == 0 and "--print-graph" in out
-    assert app._command_of.cache_info().currsize == 1

@@ -10,7 +10,7 @@ from calibgraph.fleet.child import Child
 from calibgraph.fleet.execute import execute
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.task import Outcome, Task
-from calibgraph.simulation.fleet_tables import write_fleet
+from calibgraph.simulation.fleet_rows import write_fleet
 from tests.cli.conftest import error_line
 from tests.conftest import Call
 

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from calibgraph.fleet.centers import Centers, measured_batches, solve_centers
+from calibgraph.fleet.deviations import Centers, measured_batches, solve_centers
 from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import newest_rows, observe
 from calibgraph.model.geometry import retract_all, to_T_lidar_camera, twists_between

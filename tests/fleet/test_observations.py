@@ -9,9 +9,8 @@ import pytest
 from calibgraph.errors import CalibrationError
 from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
-from calibgraph.fleet.page import payload
+from calibgraph.fleet.page import STATES, assess_status, payload
 from calibgraph.fleet.rows import SCHEMA
-from calibgraph.fleet.status import STATES, assess_status
 
 
 def rows_of(**columns: list[object]) -> pa.Table:

@@ -14,8 +14,7 @@ from pyarrow import parquet
 
 from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
-from calibgraph.fleet.page import write_fleet_report
-from calibgraph.fleet.status import STATES, assess_status, changed_poses
+from calibgraph.fleet.page import STATES, assess_status, changed_poses, write_fleet_report
 from calibgraph.model.geometry import retract_all
 from calibgraph.simulation.fleet_rows import simulate_fleet
 from tests.conftest import Call

@@ -10,9 +10,8 @@ import pytest
 from calibgraph import Rig, load_rig
 from calibgraph.errors import RigError
 from calibgraph.fleet.model import FleetModel, fit_fleet
-from calibgraph.fleet.model_files import write_fleet_model
+from calibgraph.fleet.model_files import expected_pose, prior_rig, write_fleet_model
 from calibgraph.fleet.observations import observe
-from calibgraph.fleet.prior import expected_pose, prior_rig
 from calibgraph.model.geometry import relative_transform, twists_between
 from calibgraph.simulation.fleet_rows import CAMERAS, Fleet, simulate_fleet
 from calibgraph.simulation.rigs import rig_of

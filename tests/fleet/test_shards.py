@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from calibgraph import CalibrationError
-from calibgraph.fleet.shards import Shard, shard_from
+from calibgraph.fleet.run import Shard, shard_from
 
 
 def test_every_bucket_is_in_one_shard() -> None:

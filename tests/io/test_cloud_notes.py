@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from calibgraph import load_dataset
-from calibgraph.io.cloud_notes import read_cloud_notes
+from calibgraph.io.clouds import read_cloud_notes
 from tests.io.cloud_files import CLOUD, pcd
 
 SAMPLE = Path(__file__).parents[2] / "data" / "sample"

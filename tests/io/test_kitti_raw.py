@@ -60,7 +60,7 @@ def test_frames_and_extrinsics_are_those_of_the_drive(tmp_path: Path) -> None:
     ("file", "line", "message"),
     [
         ("calib_cam_to_cam.txt", "R_rect_00: 1 0 0", "line 'R_rect_00' has 3 numbers, expected 9"),
-        ("calib_cam_to_cam.txt", "S_rect_02: 1392 512", "take the _sync drive, not the _extract"),
+        ("calib_cam_to_cam.txt", "S_rect_02: 1392 512", "S_rect_02 1392x512"),
         ("calib_cam_to_cam.txt", "P_rect_03: a b", "line 'P_rect_03' has 0 numbers, expected 12"),
         ("calib_velo_to_cam.txt", "T: 0 nan 0", "line 'T' has 3 numbers, expected 3 finite ones"),
         ("calib_velo_to_cam.txt", "R: 1 0 0 0 1 0 0 0 -1", "P_rect_02 and the LiDAR's pose"),
@@ -99,3 +99,59 @@ def test_a_camera_without_calibration_or_images_is_left_out(tmp_path: Path) -> N
     data = load_dataset(drive)
     assert list(data.rig.cameras) == ["image_02", "image_03"]
     assert "camera 'image_00' is left out" in data.notes[0]
+
+
+D = (-0.37, 0.2, 0.0005, -0.0002, -0.07)
+"""k1, k2, p1, p2, k3 as of the drives of 2011-09-26, rounded."""
+
+
+def extracted(drive: Path, *, late_ms: int = 20) -> Path:
+    """The same drive as recorded: distorted images, text clouds, and stamps that go apart."""
+    path = drive.parent / "calib_cam_to_cam.txt"
+    lines = [line.replace("S_rect_", "S_rectified_") for line in path.read_text().splitlines()]
+    for number, shift in BASELINES.items():
+        lines += [f"S_{number}: {WIDTH} {HEIGHT}", f"S_rect_{number}: 1224 370"]
+        lines += [text_of(f"K_{number}", np.array([[980.0, 0, 690], [0, 975, 247], [0, 0, 1]]))]
+        lines += [text_of(f"D_{number}", np.array(D)), text_of(f"R_{number}", RECTIFY)]
+        lines += [text_of(f"T_{number}", shift)]
+        stamps = [f"2011-09-26 13:02:25.{100 * n + late_ms:03}000000" for n in range(-1, 1)]
+        stamps = ["2011-09-26 13:02:24.9" + f"{late_ms:02}000000", stamps[1]]
+        (drive / f"image_{number}" / "timestamps.txt").write_text("\n".join(stamps))
+    path.write_text("\n".join(lines))
+    scans = drive / "velodyne_points"
+    for cloud in (scans / "data").glob("*.bin"):
+        np.savetxt(cloud.with_suffix(".txt"), CLOUD, fmt="%.9g")
+        cloud.unlink()
+    (scans / "timestamps.txt").write_text(
+        "2011-09-26 13:02:25.000000000\n2011-09-26 13:02:25.100000000"
+    )
+    return drive
+
+
+def test_a_recorded_drive_has_distorted_lenses_and_goes_by_stamps(tmp_path: Path) -> None:
+    """The second image is the nearest to the first cloud; the second cloud has none."""
+    drive = extracted(written_drive(tmp_path))
+    rig = load_rig(drive)
+    p_lidar = np.array([12.0, 1.5, -0.4, 1.0])
+    for number, shift in BASELINES.items():
+        camera = rig.cameras[f"image_{number}"]
+        assert camera.distortion == D
+        assert (camera.intrinsics_px.fx, camera.intrinsics_px.fy) == (980.0, 975.0)
+        expected = RECTIFY @ (T_CAMERA0_LIDAR @ p_lidar)[:3] + shift
+        np.testing.assert_allclose((camera.T_camera_lidar @ p_lidar)[:3], expected, atol=1e-12)
+    data = load_dataset(drive, frames="0")
+    (frame,) = data.frames
+    np.testing.assert_array_equal(frame.load_cloud(), CLOUD)
+    assert frame.load_image("image_02", rig.cameras["image_02"])[0, 0, 0] == 51
+    assert len(data.recorded) == 1  # the second cloud is 80 ms from any image
+
+
+def test_wrong_stamps_and_rows_of_a_recorded_drive_are_named(tmp_path: Path) -> None:
+    drive = extracted(written_drive(tmp_path))
+    (drive / "velodyne_points" / "data" / "0000000000.txt").write_text("1 2 3 0.5\n1 2")
+    data = load_dataset(drive, frames="0")
+    with pytest.raises(FileError, match="cannot be read as rows of numbers"):
+        data.frames[0].load_cloud()
+    (drive / "image_02" / "timestamps.txt").write_text("yesterday")
+    with pytest.raises(FileError, match="has not a stamp a line"):
+        load_dataset(drive, frames="0")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from calibgraph.model.verdict import Check
-from calibgraph.report.check_table import check_row, check_rows
+from calibgraph.report.camera_section import check_row, check_rows
 
 
 def test_the_order_of_the_thresholds_is_the_side_that_is_bad() -> None:

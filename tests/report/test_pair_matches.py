@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from calibgraph import Calibration
-from calibgraph.report.page_pairs import pair_sections
-from calibgraph.report.pair_matches import (
+from calibgraph.report.page_pairs import (
     RESIDUAL_LIMIT_PX,
     draw_matches,
+    pair_sections,
     residual_colours,
 )
 from tests.report.conftest import write_page

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from calibgraph import Calibration
-from calibgraph.report.image_cells import mean_residuals
-from calibgraph.report.plots import ARROW_COLUMNS, arrow_factor
+from calibgraph.report.camera_section import worked_point
+from calibgraph.report.plots import ARROW_COLUMNS, arrow_factor, mean_residuals
 from calibgraph.report.reprojection_errors import constrained, errors_before_after
-from calibgraph.report.worked_point import worked_point
 from calibgraph.solver.whitening import constrained_error_px
 
 

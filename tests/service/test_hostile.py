@@ -12,7 +12,7 @@ import pytest
 
 from calibgraph.child_process import memory_limit
 from calibgraph.service.job_process import run_job
-from calibgraph.service.job_task import JobOutcome
+from calibgraph.service.requests import JobOutcome
 from tests.conftest import SAMPLE
 from tests.service.conftest import Make, Problem, make_tokens, service_folder
 from tests.service.hostile import Hostile, as_form, hostile_uploads

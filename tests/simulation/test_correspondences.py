@@ -7,7 +7,7 @@ import pytest
 
 import calibgraph
 from calibgraph import Correspondences, MatcherErrors, Rig, simulate_correspondences
-from calibgraph.simulation.drive_matches import simulate_drive
+from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.simulation.matcher_errors import PoseSpread
 from calibgraph.simulation.rigs import RIG_NAMES, rig_of
 from calibgraph.solver.joint import solve_joint

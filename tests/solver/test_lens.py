@@ -11,7 +11,8 @@ from scipy.stats import chi2
 
 from calibgraph import Config, MatcherErrors, Rig, preset, simulate_correspondences, solve
 from calibgraph.graph.latent_poses import latent_pose_graph
-from calibgraph.graph.variables import aligned_key, lens_key
+from calibgraph.graph.lens import LensSigmas, LensVariable
+from calibgraph.graph.variables import aligned_key, body_key, lens_key
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import twist_between
 from calibgraph.model.rig import IntrinsicsSigma
@@ -107,6 +108,42 @@ def test_an_uncertain_lens_widens_the_error_bar(drawn: tuple[Rig, Correspondence
         assert known.marginals.error_sources(known.covariance)[name]
 
 
+def test_the_lens_is_part_of_an_alignment_and_an_error_of_a_mount(
+    drawn: tuple[Rig, Correspondences],
+) -> None:
+    """One percent of the focal length is one percent of the distances, along the axis."""
+    truth, table = drawn
+    alignments, mounts = (
+        [solve_joint(known_to(truth, focal_px), table, Config(of=of)) for focal_px in (0.01, 7.2)]
+        for of in ("alignment", "mount")
+    )
+    for number, name in enumerate(truth.cameras):
+        ahead = 6 * number + 5
+        known, unknown = (float(found.covariance[ahead, ahead]) for found in alignments)
+        assert known == pytest.approx(unknown, rel=1e-9)
+        known, unknown = (float(found.covariance[ahead, ahead]) for found in mounts)
+        assert 0.03 < np.sqrt(unknown - known) < 0.2  # its matches are 5 to 40 m away
+        np.testing.assert_allclose(
+            mounts[1].T_camera_lidar[name], alignments[1].T_camera_lidar[name]
+        )
+        shares = mounts[1].marginals.error_sources(mounts[1].covariance)[name].translation
+        assert shares["uncertain lenses"] > 0.9
+
+
+def test_the_covariance_of_a_mount_is_that_of_its_graph(
+    drawn: tuple[Rig, Correspondences],
+) -> None:
+    truth, table = drawn
+    found = solve_joint(truth, table, Config(of="mount"))
+    assert found.marginals.errors is not None
+    fit = found.marginals.errors.fit
+    marginals = gtsam.Marginals(found.graph(), fit.linear.values)
+    for number in range(len(truth.cameras)):
+        own = found.covariance[6 * number : 6 * number + 6, 6 * number : 6 * number + 6]
+        sigmas = np.sqrt(np.diag(marginals.marginalCovariance(body_key(number))))
+        np.testing.assert_allclose(np.sqrt(np.diag(own)), sigmas, rtol=1e-3)
+
+
 def test_estimate_and_sigma_are_those_of_the_whole_graph(
     drawn: tuple[Rig, Correspondences],
 ) -> None:
@@ -166,6 +203,27 @@ def test_refuses_what_has_no_lens_or_no_error_model(drawn: tuple[Rig, Correspond
     assert Config(estimate="lens").estimate == ("focal", "centre", "distortion")
     with pytest.raises(ValueError, match="estimate"):
         Config(estimate="focus")
+
+
+@pytest.mark.statistics
+def test_mounts_err_as_their_error_bar_says_with_lenses_of_good_calibrations() -> None:
+    """Mean NEES over 6: 0.8 to 1.25, give or take three standard deviations of its draws."""
+    squared, draws = [], 60
+    for seed in range(draws):
+        truth, table = simulated(seed, frames=30, matches=100)
+        found = solve_joint(with_usual_lenses(truth, seed), table, Config(of="mount"))
+        squared += squared_errors(found, truth)
+    scatter = 3 * np.sqrt(2 / 6 / (2 * draws))
+    assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter
+
+
+def with_usual_lenses(rig: Rig, seed: int) -> Rig:
+    rng, cameras = np.random.default_rng([seed, 1]), {}
+    for name, camera in rig.cameras.items():
+        sigmas = LensSigmas.calibrated(camera)
+        lens = LensVariable.of(camera, ("focal", "centre", "distortion"), sigmas)
+        cameras[name] = lens.put_into(camera, rng.standard_normal(len(lens.free)))
+    return rig.model_copy(update={"cameras": cameras})
 
 
 @pytest.mark.statistics

@@ -18,7 +18,7 @@ from calibgraph import (
     MatcherErrors,
     Rig,
 )
-from calibgraph.simulation.drive_matches import simulate_drive
+from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.simulation.place_draws import Drawn
 from calibgraph.tracking.update import json_line
 from tests.conftest import make_camera

@@ -15,7 +15,7 @@ from calibgraph import (
     Rig,
     Update,
 )
-from calibgraph.simulation.drive_matches import simulate_drive
+from calibgraph.simulation.correspondences import simulate_drive
 
 Array = np.ndarray
 

@@ -40,7 +40,7 @@ def test_a_wrong_focal_length_fails_and_is_measured(pair: Rig, factor: float) ->
     assert check.status == "FAIL"
     words = "shorter" if factor > 1 else "longer"
     assert f"% {words}" in check.text
-    percent = float(check.text.split("a focal length ")[1].split("%")[0])
+    percent = float(check.text.split("a focal length ")[1].split()[0])
     # A tenth of it goes into the pose where the gate cuts: the loss is robust.
     assert percent == pytest.approx(100 * abs(1 / factor - 1), rel=0.1)
 
@@ -60,19 +60,19 @@ def test_a_skew_is_no_pass_and_is_measured(pair: Rig) -> None:
     result = solve(pair, replace(table, pixels_px=sheared))
     (check,) = named(result, "left", "a skew of")
     assert check.status != "PASS"
-    assert float(check.text.split("a skew of ")[1].split()[0]) == pytest.approx(0.03, rel=0.25)
+    assert float(check.text.split("a skew of ")[1].split()[0]) == pytest.approx(3.0, rel=0.25)
 
 
 def test_images_undistorted_twice_fail(pair: Rig) -> None:
     result = solve(with_lens(pair, distortion=(-0.2, 0.0, 0.0, 0.0)), simulated(pair))
-    assert named(result, "left", "radial distortion")[0].status == "FAIL"
+    assert named(result, "left", "a k1 ")[0].status == "FAIL"
 
 
 def test_a_shifted_principal_point_fails_and_is_measured(pair: Rig) -> None:
     result = solve(with_lens(pair, cx=20.0), simulated(pair))
     (check,) = named(result, "left", "principal point")
     assert check.status == "FAIL"  # it turns the camera by a degree
-    (found,) = re.findall(r"off by \((-[0-9.]+), ", check.text)
+    (found,) = re.findall(r"off by \((-[0-9.]+) ", check.text)
     assert abs(float(found) + 20) < 1
 
 

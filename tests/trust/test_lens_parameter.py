@@ -8,6 +8,7 @@ import pytest
 from calibgraph.model.verdict import FAIL_ABOVE
 from calibgraph.trust.lens_parameter import (
     IMAGES,
+    RESIDUALS,
     LensParameter,
     check_parameter,
     probability_of_lens,
@@ -15,13 +16,9 @@ from calibgraph.trust.lens_parameter import (
 
 
 def estimate(name: str, size: float, sigma: float, moved_cm: float) -> LensParameter:
-    return LensParameter(
-        name,
-        np.array([size]),
-        np.array([sigma]),
-        np.ones(1),
-        np.array([0, 0, 0, 0, 0, moved_cm / 100]),
-    )
+    unit = np.array([0.002])  # of a calibrated lens
+    twist = np.array([0, 0, 0, 0, 0, moved_cm / 100])
+    return LensParameter(name, np.array([size]) / unit, np.array([sigma]) / unit, twist, unit)
 
 
 def test_a_parameter_of_which_the_residuals_say_nothing_raises_no_doubt() -> None:
@@ -55,8 +52,16 @@ def test_a_parameter_that_moves_the_camera_beyond_any_length_is_wrong() -> None:
 
 
 def test_a_single_frame_leaves_the_significance_unknown() -> None:
-    check = check_parameter(estimate("skew", 0.03, math.nan, 0.1), IMAGES, "a skew of 0.03")
-    assert check.status == "PASS" and "unknown sigma" in check.text
+    check = check_parameter(estimate("skew", 0.03, math.nan, 0.1), IMAGES)
+    assert check.status == "PASS" and "a skew of 3 +- unknown % of fx" in check.text
+
+
+def test_a_check_states_the_value_its_sigma_the_motion_and_what_to_run() -> None:
+    check = check_parameter(estimate("focal length", -0.017, 0.002, 31.2), RESIDUALS)
+    assert check.status == "FAIL"
+    assert "a focal length 1.70 +- 0.20 % shorter" in check.text
+    assert "the camera would move by 0 deg, 31 cm" in check.text
+    assert check.text.endswith("or run with --estimate focal")
 
 
 def test_the_worst_lens_parameter_counts_and_a_warning_as_one() -> None:

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.io.lenses import (
     CameraLens,
     fitted_coefficients,
@@ -15,8 +15,6 @@ from calibgraph.io.lenses import (
 )
 from calibgraph.model.rig import Intrinsics
 from factors import LensModel
-
-Array = NDArray[np.float64]
 
 _AS_NONE = ("", "inverse_brown_conrady")
 """Models of drivers that state zeros for an image without distortion."""
@@ -29,7 +27,6 @@ class StatedLens:
 
     Attributes:
         frame: the frame of the camera, z forward and y down, as the message names it.
-        lens: of the images.
         R_image_frame: (3, 3) from the frame to the axes of the image, which rectification turns.
         baseline_m: (3,) by P's fourth column, the origin of the first camera's frame in the axes of
             this image; zero for a camera that is no second one of a pair.

@@ -25,7 +25,6 @@ class BagFrame:
     Attributes:
         number: counts the clouds that were read, and goes on by one more wherever others were not:
             the frames before and after in the recording have the numbers before and after.
-        stamp_ns: of the cloud.
         cloud: its address.
         images: the address of each camera's image.
         to_s: the median stamp of the images, in seconds after the cloud's.

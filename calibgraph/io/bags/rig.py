@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.files import checked_model
 from calibgraph.io.bags.camera_info import StatedLens, lens_of, stated_baseline
@@ -18,8 +18,6 @@ from calibgraph.io.bags.topics import CameraTopics, choose_topics
 from calibgraph.io.bags.transforms import Transforms
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Camera, RelativePose, Rig
-
-Array = NDArray[np.float64]
 
 _UPWARD = 0.9
 """Vertical part of a camera's axis (64 deg), beyond which it looks up: z is up in body axes."""
@@ -50,7 +48,6 @@ class BagRig:
     """What a bag holds about its rig; extrinsics may be missing.
 
     Attributes:
-        path: of the bag.
         lidar: the LiDAR's frame.
         cameras: by name.
         transforms: of the bag and those beside it.

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from calibgraph.errors import CalibrationError, DatasetError
+from calibgraph.arrays import Array
+from calibgraph.errors import DatasetError
 from calibgraph.io.bags.frames import BagFrame
 from calibgraph.io.bags.messages import Bag, Drive, read_message
 from calibgraph.io.bags.options import ODOMETRY, BagOptions
@@ -23,18 +23,15 @@ from calibgraph.io.bags.transforms import (
     stamped_transforms,
     values_of,
 )
-from calibgraph.io.motion import ScanMotion, twist_between
+from calibgraph.io.motion import ScanMotion, register, twist_between
 from calibgraph.model.geometry import transform
 
-Array = NDArray[np.float64]
 MotionOf = Callable[[BagFrame], ScanMotion]
 
 _ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 _HALF_S = 0.05  # half a turn of a LiDAR at 10 Hz: the velocity is the mean of a scan
 _GAP_S = 0.5
 """Poses farther apart are not interpolated: at 2 m/s^2 the mean is off by 0.25 m/s, 1 cm a scan."""
-_COARSE_M, _FINE_M = 1.0, 0.25
-_REACH_M = 4.0  # of the coarse registration: 40 m/s in 0.1 s
 _NEIGHBOUR_S = 0.35  # of a scan, that is registered with it
 
 
@@ -123,7 +120,7 @@ class _ByScans:
             )
         cloud = _xyz(frame)
         twists = [
-            twist_between(np.eye(4), _register(cloud, _xyz(other), frame.cloud),
+            twist_between(np.eye(4), register(cloud, _xyz(other), frame.cloud),
                           (other.stamp_ns - frame.stamp_ns) / 1e9)
             for other in near
         ]  # fmt: skip
@@ -137,25 +134,6 @@ def _motion(twist: Array, frame: BagFrame) -> ScanMotion:
 def _xyz(frame: BagFrame) -> Array:
     points = points_of(read_message(frame.cloud)[1], str(frame.cloud))
     return np.ascontiguousarray(points[:, :3], dtype=np.float64)
-
-
-def _register(target: Array, source: Array, where: Path) -> Array:
-    """(4, 4) T_target_source of two scans, coarse and then fine."""
-    try:
-        import small_gicp
-    except ImportError as error:
-        raise CalibrationError(
-            f"--motion scans needs small_gicp: pip install 'calibgraph[motion]' ({error})"
-        ) from error
-    T = np.eye(4)
-    for size_m, reach_m in ((_COARSE_M, _REACH_M), (_FINE_M, _COARSE_M)):
-        found = small_gicp.align(
-            target, source, T, downsampling_resolution=size_m, max_correspondence_distance=reach_m
-        )
-        T = np.asarray(found.T_target_source)
-    if not found.converged:
-        raise DatasetError(f"{where}: its scan and that beside it do not fit; choose other frames")
-    return T
 
 
 def _odometry(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, Array]]:

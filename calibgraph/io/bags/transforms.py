@@ -12,13 +12,11 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.io.bags.messages import TREES, Bag, Drive
 from calibgraph.model.geometry import invert, transform
-
-Array = NDArray[np.float64]
 
 STATIC, MOVING = "tf_static", "tf"
 _LEAST_LENGTH = 1e-6  # of a quaternion that is one

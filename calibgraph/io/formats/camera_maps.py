@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.io.formats.lens_keys import LensKeys, is_group
 from calibgraph.io.formats.part import IMU, ONLY_CAMERA, FrameLink, Part
@@ -35,8 +35,6 @@ from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import rigid_transform
-
-Array = NDArray[np.float64]
 
 _LIDAR = "lidar"
 _T_CAMERA_LIDAR = (

@@ -4,12 +4,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import angle_deg, camera_center
 from calibgraph.model.rig import RelativePose, Rig
-
-Array = NDArray[np.float64]
 
 _LIDAR_SIDES = (("ahead", "behind"), ("left", "right"), ("above", "below"))
 _CAMERA_SIDES = (("right", "left"), ("below", "above"), ("ahead", "behind"))

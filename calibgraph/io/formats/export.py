@@ -4,26 +4,25 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.files import read_yaml, write_bytes, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
 from calibgraph.io.formats.autoware import write_autoware
 from calibgraph.io.formats.documents import commented
 from calibgraph.io.formats.kalibr import write_kalibr
-from calibgraph.io.formats.kitti_calib import kitti_statement, write_kitti
 from calibgraph.io.formats.koide import write_koide
 from calibgraph.io.formats.names import EXPORT_FORMATS
-from calibgraph.io.formats.nuscenes import write_nuscenes
-from calibgraph.io.formats.opencv_yaml import write_opencv
-from calibgraph.io.formats.plain import write_json, write_npz
-from calibgraph.io.formats.rig_export import Array, RigExport, prepare_export
+from calibgraph.io.formats.plain import write_json, write_npz, write_opencv
+from calibgraph.io.formats.rig_export import RigExport, prepare_export
 from calibgraph.io.formats.ros_transforms import (
     write_ros1,
     write_ros2,
     write_ros2_launch,
     write_tf2,
+    write_urdf,
 )
-from calibgraph.io.formats.urdf import write_urdf
+from calibgraph.io.formats.undistorted import kitti_statement, write_kitti, write_nuscenes
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import Calibration

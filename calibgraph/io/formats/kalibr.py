@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,9 +11,13 @@ from pydantic import ConfigDict, Field
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.documents import commented_yaml
-from calibgraph.io.formats.lenses import carried_coefficients, no_place_for
 from calibgraph.io.formats.part import IMU, FrameLink, Part, RelativeCamera
-from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
+from calibgraph.io.formats.rig_export import (
+    COVARIANCE_SENTENCE,
+    RigExport,
+    carried_coefficients,
+    no_place_for,
+)
 from calibgraph.io.lenses import (
     CameraLens,
     listed_coefficients,
@@ -21,6 +26,7 @@ from calibgraph.io.lenses import (
     unified_coefficients,
 )
 from calibgraph.model.geometry import invert, relative_transform
+from calibgraph.model.image_times import Seconds
 from calibgraph.model.rig import Camera, Finite, Size, Transform
 
 _DERIVED = "computed from T_cam_lidar"
@@ -58,8 +64,15 @@ def _content(export: RigExport, names: list[str], index: int) -> dict[str, Any]:
         "rostopic": f"/{name}/image_raw",
         **chain,
         "T_cam_lidar": camera.T_camera_lidar,
+        **_time_shift(camera),
         "calibgraph": own,
     }
+
+
+def _time_shift(camera: Camera) -> dict[str, Any]:
+    """As Kalibr's timeshift_cam_imu: the LiDAR's time of an image is the camera's plus it."""
+    known = camera.time_offset_s is not None
+    return {"timeshift_cam_lidar": camera.time_offset_s} if known else {}
 
 
 def _projection(name: str, camera: Camera) -> dict[str, Any]:
@@ -103,6 +116,7 @@ class _Camera(StrictNumbers):
     T_cn_cnm1: Transform | None = None
     T_cam_lidar: Transform | None = None
     T_cam_imu: Transform | None = None
+    timeshift_cam_lidar: Seconds | None = None
     calibgraph: _Own = _Own()
 
 
@@ -158,6 +172,10 @@ def _number(key: str) -> int:
 
 
 def _lens(camera: _Camera, path: Path) -> CameraLens:
+    return replace(_projection_of(camera, path), time_offset_s=camera.timeshift_cam_lidar)
+
+
+def _projection_of(camera: _Camera, path: Path) -> CameraLens:
     names = camera.model_dump(include={"camera_model", "distortion_model"})
     model = stated_model(names, path) or "pinhole"
     if model == "omnidirectional":

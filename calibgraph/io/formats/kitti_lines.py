@@ -16,8 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
 from calibgraph.io.formats.part import ONLY_CAMERA, FrameLink, Part
@@ -25,8 +25,6 @@ from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.io.lenses import CameraLens, intrinsics_of_matrix
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import rigid_transform
-
-Array = NDArray[np.float64]
 
 _LIDAR, _POSE = "velodyne", "pose"
 _KITTI_360, _FIRST = "calib_cam_to_velo", "image_00"

@@ -7,9 +7,8 @@ from typing import Any
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.documents import stated_json
-from calibgraph.io.formats.lenses import carried_coefficients, no_place_for
 from calibgraph.io.formats.part import Part
-from calibgraph.io.formats.rig_export import RigExport
+from calibgraph.io.formats.rig_export import RigExport, carried_coefficients, no_place_for
 from calibgraph.io.lenses import (
     CameraLens,
     listed_coefficients,

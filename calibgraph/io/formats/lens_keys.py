@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model, holds_truth_value
 from calibgraph.io.lenses import (
@@ -27,8 +27,6 @@ from calibgraph.model.rig import Intrinsics, Size
 from calibgraph.yaml_text import describe_value
 from factors import LensModel
 from factors.lens import COEFFICIENTS
-
-Array = NDArray[np.float64]
 
 _KEYS = {
     "K": (

@@ -1,8 +1,9 @@
-"""Plain JSON and NumPy archives: both directions of the extrinsic, lenses, covariance."""
+"""Plain JSON, NumPy archives and OpenCV FileStorage: extrinsics, lenses, covariance."""
 
 import io
 from typing import Any
 
+import cv2
 import numpy as np
 
 from calibgraph.io.formats.documents import stated_json
@@ -56,3 +57,30 @@ def write_npz(export: RigExport) -> bytes:
         covariance=np.array([np.full((6, 6), np.nan) if c is None else c for c in covariances]),
     )
     return file.getvalue()
+
+
+def write_opencv(export: RigExport) -> str:
+    """Maps camera_0, camera_1, ... in the order of the rig, written by OpenCV itself."""
+    file = cv2.FileStorage("rig.yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    direction = f"T_camera_lidar maps LiDAR to camera coordinates: {FRAMES_SENTENCE}"
+    for line in export.statement(direction, COVARIANCE_SENTENCE):
+        file.writeComment(line, False)
+    for index, (name, camera) in enumerate(export.cameras.items()):
+        file.startWriteStruct(f"camera_{index}", cv2.FileNode_MAP)
+        file.write("name", name)
+        file.write("model", camera.model)
+        file.write("fisheye_model", int(camera.model == "fisheye"))
+        file.write("image_width", camera.width_px)
+        file.write("image_height", camera.height_px)
+        file.write("camera_matrix", camera.matrix_px)
+        distortion = [*camera.distortion] or [0.0] * 5
+        if camera.model == "omnidirectional":  # OpenCV's omnidir keeps xi apart
+            xi, *distortion = camera.distortion
+            file.write("xi", xi)
+        file.write("distortion_coefficients", np.array(distortion)[None])
+        file.write("T_camera_lidar", np.array(camera.T_camera_lidar))
+        covariance = export.ros_covariance(name)
+        if covariance is not None:
+            file.write("covariance", covariance)
+        file.endWriteStruct()
+    return str(file.releaseAndGetString())

@@ -24,8 +24,7 @@ from calibgraph.io.formats.kitti_lines import is_kitti_lines, read_kitti_lines
 from calibgraph.io.formats.koide import is_koide, read_koide
 from calibgraph.io.formats.names import IMPORT_FORMATS
 from calibgraph.io.formats.part import Part, RelativeCamera
-from calibgraph.io.formats.ros_transforms import is_tf2, read_tf2
-from calibgraph.io.formats.urdf import read_urdf
+from calibgraph.io.formats.ros_transforms import is_tf2, read_tf2, read_urdf
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rigs import is_exported_rig, read_rig

@@ -1,19 +1,20 @@
-"""A rig as the exporters take it: frames by name, covariances, and the statement of direction."""
+"""A rig as the exporters take it: frames by name, covariances, and the statement of direction.
+
+Lenses that a format cannot carry are refused, not rounded.
+"""
 
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.geometry import invert, point_in_lidar, ros_pose_covariance
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.model.verdict import rig_verdict
-
-Array = NDArray[np.float64]
 
 EXPORT_MARK = "calibgraph export"
 CAMERA_FRAME = "{camera}_optical_frame"
@@ -162,3 +163,35 @@ def _covariances(result: Calibration | None, names: Iterable[str]) -> dict[str, 
         return {}
     found = {name: result.covariance.get(name) for name in names if result.error_bar_holds(name)}
     return {name: covariance for name, covariance in found.items() if covariance is not None}
+
+
+def carried_coefficients(name: str, camera: Camera, most: int, what: str) -> list[float]:
+    """A pinhole's coefficients, ``most`` of them, in OpenCV's order."""
+    padded = [*camera.distortion, *[0.0] * most]
+    if any(padded[most:]):
+        raise CalibrationError(
+            f"camera {name!r}: {what} holds {most or 'no'} distortion coefficients, this lens has "
+            f"{camera.distortion}; choose another --format (opencv, json)",
+            camera=name,
+        )
+    return padded[:most]
+
+
+def no_place_for(name: str, camera: Camera, what: str) -> CalibrationError:
+    """The error of a format that has no place for a camera's lens model."""
+    return CalibrationError(
+        f"camera {name!r}: {what} cannot hold a lens of the model {camera.model}; choose another "
+        "--format (opencv, json)",
+        camera=name,
+    )
+
+
+def require_undistorted(name: str, camera: Camera, what: str) -> None:
+    """Check that a camera is a pinhole without distortion."""
+    if camera.model != "pinhole":
+        raise CalibrationError(
+            f"camera {name!r}: {what} cannot hold a {camera.model} lens; choose another --format, "
+            "or undistort the images and calibrate these",
+            camera=name,
+        )
+    carried_coefficients(name, camera, 0, what)

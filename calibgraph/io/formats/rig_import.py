@@ -8,16 +8,19 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, FileError, RigError
 from calibgraph.files import checked_model
-from calibgraph.io.formats.frames import (
+from calibgraph.io.formats.part import (
     NO_LIDAR_IN_IMU,
+    ONLY_CAMERA,
     FrameTree,
+    Part,
+    RelativeCamera,
     find_camera_frame,
     find_lidar_frame,
     tied_links,
 )
-from calibgraph.io.formats.part import ONLY_CAMERA, Array, Part, RelativeCamera
 from calibgraph.io.formats.read_part import read_part
 from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import invert
@@ -73,7 +76,6 @@ class RigParts:
     """What files of other programs hold about a rig together; extrinsics may be missing.
 
     Attributes:
-        path: of the first file, for errors.
         lidar: name of the LiDAR.
         lenses: by camera.
         T_camera_lidar: (4, 4) of the cameras that have one.

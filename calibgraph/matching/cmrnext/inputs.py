@@ -18,6 +18,7 @@ from calibgraph.errors import DatasetError
 from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.network import SIZE_MIN, SIZE_MULTIPLE
 from calibgraph.model.rig import Camera
+from factors import Lens
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -53,6 +54,12 @@ class View:
         if self.camera.distortion or self.camera.model != "pinhole":
             rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
         return np.ascontiguousarray(rgb[: self.height, : self.width], dtype=np.uint8)
+
+    @cached_property
+    def lens(self) -> Lens:
+        """The pinhole."""
+        (fx, fy), (cx, cy) = self.focal_px.tolist(), self.centre_px.tolist()
+        return Lens.pinhole(fx=fx, fy=fy, cx=cx, cy=cy)
 
     def project(self, points_camera_m: Array) -> Array:
         """(n, 2) pixels of (n, 3) points in front of the camera."""

@@ -25,6 +25,7 @@ from calibgraph.matching.structure.shift_scores import (
     concatenate_scores,
     score_frame,
 )
+from calibgraph.model.clock import when_taken
 from calibgraph.model.config import Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.error_components import error_components
@@ -189,6 +190,7 @@ class StructureMatcher:
 
         def score(frame: Frame, name: str, camera: Camera) -> ShiftScores:
             gray, cloud = cache.image(frame, name, camera), cache.cloud(frame)
+            camera = when_taken(camera, frame.twist_per_s)
             return score_frame(
                 gray, cloud, camera, level, frame=frame.index, max_windows=max_windows
             )

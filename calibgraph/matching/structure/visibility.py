@@ -14,7 +14,6 @@ from factors.compiled import compiled
 from factors.lens_kernels import (
     EQUIRECTANGULAR,
     PINHOLE,
-    RADTAN,
     is_projectable,
     project_one,
     subtract_columns,
@@ -107,7 +106,7 @@ def _least_cosine(camera: Camera) -> float:
     sides = [np.column_stack([u, np.full_like(u, end)]) for end in (v[0], v[-1])]
     sides += [np.column_stack([np.full_like(v, end), v]) for end in (u[0], u[-1])]
     rays, valid = unproject(camera.lens, np.concatenate(sides))
-    if not valid.all() or camera.lens.kind not in (PINHOLE, RADTAN):
+    if not valid.all() or camera.lens.kind != PINHOLE:
         return -1.0
     return float(rays[:, 2].min()) * _COSINE_MARGIN
 

@@ -3,13 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.rig import Camera
 from calibgraph.service.pick.joint import pixel_jacobians
-from calibgraph.service.pick.pairs import PICK_SIGMA_PX
-
-Array = NDArray[np.float64]
+from calibgraph.service.pick.session import PICK_SIGMA_PX
 
 TOLERABLE: Array = np.repeat([np.radians(0.15), 0.05], 3)
 """Errors of rotation [rad] and translation [m] that weigh alike: 0.15 deg, 5 cm."""

@@ -6,7 +6,7 @@ from calibgraph.model.geometry import degrees_and_centimetres, pose_difference
 from calibgraph.service.pick.advice import Advice
 from calibgraph.service.pick.estimate import CameraEstimate, PickEstimate
 from calibgraph.service.pick.joint import JointSolve
-from calibgraph.service.pick.pairs import Pair
+from calibgraph.service.pick.session import Pair
 from calibgraph.service.pick.workspace import Workspace
 
 

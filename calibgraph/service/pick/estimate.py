@@ -7,9 +7,8 @@ import numpy as np
 
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.rig import Rig
-from calibgraph.service.pick.joint import JointSolve, solve_pairs
-from calibgraph.service.pick.leave_out import Influence, influences
-from calibgraph.service.pick.pairs import Pair, pixels_of, points_of, sigmas_of
+from calibgraph.service.pick.joint import Influence, JointSolve, influences, solve_pairs
+from calibgraph.service.pick.session import Pair, pixels_of, points_of, sigmas_of
 from calibgraph.service.pick.solvers import MIN_PAIRS, Shape, SolverPose, poses_by_solver, shape_of
 from calibgraph.trust.observability import weakest_direction
 

@@ -14,8 +14,7 @@ from calibgraph.model.result_files import WRITTEN_KEY, table_mark
 from calibgraph.model.rig import Rig
 from calibgraph.outputs import Output, marked_yaml, yaml_mark
 from calibgraph.service.pick.estimate import PickEstimate
-from calibgraph.service.pick.pairs import Pair, to_table
-from calibgraph.service.pick.session import SESSION_FILE, SESSION_FORMAT
+from calibgraph.service.pick.session import SESSION_FILE, SESSION_FORMAT, Pair, to_table
 
 TABLE_FILE = "picked.parquet"
 PICK = "calibgraph pick"

@@ -1,15 +1,22 @@
-"""Routes of a session of picking, under ``/v1/pick``, and its page, ``/pick``."""
+"""Routes of a session of picking, under ``/v1/pick``, its page, ``/pick``, and their server."""
 
+import socket
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import cv2
-from fastapi import APIRouter, Query, Response
+import uvicorn
+from fastapi import APIRouter, FastAPI, Query, Response
 from fastapi.responses import FileResponse, RedirectResponse
+from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel, ConfigDict, Field
 
-from calibgraph.service.access import Reader, Submitter
+from calibgraph.errors import CalibrationError
+from calibgraph.service.access import Gate, Reader, Submitter
+from calibgraph.service.app import STATIC_FOLDER
+from calibgraph.service.connections import LimitedConnection
+from calibgraph.service.metrics import Metrics
 from calibgraph.service.pick.answers import (
     CornerAnswer,
     EstimateAnswer,
@@ -18,11 +25,11 @@ from calibgraph.service.pick.answers import (
     estimate_answer,
     session_answer,
 )
-from calibgraph.service.pick.pairs import PICK_SIGMA_PX, Coordinate, Pair
 from calibgraph.service.pick.reference import reference_rig
-from calibgraph.service.pick.session import MAX_PAIRS, Session
+from calibgraph.service.pick.session import MAX_PAIRS, PICK_SIGMA_PX, Coordinate, Pair, Session
 from calibgraph.service.pick.workspace import Change, StaleError, Workspace
-from calibgraph.service.problems import Problem, documented
+from calibgraph.service.problems import Problem, add_problem_handlers, documented
+from calibgraph.service.request_guard import LOCAL_NAMES, RequestGuard
 
 STATIC_PAGE = Path(__file__).parents[1] / "static" / "pick" / "index.html"
 
@@ -203,3 +210,41 @@ def _pairs_with(session: Session, place: int) -> list[Pair]:
     if place >= len(session.pairs):
         raise Problem(404, f"the session has {len(session.pairs)} pairs")
     return list(session.pairs)
+
+
+def create_pick_app(workspace: Workspace) -> FastAPI:
+    """The application of a session: its routes, without jobs and trackers."""
+    app = FastAPI(title="calibgraph pick", docs_url=None, redoc_url=None)
+    app.state.gate = Gate(None)
+    app.add_middleware(RequestGuard, hosts=LOCAL_NAMES, observe=Metrics().observe_request)
+    app.mount("/static", StaticFiles(directory=STATIC_FOLDER), name="static")
+    add_problem_handlers(app)
+    app.include_router(pick_router(workspace))
+    return app
+
+
+def loopback_socket(port: int) -> socket.socket:
+    """A socket that listens on this machine alone."""
+    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind(("127.0.0.1", port))
+    except OSError as error:
+        listening.close()
+        raise CalibrationError(
+            f"port {port} cannot be used ({error.strerror}); give another with --port"
+        ) from error
+    return listening
+
+
+def pick_server(workspace: Workspace) -> uvicorn.Server:
+    """A server of a session; ``run(sockets=[...])`` serves until it is interrupted."""
+    config = uvicorn.Config(
+        create_pick_app(workspace),
+        http=LimitedConnection,
+        ws="none",
+        log_level="warning",
+        server_header=False,
+        access_log=False,
+    )
+    return uvicorn.Server(config)

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 from calibgraph.solver.pnp import magsac, normalized
 
-Array = NDArray[np.float64]
 Shape = Literal["line", "plane", "space"]
 
 FLAT_M = 0.06

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.structure.visibility import find_in_view, find_visible
 from calibgraph.model.rig import Camera
-
-Array = NDArray[np.float64]
 
 OCCLUSION_SPACINGS = 1.5
 """Side of a cell in which near points hide far ones, in spacings of the points in the image."""

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from calibgraph import FileError, load_dataset
-from calibgraph.io.bags.livox import LIVOX_CLOUDS, read_custom_msg
-from calibgraph.io.bags.messages import Bag
+from calibgraph.io.bags.messages import LIVOX_CLOUDS, Bag, read_custom_msg
 from calibgraph.io.bags.point_clouds import points_of, time_fields
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (

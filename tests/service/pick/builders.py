@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibgraph import Rig
-from calibgraph.service.pick.pairs import Pair
+from calibgraph.service.pick.session import Pair
 
 
 def draw_pairs(

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from calibgraph.service.pick.app import loopback_socket, pick_server
+from calibgraph.service.pick.router import loopback_socket, pick_server
 from calibgraph.service.pick.workspace import Workspace
 
 START_S, STOP_S = 20.0, 20.0

@@ -6,7 +6,7 @@ import pytest
 from calibgraph import Rig, perturb
 from calibgraph.model.geometry import pose_difference, twist_between
 from calibgraph.service.pick.estimate import estimate_from_pairs
-from calibgraph.service.pick.pairs import Pair
+from calibgraph.service.pick.session import Pair
 from calibgraph.simulation.rigs import rig_of
 from tests.conftest import stereo_relative_pose
 from tests.service.pick.builders import draw_pairs, pair_of, project

@@ -1,16 +1,25 @@
 """The losses of training, at the points of a batch of samples."""
 
+import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
+import gtsam
+import numpy as np
 import torch
 from torch import Tensor
 
+from calibgraph.graph.objective import pose_key
 from calibgraph.matching.cmrnext.correlation import WINDOW, Correlation, cross_entropy
 from calibgraph.matching.cmrnext.layers import CELL
 from calibgraph.matching.cmrnext.network import upscale
-from calibgraph.matching.cmrnext.training.samples import Sample
+from calibgraph.matching.cmrnext.training.samples import Sample, SampleSettings
+from calibgraph.solver.pose_loss import pose_loss
+from factors import ProjectionBlock, pose_sigmas
 
 _DISCOUNT = 0.8  # of each iteration's loss against the next one's
+_CAMERA = "camera"
+_USUAL, _LEAST_PX = 1.5, 1.0  # scale of the robust loss: in median errors, and at least
 _OFFSET_CELLS = 3.5  # largest distance of the correlation loss's windows from the truth, per axis
 
 
@@ -76,3 +85,56 @@ def flow_at_points(flow: Tensor, samples: Sequence[Sample], *, halved: bool) -> 
 def true_flow(samples: Sequence[Sample], device: torch.device) -> Tensor:
     """(n, 2) true flow at the points of all samples [px]."""
     return torch.cat([sample.flow_px for sample in samples]).to(device)
+
+
+def optimum_loss(flow: Tensor, samples: Sequence[Sample], settings: SampleSettings) -> Tensor:
+    """How unlikely the true poses are under those that minimize the graph of the predicted pixels.
+
+    A graph has the matches of a sample, with the Cauchy loss, and the perturbation's distribution
+    as a prior. The gradient is that of its minimum, see ``solver.pose_loss``. Mean over samples.
+
+    Args:
+        flow: (B, 2, H, W) after the last iteration [px].
+        samples: of the batch.
+        settings: of the samples.
+    """
+    losses = [
+        _OptimumLoss.apply(  # type: ignore[no-untyped-call]
+            flow_at_points(flow[i : i + 1], [sample], halved=settings.half_resolution),
+            sample,
+            settings,
+        )
+        for i, sample in enumerate(samples)
+    ]
+    return torch.stack(losses).mean()
+
+
+class _OptimumLoss(torch.autograd.Function):
+    """Of (n, 2) flow at the points of one sample."""
+
+    @staticmethod
+    def forward(ctx: Any, flow_px: Tensor, sample: Sample, settings: SampleSettings) -> Tensor:
+        pixels = sample.pixels_px + flow_px.detach().cpu().numpy()
+        errors_px = np.linalg.norm(pixels - sample.view.project(sample.points_camera_m), axis=1)
+        block = ProjectionBlock(
+            sample.view.lens, sample.points_camera_m, pixels,
+            scale=max(_USUAL * float(np.median(errors_px)), _LEAST_PX),
+        )  # fmt: skip
+        prior = gtsam.NonlinearFactorGraph()
+        prior.add(_perturbation_prior(sample, settings))
+        found = pose_loss({_CAMERA: block}, prior, {_CAMERA: np.eye(4)})
+        ctx.save_for_backward(flow_px.new_tensor(found.by_pixels[_CAMERA]))
+        return flow_px.new_tensor(found.value)
+
+    @staticmethod
+    def backward(ctx: Any, *above: Tensor) -> tuple[Tensor, None, None]:
+        return above[0] * ctx.saved_tensors[0], None, None
+
+
+def _perturbation_prior(sample: Sample, settings: SampleSettings) -> gtsam.PriorFactorPose3:
+    """About the perturbed start, as wide as perturbations are drawn."""
+    sigmas = pose_sigmas(
+        rotation_rad=math.radians(settings.rotation_deg), translation_m=settings.translation_m
+    )
+    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas / math.sqrt(3))  # of a uniform distribution
+    return gtsam.PriorFactorPose3(pose_key([_CAMERA], _CAMERA), gtsam.Pose3(sample.E), noise)

@@ -16,6 +16,7 @@ from calibgraph.matching.cmrnext.training.losses import (
     correlation_loss,
     flow_at_points,
     flow_loss,
+    optimum_loss,
     true_flow,
 )
 from calibgraph.matching.cmrnext.training.samples import Sample, stack_inputs
@@ -84,10 +85,13 @@ class TrainingRun:
                 correlation, samples, seed=self.step, halved=s.half_resolution
             )
         if self.step >= s.correlation_steps:
-            flows = self.network.all_flows(correlation, rgb, lidar, iterations=s.iterations)
+            flows = [*self.network.all_flows(correlation, rgb, lidar, iterations=s.iterations)]
             loss = loss + flow_loss(
                 flows, samples, iterations=s.iterations, halved=s.half_resolution
             )
+            if s.pose_weight:
+                of_samples = s.samples(augment=True)
+                loss = loss + s.pose_weight * optimum_loss(flows[-1], samples, of_samples)
         return loss
 
     @torch.inference_mode()

@@ -49,6 +49,7 @@ class Sample:
         pixels_px: (m, 2) exact pixel of each point in the view, before cropping.
         points_camera_m: (m, 3) each point in the true camera's frame.
         E: (4, 4) the perturbation.
+        view: the camera without its distortion.
     """
 
     rgb: Tensor
@@ -59,6 +60,7 @@ class Sample:
     pixels_px: Array
     points_camera_m: Array
     E: Array
+    view: View
 
 
 def draw_perturbation(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
@@ -131,6 +133,7 @@ def make_sample(
         pixels_px=lidar.pixels_px[inside],
         points_camera_m=truth[inside],
         E=E,
+        view=view,
     )
 
 

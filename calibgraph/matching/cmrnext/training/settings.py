@@ -50,6 +50,9 @@ class TrainSettings(BaseModel):
     gradients of the flow to reach the encoders."""
     correlation_steps: Annotated[int, Field(ge=0, le=10**9)] = 0
     """Steps at the beginning with that loss alone."""
+    pose_weight: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """Weight of an additional loss on the pose that minimizes the factor graph of the matches: its
+    negative log-likelihood, differentiated through the optimum. For fine-tuning (`--from`)."""
     crop_px: tuple[CropSize, CropSize] | None = (320, 960)
     """Height and width of random crops at full resolution, even numbers; null for whole images."""
     half_resolution: bool = False

@@ -77,6 +77,21 @@ def test_fine_tuning_starts_from_given_weights(
 
 
 @pytest.mark.slow
+def test_fine_tuning_on_the_pose_changes_the_flow(
+    parts: tuple[Dataset, Dataset], tmp_path: Path
+) -> None:
+    flow, pose = tmp_path / "flow.tar", tmp_path / "pose.tar"
+    settings = TINY.changed(steps=2, correlation_weight=0.0, correlation_steps=0)
+    (of_flow,) = train([parts[0]], [parts[1]], flow, settings)
+    (of_pose,) = train([parts[0]], [parts[1]], pose, settings.changed(pose_weight=1.0))
+    assert np.isfinite(of_pose.train_loss)
+    assert of_pose.train_loss != of_flow.train_loss
+    assert load_checkpoint(pose).config["train_pose_weight"] == 1.0
+    one, other = (load_checkpoint(path).state for path in (flow, pose))
+    assert any(not torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.slow
 def test_encoders_learn_to_find_each_other(trusted: Dataset, tmp_path: Path) -> None:
     """On one image, repeatedly: the correlation loss falls below that of a uniform guess, ln 49."""
     settings = TINY.changed(

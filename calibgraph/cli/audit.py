@@ -1,0 +1,165 @@
+"""The commands that compare calibrations with a recording, and with each other: check, drift."""
+
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibgraph.cli import remote
+from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
+from calibgraph.cli.options import DatasetArgument, FramesOption, JsonOption, SeedOption
+from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
+
+_EXIT_CODES = {"OK": 0, "WRONG": 1, "CANNOT TELL": 3}
+
+
+def check(
+    rig: Annotated[
+        Path, typer.Argument(metavar="RIG", help="The deployed calibration: a result or a rig.")
+    ],
+    dataset: DatasetArgument,
+    tolerance_deg: Annotated[
+        float, typer.Option(metavar="DEG", help="Largest deviation about an axis that is OK.")
+    ] = 0.5,
+    tolerance_cm: Annotated[
+        float, typer.Option(metavar="CM", help="Largest deviation along an axis that is OK.")
+    ] = 10.0,
+    frames: FramesOption = None,
+    seed: SeedOption = 0,
+    page: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Show the answer on a page, with pictures."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Is a deployed calibration still right? Exit 0: all OK, 1: WRONG, 3: the data cannot tell.
+
+    Compares it with images and clouds of a recent recording, per camera and axis. Writes no file
+    but the page, if one is wanted.
+    """
+    from calibgraph.audit import check
+    from calibgraph.audit.check import is_made_from
+    from calibgraph.audit.result import audit_of
+    from calibgraph.audit.significance import Tolerance
+    from calibgraph.io.rigs import load_rig
+
+    with checked_arguments():
+        Tolerance(tolerance_deg, tolerance_cm)
+        matcher = matcher_from("structure", None, seed=seed, all_frames=frames is not None)
+    data, deployed = dataset_from(dataset, rig, frames), load_rig(rig)
+    if remote.SERVER.get() is not None:
+        wanted = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm, "seed": seed}
+        audit = audit_of(remote.check(rig, data, frames, wanted)).of_recording(deployed, data)
+    else:
+        with progress_bar() as progress:
+            audit = check(
+                deployed,
+                data,
+                tolerance_deg=tolerance_deg,
+                tolerance_cm=tolerance_cm,
+                matcher=matcher,
+                seed=seed,
+                progress=progress,
+            )
+    audit = replace(audit, same_recording=is_made_from(rig, data))
+    if page is not None:
+        from calibgraph.audit.page import write_audit_report
+
+        write_audit_report(audit, page)
+    if as_json:
+        from calibgraph.audit import audit_summary
+
+        print_json(audit_summary(audit))
+    else:
+        from calibgraph.cli.audit_tables import print_audit
+
+        print_audit(terminal(), audit, page)
+    raise typer.Exit(_EXIT_CODES[audit.status])
+
+
+_DRIFT_EXIT_CODES = {"OK": 0, "CHANGED": 1, "CANNOT TELL": 3}
+
+
+def drift(
+    results: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RESULT...",
+            help="Results of one rig: their folders, or calibration.yaml files.",
+        ),
+    ],
+    days: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DAY,DAY,...",
+            help="When each was recorded, for the trend: dates like 2026-03-01, or numbers of "
+            "days. (default: the order given)",
+        ),
+    ] = None,
+    tolerance_deg: Annotated[
+        float, typer.Option(metavar="DEG", help="Largest deviation about an axis that is OK.")
+    ] = 0.5,
+    tolerance_cm: Annotated[
+        float, typer.Option(metavar="CM", help="Largest deviation along an axis that is OK.")
+    ] = 10.0,
+    own_lenses: Annotated[
+        bool,
+        typer.Option(
+            "--own-lenses", help="Lenses may differ: several vehicles, each with its own."
+        ),
+    ] = False,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Draw the deviations, per camera.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Which of several results of one rig deviates? Exit 0: none, 1: one CHANGED, 3: cannot tell.
+
+    Compares each result with the others that agree, per camera and axis, without a reference: of
+    several days, or of several vehicles. One false alarm in 100 calls.
+    """
+    from calibgraph.audit import drift
+
+    with checked_arguments():
+        found = drift(
+            results,
+            days=None if days is None else _parse_days(days),
+            tolerance_deg=tolerance_deg,
+            tolerance_cm=tolerance_cm,
+            own_lenses=own_lenses,
+        )
+    if plot is not None:
+        from calibgraph.audit.drift_plot import draw_drift
+
+        draw_drift(found, plot)
+    if as_json:
+        from calibgraph.audit import drift_summary
+
+        print_json(drift_summary(found))
+    else:
+        from calibgraph.cli.audit_tables import print_drift
+
+        print_drift(terminal(), found)
+        print_plain(terminal(), f"{plot}: written" if plot is not None else "nothing was written")
+    raise typer.Exit(_DRIFT_EXIT_CODES[found.status])
+
+
+def _parse_days(text: str) -> list[float]:
+    """Days of dates or numbers, separated by commas."""
+    return [_parse_day(part.strip()) for part in text.split(",")]
+
+
+def _parse_day(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return float(date.fromisoformat(text).toordinal())
+    except ValueError as error:
+        raise ValueError(
+            f"--days {text!r}: expected a date like 2026-03-01 or a number, for each result, "
+            "separated by commas"
+        ) from error

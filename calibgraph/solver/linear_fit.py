@@ -1,0 +1,159 @@
+"""Pose and further unknowns of one camera, such as those of its lens: a robust linear fit.
+
+All unknowns are fitted together, once. The fit of some of them, the others held at zero, follows
+from its quadratic.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.rig import Camera
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_twist import fill_twist_columns
+from calibgraph.solver.covariance import with_pseudo_frames
+from calibgraph.solver.spread_kernel import median
+from calibgraph.solver.whitening import upper_root
+from calibgraph.solver.within_place import WEAK
+from factors import ProjectionBlock, unit_diagonal
+
+Array = NDArray[np.float64]
+
+MIN_ROWS = 30  # fewer correspondences do not determine further unknowns
+_MAX_ITERATIONS = 20
+_CONVERGED = 1e-3  # largest change of an error in a step, in units of the loss' scale
+_WEAK = 1e-4  # information of an unknown: nearly free, so that a few matches have an inverse
+_LOSS_MEDIANS = 2.0 * 1.4826  # loss scale of 2 standard deviations, by the median of the errors
+
+
+@dataclass(frozen=True, eq=False)
+class Freed:
+    """Some of the unknowns, fitted with the pose.
+
+    Attributes:
+        twist: (6,) of the pose: T_camera_lidar = exp(twist) estimate [rad, m].
+        values: (m,) of the unknowns.
+        sigmas: (m,) standard deviations, by the scatter of the frames and what they share; NaN with
+            one frame.
+        compensating: (6, m) twists by which the pose makes up for a unit of each.
+        independent_shares: (m,) share (0 to 1, root mean square) of an unknown's Jacobian that is
+            independent of the pose and of the others. Near zero, the unknown is not observable.
+    """
+
+    twist: Array
+    values: Array
+    sigmas: Array
+    compensating: Array
+    independent_shares: Array
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFit:
+    """The minimum with all unknowns free, and what the fits of fewer are made of.
+
+    Attributes:
+        values: (6 + k,) twist, and the unknowns.
+        hessian: (6 + k, 6 + k), by the weights at the minimum.
+        gradients: (f, 6 + k) of the frames, there.
+        shared: variance of what all frames share, which their scatter does not show, over that of
+            independent matches.
+    """
+
+    values: Array
+    hessian: Array
+    gradients: Array
+    shared: float
+
+    def counted_from(self, start: Array) -> LinearFit:
+        """The same fit; the unknowns were linearized at (k,) values."""
+        return replace(self, values=self.values + np.append(np.zeros(6), start))
+
+    def free(self, *unknowns: int) -> Freed:
+        """The fit of the pose and some unknowns, with their numbers; the others are zero."""
+        rows = np.array([*range(6), *(6 + number for number in unknowns)])
+        own, frames = self.hessian[np.ix_(rows, rows)], len(self.gradients)
+        (scaled, units), pulls = unit_diagonal(own), self.gradients[:, rows]
+        inverse = np.linalg.inv(scaled) / np.outer(units, units)
+        values = inverse @ (self.hessian @ self.values)[rows]
+        scatter = with_pseudo_frames(pulls.T @ pulls, own, np.full(len(rows), float(frames)))
+        scatter += _weak(len(rows)) if frames > 1 else np.nan
+        whole = np.diag(inverse @ scatter @ inverse + self.shared * inverse)
+        shares = 1 / np.sqrt(np.diag(inverse) * np.diag(own))
+        compensating = np.asarray(-np.linalg.solve(own[:6, :6], own[:6, 6:]))
+        return Freed(values[:6], values[6:], np.sqrt(whole[6:]), compensating, shares[6:])
+
+
+def fit_camera(
+    camera: Camera,
+    block: CameraBlock,
+    fields_px: Array,
+    *,
+    loss_scale: float | None = None,
+    shared_variance: float = 0.0,
+) -> LinearFit | None:
+    """Fit pose and unknowns with a Cauchy loss on the norm of each match's error.
+
+    Args:
+        camera: lens, and the extrinsic about which is linearized.
+        block: its matches.
+        fields_px: (k, 2, n) derivatives of the pixels by the unknowns.
+        loss_scale: of the whitened errors; None: from their median, which holds for up to about a
+            third of outliers.
+        shared_variance: of what all frames share, over that of all matches if these were
+            independent.
+
+    Returns:
+        The fit, or None of fewer than ``MIN_ROWS`` matches, or where it has no derivative.
+    """
+    if len(block) < MIN_ROWS:
+        return None
+    columns = _linearize(camera, block.block, fields_px)
+    size, errors = len(columns) - 1, columns[-1].ravel()
+    flat, values = columns[:-1].reshape(size, -1), np.zeros(size)
+    for _ in range(_MAX_ITERATIONS):
+        squares = np.square((errors - values @ flat).reshape(2, -1)).sum(axis=0)
+        scale = loss_scale or _LOSS_MEDIANS * math.sqrt(median(squares)) + 1e-12
+        weights = np.tile(1.0 / (1.0 + squares / scale**2), 2)
+        weighted = flat * weights
+        hessian, before = weighted @ flat.T + _weak(size), values
+        values = np.linalg.solve(hessian, weighted @ errors)
+        if np.abs((values - before) @ flat).max() < _CONVERGED * scale:
+            break
+    if not np.isfinite(values).all():  # points where no derivative exists
+        return None
+    left = errors - values @ flat
+    pulls = (weighted * left).reshape(size, 2, -1).sum(axis=1)
+    gradients = np.add.reduceat(pulls, block.frame_edges[:-1], axis=1).T
+    variance = float(weights @ left**2 / weights.sum())
+    return LinearFit(values, hessian, gradients, shared_variance * variance)
+
+
+def _linearize(camera: Camera, block: ProjectionBlock, fields_px: Array) -> Array:
+    """(6 + k + 1, 2, n) whitened derivatives by a twist and the unknowns; last the errors."""
+    columns = np.empty((7 + len(fields_px), 2, len(block)))
+    pixels = fill_twist_columns(camera, block.points_lidar_m, columns[:6])
+    columns[6:-1] = fields_px
+    columns[-1] = camera.lens.subtract(block.pixels_px, pixels.T).T
+    if block.sqrt_information is not None:
+        s00, s01, s11 = block.sqrt_information.T
+        columns[:, 0] = s00 * columns[:, 0] + s01 * columns[:, 1]
+        columns[:, 1] *= s11
+    return columns
+
+
+def _weak(size: int) -> Array:
+    """(6 + k, 6 + k) information of a pose within sight and of unknowns that are nearly free."""
+    return np.diag([*np.diag(WEAK), *[_WEAK] * (size - 6)])
+
+
+def block_of(camera: Camera, table: Correspondences) -> CameraBlock:
+    """The rows of one camera, by frame, whitened by their information alone."""
+    table = table.select(np.argsort(table.frame, kind="stable"))
+    root = None if table.information_px is None else upper_root(table.information_px)
+    block = ProjectionBlock(camera.lens, table.points_lidar_m, table.pixels_px, root)
+    return CameraBlock(block, table.information_px, table.frame)

@@ -1,0 +1,113 @@
+"""Times of images: what they do to points and poses, in rig files, tables and comparisons."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibgraph import (
+    Correspondences,
+    Rig,
+    dataset_from_arrays,
+    evaluate,
+    export_calibration,
+    import_rig,
+    load_correspondences,
+    load_rig,
+)
+from calibgraph.errors import CalibrationError, FileError
+from calibgraph.matching.run import with_motion
+from calibgraph.model.clock import at_pixels, when_taken
+from calibgraph.simulation.rigs import rig_of
+
+TWISTS = np.array([[0.01, 0.02, 0.3, 8.0, 0.1, 0.0], [0.0, 0.0, -0.2, 12.0, 0.0, 0.1]])
+
+
+def rig_with(**times: float) -> Rig:
+    rig = rig_of("kitti")
+    cameras = {name: camera.model_copy(update=times) for name, camera in rig.cameras.items()}
+    return rig.model_copy(update={"cameras": cameras})
+
+
+def rows(twists: np.ndarray | None = TWISTS) -> Correspondences:
+    return Correspondences.from_arrays(
+        camera="image_2",
+        frame=[0, 1],
+        pixels_px=[[100.0, 50.0], [900.0, 300.0]],
+        points_lidar_m=[[12.0, 3.0, -1.0], [20.0, -4.0, 0.5]],
+        twist_per_s=twists,
+    )
+
+
+def test_points_at_a_late_image_are_seen_as_by_a_camera_that_moved_on() -> None:
+    camera, table = rig_with(time_offset_s=0.05).cameras["image_2"], rows()
+    moved = at_pixels(camera, table).points_lidar_m
+    for point, later, twist in zip(table.points_lidar_m, moved, TWISTS, strict=True):
+        there = when_taken(camera, twist).T_camera_lidar
+        here = camera.T_camera_lidar
+        np.testing.assert_allclose(
+            there[:3, :3] @ point + there[:3, 3], here[:3, :3] @ later + here[:3, 3], atol=1e-12
+        )
+        # 5 cm of the 10 m/s or so, and the turn; to second order 0.05^2 0.3 12 / 2 = 5 mm.
+        first_order = point - 0.05 * (twist[3:] + np.cross(twist[:3], point))
+        np.testing.assert_allclose(later, first_order, atol=0.01)
+
+
+def test_rows_below_the_middle_are_taken_later() -> None:
+    camera, table = rig_with(readout_s=0.04).cameras["image_2"], rows(TWISTS[[1, 1]])
+    moved = at_pixels(camera, table).points_lidar_m - table.points_lidar_m
+    assert moved[0, 0] > 0 > moved[1, 0]  # ahead: a later point is nearer
+
+
+def test_without_motion_or_times_nothing_moves() -> None:
+    late, table = rig_with(time_offset_s=0.05).cameras["image_2"], rows()
+    assert at_pixels(late, rows(None)).twist_per_s is None
+    np.testing.assert_array_equal(at_pixels(late, rows(None)).points_lidar_m, table.points_lidar_m)
+    assert at_pixels(rig_of("kitti").cameras["image_2"], table) is table
+    assert when_taken(late, None) is late
+
+
+@pytest.mark.parametrize("name", ["table.parquet", "table.csv"])
+def test_motion_is_kept_in_tables(tmp_path: Path, name: str) -> None:
+    rows().save(tmp_path / name)
+    np.testing.assert_array_equal(load_correspondences(tmp_path / name).twist_per_s, TWISTS)
+
+
+def test_half_a_motion_and_an_infinite_one_are_refused(tmp_path: Path) -> None:
+    rows().save(tmp_path / "table.csv")
+    text = (tmp_path / "table.csv").read_text().replace('"wz_rad_s",', "", 1)
+    (tmp_path / "table.csv").write_text(text)
+    with pytest.raises(FileError):
+        load_correspondences(tmp_path / "table.csv")
+    with pytest.raises(CalibrationError, match="twist must be finite"):
+        rows(np.full((2, 6), np.inf))
+
+
+def test_a_table_gets_the_motion_of_its_frames() -> None:
+    rig = rig_of("kitti")
+    cloud = np.ones((2, 10, 3))
+    images = {n: np.zeros((2, c.height_px, c.width_px), np.uint8) for n, c in rig.cameras.items()}
+    data = dataset_from_arrays(rig, cloud, images, twists_per_s=TWISTS)
+    np.testing.assert_array_equal(with_motion(rows(None), data).twist_per_s, TWISTS)
+    assert with_motion(rows(None), dataset_from_arrays(rig, cloud, images)).twist_per_s is None
+    with pytest.raises(CalibrationError, match="twists_per_s"):
+        dataset_from_arrays(rig, cloud, images, twists_per_s=TWISTS[:1])
+
+
+def test_rig_files_and_kalibr_carry_the_times(tmp_path: Path) -> None:
+    rig = rig_with(time_offset_s=0.021, time_offset_sigma_s=0.002, readout_s=0.03)
+    rig.save(tmp_path / "rig.yaml")
+    camera = load_rig(tmp_path / "rig.yaml").cameras["image_2"]
+    assert (camera.time_offset_s, camera.time_offset_sigma_s) == (0.021, 0.002)
+    assert (camera.readout_s, camera.readout_sigma_s) == (0.03, None)
+    (chain,) = export_calibration(rig, tmp_path / "camchain.yaml", "kalibr")
+    assert "timeshift_cam_lidar: 0.021" in Path(chain).read_text()
+    assert import_rig([chain]).cameras["image_2"].time_offset_s == 0.021
+
+
+def test_evaluation_compares_times_that_both_rigs_state() -> None:
+    found = evaluate(rig_with(time_offset_s=0.021, readout_s=0.03), rig_with(time_offset_s=0.02))
+    assert found.time_offset_ms == pytest.approx(dict.fromkeys(found.cameras, 1.0))
+    assert found.readout_ms == {}

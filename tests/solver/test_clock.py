@@ -1,0 +1,151 @@
+"""Clocks that are estimated with the extrinsics: found, not overrated, and kept where unseen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from calibgraph import (
+    Config,
+    Rig,
+    load_calibration,
+    load_correspondences,
+    simulate_correspondences,
+    solve,
+)
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import twist_between
+from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
+from calibgraph.simulation.lens_errors import put_lens_error
+from calibgraph.simulation.rigs import rig_of
+from calibgraph.solver.joint import solve_joint
+from factors import Clock
+from tests.solver.test_lens import FIVE_SIGMAS, simulated, squared_errors
+
+STRAIGHT = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
+
+
+def late(
+    offset_s: float, readout_s: float, seed: int = 0, twists: np.ndarray | None = None
+) -> tuple[Rig, Correspondences]:
+    """Two cameras like KITTI's whose images are late, and matches of 30 frames."""
+    rig, table = simulated(seed, frames=30, matches=100)
+    twists = draw_twists(30, np.random.default_rng(seed)) if twists is None else twists
+    return rig, put_clock_error(table, rig, twists, Clock(offset_s, readout_s))
+
+
+def with_times(rig: Rig, **times: float) -> Rig:
+    cameras = {name: camera.model_copy(update=times) for name, camera in rig.cameras.items()}
+    return rig.model_copy(update={"cameras": cameras})
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "readout_s", "part"),
+    [(0.1, 0.0, "offset"), (-0.02, 0.0, "offset"), (0.02, 0.03, "clock")],
+)
+def test_late_images_are_found(offset_s: float, readout_s: float, part: str) -> None:
+    truth, table = late(offset_s, readout_s)
+    found = solve_joint(truth, table, Config(estimate=part))
+    right = {"offset": offset_s, "readout": readout_s}
+    for name, parameters in found.lens.items():
+        for one in parameters:
+            assert one.is_determined
+            assert abs(one.value - right[one.name]) < FIVE_SIGMAS * one.sigma
+            assert one.sigma < 1e-3
+        assert found.solved_rig.cameras[name].time_offset_s == pytest.approx(
+            parameters[0].value, abs=1e-12
+        )
+    assert max(squared_errors(found, truth)) < chi2.isf(1e-6, 6)
+
+
+def test_a_known_clock_is_as_good_as_none() -> None:
+    """Points at the times of the pixels, and points of late images with the times in the rig."""
+    truth, table = late(0.04, 0.02)
+    _, same = late(0.0, 0.0)
+    known = with_times(truth, time_offset_s=0.04, readout_s=0.02)
+    expected, found = (solve_joint(rig, t) for rig, t in ((truth, same), (known, table)))
+    for name, T in expected.T_camera_lidar.items():
+        twist = twist_between(found.T_camera_lidar[name], T)
+        assert np.abs(twist).max() < 1e-6  # exact but for the digits of the displacement
+
+
+def test_a_saved_result_is_solved_again(tmp_path: Path) -> None:
+    truth, table = late(0.03, 0.0)
+    result = solve(truth, table, Config(estimate=("offset",)))
+    result.save(tmp_path)
+    saved = load_calibration(tmp_path)
+    for name, camera in result.rig.cameras.items():
+        assert saved.rig.cameras[name].time_offset_s == camera.time_offset_s
+    for name in ("correspondences.parquet", "table.csv"):
+        assert result.correspondences is not None
+        if name.endswith("csv"):
+            result.correspondences.save(tmp_path / name)
+        again = solve(saved.rig, load_correspondences(tmp_path / name))
+        for camera, T in result.T_camera_lidar.items():
+            twist = twist_between(again.T_camera_lidar[camera], T)
+            sigmas = np.sqrt(np.diag(result.covariance[camera]))
+            assert np.abs(twist / sigmas).max() < 1.0  # its offset is now exact
+
+
+@pytest.mark.parametrize("twists", [np.zeros((30, 6)), np.tile(STRAIGHT, (30, 1))])
+def test_at_rest_or_straight_ahead_the_offset_stays_at_its_prior(twists: np.ndarray) -> None:
+    """Straight ahead at constant speed it is a translation ahead, which is then as uncertain."""
+    truth, table = late(0.02, 0.0, twists=twists)
+    found = solve_joint(truth, table, Config(estimate=("offset",)))
+    for parameters in found.lens.values():
+        (one,) = parameters
+        assert not one.is_determined
+        assert abs(one.value - one.prior) < 0.1 * one.prior_sigma
+        assert "not determined by these data; record turns" in one.describe()
+        if twists.any():
+            assert (one.direction, round(one.correlation, 1)) == ("z", 1.0)
+    if twists.any():
+        assert found.covariance is not None
+        ahead_m = found.covariance[5, 5] ** 0.5
+        assert ahead_m == pytest.approx(10.0 * one.sigma, rel=0.05)
+
+
+def test_a_table_without_motion_keeps_the_prior() -> None:
+    rig, table = simulated(0, frames=10, matches=150)
+    found = solve_joint(rig, table, Config(estimate=("clock",)))
+    for parameters in found.lens.values():
+        assert [one.name for one in parameters] == ["offset", "readout"]
+        assert not any(one.is_determined for one in parameters)
+
+
+def test_lens_and_clock_are_told_apart() -> None:
+    truth, table = late(0.05, 0.0)
+    found = solve_joint(put_lens_error(truth, "focal", 0.01), table, Config(estimate="lens,offset"))
+    for parameters in found.lens.values():
+        by_name = {one.name: one for one in parameters}
+        for name, right in (("focal", 718.856), ("offset", 0.05)):
+            one = by_name[name]
+            assert one.is_determined
+            assert abs(one.value - right) < FIVE_SIGMAS * one.sigma
+
+
+def test_a_panorama_has_a_clock() -> None:
+    rig = rig_of("panorama")
+    (name,) = rig.cameras
+    table = simulate_correspondences(rig, frames=20, matches=200)
+    twists = draw_twists(20, np.random.default_rng(0))
+    table = put_clock_error(table, rig, twists, Clock(0.05))
+    found = solve_joint(rig, table, Config(estimate="lens,offset"))
+    (one,) = found.lens[name]
+    assert one.name == "offset"
+    assert abs(one.value - 0.05) < FIVE_SIGMAS * one.sigma
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize(("offset_s", "readout_s"), [(0.005, 0.0), (0.1, 0.03)])
+def test_errors_are_as_large_as_the_error_bar_says(offset_s: float, readout_s: float) -> None:
+    """Mean NEES over 6: 0.8 to 1.25, give or take three standard deviations of its draws."""
+    squared, draws = [], 40
+    for seed in range(draws):
+        truth, table = late(offset_s, readout_s, seed)
+        squared += squared_errors(solve_joint(truth, table, Config(estimate="clock")), truth)
+    scatter = 3 * np.sqrt(2 / 6 / draws)
+    assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter
