@@ -25,7 +25,6 @@ READERS_PAGES = [page for page in PAGES if page.name != "CHANGELOG.md"]
 PROSE_PAGES = sorted([ROOT / "README.md", ROOT / "data" / "README.md", *ROOT.glob("docs/**/*.md")])
 LONGEST_SENTENCE = 35
 LONGEST_README = 800
-SERVER = "--server http://127.0.0.1:8080 "  # an option of the program, before the command
 VALUES = ("--help", "--version", "--debug")
 
 
@@ -92,7 +91,7 @@ def command_lines(page: Path) -> Iterator[list[str]]:
         found = re.search(r"(?:^|\| )calibgraph (.*)", line)
         if found:
             shell = re.split(r" [|<>] ", found[1].split("  #")[0])[0]
-            yield shlex.split(shell.removeprefix(SERVER))
+            yield shlex.split(shell)
 
 
 @pytest.mark.parametrize("page", READERS_PAGES, ids=name_of)

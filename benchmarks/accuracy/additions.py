@@ -45,10 +45,12 @@ def main() -> None:
                for paths in (options.tune, options.count)]  # fmt: skip
     tables = []
     for name, level in ((TABLES, "table"), (STRUCTURE, "data")):
-        tuned, kept_out = (samples_of(r for r in of if r["level"] == level) for of in records)
-        clear = [sample for sample in tuned if sample.kind not in AMBIGUOUS]
-        if clear and kept_out:
-            tables.append(additions(name, clear, kept_out, jobs=options.jobs))
+        tuned, kept_out = (
+            [s for s in samples_of(r for r in of if r["level"] == level) if s.kind not in AMBIGUOUS]
+            for of in records
+        )
+        if tuned and kept_out:
+            tables.append(additions(name, tuned, kept_out, jobs=options.jobs))
     ledger.publish_cases("accuracy.additions", tables, sum(records, []), record=options.record)
 
 

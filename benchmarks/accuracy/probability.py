@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 from scipy.special import expit, logit
 
 from benchmarks.accuracy import data_cases, ledger, table_cases
@@ -167,6 +167,19 @@ def fit(samples: Sequence[Sample]) -> dict[str, Any]:
     }
 
 
+def with_intercept(model: dict[str, Any], samples: Sequence[Sample]) -> dict[str, Any]:
+    """The same weights with the intercept that suits the samples best."""
+    off = np.array([sample.off for sample in samples])
+    counts = np.where(off, SHARE_OFF / off.mean(), (1 - SHARE_OFF) / (1 - off.mean()))
+
+    def loss(intercept: float) -> float:
+        p = np.clip(probabilities({**model, "intercept": intercept}, samples), 1e-12, 1 - 1e-12)
+        return -float(counts @ np.log(np.where(off, p, 1 - p)))
+
+    found = minimize_scalar(loss, bounds=(-15.0, 0.0), method="bounded").x
+    return {**model, "intercept": round(float(found), 3)}
+
+
 def drop(sample: Sample, kinds: Collection[str]) -> Sample:
     """The sample without some kinds of checks."""
     kept = {kind: value for kind, value in sample.severities.items() if kind not in kinds}
@@ -246,6 +259,7 @@ def main() -> None:
     parser.add_argument("--tune", type=Path, nargs="+", default=[], help="files of verdicts")
     parser.add_argument("--count", type=Path, nargs="+", required=True, help="files of verdicts")
     parser.add_argument("--without", default="", help="kinds of checks, left out of everything")
+    parser.add_argument("--keep-weights", action="store_true", help="fit the intercepts alone")
     parser.add_argument("--write", action="store_true", help="the weights into the package")
     add_record_option(parser)
     options = parser.parse_args()
@@ -263,7 +277,11 @@ def main() -> None:
             for which, each in sets.items()
         }
         clear = [sample for sample in of_level["fitted"] if sample.kind not in AMBIGUOUS]
-        models[name] = fit(clear) if clear else json.loads(FILE.read_text("utf-8"))["models"][name]
+        present = json.loads(FILE.read_text("utf-8"))["models"][name]
+        if not clear:
+            models[name] = present
+        else:
+            models[name] = with_intercept(present, clear) if options.keep_weights else fit(clear)
         for which, samples in of_level.items():
             if samples:
                 tables += judged(f"{name}, {which}", models[name], samples)

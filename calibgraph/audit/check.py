@@ -29,7 +29,7 @@ from calibgraph.model.versions import package_versions
 from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, assign_places
-from calibgraph.trust.cross_validation import competing_solution_checks
+from calibgraph.trust.competing_solution import competing_solution_checks
 from calibgraph.trust.evidence import Checks, Evidence, concatenate
 from calibgraph.trust.guess import point_distance_checks
 from calibgraph.trust.image_evidence import measure_image_evidence

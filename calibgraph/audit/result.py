@@ -73,7 +73,7 @@ class Audit:
         tolerance_deg, tolerance_cm: largest deviation per axis that is OK.
         frames: number of frames that were matched.
         timings_s: wall time per stage.
-        versions: of this package and the libraries that matter; empty if a server has measured.
+        versions: of this package and the libraries that matter.
         deployed: the rig that was compared; None if only the numbers are known.
         shown: the frame that a page shows, in the middle of the recording; None if unknown.
         recording: the sources of the frames.
@@ -172,42 +172,3 @@ def twist_cells(twist: Array | None, form: str) -> list[str]:
     if twist is None:
         return ["-"] * 6
     return [format(value, form) for value in (*np.degrees(twist[:3]), *(100 * twist[3:]))]
-
-
-def audit_of(summary: Mapping[str, Any]) -> Audit:
-    """The audit of a summary, see :func:`audit_summary`."""
-    lidar = summary["lidar"]
-    return Audit(
-        cameras={
-            name: CameraAudit(
-                status=camera["status"],
-                reason=camera["reason"],
-                deviation=_from_units("deviation", camera),
-                sigma=_from_units("sigma", camera),
-                detectable=_from_units("detectable", camera),
-                z_score=camera["z_score"],
-            )
-            for name, camera in summary["cameras"].items()
-        },
-        lidar=None if lidar is None else _lidar_of(lidar),
-        tolerance_deg=summary["tolerance_deg"],
-        tolerance_cm=summary["tolerance_cm"],
-        frames=summary["frames"],
-        same_recording=summary.get("same_recording", False),
-        timings_s=summary["timings_s"],
-    )
-
-
-def _lidar_of(summary: Mapping[str, Any]) -> LidarAudit:
-    motion, sigma = _from_units("motion", summary), _from_units("sigma", summary)
-    if motion is None or sigma is None:
-        raise ValueError("the motion of the LiDAR has no numbers")
-    return LidarAudit(summary["reason"], motion, sigma)
-
-
-def _from_units(name: str, summary: Mapping[str, Any]) -> Array | None:
-    """The inverse of :func:`by_unit`."""
-    degrees, centimetres = summary[f"{name}_deg"], summary[f"{name}_cm"]
-    if degrees is None:
-        return None
-    return np.concatenate([np.radians(degrees), np.array(centimetres) / 100.0])

@@ -18,7 +18,7 @@ from typing import Annotated, Any, TextIO
 
 import typer
 
-from calibgraph.cli import outputs, remote
+from calibgraph.cli import outputs
 from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.exchange import export, import_
@@ -58,7 +58,6 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    context: typer.Context,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
     version: Annotated[
         bool,
@@ -66,18 +65,8 @@ def _options(
             "--version", callback=_print_version, is_eager=True, help="Print the version."
         ),
     ] = False,
-    server: Annotated[
-        str | None,
-        typer.Option(
-            metavar="URL",
-            help="Let a server of calibgraph serve carry out calibrate, solve or check. Its token: "
-            "the variable CALIBGRAPH_TOKEN.",
-        ),
-    ] = None,
 ) -> None:
     """Options before the command; ``--debug`` is read by :func:`main`."""
-    remote.SERVER.set(server)
-    remote.require_known(context.invoked_subcommand)
 
 
 COMMANDS: dict[Callable[..., None], outputs.Outputs] = {

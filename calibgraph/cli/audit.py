@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from calibgraph.cli import remote
 from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
 from calibgraph.cli.options import DatasetArgument, FramesOption, JsonOption, SeedOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
@@ -41,7 +40,6 @@ def check(
     """
     from calibgraph.audit import check
     from calibgraph.audit.check import is_made_from
-    from calibgraph.audit.result import audit_of
     from calibgraph.audit.significance import Tolerance
     from calibgraph.io.rigs import load_rig
 
@@ -49,20 +47,16 @@ def check(
         Tolerance(tolerance_deg, tolerance_cm)
         matcher = matcher_from("structure", None, seed=seed, all_frames=frames is not None)
     data, deployed = dataset_from(dataset, rig, frames), load_rig(rig)
-    if remote.SERVER.get() is not None:
-        wanted = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm, "seed": seed}
-        audit = audit_of(remote.check(rig, data, frames, wanted)).of_recording(deployed, data)
-    else:
-        with progress_bar() as progress:
-            audit = check(
-                deployed,
-                data,
-                tolerance_deg=tolerance_deg,
-                tolerance_cm=tolerance_cm,
-                matcher=matcher,
-                seed=seed,
-                progress=progress,
-            )
+    with progress_bar() as progress:
+        audit = check(
+            deployed,
+            data,
+            tolerance_deg=tolerance_deg,
+            tolerance_cm=tolerance_cm,
+            matcher=matcher,
+            seed=seed,
+            progress=progress,
+        )
     audit = replace(audit, same_recording=is_made_from(rig, data))
     if page is not None:
         from calibgraph.audit.page import write_audit_report

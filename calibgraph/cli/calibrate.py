@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibgraph.cli import options, remote
+from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments, config_from, terms_from
 from calibgraph.cli.matching_options import MatchingOptions, with_matching_options
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
@@ -49,19 +49,16 @@ def calibrate(
         checked_terms = terms_from(terms)
         chosen = matching.find_matcher(seed=settings.seed, lens_too=True)
     data = matching.load_dataset(dataset)
-    if remote.SERVER.get() is not None:
-        result, written = remote.calibrate(data, matching, settings, checked_terms, out)
-    else:
-        with progress_bar() as progress:
-            result = calibrate(
-                data,
-                matcher=chosen,
-                config=settings,
-                terms=checked_terms,
-                time_limit_s=matching.limit_s,
-                progress=progress,
-            )
-            written = write_result(result, out, data)
+    with progress_bar() as progress:
+        result = calibrate(
+            data,
+            matcher=chosen,
+            config=settings,
+            terms=checked_terms,
+            time_limit_s=matching.limit_s,
+            progress=progress,
+        )
+        written = write_result(result, out, data)
     _print_frames_used(len(result.frames), data)
     _print_and_exit(result, written, as_json=as_json)
 
@@ -139,16 +136,8 @@ def solve(
         }
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)
-        if camera_matches is not None and remote.SERVER.get() is not None:
-            raise ValueError("--camera-matches stays here: a server takes correspondences alone")
-        if (print_graph or graph is not None) and remote.SERVER.get() is not None:
-            raise ValueError("a server returns no graph; leave --print-graph and --graph out")
         if print_graph and as_json:
             raise ValueError("--print-graph and --json both print; choose one")
-    if remote.SERVER.get() is not None:
-        remote_result = remote.solve(rig, correspondences, settings, checked_terms, out)
-        _print_and_exit(*remote_result, as_json=as_json)
-        return
     with progress_bar("solving"), checked_arguments():
         seen = None if camera_matches is None else load_camera_matches(camera_matches)
         result = solve(load_rig(rig), correspondences, settings, checked_terms, camera_matches=seen)

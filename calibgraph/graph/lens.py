@@ -101,6 +101,11 @@ class LensVariable:
         free = FreeLens(camera.lens, tuple(chosen), tuple(chosen.values()), clock_of(camera))
         return LensVariable(camera, free, np.zeros(len(chosen)))
 
+    @property
+    def has_free_lens(self) -> bool:
+        """Whether more than the clock is free."""
+        return not {*self.free.parameters} <= {*CLOCK}
+
     def moved_to(self, values: Array) -> LensVariable:
         """The same variable, where correspondences are weighed and gated at other values."""
         return replace(self, values=values)
@@ -108,7 +113,7 @@ class LensVariable:
     def put_into(self, camera: Camera, values: Array) -> Camera:
         """A camera with the lens and clock of (k,) values."""
         camera = put_clock_into(camera, self.free.clock_at(values), self.free.parameters)
-        if not {*self.free.parameters} - {*CLOCK}:
+        if not self.has_free_lens:
             return camera
         packed = self.free.at(values).packed
         intrinsics = dict(zip(("fx", "fy", "cx", "cy"), packed[:4].tolist(), strict=True))

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.files import sha256
 from calibgraph.io.bags import MESSAGE_SUFFIX, hash_message
@@ -32,7 +33,6 @@ class Sized(Protocol):
         ...
 
 
-Array = NDArray[np.float64]
 Derived = TypeVar("Derived", bound=Sized)
 
 

@@ -183,8 +183,9 @@ class Calibration:
     def not_included(self) -> str:
         """Sentence about errors that the bars leave out: relative poses show the clouds' scale."""
         scale = "" if self.rig.relative_poses else ", and of the clouds' scale,"
-        fixed = "errors of the other intrinsics" if self.lens else "errors of the intrinsics"
-        if self.config.of == "mount" and not self.lens:
+        free = self.lens and {*self.config.estimate} - {"offset", "readout"}
+        fixed = "errors of the other intrinsics" if free else "errors of the intrinsics"
+        if self.config.of == "mount" and not free:
             fixed += " beyond what a calibration with a target leaves"
         return f"{fixed}{scale} are not included"
 

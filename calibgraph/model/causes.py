@@ -92,8 +92,7 @@ CAUSES: dict[str, Cause] = {
     "matches": Cause(
         "wrong correspondences",
         "Look at the residuals of the matches in the report: too many are wrong.",
-        {"residual_spread": "", "inlier_share": "", "competing_solution": "", "held_out": "",
-         "failed_frames": "", "restart_rotation": _SPREAD, "restart_translation": _SPREAD,
+        {"competing_solution": "", "failed_frames": "",
          "assumed_spread": "Leave loss_scale_px out of the config, or raise it.",
          "start_dependence": _LEARNED, "memorization": _LEARNED},
     ),

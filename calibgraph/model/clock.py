@@ -10,13 +10,11 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
 from factors import Clock, displace
-
-Array = NDArray[np.float64]
 
 
 def clock_of(camera: Camera) -> Clock:

@@ -22,6 +22,7 @@ ABOUT_THE_DATA = frozenset(
         "correspondences",
         "correspondences_used",
         "difference between even and odd frames",  # too few frames to split
+        "failed_frames",
         "focal_sensitivity",
         "frames",
         "image evidence",

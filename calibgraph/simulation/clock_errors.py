@@ -3,13 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from factors import Clock, displace
-
-Array = NDArray[np.float64]
 
 _TURN_RAD_S = (0.02, 0.02, 0.2)
 _SPEED_M_S, _SLIP_M_S = (2.0, 15.0), (0.1, 0.05)

@@ -93,8 +93,8 @@ def lens_errors(at: FittedObjective) -> dict[int, Array]:
     """
     found = {}
     for name, block in at.projections.items():
-        camera = at.objective.rig.cameras[name]
-        if name in at.objective.lenses or camera.model == "equirectangular":
+        camera, free = at.objective.rig.cameras[name], at.objective.lenses.get(name)
+        if (free is not None and free.has_free_lens) or camera.model == "equirectangular":
             continue
         lens = LensVariable.of(camera, _LENS, LensSigmas.calibrated(camera))
         sums = FreeLensBlock(block, lens.free).sums(at.T_camera_lidar[name], lens.values)

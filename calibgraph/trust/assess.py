@@ -12,12 +12,10 @@ from collections.abc import Callable
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
-from calibgraph.trust.conventions import likely_intended_guess
-from calibgraph.trust.cross_validation import (
+from calibgraph.trust.competing_solution import (
     competing_solution_checks,
-    held_out_checks,
-    restart_checks,
 )
+from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.evidence import Checks, Evidence, concatenate
 from calibgraph.trust.guess import (
     guess_checks,
@@ -58,9 +56,7 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     place_checks,               # does a place contradict the others?
     repeated_frame_checks,      # how many are of one place, or copies?
     assumed_spread_checks,      # does the configured loss scale suit the residuals?
-    held_out_checks,            # does it explain frames that it was not fitted to?
     intrinsics_checks,          # would another lens explain the residuals?
-    restart_checks,             # do solves from displaced starts end here?
     bootstrap_checks,           # does a bootstrap over frames give the reported covariance?
     prior_share_checks,         # how much of it comes from the priors?
 )  # fmt: skip

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, gammaincc
 
-from calibgraph.model.verdict import COMMON_ERROR, Check, ErrorProbability, Verdict
+from calibgraph.model.verdict import COMMON_ERROR, PASS_BELOW, Check, ErrorProbability, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
 
 Array = NDArray[np.float64]
@@ -60,6 +60,8 @@ def probability_of_checks(checks: Sequence[Check], model: str) -> float:
     worst = worst_severities(zip(kinds, (check.severity for check in checks), strict=True))
     parts = contributions(worst, fitted["weights"], fitted["other"])
     grossly = float(expit(fitted["intercept"] + sum(parts.values())))
+    if any(value > 1.0 for kind, value in worst.items() if kind not in fitted["weights"]):
+        grossly = max(grossly, PASS_BELOW)  # no case had it: what it says is not known
     values = [(k, check.status, check.value) for k, check in zip(kinds, checks, strict=True)]
     return 1.0 - (1.0 - grossly) * (1.0 - probability_of_lens(values))
 

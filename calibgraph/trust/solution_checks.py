@@ -41,18 +41,6 @@ def check_estimate(estimate: Estimate) -> list[Check]:
     return [check for function in ESTIMATE_CHECKS for check in function(estimate)]
 
 
-def residual_checks(estimate: Estimate) -> list[Check]:
-    """How large the residuals are, and how many are within the gate."""
-    residuals = estimate.residuals
-    if residuals is None:
-        return []
-    spread_deg = np.degrees(residuals.sigma_px / estimate.camera.lens.pixels_per_rad)
-    return [
-        threshold("residual_spread").check(spread_deg),
-        threshold("inlier_share").check(residuals.inlier_share),
-    ]
-
-
 def sigma_checks(estimate: Estimate) -> list[Check]:
     """The error bar, and its lower bound if every correspondence were independent."""
     return [
@@ -155,7 +143,6 @@ def convergence_checks(estimate: Estimate) -> list[Check]:
 
 
 ESTIMATE_CHECKS: tuple[Callable[[Estimate], list[Check]], ...] = (
-    residual_checks,
     sigma_checks,
     common_error_checks,
     relative_pose_checks,

@@ -43,11 +43,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "Can the points be in metres?", "LiDARs do not measure farther.",
               "are the clouds in millimetres?"),
     # the estimate
-    Threshold("residual_spread", "residual spread", "at most", 0.25, 0.5, "deg",
-              "How large are the residuals, as a viewing angle?",
-              "Half a degree is what a wrong match looks like."),
-    Threshold("inlier_share", "inlier share", "at least", 0.6, 0.3, "share",
-              "How many correspondences does the gate tau keep?", _COUNTED),
     Threshold("sigma_rotation", "sigma: rotation", "at most", 0.15, 0.5, "deg",
               "How large is the standard deviation about the worst axis; its lower bound from the "
               "data alone; the error that the matcher's frames share?",
@@ -103,7 +98,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "image and cloud hardly agree better than by chance; check the guess (p_camera = "
               "T_camera_lidar * p_lidar: its direction, axes and units), the intrinsics, and that "
               "images and clouds belong together"),
-    # cross-validation
+    # the frames
     Threshold("competing_solution", "matches of a competing solution over those of this one",
               "at most", 0.25, 0.5, "share",
               "Do the matches that were left out agree on another extrinsic?", _COUNTED),
@@ -125,17 +120,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("assumed_spread", "residual spread over the assumed one", "at most", 2.0, 4.0,
               "times", "Does the configured loss scale suit the residuals?", _COUNTED,
               "the matches are worse than loss_scale_px (delta) assumes"),
-    Threshold("held_out", "error of held-out frames over that of fitted ones", "at most", 1.5, 3.0,
-              "times", "Does the result explain frames that it was not fitted to?", _COUNTED,
-              "too few matches for the numbers that were fitted to them"),
-    Threshold("restart_rotation", "difference after a displaced start", "at most", 0.1, 0.5, "deg",
-              "Do solves from displaced starts end at the same result?", _COUNTED,
-              "the matches leave room for several solutions; give more of them, or better spread",
-              of_tolerance=True),
-    Threshold("restart_translation", "difference after a displaced start", "at most", 3.0, 15.0,
-              "cm", "The same.", _COUNTED,
-              "the matches leave room for several solutions; give more of them, or better spread",
-              of_tolerance=True),
     Threshold("bootstrap_sigma", "bootstrap sigma over reported sigma", "at most", 2.0, 5.0, "",
               "Does a bootstrap over frames give the reported covariance?", _COUNTED,
               "the frames disagree more than the error bar allows"),

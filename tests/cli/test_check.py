@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from calibgraph import Audit, CameraAudit, load_rig
-from calibgraph.audit import audit_summary, check
-from calibgraph.cli import remote
+from calibgraph import Audit, load_rig
+from calibgraph.audit import check
 from tests.audit.deployed import motion, with_camera_moved
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call, CommandRun
@@ -105,21 +104,6 @@ def test_the_page_replaces_only_its_own(call: Call, tmp_path: Path) -> None:
     (recording / "cameras").mkdir(parents=True)
     found = call("check", REFERENCE, recording, "--page", recording / "cameras" / "check.html")
     assert "is among the data of" in error_line(*found)
-
-
-def test_a_server_measures_and_the_page_is_made_here(
-    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    names = ("front_left", "front_right", "left")
-    audit = Audit({name: CameraAudit("OK", "nothing") for name in names}, None, 0.5, 10.0, 6)
-    monkeypatch.setattr(remote, "check", lambda *_: audit_summary(audit))
-    page = tmp_path / "check.html"
-    given = ("--server", "http://127.0.0.1:1", "check", REFERENCE, SAMPLE, "--page", page)
-    code, _, err = call(*given)
-    assert (code, err.rstrip().endswith(f"{page}: written")) == (0, True)
-    text = page.read_text()
-    assert "a server has measured" in text
-    assert text.count("data:image/jpeg") == 3
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,7 @@ def test_checks_of_one_cause_are_one_reason_that_names_its_own_cameras_and_the_o
 
 
 def test_of_many_causes_the_worst_three_are_shown_and_the_others_folded() -> None:
-    verdict = of_kinds("residual_spread", "frames", "lens", "own_clouds", "guess_rotation")
+    verdict = of_kinds("competing_solution", "frames", "lens", "own_clouds", "guess_rotation")
     summary = summarize({"left": Verdict((*verdict.checks, FAILED))}, {"left": ("loose height",)})
     assert [reason.cause for reason in summary.reasons] == ["solver", "guess", "time"]
     assert len(summary.actions) == MOST
@@ -133,7 +133,7 @@ def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
 
 
 def test_a_failed_camera_has_no_error_bar_and_no_advice_about_it() -> None:
-    checks = (threshold("residual_spread").check(9.0), threshold("sigma_rotation").check(9.0))
+    checks = (threshold("competing_solution").check(9.0), threshold("sigma_rotation").check(9.0))
     summary = summarize({"left": Verdict(checks, ErrorProbability(0.9))}, sources={"left": WIDE})
     assert [reason.cause for reason in summary.reasons] == ["matches", "error bar"]
     assert summary.actions == (CAUSES["matches"].action,)
@@ -141,11 +141,12 @@ def test_a_failed_camera_has_no_error_bar_and_no_advice_about_it() -> None:
 
 
 def test_a_doubt_without_a_check_beyond_its_limit_names_the_nearest_one() -> None:
-    checks = (threshold("residual_spread").check(0.24), threshold("time_offset").check(0.01))
+    checks = (threshold("competing_solution").check(0.24), threshold("time_offset").check(0.01))
     summary = summarize({"left": Verdict(checks, ErrorProbability(0.02))})
     (reason,) = summary.reasons
     assert (reason.status, reason.cause) == ("WARN", "matches")
     assert reason.text == (
-        "no check is beyond its limit; nearest to it is residual spread 0.24 deg"
+        "no check is beyond its limit; nearest to it is "
+        "matches of a competing solution over those of this one 24%"
     )
     assert summary.actions == (CAUSES["matches"].action,)

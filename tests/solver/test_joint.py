@@ -269,7 +269,6 @@ def test_seven_of_ten_outliers_and_a_guess_20_deg_off_are_survived(mixed_rig: Ri
         assert degrees < 0.1
         assert centimetres < 3
         assert result.residuals["front"].sigma_px == pytest.approx(1.0, rel=0.1)
-        assert result.verdict.status != "PASS"  # so few inliers are worth a word
 
 
 def test_without_pnp_a_narrowing_loss_leads_to_where_matches_are_densest(

@@ -41,7 +41,7 @@ def test_a_check_that_gets_worse_is_never_less_severe(row) -> None:  # type: ign
 
 
 def test_severity_has_no_step_at_the_limits() -> None:
-    row = threshold("residual_spread")
+    row = threshold("halves_rotation")
     for limit, expected in ((row.warn, 1.0), (row.fail, 2.0)):
         for side in (1 - 1e-9, 1 + 1e-9):
             assert row.check(limit * side).severity == pytest.approx(expected, abs=1e-6)
@@ -50,7 +50,7 @@ def test_severity_has_no_step_at_the_limits() -> None:
 def test_a_finding_without_a_number_is_in_the_middle_of_its_status() -> None:
     severities = [Check("x", status, "").severity for status in ("PASS", "WARN", "FAIL")]
     assert severities == [0.0, 1.5, 2.5]
-    assert threshold("residual_spread").check(math.nan).severity == 3.0
+    assert threshold("halves_rotation").check(math.nan).severity == 3.0
 
 
 def test_steps_go_through_pass_warn_and_fail() -> None:

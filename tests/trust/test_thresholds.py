@@ -62,6 +62,6 @@ def test_the_markdown_has_all_rows() -> None:
         assert f"{row.direction} " in line
     for limit in LIMITS:
         assert sum(line.startswith(f"| `{limit.key}` ") for line in lines) == 1
-    assert "| at most 0.25 deg | above 0.5 deg |" in thresholds_markdown()
-    assert "| at least 60% | below 30% |" in thresholds_markdown()
+    assert "| at most 35% | above 90% |" in thresholds_markdown()
+    assert "| at least 4 | below 2.5 |" in thresholds_markdown()
     assert "| at least 50 | never |" in thresholds_markdown()
