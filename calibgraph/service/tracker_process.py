@@ -156,8 +156,8 @@ def _open(folder: Path) -> _Open:
 
 def _take_frames(tracker: _Open, request: TrackerRequest) -> dict[str, Any]:
     """Take in frames; each update is on disk before it is in the answer."""
-    from calibgraph.tracking.report import json_line
     from calibgraph.tracking.streams import Refused
+    from calibgraph.tracking.update import json_line
 
     updates: list[Any] = []
     refused: list[str] = []
@@ -200,7 +200,7 @@ def _items(request: TrackerRequest, refused: list[str]) -> Iterator[Item]:
 
 def _note_events(folder: Path, update: Any, known: set[str]) -> None:
     """Add an update's events to the list."""
-    from calibgraph.tracking.report import json_line
+    from calibgraph.tracking.update import json_line
 
     if not update.events:
         return

@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.model.rig import Rig
@@ -17,16 +17,17 @@ from calibgraph.solver.camera_block import (
     CameraBlock,
     camera_blocks,
 )
+from calibgraph.solver.elimination import Linearization
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.tracking.cause import squared_sigmas
+from calibgraph.tracking.cause import chance_limit, squared_sigmas
+from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
-from calibgraph.tracking.place_shift import agrees_at_its_place
-from calibgraph.tracking.posterior import sums_of_frame
+from calibgraph.tracking.place_model import states_places
 from calibgraph.tracking.start import count_residuals
 from calibgraph.tracking.state import State
-from calibgraph.tracking.window import Window
+from calibgraph.tracking.sums import Sums, minimum, sums_of_frame, sums_of_matches
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
@@ -55,28 +56,21 @@ def blocks_by_camera(state: State, rig: Rig, table: Correspondences) -> dict[int
     return {state.names.index(name): block for name, block in blocks.items()}
 
 
-def inliers_at(
-    state: State, window: Window, blocks: Mapping[int, CameraBlock]
-) -> dict[int, NDArray[np.bool_]]:
-    """Per camera which matches are within the gate at the window's estimate, if enough are."""
-    inliers = {}
-    for camera, block in blocks.items():
-        T_camera_lidar = to_T_camera_lidar(window.T_lidar_camera(camera))
-        rows = block.at(T_camera_lidar).inliers(state.cameras[camera].scale)
-        if np.count_nonzero(rows) >= MIN_MATCHES:
-            inliers[camera] = rows
-    return inliers
+def at_minimum(state: State, closed: ClosedPlaces, more: Mapping[int, Sums] | None = None) -> State:
+    """The state with the last epoch's estimates at the minimum of Eq. 5, where frames are gated.
 
-
-def with_estimates(state: State, window: Window) -> State:
-    """The state with the window's estimates of the last epoch."""
-    estimates = tuple(window.T_lidar_camera(camera) for camera in range(len(state.names)))
-    last = replace(state.epochs[-1], T_lidar_camera=estimates)
+    Args:
+        state: the tracker's.
+        closed: its closed epochs.
+        more: sums of further matches, per camera.
+    """
+    poses = minimum(closed.equation_5(state, more), state.T_lidar_camera)
+    last = replace(state.epochs[-1], T_lidar_camera=poses)
     return replace(state, epochs=(*state.epochs[:-1], last))
 
 
 def select_agreeing(
-    state: State, blocks: Mapping[int, CameraBlock]
+    state: State, closed: ClosedPlaces, blocks: Mapping[int, CameraBlock]
 ) -> tuple[State, dict[int, CameraBlock]]:
     """The blocks of started cameras that agree with the estimate; the others are set aside.
 
@@ -98,11 +92,39 @@ def select_agreeing(
             camera_state=one,
             config=state.config,
         )
-        if own is not None and agrees_at_its_place(state, camera, own):
+        if own is not None and agrees_at_its_place(state, closed, camera, own):
             agreeing[camera] = block
         else:
             state = _set_aside(state, camera, own)
     return state, agreeing
+
+
+def agrees_at_its_place(state: State, closed: ClosedPlaces, camera: int, own: OutlierFrame) -> bool:
+    """Whether a frame that disagrees with a camera's estimate agrees with the pose of its place.
+
+    In the graph with this frame: if its place is displaced by no more than places are, and the
+    pose there explains it.
+
+    Args:
+        state: before the frame is absorbed; the last live frame has its place.
+        closed: its closed epochs.
+        camera: by its place in the rig.
+        own: the frame, with the T_lidar_camera that fits it.
+    """
+    one, frame = state.cameras[camera], state.live_frames[-1]
+    if one.summary.walk or state.config.preset != "auto" or not states_places(state):
+        return False
+    residuals = own.raw.at(to_T_camera_lidar(own.T_lidar_camera))
+    inliers = residuals.inliers(one.scale)
+    sums = sums_of_frame(residuals, inliers, one.scale, state.references[camera])
+    state = with_open_frame(state, frame.add(camera, own.raw, inliers, sums))
+    window, _ = closed.with_open_epoch(state, closed.posterior + state.epochs[-1].sums, None)
+    place = window.places.index(frame.place)
+    displaced = Linearization.at(window.model, window.values).distances[place, [0, 1 + camera]]
+    if displaced @ displaced > chance_limit():
+        return False
+    cloud, pose = window.T_lidar_camera([cloud_at_key(place), matched_at_key(place, camera)])
+    return agrees(own.raw, cloud.inverse().compose(pose), one)
 
 
 def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> State:
@@ -122,17 +144,37 @@ def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> State:
 
 
 def absorb(
-    state: State, blocks: Mapping[int, CameraBlock], inliers: Mapping[int, NDArray[np.bool_]]
-) -> State:
-    """The state with the inliers of its last frame, and their sums at its estimates."""
-    frame = state.epochs[-1].frames[-1]
-    for camera, rows in inliers.items():
-        pose, scale = state.T_lidar_camera[camera], state.cameras[camera].scale
-        residuals = blocks[camera].at(to_T_camera_lidar(pose))
+    state: State, closed: ClosedPlaces, blocks: Mapping[int, CameraBlock]
+) -> tuple[State, dict[int, CameraBlock]]:
+    """The state with the inliers of its last frame, and these.
+
+    In two passes: the gate is drawn at the minimum with all matches of the blocks.
+    """
+    if not blocks:
+        return state, {}
+    everything = {
+        camera: sums_of_matches(
+            block,
+            state.cameras[camera].scale,
+            state.T_lidar_camera[camera],
+            state.references[camera],
+        )
+        for camera, block in blocks.items()
+    }
+    state = at_minimum(state, closed, everything)
+    frame, used = state.epochs[-1].frames[-1], {}
+    for camera, block in blocks.items():
+        scale = state.cameras[camera].scale
+        residuals = block.at(to_T_camera_lidar(state.T_lidar_camera[camera]))
+        rows = residuals.inliers(scale)
+        if np.count_nonzero(rows) < MIN_MATCHES:
+            continue
         sums = sums_of_frame(residuals, rows, scale, state.references[camera])
-        frame = frame.add(camera, blocks[camera], rows, sums)
+        frame = frame.add(camera, block, rows, sums)
         state = count_absorbed(state, camera, residuals, int(np.count_nonzero(rows)))
-    return add_to_totals(with_open_frame(state, frame), frame)
+        used[camera] = block.select(rows)
+    state = add_to_totals(with_open_frame(state, frame), frame)
+    return at_minimum(state, closed), used
 
 
 def count_absorbed(state: State, camera: int, residuals: BlockResiduals, used: int) -> State:

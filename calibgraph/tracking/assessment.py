@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -14,13 +13,13 @@ from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_l
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES
-from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.posterior import estimates_of_halves, in_its_half
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.tracking.sums import Sums, is_determined, step_between
+from calibgraph.tracking.window import Window
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
@@ -37,24 +36,21 @@ class Assessment:
         joint_covariance: (6 n, 6 n) of xi in T_camera_lidar = exp(xi) estimate; NaN for cameras
             with too few frames.
         verdicts: per camera.
-        fit: the error model at its optimum.
-        places: names of its places.
+        window: the graph at its optimum, until the next frame.
     """
 
     T_lidar_camera: tuple[gtsam.Pose3, ...]
     joint_covariance: Array
     verdicts: dict[str, Verdict]
-    fit: LatentPoseFit
-    places: Sequence[str]
+    window: Window
 
     def newest(self, optimum: Optimum | None) -> Optimum | None:
         """The optimum of closed epochs, with the newer poses of this one."""
-        model, values = self.fit.linear.model, self.fit.linear.values
-        newer = Optimum.of(model, values, self.places, ())
+        newer = Optimum.of(self.window.model, self.window.values, self.window.places, ())
         return None if optimum is None else optimum.updated(newer)
 
 
-def assess(state: State, closed: ClosedPlaces) -> Assessment:
+def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessment:
     """Assess the present estimates.
 
     A relative pose that contradicts the correspondences of both its cameras takes no part, as in a
@@ -63,19 +59,22 @@ def assess(state: State, closed: ClosedPlaces) -> Assessment:
     Args:
         state: the tracker's.
         closed: its closed epochs.
+        window: of the frame before, if of the same epoch.
     """
     sums = closed.posterior + state.epochs[-1].sums
     halves = closed.halves + in_its_half(state, state.epochs[-1], len(state.epochs) - 1)
-    fit, conflicts, places = closed.fit_with(state, sums)
-    estimates = fit.T_lidar_camera if state.config.preset == "auto" else state.T_lidar_camera
-    covariance, few = fit.covariance.copy(), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
+    window, conflicts = closed.with_open_epoch(state, sums, window)
+    keys, estimates = window.model.reported_keys, state.T_lidar_camera
+    if state.config.preset == "auto":
+        estimates = window.T_lidar_camera(keys)
+    covariance, few = window.covariance(keys), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
     verdicts = {}
     for camera, name in enumerate(state.names):
         own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
         apart = estimates_of_halves(state, halves, camera)
         verdicts[name] = _verdict(state, sums, camera, covariance, conflicts=own, halves=apart)
-    return Assessment(estimates, covariance, verdicts, fit, places)
+    return Assessment(estimates, covariance, verdicts, window)
 
 
 def _verdict(
@@ -176,10 +175,10 @@ def _counts(one: CameraState) -> dict[str, int]:
 
 def second_moments(assessment: Assessment) -> Array:
     """(6 n, 6 n) of the mounts about the estimates."""
-    mount = assessment.fit.of_mount
-    steps = zip(mount.T_lidar_camera, assessment.T_lidar_camera, strict=True)
+    window, keys = assessment.window, assessment.window.model.camera_keys
+    steps = zip(window.T_lidar_camera(keys), assessment.T_lidar_camera, strict=True)
     away = np.concatenate([step_between(pose, estimate) for pose, estimate in steps])
-    return np.asarray(mount.covariance + np.outer(away, away))
+    return np.asarray(window.covariance(keys) + np.outer(away, away))
 
 
 def to_calibration(state: State, assessment: Assessment) -> Calibration:

@@ -1,6 +1,4 @@
-"""The closed epochs, and with the open one optimum and marginal of the error model's graph.
-
-Frames are gated, and moves are found, at another estimate (``calibgraph.tracking.window``).
+"""The closed epochs, and with the open one the error model's graph (``tracking.window``).
 
 Between the ends of epochs the places that no frame of the open epoch is of keep the weights that
 their robust loss has at the optimum of the last one: within 0.02 sigma that is the whole graph.
@@ -8,7 +6,7 @@ their robust loss has at the optimum of the last one: within 0.02 sigma that is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -17,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.objective import join
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.solver.elimination import (
     LatentPoseFit,
@@ -27,9 +26,11 @@ from calibgraph.solver.variance_components import VarianceRatios, estimate_varia
 from calibgraph.tracking.contradictions import (
     Conflicts,
     Rows,
+    contradicting,
+    find_conflicts,
     fit_without_contradictions,
+    pose_priors,
     poses_by_name,
-    with_pose_graph,
 )
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
@@ -45,8 +46,8 @@ from calibgraph.tracking.place_model import (
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
 from calibgraph.tracking.posterior import closed_posterior, split_halves
 from calibgraph.tracking.state import State
-from calibgraph.tracking.sums import Sums
-from calibgraph.tracking.window import pose_priors
+from calibgraph.tracking.sums import Sums, equation_5
+from calibgraph.tracking.window import Window
 
 Array = NDArray[np.float64]
 
@@ -70,7 +71,7 @@ class ClosedPlaces:
         fit: the graph near its optimum.
         quadratics: of its matches there.
         contradicting: places in ``rig.relative_poses`` of those that take no part.
-        pose_graphs: the priors, without some relative poses.
+        priors: those of all cameras, and the relative poses.
         sizes: the variance ratios of the graph.
     """
 
@@ -83,9 +84,11 @@ class ClosedPlaces:
     fit: LatentPoseFit
     quadratics: Quadratics
     contradicting: Rows
-    pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph]
+    priors: gtsam.NonlinearFactorGraph
     sizes: VarianceRatios
-    _summaries: dict[Rows, gtsam.NonlinearFactorGraph] = field(default_factory=dict)
+    _pose_graphs: dict[tuple[Rows, Rows | None], gtsam.NonlinearFactorGraph] = field(
+        default_factory=dict
+    )
 
     @staticmethod
     def of(state: State) -> ClosedPlaces:
@@ -98,34 +101,30 @@ class ClosedPlaces:
         rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
         data = PlaceData.of(state, quadratics_of(state, earlier), frames, rows)
         model = place_model(state, sums, seen, data)
-        pose_graphs = {NO_ROWS: pose_priors(state)}
         values = _start(state, model, data.names)
         if state.optimum is None:
-            fit, dropped, _ = fit_without_contradictions(
-                state, sums, model, values, pose_graphs=pose_graphs
-            )
+            fit, dropped = fit_without_contradictions(state, sums, model, values)
         else:
             dropped = state.optimum.contradicting
-            model = with_pose_graph(state, model, dropped, pose_graphs)
+            model = replace(model, pose_graph=pose_priors(state, dropped))
             fit = LatentPoseFit(Linearization.at(model, values), 0, True)
         return ClosedPlaces(
             sums, closed_posterior(state), split_halves(state), state.findings, seen, data,
-            fit, linearized(data, fit), dropped, pose_graphs, state.sizes,
+            fit, linearized(data, fit), dropped, pose_priors(state), state.sizes,
         )  # fmt: skip
 
     def fitted(self, state: State) -> ClosedPlaces:
         """At the optimum for the variance ratios of the state."""
         model = place_model(state, self.sums, self.seen, self.data)
-        fit, dropped, _ = fit_without_contradictions(
-            state, self.sums, model, self.fit.linear.values, pose_graphs=self.pose_graphs
-        )
+        values = self.fit.linear.values
+        fit, dropped = fit_without_contradictions(state, self.sums, model, values)
         return replace(
             self,
             fit=fit,
             quadratics=linearized(self.data, fit),
             contradicting=dropped,
             sizes=state.sizes,
-            _summaries={},
+            _pose_graphs={},
         )
 
     @property
@@ -139,6 +138,15 @@ class ClosedPlaces:
         """Per place, on what all places share."""
         return marginals_of_places(self.fit)
 
+    def equation_5(
+        self, state: State, more: Mapping[int, Sums] | None = None
+    ) -> gtsam.NonlinearFactorGraph:
+        """Eq. 5 of the paper with the sums of all frames, and more of some cameras."""
+        sums = self.posterior + state.epochs[-1].sums
+        for camera, own in (more or {}).items():
+            sums = sums.replace_at(camera, sums[camera] + own)
+        return equation_5(self.priors, state.references, sums)
+
     def shows_ratios(self, state: State) -> bool:
         """Whether anything is measured twice."""
         return not self.sums.is_of_one_place or bool(state.rig.relative_poses)
@@ -149,14 +157,15 @@ class ClosedPlaces:
         cameras = zip(state.cameras, frames, strict=True)
         return all(count >= _SETTLED for one, count in cameras if one.started)
 
-    def fit_with(self, state: State, sums: Sums) -> tuple[LatentPoseFit, Conflicts, Sequence[str]]:
-        """The optimum with the frames of the open epoch, and the relative poses that contradict.
-
-        Further the names of its places.
+    def with_open_epoch(
+        self, state: State, sums: Sums, window: Window | None
+    ) -> tuple[Window, Conflicts]:
+        """The whole graph in iSAM2, and the conflicts of relative poses with correspondences.
 
         Args:
             state: of the tracker.
             sums: over its summaries and live frames.
+            window: of the frame before, if of the same epoch; it goes on if its graph allows.
         """
         frames = state.epochs[-1].frames
         every = self.sums.add(sums_by_place(frames))
@@ -170,17 +179,31 @@ class ClosedPlaces:
             every = every.bounded(most=0)
             earlier = quadratics_of(state, every)
             frames, kept, rows = (), NO_ROWS, [0] if every.frames.any() else []
-        if kept not in self._summaries:
-            chosen = [self.marginals[i] for i in kept]
-            self._summaries[kept] = summary_factor(chosen, self.fit.linear.values)
         data = PlaceData.of(state, earlier, frames, {every.names[row]: row for row in rows})
         model = place_model(state, every, seen, data)
-        model = replace(model, pose_graph=self._summaries[kept])
-        values = _start(state, model, data.names)
-        fit, _, conflicts = fit_without_contradictions(
-            state, every, model, values, pose_graphs=self.pose_graphs
-        )
-        return fit, conflicts, data.names
+        start = _start(state, model, data.names)
+        model = replace(model, pose_graph=self._summary(kept))
+        conflicts = find_conflicts(state, every, model, start)
+        model = replace(model, pose_graph=self._pose_graph(state, kept, contradicting(conflicts)))
+        if window is not None and window.has_graph_of(model, data.names):
+            window.exchange(model)
+        else:
+            window = Window(model, data.names, start)
+        return window, conflicts
+
+    def _summary(self, kept: Rows) -> gtsam.NonlinearFactorGraph:
+        """One factor that stands for some of the places."""
+        if (kept, None) not in self._pose_graphs:
+            chosen = [self.marginals[place] for place in kept]
+            self._pose_graphs[kept, None] = summary_factor(chosen, self.fit.linear.values)
+        return self._pose_graphs[kept, None]
+
+    def _pose_graph(self, state: State, kept: Rows, dropped: Rows) -> gtsam.NonlinearFactorGraph:
+        """The same with the priors, without some relative poses."""
+        if (kept, dropped) not in self._pose_graphs:
+            graph = join(pose_priors(state, dropped), self._summary(kept))
+            self._pose_graphs[kept, dropped] = graph
+        return self._pose_graphs[kept, dropped]
 
     def _split(self, every: PlaceSums, touched: set[str]) -> tuple[Rows, list[int]]:
         """Which of the closed places a summary stands for, and the rows of the other places.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.graph.latent_poses import LatentPoseModel
-from calibgraph.graph.objective import join
+from calibgraph.graph.objective import join, objective_graph
 from calibgraph.graph.variables import camera_key
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import to_T_camera_lidar
@@ -21,7 +21,6 @@ from calibgraph.solver.error_model import held_graph
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import is_determined
-from calibgraph.tracking.window import pose_priors
 
 Array = NDArray[np.float64]
 Conflicts = dict[int, Conflict]
@@ -29,45 +28,43 @@ Rows = tuple[int, ...]
 
 
 def fit_without_contradictions(
-    state: State,
-    sums: PlaceSums,
-    model: LatentPoseModel,
-    values: gtsam.Values,
-    *,
-    pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph],
-) -> tuple[LatentPoseFit, Rows, Conflicts]:
-    """The optimum with priors and relative poses, and the conflicts of these with the data.
+    state: State, sums: PlaceSums, model: LatentPoseModel, values: gtsam.Values
+) -> tuple[LatentPoseFit, Rows]:
+    """The optimum with priors and relative poses, and which of these contradict the data.
 
     Args:
         state: of the tracker.
-        sums: of all frames.
-        model: with the places, and the summary of others.
+        sums: of the frames of the model.
+        model: without any prior of a camera.
         values: near the optimum.
-        pose_graphs: the priors without contradicting relative poses, by their places in the rig.
     """
-    conflicts = _conflicts(state, sums, model, values)
-    limit = error_components().contradiction_sigmas
-    dropped = tuple(place for place, one in conflicts.items() if one.largest > limit)
-    fit = fit_latent_poses(with_pose_graph(state, model, dropped, pose_graphs), values)
+    dropped = contradicting(find_conflicts(state, sums, model, values))
+    fit = fit_latent_poses(replace(model, pose_graph=pose_priors(state, dropped)), values)
     if fit is None:
         raise RuntimeError("a direction of a camera is not determined")
-    return fit, dropped, conflicts
+    return fit, dropped
 
 
-def with_pose_graph(
-    state: State,
-    model: LatentPoseModel,
-    dropped: Rows,
-    pose_graphs: dict[Rows, gtsam.NonlinearFactorGraph],
-) -> LatentPoseModel:
-    """The model with the priors, without contradicting relative poses."""
-    if dropped not in pose_graphs:
-        without = tuple(sorted({*state.dropped_pairs, *dropped}))
-        pose_graphs[dropped] = pose_priors(replace(state, dropped_pairs=without))
-    return replace(model, pose_graph=join(pose_graphs[dropped], model.pose_graph))
+def contradicting(conflicts: Conflicts) -> Rows:
+    """Those that take no part, by their places in the rig."""
+    limit = error_components().contradiction_sigmas
+    return tuple(place for place, one in conflicts.items() if one.largest > limit)
 
 
-def _conflicts(
+def pose_priors(state: State, dropped: Rows = ()) -> gtsam.NonlinearFactorGraph:
+    """Priors about the references, and the relative poses that no move has invalidated.
+
+    Args:
+        state: of the tracker.
+        dropped: further relative poses that take no part.
+    """
+    pairs = enumerate(state.rig.relative_poses)
+    kept = tuple(pair for place, pair in pairs if place not in (*state.dropped_pairs, *dropped))
+    rig = state.rig.model_copy(update={"relative_poses": kept})
+    return objective_graph(rig, {}, poses_by_name(state), state.config, terms="full")
+
+
+def find_conflicts(
     state: State, sums: PlaceSums, model: LatentPoseModel, values: gtsam.Values
 ) -> Conflicts:
     """Conflicts between the rig's relative poses and the correspondences, by place in the rig."""

@@ -70,7 +70,7 @@ class FrameSpread:
         for camera in np.flatnonzero(frames):
             count, seen = frames[camera], left[camera] + 1.0
             own = _usual_while_few(state, int(camera), scatter[camera], count)
-            if not _states_places(state):
+            if not states_places(state):
                 own = state.widen(int(camera), own)
             true = convex_hessian(hessian[camera], reweighted[camera])
             usual = 1.0 + correlation * (matches[camera] / count - 1.0)
@@ -272,7 +272,7 @@ def _distortion(state: State, camera: int, places: int) -> DistortionEvidence | 
     return replace(found, jacobian=own.jacobian, hessian=own.hessian)
 
 
-def _states_places(state: State) -> bool:
+def states_places(state: State) -> bool:
     """Whether frames of one place share more than all frames do."""
     stated = state.findings
     sizes = stated.place_rotation_rad, stated.place_translation_m

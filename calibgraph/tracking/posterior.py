@@ -4,54 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.solver.camera_block import BlockResiduals
-from calibgraph.solver.curvature import robust_hessian
-from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.live_frames import Epoch
 from calibgraph.tracking.state import State
-from calibgraph.tracking.sums import Sums, step_between
-from factors import ProjectionBlock
+from calibgraph.tracking.sums import Sums
 
 Array = NDArray[np.float64]
-
-
-def sums_of_frame(
-    residuals: BlockResiduals,
-    inliers: NDArray[np.bool_],
-    scale: ResidualScale,
-    reference: gtsam.Pose3,
-) -> Sums:
-    """The sums of one frame's matches of a camera, linearized where their residuals are.
-
-    Args:
-        residuals: of its matches, near the minimum.
-        inliers: (m,) which of them are within the gate.
-        scale: of the residuals.
-        reference: T_lidar_camera at which the gradient is taken.
-    """
-    pose = residuals.T_lidar_camera
-    block = residuals.block.select(inliers).with_scale(scale)
-    hessian, sums = true_hessian(residuals, block, scale), block.sums(pose)
-    return Sums(
-        hessian,
-        sums.gradient + hessian @ step_between(pose, reference),
-        sums.hessian,
-        sums.gradient,
-        np.outer(sums.gradient, sums.gradient),
-        np.array(1.0),
-        np.array(float(len(block))),
-    )
-
-
-def true_hessian(residuals: BlockResiduals, block: ProjectionBlock, scale: ResidualScale) -> Array:
-    """(6, 6) of the robust cost of the matches in the gate, which moves with the extrinsic."""
-    return robust_hessian(block, residuals.T_lidar_camera) + residuals.gate_hessian(scale)
 
 
 def posterior(state: State, before: int | None = None) -> Sums:
@@ -100,11 +62,6 @@ def estimates_of_halves(state: State, halves: Sums, camera: int) -> tuple[Array,
         return None
     reference = state.references[camera]
     return to_T_camera_lidar(reference.retract(first)), to_T_camera_lidar(reference.retract(second))
-
-
-def steps_of(state: State) -> Array:
-    """(n, 6) from the references to the tracker's own estimates."""
-    return np.array([*map(step_between, state.references, state.T_lidar_camera)])
 
 
 def _summaries(state: State) -> Sums:

@@ -18,11 +18,11 @@ from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
 from calibgraph.tracking.outlier_frames import refine
 from calibgraph.tracking.place_shift import shift_since
-from calibgraph.tracking.posterior import posterior, sums_of_frame
+from calibgraph.tracking.posterior import posterior
 from calibgraph.tracking.start import absorb_frames
 from calibgraph.tracking.state import DriftWatch, State, block_diagonal, replace_item
 from calibgraph.tracking.step_detection import DetectedStep
-from calibgraph.tracking.sums import Sums, step_between
+from calibgraph.tracking.sums import Sums, step_between, sums_of_frame
 
 Array = NDArray[np.float64]
 Measured = tuple[Steps, dict[int, Array]]

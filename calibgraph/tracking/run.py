@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from calibgraph.errors import CorrespondenceError
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
-from calibgraph.tracking.report import json_line
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
-from calibgraph.tracking.update import Update
+from calibgraph.tracking.update import Update, json_line
 
 Notify = Callable[[str], None]
 

@@ -24,8 +24,8 @@ from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import Epoch, LiveFrame
 from calibgraph.tracking.noise import ResidualHistogram, median
-from calibgraph.tracking.posterior import sums_of_frame
 from calibgraph.tracking.state import HISTORY, CameraState, State, replace_item
+from calibgraph.tracking.sums import sums_of_frame
 
 _TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt
 

@@ -24,11 +24,17 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import smallest_scaled_eigenvalue
+from calibgraph.graph.objective import join
+from calibgraph.graph.variables import camera_key
+from calibgraph.solver.camera_block import BlockResiduals, CameraBlock
+from calibgraph.solver.curvature import convex_hessian, robust_hessian
+from calibgraph.solver.residual_scale import ResidualScale
+from factors import ProjectionBlock, smallest_scaled_eigenvalue
 
 Array = NDArray[np.float64]
 
 _SHAPES: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (6, 6), (6,), (6, 6), (), ())
+_STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away
 _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
 
@@ -140,3 +146,72 @@ def is_determined(hessian: Array) -> bool:
 def step_between(one: gtsam.Pose3, two: gtsam.Pose3) -> Array:
     """(6,) tangent step from one T_lidar_camera to another."""
     return np.asarray(one.localCoordinates(two))
+
+
+def sums_of_frame(
+    residuals: BlockResiduals,
+    inliers: NDArray[np.bool_],
+    scale: ResidualScale,
+    reference: gtsam.Pose3,
+) -> Sums:
+    """The sums of one frame's matches of a camera, linearized where their residuals are.
+
+    Args:
+        residuals: of its matches, near the minimum.
+        inliers: (m,) which of them are within the gate.
+        scale: of the residuals.
+        reference: T_lidar_camera at which the gradient is taken.
+    """
+    pose = residuals.T_lidar_camera
+    block = residuals.block.select(inliers).with_scale(scale)
+    hessian, sums = true_hessian(residuals, block, scale), block.sums(pose)
+    return Sums(
+        hessian,
+        sums.gradient + hessian @ step_between(pose, reference),
+        sums.hessian,
+        sums.gradient,
+        np.outer(sums.gradient, sums.gradient),
+        np.array(1.0),
+        np.array(float(len(block))),
+    )
+
+
+def equation_5(
+    priors: gtsam.NonlinearFactorGraph, references: Sequence[gtsam.Pose3], sums: Sums
+) -> gtsam.NonlinearFactorGraph:
+    """Eq. 5 of the paper: priors, and (n,) sums of all matches as a quadratic per camera."""
+    graph, at = join(priors), gtsam.Values()
+    for camera, reference in enumerate(references):
+        own, key = sums[camera], camera_key(camera)
+        if own.hessian.any():
+            at.insert(key, reference)
+            hessian = convex_hessian(own.hessian, own.reweighted)
+            factor = gtsam.HessianFactor(key, hessian, -own.gradient, 0.0)
+            graph.add(gtsam.LinearContainerFactor(factor, at))
+    return graph
+
+
+def minimum(
+    graph: gtsam.NonlinearFactorGraph, start: Sequence[gtsam.Pose3]
+) -> tuple[gtsam.Pose3, ...]:
+    """T_lidar_camera of all cameras at the minimum of :func:`equation_5`, by Gauss-Newton."""
+    values, keys = gtsam.Values(), range(len(start))
+    for camera in keys:
+        values.insert(camera_key(camera), start[camera])
+    for _ in range(_STEPS):
+        values = values.retract(graph.linearize(values).optimize())
+    return tuple(values.atPose3(camera_key(camera)) for camera in keys)
+
+
+def sums_of_matches(
+    block: CameraBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3, reference: gtsam.Pose3
+) -> Sums:
+    """Hessian by their weights, and gradient at a reference, of matches in and out of the gate."""
+    here = block.with_scale(scale).sums(T_lidar_camera)
+    sums = replace(Sums.zeros(), hessian=here.hessian, gradient=here.gradient)
+    return sums.shift_reference(step_between(T_lidar_camera, reference))
+
+
+def true_hessian(residuals: BlockResiduals, block: ProjectionBlock, scale: ResidualScale) -> Array:
+    """(6, 6) of the robust cost of the matches in the gate, which moves with the extrinsic."""
+    return robust_hessian(block, residuals.T_lidar_camera) + residuals.gate_hessian(scale)

@@ -18,11 +18,10 @@ from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.shared_error import with_common_error
 from calibgraph.tracking.absorption import (
     absorb,
+    at_minimum,
     blocks_by_camera,
     count_absent,
-    inliers_at,
     select_agreeing,
-    with_estimates,
     with_open_frame,
 )
 from calibgraph.tracking.assessment import Assessment, assess, to_calibration
@@ -34,9 +33,9 @@ from calibgraph.tracking.frame_order import (
     number_and_stamp,
     with_metadata_per_frame,
     with_place,
+    without_repeats,
 )
 from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.repeated_frames import without_repeats
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
@@ -49,7 +48,6 @@ from calibgraph.tracking.state_bytes import (
 )
 from calibgraph.tracking.step_detection import detect_small_step, detect_step
 from calibgraph.tracking.update import Update, make_update, rig_at
-from calibgraph.tracking.window import Window
 
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
 
@@ -121,8 +119,8 @@ class IncrementalCalibrator:
         reported.
         """
         if self.config.preset != "auto":
-            return self._window.graph
-        return latent_pose_graph(self._assess().fit.linear.model)
+            return self._closed.equation_5(self._state)
+        return latent_pose_graph(self._assess().window.model)
 
     def update(
         self, table: Correspondences, *, frame: int | None = None, place: str | int | None = None
@@ -178,8 +176,8 @@ class IncrementalCalibrator:
 
     def _take(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
-        self._state, agreeing = select_agreeing(self._state, blocks)
-        used = self._absorb(agreeing)
+        self._state, agreeing = select_agreeing(self._state, self._closed, blocks)
+        self._state, used = absorb(self._state, self._closed, agreeing)
         self._state, events = start_cameras(self._state, table, blocks)
         if events:
             self._rebuild()
@@ -202,7 +200,8 @@ class IncrementalCalibrator:
         """Assess the estimates, once: the sums over closed epochs are at hand."""
         state = self._state
         if self._assessed is None or self._assessed[0] is not state:
-            self._assessed = state, assess(state, self._closed)
+            before = self._assessed and self._assessed[1].window
+            self._assessed = state, assess(state, self._closed, before)
         return self._assessed[1]
 
     def _at(self, estimates: tuple[gtsam.Pose3, ...]) -> Rig:
@@ -254,23 +253,9 @@ class IncrementalCalibrator:
         self._rebuild(closed)
 
     def _rebuild(self, closed: ClosedPlaces | None = None) -> None:
-        """Set up iSAM2 anew, after anything but a frame has changed the state."""
-        self._closed = closed or ClosedPlaces.of(self._state)
-        self._window = Window(self._state)
-        self._state = with_estimates(self._state, self._window)
-
-    def _absorb(self, agreeing: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
-        """The two passes: add the blocks, gate them at the new estimate, replace them."""
-        if not agreeing:
-            return {}
-        scales = {camera: self._state.cameras[camera].scale for camera in agreeing}
-        self._window.fit({c: block.with_scale(scales[c]) for c, block in agreeing.items()})
-        inliers = inliers_at(self._state, self._window, agreeing)
-        used = {c: agreeing[c].select(rows) for c, rows in inliers.items()}
-        self._window.refit({c: block.with_scale(scales[c]) for c, block in used.items()})
-        self._state = with_estimates(self._state, self._window)
-        self._state = absorb(self._state, agreeing, inliers)
-        return used
+        """Start from the state anew, after anything but a frame has changed it."""
+        self._closed, self._assessed = closed or ClosedPlaces.of(self._state), None
+        self._state = at_minimum(self._state, self._closed)
 
     def _restart_after_step(self) -> list[Event]:
         """Restart what has moved so far that frames disagree with the estimate."""
@@ -282,11 +267,11 @@ class IncrementalCalibrator:
         return list(events)
 
     def _close_epoch(self) -> list[Event]:
-        """Summarize the oldest live epoch, test for a small step, set up iSAM2 anew."""
+        """Summarize the oldest live epoch, test for a small step, begin another."""
         state = self._state
         if self._assessed is not None:
             state = replace(state, optimum=self._assessed[1].newest(state.optimum))
-        self._state, events = close_epoch(state, self._window.T_lidar_camera_by_epoch())
+        self._state, events = close_epoch(state)
         detected = detect_small_step(self._state)
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)

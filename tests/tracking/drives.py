@@ -20,7 +20,7 @@ from calibgraph import (
 )
 from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.simulation.place_draws import Drawn
-from calibgraph.tracking.report import json_line
+from calibgraph.tracking.update import json_line
 from tests.conftest import make_camera
 
 FRAMES = 14

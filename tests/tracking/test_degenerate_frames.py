@@ -16,7 +16,7 @@ from calibgraph import (
     Rig,
     perturb,
 )
-from calibgraph.tracking.report import json_line
+from calibgraph.tracking.update import json_line
 from tests.conftest import KANNALA, make_camera, stereo_relative_pose
 from tests.tracking.drives import (
     drive,

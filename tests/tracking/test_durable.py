@@ -24,10 +24,10 @@ from calibgraph import (
 )
 from calibgraph.tracking import command, durable, tracker
 from calibgraph.tracking.history import History
-from calibgraph.tracking.report import json_line
 from calibgraph.tracking.run import follow
 from calibgraph.tracking.state_database import DATABASE, StateDatabase
 from calibgraph.tracking.streams import StreamFrame
+from calibgraph.tracking.update import json_line
 from tests.conftest import KANNALA, Call
 from tests.tracking.drives import (
     FRAMES,

@@ -37,13 +37,13 @@ from calibgraph.solver.scan_distortion import DistortionEvidence, distortions_at
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
 from calibgraph.tracking.closed_places import ClosedPlaces
+from calibgraph.tracking.contradictions import pose_priors
 from calibgraph.tracking.frame_order import PLACE, with_place
 from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model, quadratics_of
 from calibgraph.tracking.place_shift import shift_covariance
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
 from calibgraph.tracking.stream_lines import frames_of_lines
 from calibgraph.tracking.streams import Refused, StreamFrame
-from calibgraph.tracking.window import pose_priors
 from calibgraph.trust.evidence import Evidence
 from tests.conftest import stereo_relative_pose
 from tests.tracking.drives import drive, pair_of, track_draw
@@ -227,7 +227,7 @@ def tracked_at_three_places(frames: int, **config: object) -> tuple[IncrementalC
 def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:
     """By GTSAM's LM and Marginals: within 0.01 sigma, and a thousandth of the covariance."""
     tracker, update = tracked_at_three_places(24)
-    linear, graph = tracker._assess().fit.linear, tracker.graph
+    linear, graph = tracker._assess().window, tracker.graph
     start, keys = linear.values, linear.model.reported_keys
     values = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     marginals = gtsam.Marginals(graph, values)
