@@ -9,10 +9,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import to_T_lidar_camera
 from factors import BlockSums, PairBlock, ProjectionBlock, pair_block_factor
 
-Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 

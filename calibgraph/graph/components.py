@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from calibgraph.arrays import Array
 
 EXACT = 1e-5
 """Standard deviation [rad and m] of what holds exactly; less is lost in rounding."""

@@ -26,8 +26,8 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
     BlockByPlace,
     PairByPlace,
@@ -57,8 +57,6 @@ from factors import (
     placed_pair_factor,
     robust_noise,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

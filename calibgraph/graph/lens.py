@@ -19,6 +19,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.graph.clock import clock_sigmas, put_clock_into
 from calibgraph.graph.variables import DISTORTION, lens_key, seen_lens_key
@@ -35,8 +36,6 @@ from factors import (
 )
 from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
 from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
-
-Array = NDArray[np.float64]
 
 
 class LensSigmas(NamedTuple):

@@ -7,16 +7,14 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.by_place import PairByPlace
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, paired_key
 from calibgraph.model.geometry import adjoints, invert_each
 from factors import pair_run_sums
-
-Array = NDArray[np.float64]
 
 
 @dataclass(eq=False)

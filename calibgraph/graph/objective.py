@@ -9,9 +9,8 @@ from itertools import combinations, pairwise
 from typing import Literal
 
 import gtsam
-import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.variables import camera_key
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.geometry import relative_transform
@@ -39,8 +38,6 @@ __all__ = [  # with the factors that calibgraph re-exports
     "relative_prior_factor",
     "relative_prior_graph",
 ]
-
-Array = NDArray[np.float64]
 
 
 def pose_key(cameras: Sequence[str], name: str) -> int:

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import invert, transform
-
-Array = NDArray[np.float64]
 
 LEAST_OVERLAP = 0.5
 """Of the upright points of either cloud, the share that must be within _NEAR_M of the other's. In

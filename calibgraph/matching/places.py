@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
@@ -24,8 +25,6 @@ from calibgraph.matching.cloud_similarity import LEAST_UPRIGHT, UprightCloud, al
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
-
-Array = NDArray[np.float64]
 
 PLACE_M = 20.0
 """Radius [m] of a place about its first frame: a camera that looks

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.clock import at_pixels, motion_of
 from calibgraph.model.config import Config
@@ -30,8 +31,6 @@ from calibgraph.solver.whitening import (
     whitened_norm,
 )
 from factors import ProjectionBlock, to_runs
-
-Array = NDArray[np.float64]
 
 MIN_MATCHES = 6
 """Of fewer correspondences a pose (three determine it) leaves too few residuals to check it by."""

@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.model.error_components import error_components
@@ -35,7 +36,6 @@ from factors import (
     unproject,
 )
 
-Array = NDArray[np.float64]
 Kind = Literal["surface", "point"]
 
 MIN_PAIR_MATCHES = 12

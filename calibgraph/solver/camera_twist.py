@@ -1,13 +1,11 @@
 """A camera under a twist of its extrinsic: its pose, its pixels, and their derivatives."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
-
-Array = NDArray[np.float64]
 
 
 def apply_twist(camera: Camera, twist: Array) -> Camera:

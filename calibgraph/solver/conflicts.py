@@ -5,13 +5,11 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import invert, relative_covariance, relative_transform
 from calibgraph.model.rig import RelativePose
 from factors import pose_sigmas
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

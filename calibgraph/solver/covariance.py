@@ -1,8 +1,8 @@
 """Cluster-robust covariance: matches of one frame share their errors, frames do not."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.objective import relative_pose_graph
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import pose_rows
@@ -17,8 +17,6 @@ from calibgraph.solver.curvature import (
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.objective import Objective
 from factors import unit_diagonal
-
-Array = NDArray[np.float64]
 
 ENOUGH_FRAMES = 5
 """From so many on, the scatter between frames decides about the error bar; with fewer, mostly what

@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.objective import relative_pose_graph
 from calibgraph.model.geometry import pose_rows, retract_all, to_T_camera_lidar
 from calibgraph.parallel import map_on_cores
@@ -15,8 +16,6 @@ from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.optimizer import to_values
 from factors import ProjectionBlock, unit_diagonal
-
-Array = NDArray[np.float64]
 
 _SINGULAR = 1e-12  # smallest over largest eigenvalue: rounding noise
 _STEP = 1e-5  # rad and m: of the central differences of the gradient

@@ -13,8 +13,8 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.lens import start_lenses
 from calibgraph.graph.linear_data import LinearData
@@ -32,8 +32,6 @@ from calibgraph.graph.variables import (
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.solver.optimizer import MAX_ITERATIONS
 from factors import unit_diagonal
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-6
 """Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.lens import FreeLensByPlace
@@ -30,7 +31,6 @@ from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobian
 from calibgraph.solver.variance_components import VarianceRatios, estimate_variance_ratios
 from calibgraph.solver.within_place import within_place
 
-Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 _ROUNDS = 3  # of fits and estimates of the variance ratios

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.model.error_sources import (
     COMMON,
@@ -31,7 +31,6 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.elimination import Linearization, join_linear, marginal_information
 from calibgraph.solver.error_model import ErrorFit
 
-Array = NDArray[np.float64]
 Variances = dict[str, Array]
 
 _DISTORTIONS = ELEVATION, STRETCH, MOTION

@@ -7,14 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
-import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from factors import ProjectionBlock
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,15 +3,13 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import retract_all
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.frame_poses import solve_damped
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spreads
 from factors import to_runs
-
-Array = NDArray[np.float64]
 
 DAMPING = 1e-6
 """Of the diagonal, for frames that leave a direction free."""

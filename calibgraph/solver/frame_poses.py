@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import retract_all
 from factors import ProjectionBlock
 from factors.block_arrays import contiguous
 from factors.compiled import compiled
 
-Array = NDArray[np.float64]
 Runs = NDArray[np.int64]
 """(f, 2): the first correspondence of each frame, and the one behind its last."""
 

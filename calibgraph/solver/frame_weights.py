@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
+from calibgraph.arrays import Array
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert, local_coordinates, retract_all
@@ -27,8 +28,6 @@ from calibgraph.solver.frame_poses import solve_damped
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread, robust_spreads
 from calibgraph.solver.stage1 import Stage1
 from factors import to_runs
-
-Array = NDArray[np.float64]
 
 MIN_FRAMES_TO_WEIGH = 8
 """Fewer frames do not determine their own scatter; weights from them would shrink the error bar."""

@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.graph.components import EXACT
 from calibgraph.graph.lens import FreeLensByPlace, LensSigmas, LensTerm, LensVariable
@@ -30,7 +30,6 @@ from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import FreeLensBlock
 from factors.free_lens import ASPECT, FOCAL, OFFSET, READOUT
 
-Array = NDArray[np.float64]
 Lenses = Mapping[str, LensVariable]
 
 MATCH_SHARE = 0.01

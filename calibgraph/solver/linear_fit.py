@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
@@ -21,8 +21,6 @@ from calibgraph.solver.spread_kernel import median
 from calibgraph.solver.whitening import upper_root
 from calibgraph.solver.within_place import WEAK
 from factors import ProjectionBlock, unit_diagonal
-
-Array = NDArray[np.float64]
 
 MIN_ROWS = 30  # fewer correspondences do not determine further unknowns
 _MAX_ITERATIONS = 20

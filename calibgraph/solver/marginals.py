@@ -12,8 +12,8 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.correspondences import Correspondences
@@ -35,8 +35,6 @@ from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
 from calibgraph.solver.shared_error import error_between, shared_scatter, shared_variance_ratio
 from factors import pose_sigmas
-
-Array = NDArray[np.float64]
 
 _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unknown
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.objective import join, objective_graph, pose_key, projection_graph
@@ -22,7 +22,6 @@ from calibgraph.solver.camera_pairs import PairTerm, pair_graph
 from calibgraph.solver.optimizer import RELATIVE_TOLERANCE, Optimum, optimize
 from calibgraph.solver.residual_scale import ResidualScale
 
-Array = NDArray[np.float64]
 Transforms = dict[str, Array]
 """Per camera, (4, 4) T_camera_lidar."""
 Scales = dict[str, ResidualScale]

@@ -5,13 +5,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import gtsam
-import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.objective import pose_key
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
-
-Array = NDArray[np.float64]
 
 MAX_ITERATIONS = 200
 """Of Levenberg-Marquardt."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.objective import pose_key
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
@@ -23,8 +23,6 @@ from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum, optimize
 from factors import EpipolarBlock, pose_sigmas
-
-Array = NDArray[np.float64]
 
 _NARROWINGS = 4  # steps from the spread at the estimate to the least one
 _PAIR_RESCALINGS = 6

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import transform
@@ -17,8 +18,6 @@ from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import MIN_MATCHES
 from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
 from factors import ProjectionBlock, smallest_scaled_eigenvalues, unproject
-
-Array = NDArray[np.float64]
 
 _REFINEMENTS = 2  # the first with the inliers of PnP, the second with those of the first
 _MAX_SAMPLE = 4000  # matches; chosen, not measured

@@ -12,16 +12,14 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.graph.objective import join, projection_graph
 from calibgraph.model.geometry import pose_rows, retract_all, to_T_lidar_camera
 from calibgraph.solver.curvature import invert_or_none, pose_hessian, robust_hessian
 from calibgraph.solver.optimizer import optimize
 from factors import ProjectionBlock
-
-Array = NDArray[np.float64]
 
 DEGREES = 6.0
 """Of freedom, of the errors' distribution: matches are not independent, as the Hessian takes them

@@ -4,16 +4,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.components import EXACT, VarianceComponents
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.solver.pair_refinement import pair_sigmas
 from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WithinPlace
-
-Array = NDArray[np.float64]
 
 
 def variance_components(

@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.config import Config
 from calibgraph.solver.spread_kernel import spreads
 from factors.compiled import one_at_a_time
-
-Array = NDArray[np.float64]
 
 CAUCHY_SCALE_SIGMAS = 2.385
 """Robust scale in standard deviations: 95 % efficiency on Gaussian noise with Cauchy's loss."""

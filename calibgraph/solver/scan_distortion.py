@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.by_place import place_of
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import adjoints, to_T_camera_lidar
@@ -24,7 +25,6 @@ from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
 from factors import FreeLensBlock, ProjectionBlock
 
-Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 _DISTORTIONS = 3

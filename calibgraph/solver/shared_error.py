@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
@@ -16,8 +16,6 @@ from calibgraph.solver.camera_pairs import ENOUGH_SURFACES, PairTerm
 from calibgraph.solver.curvature import Curvature
 from calibgraph.solver.pair_refinement import PairFit, pair_sigmas
 from factors import pose_sigmas
-
-Array = NDArray[np.float64]
 
 
 def with_common_error(table: Correspondences, config: Config) -> Correspondences:

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
-import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
@@ -21,8 +20,6 @@ from calibgraph.solver.lens import lens_estimates, moved_lenses, put_into
 from calibgraph.solver.marginals import Marginals
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import Optimum
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

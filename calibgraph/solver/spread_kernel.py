@@ -12,10 +12,9 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from factors.block_arrays import contiguous
 from factors.compiled import compiled, kernel_part
-
-Array = NDArray[np.float64]
 
 _MANTISSA, _BIAS = 52, 1023  # bits, and the exponent of 1
 _LEAST, _LARGEST = _BIAS - 16, _BIAS + 16  # exponents: smaller and larger values share a bin

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.clock import at_pixels
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
@@ -27,8 +28,6 @@ from calibgraph.solver.pnp import (
     select_evenly,
 )
 from factors import ProjectionBlock, to_runs
-
-Array = NDArray[np.float64]
 
 _MEDOID_OF = 500  # rotations at most: it is a start of the median, and its cost is quadratic
 _MEDIAN_STEPS, _CONVERGED_RAD = 100, 1e-12  # far below any rotation that matters

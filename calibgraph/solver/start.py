@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.geometry import invert, relative_transform
@@ -13,8 +14,6 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.objective import Transforms
 from calibgraph.solver.preprocess import FILTERS
 from calibgraph.solver.stage1 import CameraStage1, Stage1
-
-Array = NDArray[np.float64]
 
 
 def best_start(

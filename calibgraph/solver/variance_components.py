@@ -16,14 +16,12 @@ from typing import Literal, NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.graph.components import VarianceComponents, least_cost_of_distortion
 from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.model.error_components import error_components
 from calibgraph.solver.elimination import LatentPoseFit, Linearization, join_linear
 
-Array = NDArray[np.float64]
 Component = Literal["shared", "cloud", "cameras"]
 
 _SETTLED = 0.1  # relative change of the ratios: the data leave far more open

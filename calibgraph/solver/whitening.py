@@ -6,12 +6,10 @@ direction only.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-
-Array = NDArray[np.float64]
 
 IDENTITY = np.array([1.0, 0.0, 1.0])
 """The entries (0,0), (0,1), (1,1) of the 2x2 identity."""

@@ -15,8 +15,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.model.error_components import error_components
 from calibgraph.solver.camera_block import CameraBlock
@@ -24,8 +24,6 @@ from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.fitted import FittedObjective
 from factors import pose_sigmas
-
-Array = NDArray[np.float64]
 
 _LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with
 _ROUNDING = 1e-7  # rad and m: a pose that is shared more exactly makes the graph lose digits

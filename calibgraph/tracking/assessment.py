@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
 from calibgraph.model.verdict import Check, Verdict
@@ -23,8 +23,6 @@ from calibgraph.tracking.window import Window
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import adjoint_camera_lidar, pose_rows
-
-Array = NDArray[np.float64]
 
 ALARM_CHANCE = 1e-8
 """Probability that one test of a camera that has not moved raises an alarm."""

@@ -12,7 +12,6 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import join
@@ -48,8 +47,6 @@ from calibgraph.tracking.posterior import closed_posterior, split_halves
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, equation_5
 from calibgraph.tracking.window import Window
-
-Array = NDArray[np.float64]
 
 NO_ROWS: Rows = ()
 

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import join, objective_graph
 from calibgraph.graph.variables import camera_key
@@ -22,7 +23,6 @@ from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import is_determined
 
-Array = NDArray[np.float64]
 Conflicts = dict[int, Conflict]
 Rows = tuple[int, ...]
 

@@ -9,11 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.tracking.sums import Sums
-
-Array = NDArray[np.float64]
 
 STRENGTHS = np.array([0.0, 0.2, 1.0, 5.0])
 """The walks, in units of the configured one; the first is static."""

@@ -8,8 +8,8 @@ from operator import add
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
@@ -22,8 +22,6 @@ from calibgraph.tracking.place_sums import sums_by_place
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.tracking.sums import Sums, step_between, sums_of_matches
 from factors import to_runs
-
-Array = NDArray[np.float64]
 
 
 def close_epoch(state: State) -> tuple[State, list[Event]]:

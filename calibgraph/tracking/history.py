@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.files import write_atomically
 from calibgraph.model.geometry import twist_between
 from calibgraph.tracking.events import Event, Size
@@ -24,7 +25,6 @@ from calibgraph.tracking.update import Update
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 _MOST_EVENTS = 1000
 _POSE = 6

@@ -13,13 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.config import Config
 from calibgraph.solver.camera_block import BlockResiduals
 from calibgraph.solver.residual_scale import ResidualScale, iterate_spread, scale_from
-
-Array = NDArray[np.float64]
 
 _EDGES = np.concatenate([[0.0], np.geomspace(1e-5, 1e5, 2304)])  # 1 % wide
 _RESIDUALS_KEPT = 1 - 1 / 2000  # from frame to frame

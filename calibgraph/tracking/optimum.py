@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.variables import (
     CLOUD,
@@ -19,8 +19,6 @@ from calibgraph.graph.variables import (
     matched_at_key,
     matched_key,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace, QuadraticByPlace, SummarizedByPlace
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.linear_data import poses_of
@@ -32,7 +33,6 @@ from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
 
-Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 Data = BlockByPlace | QuadraticByPlace | SummarizedByPlace
 Quadratics = dict[int, dict[str, tuple[gtsam.Pose3, Array]]]

@@ -9,15 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import adjoint_camera_lidar, pose_rows
 from calibgraph.solver.prior_components import pose_covariance
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.state import State
-
-Array = NDArray[np.float64]
 
 
 def shift_since(state: State, number: int) -> Array:

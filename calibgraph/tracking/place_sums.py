@@ -10,12 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.sums import Sums
-
-Array = NDArray[np.float64]
 
 MOST_PLACES = 24
 """Places that are kept apart."""

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.live_frames import Epoch
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums
-
-Array = NDArray[np.float64]
 
 
 def posterior(state: State, before: int | None = None) -> Sums:

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.tracking.cause import Cause, Steps, alarm_limit, find_cause
@@ -24,7 +24,6 @@ from calibgraph.tracking.state import DriftWatch, State, block_diagonal, replace
 from calibgraph.tracking.step_detection import DetectedStep
 from calibgraph.tracking.sums import Sums, step_between, sums_of_frame
 
-Array = NDArray[np.float64]
 Measured = tuple[Steps, dict[int, Array]]
 
 _RECENTLY = 300  # frames: a second small step within them is a drift

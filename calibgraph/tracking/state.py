@@ -9,8 +9,8 @@ from typing import TypeVar
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
@@ -33,7 +33,6 @@ from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.sums import Sums
 
-Array = NDArray[np.float64]
 Item = TypeVar("Item")
 
 LEAST_FRAMES = 15  # for the scatter of a six-vector

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from itertools import accumulate
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
 from calibgraph.tracking.live_frames import OutlierFrame
@@ -17,8 +17,6 @@ from calibgraph.tracking.place_shift import shift_since
 from calibgraph.tracking.posterior import posteriors_before_epochs
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.tracking.sums import Sums
-
-Array = NDArray[np.float64]
 
 _PATIENCE = 5  # frames more, until the other cameras show whether they moved too
 _OUTVOTE = 2  # outlier frames per frame that still agrees with the old estimate

@@ -24,14 +24,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import camera_key
 from calibgraph.solver.camera_block import BlockResiduals, CameraBlock
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
 from factors import ProjectionBlock, smallest_scaled_eigenvalue
-
-Array = NDArray[np.float64]
 
 _SHAPES: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (6, 6), (6,), (6, 6), (), ())
 _STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away

@@ -9,8 +9,8 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.model.rig import Rig
 from calibgraph.model.summary import summarize
@@ -20,8 +20,6 @@ from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.tracking.assessment import Assessment, covariance_by_camera
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.state import State
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,12 +14,10 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import LatentPoseModel, data_graph
 from calibgraph.graph.objective import join
-
-Array = NDArray[np.float64]
 
 _RELINEARIZE = 1e-5  # rad and m: far below any sigma
 _MOST_STEPS = 20  # of Gauss-Newton: from frame to frame one or two do

@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.geometry import twist_between
 from calibgraph.solver.camera_block import CameraBlock
@@ -15,7 +16,6 @@ from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.objective import Transforms
 from calibgraph.solver.solution import Solution
 
-Array = NDArray[np.float64]
 Matches = TypeVar("Matches", CameraBlock, PairTerm)
 
 _MAX_TRIES = 20  # draws in turn that leave a camera with too few matches

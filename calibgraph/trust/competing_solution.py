@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.verdict import Check
 from calibgraph.solver.camera_block import CameraBlock, camera_block
@@ -14,8 +11,6 @@ from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import limit, threshold
-
-Array = NDArray[np.float64]
 
 _FEWEST_ITERATIONS = 50  # of MAGSAC, which also polishes its result
 _MISSED = 1e-6  # probability that no sample of a competing solution large enough to count is clean

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.acceptance import are_accepted, least_z_score
@@ -27,8 +27,6 @@ from calibgraph.model.geometry import T_OPTICAL_LINK, angle_deg, invert, transfo
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
 from calibgraph.trust.thresholds import limit
-
-Array = NDArray[np.float64]
 
 _FRAMES = 3  # that a corrected guess is matched in
 _CAMERAS = 3  # of a rig, that they are tried for

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.config import Terms
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import TOLERANCE
 from calibgraph.solver.conflicts import Conflict
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

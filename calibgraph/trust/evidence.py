@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.error_components import error_components
 from calibgraph.model.error_sources import ErrorSources
@@ -37,8 +38,6 @@ from calibgraph.trust.pose_posterior import (
 from calibgraph.trust.probability import probability_beyond
 from calibgraph.trust.thresholds import limit
 from factors import pose_sigmas
-
-Array = NDArray[np.float64]
 
 _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unknown
 

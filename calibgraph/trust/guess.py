@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import angle_deg, pose_difference, relative_transform
 from calibgraph.model.verdict import Check
@@ -18,8 +18,6 @@ from calibgraph.trust.conventions import convention_error_between
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import limit, threshold
-
-Array = NDArray[np.float64]
 
 
 def guess_checks(evidence: Evidence) -> Checks:

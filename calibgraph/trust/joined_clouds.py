@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import angle_deg, transform
-
-Array = NDArray[np.float64]
 
 APART_DEG, APART_M = 0.5, 0.1
 """Least displacement that counts. On 19 recordings, 8 of them with clouds whose parts overlap,

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.structure.consensus import maximize_score
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.shift_scores import ShiftScores
@@ -29,7 +29,6 @@ from calibgraph.trust.lens_parameter import (
     lens_variable,
 )
 
-Array = NDArray[np.float64]
 SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)
 """Half-widths of a search; a focal length wrong by 5 % displaces a result by up to 0.5 m."""
 SEARCH_LENS = 0.08, 0.15, 0.04, 0.08

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit, logit, ndtr
 
+from calibgraph.arrays import Array
 from calibgraph.graph.lens import LensSigmas, LensVariable
 from calibgraph.model.config import LensPart
 from calibgraph.model.rig import Camera
@@ -24,8 +24,6 @@ from calibgraph.solver.linear_fit import Freed
 from calibgraph.trust.thresholds import limit, threshold
 from factors import FreeLens
 from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, FOCAL
-
-Array = NDArray[np.float64]
 
 
 class Free(IntEnum):

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.curvature import invert_or_none, pose_hessian
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.spread_kernel import quantile
-
-Array = NDArray[np.float64]
 
 _ROTATIONS = ("about x (pitch)", "about y (yaw)", "about z (roll)")
 _SHIFTS = ("along x (right)", "along y (down)", "along z (the optical axis)")

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import (
     pose_difference,
     relative_covariance,
@@ -19,8 +19,6 @@ from calibgraph.model.verdict import Check
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.thresholds import threshold
-
-Array = NDArray[np.float64]
 
 BLAME_SIGMAS = 1.0
 """Factor by which one camera of a pair must disagree more with its other neighbours than the other

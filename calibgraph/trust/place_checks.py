@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.graph.by_place import place_of
 from calibgraph.model.error_components import error_components
 from calibgraph.model.threshold import Threshold
@@ -17,7 +18,6 @@ from calibgraph.solver.error_model import ErrorFit
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import threshold
 
-Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 

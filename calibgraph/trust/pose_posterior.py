@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.special import expit
 
+from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.likelihood import FAR, log_likelihood
 from calibgraph.model.geometry import pose_rows, relative_transform
@@ -31,8 +31,6 @@ from calibgraph.trust.frame_scores import FrameScorer
 from calibgraph.trust.probability import probability_beyond
 from calibgraph.trust.tempering import sample_posterior
 from factors import pose_sigmas
-
-Array = NDArray[np.float64]
 
 MAX_FRAMES = 10  # evenly spread over the dataset: bounds the time
 SAMPLES = 1000

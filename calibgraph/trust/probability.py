@@ -17,13 +17,11 @@ from operator import mul
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit, gammaincc
 
+from calibgraph.arrays import Array
 from calibgraph.model.verdict import COMMON_ERROR, PASS_BELOW, Check, ErrorProbability, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
-
-Array = NDArray[np.float64]
 
 TABLES, STRUCTURE = "tables", "structure"
 """The models: of correspondences from any source; of runs of the matcher."""

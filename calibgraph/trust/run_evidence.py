@@ -6,15 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-
+from calibgraph.arrays import Array
 from calibgraph.matching.run import MatchingRun
 from calibgraph.progress import Progress, no_progress
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.pose_posterior import PosePosterior, measure_posteriors
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import angle_deg, camera_center
 from calibgraph.model.verdict import COMMON_ERROR, Check
 from calibgraph.solver.conflicts import Conflict
@@ -14,8 +14,6 @@ from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import threshold
-
-Array = NDArray[np.float64]
 
 
 def estimate_checks(evidence: Evidence) -> Checks:

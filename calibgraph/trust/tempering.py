@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import logsumexp
 
-Array = NDArray[np.float64]
+from calibgraph.arrays import Array
 
 _EFFECTIVE = 0.8  # share of the samples that each step keeps
 _MOVES = 3  # of every sample, after each step

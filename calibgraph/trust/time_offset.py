@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
 from calibgraph.model.clock import at_pixels
@@ -23,7 +24,6 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.linear_fit import MIN_ROWS, block_of, fit_camera
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 MAX_ROWS = 200  # per camera and frame: more of dense matches add no information

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Camera
 from factors import unproject
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 
 MAX_SIDE_PX = 800

@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
 from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
@@ -19,7 +20,6 @@ from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress, no_progress
 from factors import unproject
 
-Array = NDArray[np.float64]
 Pair = tuple[str, str]
 PAIR_FRAMES = 3
 """So many frames of a recording are enough: on KITTI, 2 to 10 give relative poses within 0.01 deg

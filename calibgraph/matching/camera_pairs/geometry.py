@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from calibgraph.arrays import Array
 from calibgraph.model.rig import Camera
 from calibgraph.solver.pnp import magsac
 from factors import ray_spreads
-
-Array = NDArray[np.float64]
 
 MAX_LOG10_FALSE_ALARMS = -3.0
 """One pair of cameras in a thousand that see nothing in common may be taken for overlapping."""

@@ -4,13 +4,11 @@ import math
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.camera_pairs.geometry import MAX_ANGLE_RAD, turn_to_axis
 from calibgraph.model.geometry import transform
 from calibgraph.solver.pnp import magsac
-
-Array = NDArray[np.float64]
 
 MIN_INLIERS = 12
 """Features that must agree on a pose: 4 determine one, and of those that agree on an epipolar

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-Array = NDArray[np.float64]
+from calibgraph.arrays import Array
 
 NEIGHBOURS = 24
 MAX_ANGLE_RAD = np.radians(2.5)  # of a neighbour: beyond, the LiDAR's rows are too far apart

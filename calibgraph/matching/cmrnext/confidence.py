@@ -8,9 +8,8 @@ ranks matches, but is not calibrated: it is no probability.
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.cmrnext.correlation import WINDOW
-
-Array = NDArray[np.float64]
 
 STEP_PX = 1.0
 """A last iteration that moves the match by this halves its confidence."""

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.io.frame import Frame
 from calibgraph.matching.cmrnext import confidence
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint
@@ -26,7 +27,6 @@ from calibgraph.matching.cmrnext.network import CmrNext, upscale
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
 
-Array = NDArray[np.float64]
 Maps = NDArray[np.float32]
 
 HALVED_FROM_PX = 1400

@@ -4,15 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint
 from calibgraph.matching.cmrnext.flow_matching import MatchingJob
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,13 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.network import SIZE_MIN, SIZE_MULTIPLE
 from calibgraph.model.rig import Camera
 from factors import Lens
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 MAX_DEPTH_M = 1000.0

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.cmrnext import confidence, probe
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint, load_checkpoint
@@ -28,8 +28,6 @@ from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress
 from calibgraph.solver.pnp import frame_pose
-
-Array = NDArray[np.float64]
 
 _BATCH = {"cpu": 1, "cuda": 4}
 _PROBED_FRAMES = 5  # per camera

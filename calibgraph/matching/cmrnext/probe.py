@@ -7,14 +7,13 @@ network that finds it has memorised the extrinsic of its training.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 
-Array = NDArray[np.float64]
 BLANK = (124, 116, 104)
 """The mean colour of the networks' training: zero, once normalised."""
 

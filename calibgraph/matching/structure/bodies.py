@@ -4,12 +4,10 @@ from collections.abc import Mapping
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import invert, relative_transform
 from calibgraph.model.rig import Camera, RelativePose, Rig
-
-Array = NDArray[np.float64]
 
 Body = Mapping[str, Camera]
 """Cameras with fixed relative poses; the extrinsic of the first is the pose of the body."""

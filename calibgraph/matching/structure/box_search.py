@@ -11,14 +11,12 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.matching.structure.correlation_maps import CorrelationMaps
 from calibgraph.matching.structure.cross_entropy import maximize
 from calibgraph.model.geometry import invert, relative_transform
-
-Array = NDArray[np.float64]
 
 COARSE_BLUR_CELLS, COARSE_EVERY, FINE_BLUR_CELLS = 2.0, 2, 1.0
 SAMPLES = 1024  # of the box

@@ -5,16 +5,14 @@ from functools import partial
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
 from calibgraph.matching.camera_pairs.geometry import agree_on_epipolar_geometry
 from calibgraph.matching.camera_pairs.relative_pose import relative_pose
 from calibgraph.matching.camera_pairs.surfaces import planes_at
 from calibgraph.matching.structure.pose_refinement import CameraFrames
 from calibgraph.model.rig import Rig
-
-Array = NDArray[np.float64]
 
 FRAMES = 4
 

@@ -1,14 +1,12 @@
 """Pose consensus: the pose at which the shifts of all groups agree best."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.structure.cross_entropy import maximize
 from calibgraph.matching.structure.schedule import Level
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from factors.compiled import compiled
-
-Array = NDArray[np.float64]
 
 SAMPLES, STEPS = 400, 14  # of a search
 SAME_MAXIMUM = 1e-3  # relative difference of two searches' ends at the same maximum

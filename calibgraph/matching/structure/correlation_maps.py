@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.structure.correlation_kernels import find_best_shifts, sum_z_scores
 from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
@@ -25,7 +26,6 @@ from calibgraph.matching.structure.visibility import find_visible
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.model.rig import Camera
 
-Array = NDArray[np.float64]
 Maps = NDArray[np.float32]
 
 STEP_RAD = np.radians(0.6)  # of the angular image and of the samples in a window

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from calibgraph.arrays import Array
 
 ELITE_SHARE = 0.1  # of the samples, the best, shape the next step's distribution
 WIDENING = 1.2  # of the elites' covariance, against premature convergence

@@ -5,7 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from calibgraph.arrays import Array
+
 Rows = NDArray[np.intp]
 
 

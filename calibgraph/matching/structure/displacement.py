@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.structure.consensus import sum_scores
 from calibgraph.matching.structure.shift_scores import ShiftScores
-
-Array = NDArray[np.float64]
 
 DISPLACEMENTS_DEG, DISPLACEMENT_M = (1.2, 2.2), 0.4
 """About and along each axis: the displaced poses."""

@@ -9,13 +9,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.structure.consensus import sum_scores, z_score
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.shift_scores import ShiftScores
-
-Array = NDArray[np.float64]
 
 FAR = replace(LEVELS[3], reach_rad=np.radians(2.0), weighed=False)
 """A fine level that reaches as far as rounds may end off. Coarse levels only propose poses: they

@@ -1,12 +1,10 @@
 """Peaks: each group's own best shift next to the consensus, as one correspondence."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.structure.shift_scores import Grids, ShiftScores
 from calibgraph.model.correspondences import Correspondences
-
-Array = NDArray[np.float64]
 
 PEAK_STEPS = 2  # how far from the consensus a group may peak, in grid steps
 MIN_QUALITY = 0.05  # as of a level; the confidence's unit

@@ -7,15 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array, Mask
 from calibgraph.matching.structure.directions import scan_angles
 from calibgraph.matching.structure.visibility import find_visible
 from calibgraph.matching.structure.window_table import WindowTable, WindowTables
 from calibgraph.memory import mmap_copy
 from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Camera
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MIN_RANGE_M = 1.5  # nearer returns are the vehicle itself
 ORIGIN_CELL_RAD, MAX_HIDDEN_FROM_ORIGIN = np.radians(0.3), 0.04

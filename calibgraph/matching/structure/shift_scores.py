@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import Level
@@ -18,7 +19,6 @@ from calibgraph.memory import mmap_zeros
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import project_with_jacobian
 
-Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Grids = NDArray[np.float32]
 

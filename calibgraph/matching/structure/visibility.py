@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array, Mask
 from calibgraph.model.rig import Camera
 from factors import unproject
 from factors.block_arrays import contiguous
@@ -19,9 +20,7 @@ from factors.lens_kernels import (
     subtract_columns,
 )
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 HIDDEN_RATIO, HIDDEN_M = 1.15, 0.3  # a point farther than this beyond the nearest is hidden
 _BORDER_PIXELS, _COSINE_MARGIN = 17, 0.99  # of each side of an image; what lies between them

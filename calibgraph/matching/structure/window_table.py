@@ -6,6 +6,7 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array, Mask
 from calibgraph.matching.structure.directions import thin
 from calibgraph.matching.structure.windows import (
     Neighbours,
@@ -15,9 +16,7 @@ from calibgraph.matching.structure.windows import (
 from calibgraph.memory import mmap_copy, mmap_zeros
 from calibgraph.parallel import KeyedCache
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 MIN_RELIABILITY = 0.3  # of a window's variation (0 flat, 1 strong)
 MAX_BYTES = 500_000_000  # of all tables of a cache, without the trees of neighbours

@@ -17,7 +17,8 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from calibgraph.arrays import Array
+
 Floats = NDArray[np.float32]
 
 _LARGEST = 12.0  # of a logit: beyond, the weight is 0 or 1 to single precision

@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from calibgraph.arrays import Array, Mask
 from calibgraph.matching.structure.window_features_kernel import FEATURES, fill_features
 from calibgraph.matching.structure.window_kernel import describe_windows
 from calibgraph.matching.structure.window_weights import window_network
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 WINDOW_POINTS = 25  # samples of a window; fewer cannot hold an edge and both its sides
 MIN_WINDOW_POINTS = 9

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from calibgraph.arrays import Array
 from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.inputs import (
     LidarImage,
@@ -25,8 +26,6 @@ from calibgraph.matching.cmrnext.inputs import (
 )
 from calibgraph.matching.cmrnext.training.scenes import Scene
 from calibgraph.model.geometry import invert, transform
-
-Array = NDArray[np.float64]
 
 MIN_POINTS = 50
 _ROLL_DEG, _TURN_DEG = 5.0, 3.0

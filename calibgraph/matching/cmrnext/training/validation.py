@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.io.dataset import spread_out
 from calibgraph.matching.cmrnext.architecture import Architecture
@@ -16,8 +17,6 @@ from calibgraph.matching.cmrnext.training.scenes import Scene
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.solver.pnp import frame_pose
-
-Array = NDArray[np.float64]
 
 MAX_SCENES = 100
 """Most images to validate on, evenly spread over those held out: they are kept in memory."""
