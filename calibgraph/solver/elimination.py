@@ -69,9 +69,7 @@ class Linearization:
     @cached_property
     def placed(self) -> gtsam.GaussianFactorGraph:
         """The linear factors of all places, data included."""
-        graph = self.model.place_graph.linearize(self.values)
-        graph.push_back(self.data.graph)
-        return graph
+        return join_linear(self.model.place_graph.linearize(self.values), self.data.graph)
 
     @property
     def graph(self) -> gtsam.GaussianFactorGraph:

@@ -77,7 +77,7 @@ class DistortionEvidence:
         """No matches, with the weak prior alone."""
         jacobian = np.zeros((len(weak), _DISTORTIONS))
         information = np.zeros((places, _DISTORTIONS, _DISTORTIONS))
-        return DistortionEvidence(jacobian, weak, information, information[:, 0])
+        return DistortionEvidence(jacobian, weak, information, np.zeros((places, _DISTORTIONS)))
 
     def as_of_one_place(self) -> DistortionEvidence:
         """The sum over places."""

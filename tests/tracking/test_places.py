@@ -101,6 +101,18 @@ def test_places_give_what_a_batch_gives(places: int, frames: int, rounds: int, t
     np.testing.assert_allclose(sigmas_of_pair(T, found), sigmas_of_pair(T, joint), rtol=0.08)
 
 
+def test_many_places_give_the_mount_of_a_batch() -> None:
+    """In a mount is what residuals show of the scan distortion, over all epochs."""
+    drawn = drawn_of(20, 3, 1, tie=False)
+    T, joint = batch_of(drawn, of="mount")
+    tracker = IncrementalCalibrator(drawn.rig, MOUNT)
+    for frame in np.unique(drawn.table.frame):
+        tracker.update(drawn.table.select(drawn.table.frame == frame))
+    found = tracker.calibration().T_camera_lidar
+    apart = np.concatenate([twist_between(found[name], T[name]) for name in T])
+    assert np.sqrt(np.mean(np.square(apart) / np.diag(joint))) < 0.3
+
+
 def states(table: Correspondences, **more: object) -> Correspondences:
     return replace(table, metadata={**table.metadata, **STATED, **more})
 
