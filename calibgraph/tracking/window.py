@@ -1,11 +1,13 @@
 """The graph that is reported, in iSAM2: what all places share, and the places of the open epoch.
 
-    summary        the other closed places, one marginal on the cloud and the cameras
-    shared         priors, scan distortion, cameras, relative poses: as in a batch
-    place, data    of the places of the open epoch; every frame exchanges these
+    held        summary of the other closed places: one marginal on the cloud and the cameras;
+                priors and relative poses of the cameras
+    errors      of what all places share, the scan distortion among them: as in a batch
+    places      those of the open epoch, with their data
 
-What is reported is iSAM2's estimate and its joint marginal. Whatever else changes the graph, such
-as the end of an epoch or a place that is entered, begins another window.
+Every frame exchanges errors and places: their covariances depend on all frames. What is reported is
+iSAM2's estimate and its joint marginal. Whatever else changes the graph, such as the end of an
+epoch or a place that is entered, begins another window.
 """
 
 from __future__ import annotations
@@ -42,24 +44,24 @@ class Window:
         parameters.findUnusedFactorSlots = True
         self._isam = gtsam.ISAM2(parameters)
         self.places = tuple(places)
-        self._of_places: list[int] = []
-        self._update(model, model.shared_graph, start)
+        self._exchanged: list[int] = []
+        self._update(model, model.pose_graph, start)
 
     def has_graph_of(self, model: LatentPoseModel, places: Sequence[str]) -> bool:
-        """Whether a model differs in its places and their data alone."""
-        same = self.model.pose_graph is model.pose_graph and self.model.matched == model.matched
-        return same and self.places == tuple(places)
+        """Whether a model has the variables and the held factors of this one."""
+        same = self.model.pose_graph is model.pose_graph and self.places == tuple(places)
+        return same and [*self.model.matched_places()] == [*model.matched_places()]
 
     def exchange(self, model: LatentPoseModel) -> None:
-        """Put the places and data of a model in the place of those that are held."""
+        """Put the errors and places of a model in the place of those before."""
         self._update(model, gtsam.NonlinearFactorGraph(), gtsam.Values())
 
     def _update(
-        self, model: LatentPoseModel, shared: gtsam.NonlinearFactorGraph, start: gtsam.Values
+        self, model: LatentPoseModel, held: gtsam.NonlinearFactorGraph, start: gtsam.Values
     ) -> None:
-        graph = join(shared, model.place_graph, data_graph(model))
-        result = self._isam.update(graph, start, self._of_places)
-        self._of_places = [*result.getNewFactorsIndices()][shared.size() :]
+        graph = join(held, model.error_graph, model.place_graph, data_graph(model))
+        result = self._isam.update(graph, start, self._exchanged)
+        self._exchanged = [*result.getNewFactorsIndices()][held.size() :]
         for _ in range(_MOST_STEPS):
             if not self._isam.update().getVariablesRelinearized():
                 break

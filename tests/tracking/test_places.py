@@ -44,6 +44,7 @@ from calibgraph.tracking.place_shift import shift_covariance
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
 from calibgraph.tracking.stream_lines import frames_of_lines
 from calibgraph.tracking.streams import Refused, StreamFrame
+from calibgraph.tracking.window import Window
 from calibgraph.trust.evidence import Evidence
 from tests.conftest import stereo_relative_pose
 from tests.tracking.drives import drive, pair_of, track_draw
@@ -316,6 +317,32 @@ def test_a_camera_that_is_blind_at_new_places_stops_nothing() -> None:
             before = sigmas
     np.testing.assert_allclose(sigmas["right"], before["right"], rtol=0.2)
     assert (sigmas["left"][:3] < before["left"][:3]).all()
+
+
+def test_a_camera_that_sees_a_place_later_than_another_is_taken_in() -> None:
+    """Its variable at a place that the open epoch has already begins another window."""
+    tracker = IncrementalCalibrator(pair_of())
+    for frame, table in enumerate(drive(pair_of(), 40)):
+        seen = table.of_camera("left") if frame in (24, 25) else table
+        tracker.update(states(seen), place="here" if frame < 24 else "there")
+    counts = tracker.calibration().counts
+    assert [counts[name]["frames_used"] for name in ("left", "right")] == [40, 38]
+
+
+def test_within_an_epoch_the_window_holds_the_graph_of_its_last_frame() -> None:
+    """Also the covariances that depend on all frames: a new window has the same marginal."""
+    rig = rig_of("panorama")
+    table = simulate_correspondences(rig, frames=16, matches=180, seed=0)
+    stated = {"places": [[*range(16)]], "place_variance": 8.0, "scan_motion_m": 0.15}
+    tracker = IncrementalCalibrator(rig, MOUNT)
+    for frame in range(16):
+        tracker.update(replace(table.select(table.frame == frame), metadata=stated))
+        held = tracker._assess().window
+        anew, keys = Window(held.model, held.places, held.values), held.model.reported_keys
+        covariance = anew.covariance(keys)
+        np.testing.assert_allclose(
+            held.covariance(keys), covariance, atol=1e-3 * np.abs(covariance).max()
+        )
 
 
 # Where the place of a frame comes from
