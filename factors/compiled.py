@@ -17,19 +17,18 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from threading import Lock
-from typing import Any, cast
+from typing import Any
 
 import numba
 import numpy as np
 import platformdirs
-from numba.extending import register_jitable
 
 _UNUSED_S = 7 * 86400.0  # a folder of code that no process has used for so long is removed
-_COMMON: Any = {"error_model": "numpy", "no_cfunc_wrapper": True}  # C code calls none of them
+_COMMON: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 _log = logging.getLogger(__name__)
 _config: Any = numba.config  # its attributes are made when numba is imported
 
@@ -51,28 +50,18 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        if options.get("parallel"):  # the cache knows a function by its name, not by the options
-            function.__qualname__ += "_by_all_cores"
+        function.__qualname__ = _name(function, options)
         with _decorating:
             before = _config.CACHE_DIR
             folder = _folder(Path(function.__code__.co_filename).parent)
             _config.CACHE_DIR = str(folder or before)  # numba reads it where it decorates
             try:
-                jit = numba.njit(nogil=True, cache=folder is not None, **_COMMON, **options)
+                jit = numba.njit(cache=folder is not None, **_COMMON, **options)
                 return jit(function)
             finally:
                 _config.CACHE_DIR = before
 
     return decorate
-
-
-def kernel_part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """As :func:`compiled`, for a function that other kernels alone call.
-
-    It is compiled with them, without what Python would call: half of the time that a short one
-    takes. From Python it is the plain function.
-    """
-    return cast(Callable[[Callable[..., Any]], Any], register_jitable(**_COMMON, **options))
 
 
 def one_at_a_time(kernel: Any) -> Callable[..., Any]:
@@ -86,6 +75,19 @@ def one_at_a_time(kernel: Any) -> Callable[..., Any]:
             return kernel(*arguments, **options)
 
     return run
+
+
+def _name(function: Callable[..., Any], options: Mapping[str, Any]) -> str:
+    """A name for each set of options and of values that a kernel encloses.
+
+    numba keeps the code of one name in numbered files, and two processes that make kernels of one
+    name at a time may take each other's number: a lens would be projected by the code of another.
+    """
+    enclosed = [cell.cell_contents for cell in function.__closure__ or ()]
+    values = [getattr(value, "__qualname__", repr(value)) for value in enclosed]
+    known = [*values, *(f"{option}={value}" for option, value in sorted(options.items()))]
+    digest = hashlib.sha256(" ".join(known).encode()).hexdigest()[:8] if known else ""
+    return "_".join(filter(None, (function.__qualname__, digest)))
 
 
 @cache

@@ -15,7 +15,7 @@ import numpy as np
 from numba import prange
 from numba.core.errors import NumbaWarning
 
-from factors.compiled import compiled, kernel_part
+from factors.compiled import compiled
 from factors.kernel_projection import project, project_pinhole, project_rays
 from factors.kernel_sums import (
     apply_weights,
@@ -127,7 +127,7 @@ def evaluate(kind: int, *, shared: bool = False) -> Any:
     return evaluate_runs
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def fill_norms(whitening, start, n, tile, factor, norms):  # type: ignore[no-untyped-def]
     """Fill in the norms of a tile's residuals times a factor, plain and whitened."""
     ru, rv = tile[RU], tile[RV]

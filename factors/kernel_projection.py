@@ -5,12 +5,12 @@ the rows that are taken out before a loop, and Python's exception on a division 
 ``error_model="numpy"``.
 """
 
-from factors.compiled import compiled, kernel_part
+from factors.compiled import compiled
 from factors.lens_kernels import MIN_DEPTH_M, PINHOLE, project_one, subtract_columns
 from factors.tile import FAST, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def project_rays(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """Residuals of an undistorted pinhole, x/z, y/z and 1/z.
 
@@ -54,7 +54,7 @@ def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-
         rx[i], ry[i], rz[i] = x, y, z
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """``project`` for a pinhole: without branches, if no point lies outside the lens' domain.
 

@@ -2,14 +2,14 @@
 
 import math
 
-from factors.compiled import kernel_part
+from factors.compiled import compiled
 from factors.loss import CAUCHY, loss_and_weight
 from factors.tile import FAST, PRODUCT, PSI, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z
 
 _SMALL = 1e-100  # far from the smallest float by more than four factors
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def whiten(whitening, start, n, tile):  # type: ignore[no-untyped-def]
     """Multiply residuals and derivatives by the whitening matrices, or by numbers."""
     if whitening.shape[0] == 0:
@@ -29,7 +29,7 @@ def whiten(whitening, start, n, tile):  # type: ignore[no-untyped-def]
         tile[VZ, i] *= s11
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def scale_residuals(whitening, start, n, tile):  # type: ignore[no-untyped-def]
     """Multiply residuals by their weights w, if these are numbers."""
     if whitening.shape[0] == 0:
@@ -40,7 +40,7 @@ def scale_residuals(whitening, start, n, tile):  # type: ignore[no-untyped-def]
         rv[i] *= weights[i]
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def weigh(loss, scale, n, tile):  # type: ignore[no-untyped-def]
     """Fill in the weights psi; return the sum of rho."""
     ru, rv, psi = tile[RU], tile[RV], tile[PSI]
@@ -56,7 +56,7 @@ def weigh(loss, scale, n, tile):  # type: ignore[no-untyped-def]
     return -_sum_of_logarithms(psi, n, tile[PRODUCT]) / k
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def _sum_of_logarithms(values, n, products):  # type: ignore[no-untyped-def]
     """The logarithm of the product of ``n`` values, taken before it leaves the range of a float.
 
@@ -80,7 +80,7 @@ def _sum_of_logarithms(values, n, products):  # type: ignore[no-untyped-def]
     return logarithms + math.log(even) + math.log(odd)
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def sum_tile(n, tile, out):  # type: ignore[no-untyped-def]
     """Add J^T psi J and J^T psi r of a tile to 27 sums."""
     h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = 0.0
@@ -134,7 +134,7 @@ def sum_tile(n, tile, out):  # type: ignore[no-untyped-def]
         out[k] += sums[k]
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def apply_weights(whitening, start, n, tile):  # type: ignore[no-untyped-def]
     """Turn the residuals w r into psi w^2 r, and psi into psi w^2, if the weights are numbers."""
     ru, rv, psi = tile[RU], tile[RV], tile[PSI]
@@ -151,7 +151,7 @@ def apply_weights(whitening, start, n, tile):  # type: ignore[no-untyped-def]
         psi[i] *= w * w
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
     """Add the 21 sums of H of a tile of a pinhole, from a = x/z, b = y/z, w = 1/z, psi and psi r.
 
@@ -207,7 +207,7 @@ def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
         out[k] += sums[k]
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def sum_ray_gradients(lens, n, tile, out):  # type: ignore[no-untyped-def]
     """Add the gradient of a tile of a pinhole to the sums, see ``sum_rays``."""
     pull_u, pull_v = tile[RU], tile[RV]
@@ -228,7 +228,7 @@ def sum_ray_gradients(lens, n, tile, out):  # type: ignore[no-untyped-def]
         out[21 + k] += sums[k]
 
 
-@kernel_part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def sum_tile_gradients(n, tile, out):  # type: ignore[no-untyped-def]
     """Add J^T psi r of a tile to the sums, see ``sum_tile``."""
     rx, ry, rz, rp = tile[X], tile[Y], tile[Z], tile[PSI]

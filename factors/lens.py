@@ -48,6 +48,7 @@ ORDERS: dict[LensModel, str] = {
     "equirectangular": "[]",
 }
 """The distortion coefficients of each model in their order, which is OpenCV's."""
+_NO_JACOBIANS, _NO_VALIDITY = np.empty((0, 6)), np.empty(0, np.bool_)
 _MAX_RADTAN_ANGLE_RAD = math.radians(85.0)
 
 
@@ -142,7 +143,8 @@ class Lens:
             inside the injective domain of the lens). It may still lie outside the image.
         """
         points = contiguous(np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3))
-        pixels, valid = _project_many(self.kind)(self.packed, points)
+        pixels, valid = np.empty((len(points), 2)), np.empty(len(points), np.bool_)
+        _project_many(self.kind)(self.packed, points, pixels, valid, _NO_JACOBIANS)
         return pixels, valid
 
     def are_projectable(self, points_lidar_m: Array, T_camera_lidar: Array) -> NDArray[np.bool_]:
@@ -154,8 +156,9 @@ class Lens:
     def project_with_jacobian(self, points_camera_m: ArrayLike) -> tuple[Array, Array]:
         """Project points: (n, 2) pixels, and their (n, 2, 3) derivatives by the points."""
         points = contiguous(np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3))
-        pixels, jacobians = _project_many_with_jacobian(self.kind)(self.packed, points)
-        return pixels, jacobians
+        pixels, jacobians = np.empty((len(points), 2)), np.empty((len(points), 6))
+        _project_many(self.kind)(self.packed, points, pixels, _NO_VALIDITY, jacobians)
+        return pixels, jacobians.reshape(-1, 2, 3)
 
     def fill_twist_columns(
         self, T_camera_lidar: Array, points_lidar_m: Array, columns: Array
@@ -170,11 +173,15 @@ class Lens:
         Returns:
             (2, n) pixels.
         """
-        points = contiguous(np.asarray(points_lidar_m, dtype=np.float64).T)
-        pixels: Array = _fill_twist_columns(self.kind)(
-            self.packed, contiguous(T_camera_lidar), points, columns
-        )
-        return pixels
+        points = points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+        pixels, by_point = self.project_with_jacobian(points)
+        columns[3:] = by_point.transpose(2, 1, 0)
+        (x, y, z), (by_x, by_y, by_z) = points.T, columns[3:]
+        # d(exp(xi) p) / d rotation = -[p]x;  g^T (-[p]x) = (p x g)^T.
+        columns[0] = y * by_z - z * by_y
+        columns[1] = z * by_x - x * by_z
+        columns[2] = x * by_y - y * by_x
+        return pixels.T
 
 
 def _checked(fx: float, fy: float, distortion: Sequence[float], model: LensModel) -> Array:
@@ -239,54 +246,16 @@ def _are_projectable(kind: int) -> Any:
 @cache
 def _project_many(kind: int) -> Any:
     @compiled()
-    def run(lens, points):  # type: ignore[no-untyped-def]
-        pixels, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
+    def run(lens, points, pixels, valid, jacobians):  # type: ignore[no-untyped-def]
+        """Fill in (n, 2) pixels, and (n,) validity and (n, 6) derivatives where there is room."""
         for k in range(len(points)):
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
             projection = project_one(kind, lens, x, y, z)
-            pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
-            valid[k] = is_projectable(kind, lens, x, y, z)
-        return pixels, valid
-
-    return run
-
-
-@cache
-def _project_many_with_jacobian(kind: int) -> Any:
-    @compiled()
-    def run(lens, points):  # type: ignore[no-untyped-def]
-        n = len(points)
-        pixels = np.empty((n, 2))
-        jacobians = np.empty((n, 2, 3))
-        for k in range(n):
-            projection = project_one(kind, lens, points[k, 0], points[k, 1], points[k, 2])
-            pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
-            jacobians[k, 0, 0], jacobians[k, 0, 1], jacobians[k, 0, 2] = projection[2:5]
-            jacobians[k, 1, 0], jacobians[k, 1, 1], jacobians[k, 1, 2] = projection[5:8]
-        return pixels, jacobians
-
-    return run
-
-
-@cache
-def _fill_twist_columns(kind: int) -> Any:
-    @compiled()
-    def run(lens, T, points, columns):  # type: ignore[no-untyped-def]
-        n = points.shape[1]
-        pixels = np.empty((2, n))
-        for i in range(n):
-            px, py, pz = points[0, i], points[1, i], points[2, i]
-            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-            u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, x, y, z)
-            pixels[0, i], pixels[1, i] = u, v
-            columns[3, 0, i], columns[4, 0, i], columns[5, 0, i] = ux, uy, uz
-            columns[3, 1, i], columns[4, 1, i], columns[5, 1, i] = vx, vy, vz
-            # d(exp(xi) p) / d rotation = -[p]x;  g^T (-[p]x) = (p x g)^T.
-            columns[0, 0, i], columns[0, 1, i] = y * uz - z * uy, y * vz - z * vy
-            columns[1, 0, i], columns[1, 1, i] = z * ux - x * uz, z * vx - x * vz
-            columns[2, 0, i], columns[2, 1, i] = x * uy - y * ux, x * vy - y * vx
-        return pixels
+            for row in range(2):
+                pixels[k, row] = projection[row]
+            for place in range(6 if len(jacobians) else 0):
+                jacobians[k, place] = projection[2 + place]
+            if len(valid):
+                valid[k] = is_projectable(kind, lens, x, y, z)
 
     return run

@@ -2,7 +2,7 @@
 
 import math
 
-from factors.compiled import compiled, kernel_part
+from factors.compiled import compiled
 from factors.wide_lenses import (
     MIN_POLAR_SHARE,
     project_equirectangular,
@@ -53,7 +53,7 @@ def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel_part()
+@compiled()
 def _radtan(lens, a, b):  # type: ignore[no-untyped-def]
     """Distorted normalised point and its 2x2 Jacobian (row major), continued past the limit."""
     limit = lens[LIMIT]
@@ -75,7 +75,7 @@ def _radtan(lens, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel_part()
+@compiled()
 def _radtan_inside(lens, a, b):  # type: ignore[no-untyped-def]
     k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
     k4, k5, k6 = lens[9], lens[10], lens[11]
@@ -96,7 +96,7 @@ def _radtan_inside(lens, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel_part()
+@compiled()
 def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
     """Kannala-Brandt; the angle from atan2, so that fields of view over 180 degrees are seen."""
     fx, fy = lens[0], lens[1]

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.compiled import kernel_part
+from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,7 @@ def equirectangular_rays(angles_rad: Array) -> Array:
     return np.column_stack([np.sin(right) * flat, np.sin(down), np.cos(right) * flat])
 
 
-@kernel_part()
+@compiled()
 def project_equirectangular(lens, x, y, z):  # type: ignore[no-untyped-def]
     """Longitude and latitude times fx and fy, with the Jacobian, like ``project_one``."""
     fx, fy = lens[0], lens[1]
@@ -95,7 +95,7 @@ def project_equirectangular(lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel_part()
+@compiled()
 def _distort(lens, a, b):  # type: ignore[no-untyped-def]
     """Distorted point of the plane, and its Jacobian (row major)."""
     k1, k2, p1, p2 = lens[5], lens[6], lens[7], lens[8]
@@ -112,7 +112,7 @@ def _distort(lens, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel_part()
+@compiled()
 def project_omnidirectional(lens, x, y, z):  # type: ignore[no-untyped-def]
     """The unified model with its Jacobian, like ``project_one``.
 
@@ -144,7 +144,7 @@ def project_omnidirectional(lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel_part()
+@compiled()
 def _continue_omnidirectional(lens, x, y, z, theta):  # type: ignore[no-untyped-def]
     limit = lens[12]
     radius = math.sin(limit) / (math.cos(limit) + lens[4])

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from factors.compiled import compiled, kernel_part
+from factors.compiled import compiled
 
 _SMALL_ANGLE = 1e-2  # rad
 
@@ -46,7 +46,7 @@ def exponential_times(twists, T, out):  # type: ignore[no-untyped-def]
         out[i, 2, 3] += w + second * c + third * (x * b - y * a)
 
 
-@kernel_part()
+@compiled()
 def _rotation_vector(R):  # type: ignore[no-untyped-def]
     """The logarithm of a rotation matrix, by its quaternion."""
     trace = R[0, 0] + R[1, 1] + R[2, 2]

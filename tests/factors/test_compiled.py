@@ -145,6 +145,8 @@ def test_kernels_of_two_kinds_of_lens_and_of_all_cores_are_kept_apart(tmp_path: 
     )
     found = {run(code, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)}
     assert found == {("[[0.3, 0.2]]\n[[0.291, 0.189]]", "")}
+    # Each has its own index: processes that make several at a time mix up the numbers of one.
+    assert len([*tmp_path.rglob("*_project_many*.nbi")]) == 2
     code = (
         "import numpy as np; from factors.compiled import compiled\n"
         "from tests.factors.test_compiled import totals\n"

@@ -54,7 +54,9 @@ def sum_scores(scores: ShiftScores, unknowns: Array) -> Array:
     """(n,) sum over groups of the score at the shift that each row of unknowns (n, k) implies."""
     out = np.zeros(len(unknowns))
     columns = np.ascontiguousarray(unknowns.T, dtype=np.float32)
-    _sum_interpolated(scores.grids, scores.jacobian, columns, out)
+    count, size, _ = scores.grids.shape
+    grids = scores.grids.reshape(count, -1), size
+    _sum_interpolated(grids, scores.jacobian.astype(np.float32), columns, out)
     return out
 
 
@@ -83,17 +85,17 @@ def _maximize_once(
 def _sum_interpolated(grids, jacobian, unknowns, out):  # type: ignore[no-untyped-def]
     """Add bilinearly interpolated scores; shifts outside the grid count 0. unknowns: (k, n).
 
-    A grid is in the first-level cache for all of the unknowns.
+    A grid, a row of (g, size * size), is in the first-level cache for all of the unknowns.
     """
-    size, (k, n) = grids.shape[1], unknowns.shape
+    (flat, size), (k, n) = grids, unknowns.shape
     reach = (size - 1) // 2
     limit = np.float32(2 * reach)
     right, below = np.uint64(1), np.uint64(size)  # unsigned: numba tests others for negative ones
     us, vs, corner = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.uint32)
-    for g in range(len(grids)):
-        by = jacobian[g].astype(np.float32)
-        us[:] = reach
-        vs[:] = reach
+    for g in range(len(flat)):
+        by, grid = jacobian[g], flat[g]
+        for i in range(n):
+            us[i] = vs[i] = reach
         for a in range(0, k - 2, 3):  # three at once: us and vs are loaded a third as often
             b, c = a + 1, a + 2
             for i in range(n):
@@ -111,7 +113,6 @@ def _sum_interpolated(grids, jacobian, unknowns, out):  # type: ignore[no-untype
             corner[i] = row * size + column
             us[i] = u - np.float32(column)
             vs[i] = v - np.float32(row) if inside else np.float32(-1)
-        grid = grids[g].reshape(-1)
         for i in range(n):
             at, x, y = np.uint64(corner[i]), us[i], vs[i]
             under = at + below

@@ -7,13 +7,13 @@ import math
 
 import numpy as np
 
-from factors.compiled import compiled, kernel_part
+from factors.compiled import compiled
 
 HALF_PI, PI = np.float32(math.pi / 2), np.float32(math.pi)
 TRANSFORMS_AT_ONCE = 16  # whose grids of shifts stay in the second-level cache
 
 
-@kernel_part(fastmath=True)
+@compiled(fastmath=True)
 def _atan2(y, x):  # type: ignore[no-untyped-def]
     """The angle of (x, y), to 1e-5 rad, without branches, so that loops vectorize.
 
@@ -32,7 +32,7 @@ def _atan2(y, x):  # type: ignore[no-untyped-def]
     return -angle if y < 0 else angle
 
 
-@kernel_part(fastmath=True)
+@compiled(fastmath=True)
 def _project_to_cells(transforms, point, grid, us, vs):  # type: ignore[no-untyped-def]
     """Places (column, row) of a point in the maps, for transforms (12, n)."""
     px, py, pz = np.float32(point[0]), np.float32(point[1]), np.float32(point[2])
@@ -117,7 +117,7 @@ def find_best_shifts(maps, variances, points, transforms, grid, least, reach, ou
             _find_best_shift(totals[i], variance[i], least, reach, out[start + i])
 
 
-@kernel_part(fastmath=True)
+@compiled(fastmath=True)
 def _find_best_shift(total, variance, least, reach, out):  # type: ignore[no-untyped-def]
     rows, columns = total.shape
     for row in range(rows):

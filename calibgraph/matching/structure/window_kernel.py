@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from factors.compiled import compiled, kernel_part
+from factors.compiled import compiled
 
 INTENSITY_NOISE = 0.05  # of intensity ranks: below, a window counts as flat
 DEPTH_NOISE = 0.03  # of relative inverse range: below, a window counts as flat
@@ -57,7 +57,7 @@ def describe_windows(cloud, members, counts, keep_linear, moved_m, front, basis,
         reliability[w] = max(depth, shade)
 
 
-@kernel_part()
+@compiled()
 def _find_silhouette(inverse, n, ordered):  # type: ignore[no-untyped-def]
     """The inverse range of the near side of a window's silhouette; 0 if it has none.
 
@@ -78,7 +78,7 @@ def _find_silhouette(inverse, n, ordered):  # type: ignore[no-untyped-def]
     return near if wide and near > SILHOUETTE_RATIO * far else 0.0
 
 
-@kernel_part()
+@compiled()
 def _fill_trend(directions, n, trend_u, trend_v):  # type: ignore[no-untyped-def]
     """Fill an orthonormal basis of the linear functions of direction in a window.
 
@@ -111,7 +111,7 @@ def _fill_trend(directions, n, trend_u, trend_v):  # type: ignore[no-untyped-def
         trend_u[i], trend_v[i] = (cos * v - sin * u) * of_minor, (cos * u + sin * v) * of_major
 
 
-@kernel_part()
+@compiled()
 def _normalize(values, n, trend_u, trend_v, other, by_other, noise):  # type: ignore[no-untyped-def]
     """Centre and normalise values in place, orthogonal to the trend and to another column.
 
