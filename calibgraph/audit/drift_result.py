@@ -12,6 +12,7 @@ from calibgraph.audit.result import LidarAudit, by_unit, freeze, lidar_summary
 from calibgraph.errors import CalibrationError
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.image_times import IMAGE_TIMES
 from calibgraph.model.result_files import CALIBRATION_FILE
 
 DriftStatus = Literal["OK", "CANNOT TELL", "CHANGED"]
@@ -213,7 +214,8 @@ def _require_same_rig(
             "one rig"
         )
     for camera, other in b.items():
-        parts = {"T_camera_lidar"} | ({"intrinsics_px", "distortion"} if own_lenses else set())
+        parts = {"T_camera_lidar", *IMAGE_TIMES}
+        parts |= {"intrinsics_px", "distortion"} if own_lenses else set()
         if other.model_dump(exclude=parts) != a[camera].model_dump(exclude=parts):
             raise CalibrationError(
                 f"{name}: camera {camera} has another image size or lens than in {first}, which "

@@ -17,6 +17,7 @@ from calibgraph.audit.significance import DISPLAY
 from calibgraph.errors import CalibrationError
 from calibgraph.files import write_text
 from calibgraph.model.calibration import FRAMES_SENTENCE
+from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
 from calibgraph.model.summary import Reason
 from calibgraph.report.camera_section import matrix_text
@@ -254,9 +255,11 @@ def _draw(audit: Audit) -> tuple[dict[str, Pictures], str | None]:
             if name in audit.shown.image_paths:
                 image = audit.shown.load_image(name, camera)
                 measured = measured_camera(camera, audit.cameras[name])
+                twist = audit.shown.twist_per_s
+                seen = None if measured is None else when_taken(measured, twist)
                 drawn[name] = Pictures(
-                    draw_by_depth(image, cloud, camera, budget),
-                    None if measured is None else draw_by_depth(image, cloud, measured, budget),
+                    draw_by_depth(image, cloud, when_taken(camera, twist), budget),
+                    None if seen is None else draw_by_depth(image, cloud, seen, budget),
                     width_on_page(camera),
                 )
     except (CalibrationError, OSError) as error:

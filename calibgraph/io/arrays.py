@@ -83,7 +83,7 @@ def dataset_from_arrays(
             )
     if not frames:
         raise DatasetError("no frame given")
-    twists = None if twists_per_s is None else np.asarray(twists_per_s, dtype=np.float64)
+    twists = None if twists_per_s is None else np.array(twists_per_s, dtype=np.float64)
     if twists is not None and not (twists.shape == (frames, 6) and np.isfinite(twists).all()):
         raise DatasetError(f"twists_per_s: expected ({frames}, 6) finite numbers, one row a frame")
     root = Path("arrays") / uuid.uuid4().hex[:8]  # caches tell frames apart by their paths

@@ -111,11 +111,13 @@ def load_dataset(
             without a bag, or ``interval_s`` is not positive.
     """
     if interval_s is not None and not interval_s > 0:
-        raise ValueError(f"interval_s must be positive, found {interval_s}")
+        raise ValueError(f"interval_s must be positive, found {interval_s}; give seconds")
     if isinstance(folders, (str, Path)):
         folders = [folders]
     paths = tuple(Path(folder) for folder in folders)
     _require_folders(paths, bag)
+    if interval_s is not None and all(map(is_bag, paths)):
+        raise ValueError("interval_s is of folders; the clouds of a bag have stamps: give motion")
     bag = replace(bag or BagOptions(), beside=tuple(path for path in paths if is_bag(path)))
     bare = {path for path in bag.beside if len(paths) > 1 and not Bag(path).of_type(*CLOUDS)}
     data = _without_frames(tuple(path for path in paths if path not in bare) or paths, rig, bag)
@@ -261,6 +263,6 @@ def _require_same_lenses(first: Path, rig: Rig, path: Path, other: Rig) -> None:
     ]
     if lenses[0] != lenses[1]:
         raise DatasetError(
-            f"{path}: its cameras differ from those of {first} (names, sizes or intrinsics); "
-            "calibrate different rigs apart"
+            f"{path}: its cameras differ from those of {first} (names, sizes, intrinsics or image "
+            "times); calibrate different rigs apart"
         )

@@ -165,7 +165,10 @@ def twist_by_scans(frame: Frame, beside: Sequence[Frame], interval_s: float) -> 
         DatasetError: if there is none, or scans do not fit.
     """
     if not beside:
-        raise DatasetError(f"{frame.cloud_path}: no scan beside it, of which its motion follows")
+        raise DatasetError(
+            f"{frame.cloud_path}: has no neighbouring scan, which its motion is found from; give "
+            "two frames or more, or leave --interval-s out"
+        )
     clouds = [one.load_cloud()[:, :3].astype(np.float64) for one in (frame, *beside)]
     twists = [
         twist_between(

@@ -79,5 +79,8 @@ def register(target_m: Array, source_m: Array, where: Path) -> Array:
         )  # fmt: skip
         T = np.asarray(found.T_target_source)
     if not found.converged:
-        raise DatasetError(f"{where}: its scan and that beside it do not fit; choose other frames")
+        raise DatasetError(
+            f"{where}: its scan and a neighbouring one do not fit, so that the motion is "
+            "unknown; take neighbouring clouds of one drive, or leave --interval-s or --motion out"
+        )
     return T

@@ -185,8 +185,8 @@ class Calibration:
         scale = "" if self.rig.relative_poses else ", and of the clouds' scale,"
         free = self.lens and {*self.config.estimate} - {"offset", "readout"}
         fixed = "errors of the other intrinsics" if free else "errors of the intrinsics"
-        if self.config.of == "mount":
-            fixed += " beyond what a calibration with a target leaves"
+        if self.config.of == "mount" and self.config.preset == "auto":
+            fixed += " beyond what the rig states, or a calibration with a target leaves"
         return f"{fixed}{scale} are not included"
 
     def error_bar_holds(self, name: str) -> bool:

@@ -60,7 +60,7 @@ def _not_one(draws: int) -> int:
 
 def _lens_parts(value: Any) -> Any:
     """The names of parts, also with commas between them; ``lens`` and ``clock`` stand for more."""
-    names = value.split(",") if isinstance(value, str) else value
+    names = [*map(str.strip, value.split(","))] if isinstance(value, str) else value
     if not isinstance(names, list | tuple):
         return names
     whole = {"lens": ("focal", "centre", "distortion"), "clock": ("offset", "readout")}

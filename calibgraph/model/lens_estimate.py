@@ -10,6 +10,7 @@ _PRIOR_SHARE = 0.9  # of the prior's standard deviation: above, the data have sa
 _TIED, _TIED_SHARE = 0.999, 0.5
 """From this correlation with the pose on, half the prior: the prior of the pose narrows it, too."""
 
+_NONE = 0.005  # correlations that are shown as 0.00
 _LEFT_SIGMAS = 2.0  # from the prior: beyond, they have
 
 
@@ -47,11 +48,11 @@ class LensEstimate:
 
     def describe(self) -> str:
         """Whether the data determine it, and what it cannot be told from."""
-        pair = f"with {self.direction} {self.correlation:.2f}"
+        pair = f"with {self.direction} {self.correlation:.2f}" if self.correlation > _NONE else ""
         if self.is_determined:
             return pair
         needed = "; record turns and changes of speed" if self.name in ("offset", "readout") else ""
-        return f"not determined by these data{needed}; {pair}"
+        return "; ".join(filter(None, (f"not determined by these data{needed}", pair)))
 
 
 def change_of_lens(

@@ -125,7 +125,7 @@ def _of_shared(linear: Linearization) -> Variances:
                 found[name] = found[name] + part
             continue
         source = PAIRS if "n" in letters else COMMON if letters & {"m", "o", "y"} else PRIORS
-        source = LENSES if letters & {"l", "b"} else source
+        source = LENSES if letters & {"l", "b"} and "m" not in letters else source
         found[source] = found[source] + (moved**2).sum(axis=1)
     return found
 

@@ -24,6 +24,7 @@ from calibgraph.solver.preprocess import Preprocessed, preprocess
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
 from calibgraph.solver.start import best_start, require_determined, require_known
+from factors.free_lens import CLOCK
 
 _MOST_ROUNDS = 8  # of solves, each from the lenses of the last
 _SETTLED = 0.1  # standard deviations: a smaller change of a lens ends the rounds
@@ -135,6 +136,13 @@ def _solve_with_lenses(
             camera_matches=camera_matches,
             lenses=lenses,
         )
+        clock = [part for part in CLOCK if part in config.estimate]
+        if clock and solution.correspondences.twist_per_s is None:
+            raise CorrespondenceError(
+                f"to estimate {', '.join(clock)}, the motion of the LiDAR must be known: give "
+                "--interval-s with folders, --motion with bags, twists_per_s with arrays, or the "
+                "columns wx_rad_s to vz_m_s of a table"
+            )
         fit = None if solution.errors is None else solution.errors.fit
         lenses, change = moved_lenses(lenses, fit)
         if change < _SETTLED:

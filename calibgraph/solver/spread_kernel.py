@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from factors.block_arrays import contiguous
-from factors.compiled import compiled, kernel_part
+from factors.compiled import compiled
 
 _MANTISSA, _BIAS = 52, 1023  # bits, and the exponent of 1
 _LEAST, _LARGEST = _BIAS - 16, _BIAS + 16  # exponents: smaller and larger values share a bin
@@ -76,7 +76,7 @@ def _spreads(*, shared: bool) -> Any:
     return run
 
 
-@kernel_part()
+@compiled()
 def _spread(values, raw, start, cut, rounds):  # type: ignore[no-untyped-def]
     bits: Any = np.int64(0)
     for least, some in _BITS:
@@ -115,7 +115,7 @@ def _fill_bins(values, raw, bits, work, edges):  # type: ignore[no-untyped-def]
             place[b] += 1
 
 
-@kernel_part()
+@compiled()
 def _quantile_below(work, edges, bits, limit, share):  # type: ignore[no-untyped-def]
     """The quantile of the values up to a limit, interpolated; NaN without any."""
     last = edges[-1] - 1

@@ -125,7 +125,7 @@ class IncrementalCalibrator:
     def update(
         self, table: Correspondences, *, frame: int | None = None, place: str | int | None = None
     ) -> Update:
-        """Take in one frame: fit, gate, refit; then test whether something moved.
+        """Take in one frame: gate it, add its inliers; then test whether something moved.
 
         Args:
             table: the correspondences of one frame, of all cameras that have some.

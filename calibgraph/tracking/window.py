@@ -39,6 +39,7 @@ class Window:
 
     def __init__(self, model: LatentPoseModel, places: Sequence[str], start: gtsam.Values) -> None:
         parameters = gtsam.ISAM2Params()
+        parameters.setFactorization("QR")  # Cholesky takes sigmas 4096 times apart for singular
         parameters.setRelinearizeThreshold(_RELINEARIZE)
         parameters.relinearizeSkip = 1
         parameters.findUnusedFactorSlots = True

@@ -12,9 +12,7 @@ from collections.abc import Callable
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
-from calibgraph.trust.competing_solution import (
-    competing_solution_checks,
-)
+from calibgraph.trust.competing_solution import competing_solution_checks
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.evidence import Checks, Evidence, concatenate
 from calibgraph.trust.guess import (

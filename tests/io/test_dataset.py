@@ -91,5 +91,5 @@ def test_neighbouring_clouds_show_the_motion(tmp_path: Path) -> None:
     assert load_dataset(folder, rig).frames[0].twist_per_s is None
     with pytest.raises(ValueError, match="interval_s must be positive"):
         load_dataset(folder, rig, interval_s=0.0)
-    with pytest.raises(DatasetError, match="no scan beside it"):
+    with pytest.raises(DatasetError, match="no neighbouring scan"):
         twist_by_scans(data.frames[0], [], 0.1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.stats import chi2
 
 from calibgraph import (
     Config,
+    CorrespondenceError,
     Rig,
     load_calibration,
     load_correspondences,
@@ -120,9 +122,12 @@ def test_at_rest_or_straight_ahead_the_offset_stays_at_its_prior(twists: np.ndar
         assert ahead_m == pytest.approx(10.0 * one.sigma, rel=0.05)
 
 
-def test_a_table_without_motion_keeps_the_prior() -> None:
+def test_a_vehicle_at_rest_keeps_the_prior_and_an_unknown_motion_is_refused() -> None:
     rig, table = simulated(0, frames=10, matches=150)
-    found = solve_joint(rig, table, Config(estimate=("clock",)))
+    with pytest.raises(CorrespondenceError, match="offset, readout, the motion of the LiDAR must"):
+        solve_joint(rig, table, Config(estimate=("clock",)))
+    at_rest = replace(table, twist_per_s=np.zeros((len(table), 6)))
+    found = solve_joint(rig, at_rest, Config(estimate=("clock",)))
     for parameters in found.lens.values():
         assert [one.name for one in parameters] == ["offset", "readout"]
         assert not any(one.is_determined for one in parameters)
