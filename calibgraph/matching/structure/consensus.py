@@ -55,7 +55,7 @@ def sum_scores(scores: ShiftScores, unknowns: Array) -> Array:
     out = np.zeros(len(unknowns))
     columns = np.ascontiguousarray(unknowns.T, dtype=np.float32)
     count, size, _ = scores.grids.shape
-    grids = scores.grids.reshape(count, -1), size
+    grids = scores.grids.reshape(count, size * size), size
     _sum_interpolated(grids, scores.jacobian.astype(np.float32), columns, out)
     return out
 
