@@ -37,7 +37,7 @@ from calibgraph.model.lens_estimate import LensEstimate, change_of_lens
 from calibgraph.model.perturbation import perturb
 from calibgraph.model.places import Places, as_groups
 from calibgraph.model.rig import Rig
-from calibgraph.progress import Progress, Stopwatch
+from calibgraph.progress import Progress, Stopwatch, with_note
 from calibgraph.solver.joint import solve_joint, solve_without_failing
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
@@ -90,8 +90,10 @@ def match_in_rounds(
     stands, more = _OF_CLOCK if {*CLOCK} & {*config.estimate} else _OF_LENS
     indices, lens = [*range(start.first_round, full.rounds)], dict[str, tuple[LensEstimate, ...]]()
     for index in indices:
+        repeat = len(rounds) + 1 - (full.rounds - start.first_round)
+        told = with_note(progress, f"lens: repeat {repeat}, at most {more}" if repeat > 0 else "")
         with watch("match"):
-            table = full.match(data, estimate, round_index=index, progress=progress)
+            table = full.match(data, estimate, round_index=index, progress=told)
             table = with_motion(table, data).with_findings(start.findings).with_places(places)
         with watch("solve"):
             solution = _solve(data, guess, (estimate, table), config, terms=terms)
