@@ -168,11 +168,20 @@ def _with_folder(
 
 
 def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
-    """Frames of one drive, whose motion is that between neighbours."""
+    """Frames of one drive, whose motion is that between neighbours.
+
+    The usual step of the numbers that are their names is the interval: a missing cloud is seen.
+    """
+    stems = [frame.cloud_path.stem for frame in frames]
+    numbered = all(map(str.isdecimal, stems))
+    numbers = np.array([*map(int, stems)] if numbered else range(len(stems)), dtype=np.float64)
+    steps = np.diff(numbers)
+    times_s = interval_s * numbers / (np.median(steps) if len(steps) else 1.0)
     driven = []
     for place, one in enumerate(frames):
-        beside = [*frames[max(place - 1, 0) : place], *frames[place + 1 : place + 2]]
-        find = partial(twist_by_scans, one, beside, interval_s)
+        near = [i for i in (place - 1, place + 1) if 0 <= i < len(frames)]
+        beside = [(frames[i], float(times_s[i] - times_s[place])) for i in near]
+        find = partial(twist_by_scans, one, beside)
         driven.append(
             DrivenFrame(one.index, one.name, one.cloud_path, one.image_paths, find_twist=find)
         )

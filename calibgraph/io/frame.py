@@ -153,13 +153,13 @@ class DrivenFrame(Frame):
         return {**super().entry(), _MOTION: motion.entry()}
 
 
-def twist_by_scans(frame: Frame, beside: Sequence[Frame], interval_s: float) -> Array:
+def twist_by_scans(frame: Frame, beside: Sequence[tuple[Frame, float]]) -> Array:
     """(6,) mean twist between a frame's scan and those before and after, by registration.
 
     Args:
         frame: whose twist is wanted.
-        beside: the frames before and after in the recording, or one of them.
-        interval_s: between neighbours.
+        beside: the frames before and after in the recording, or one of them, and by how much later
+            they are [s].
 
     Raises:
         DatasetError: if there is none, or scans do not fit.
@@ -169,14 +169,12 @@ def twist_by_scans(frame: Frame, beside: Sequence[Frame], interval_s: float) -> 
             f"{frame.cloud_path}: has no neighbouring scan, which its motion is found from; give "
             "two frames or more, or leave --interval-s out"
         )
-    clouds = [one.load_cloud()[:, :3].astype(np.float64) for one in (frame, *beside)]
+    own, *others = (
+        one.load_cloud()[:, :3].astype(np.float64) for one in (frame, *(one for one, _ in beside))
+    )
     twists = [
-        twist_between(
-            np.eye(4),
-            register(clouds[0], cloud, frame.cloud_path),
-            (one.index - frame.index) * interval_s,
-        )
-        for one, cloud in zip(beside, clouds[1:], strict=True)
+        twist_between(np.eye(4), register(own, cloud, frame.cloud_path), later_s)
+        for cloud, (_, later_s) in zip(others, beside, strict=True)
     ]
     return np.asarray(np.mean(twists, axis=0))
 
