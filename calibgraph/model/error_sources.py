@@ -75,6 +75,11 @@ class ErrorSources:
                 "Record frames at more places, of walls, poles or vehicles: these images hardly "
                 f"tell poses {in_unit(bar.sigma, bar.unit, 2)} apart."
             )
+        if bar.shares.get(LENSES, 0.0) > _MOST:
+            return (
+                "Estimate fewer parts of the lens (--estimate), state how well it is known "
+                "(intrinsics_sigma_px, distortion_sigma), or calibrate it with a target."
+            )
         enough = (times for times, both in self.forecast.items() if _is_enough(both, tolerance))
         times = next(enough, MOST_TIMES)
         if times < MOST_TIMES:

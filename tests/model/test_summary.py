@@ -8,7 +8,7 @@ from pathlib import Path
 
 import calibgraph
 from calibgraph.model.causes import CAUSES, cause_of
-from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES, ErrorSources
+from calibgraph.model.error_sources import COMMON, LENSES, MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.summary import MOST, summarize
 from calibgraph.model.verdict import COMMON_ERROR, Check, ErrorProbability, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS
@@ -130,6 +130,15 @@ def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
     assert "0.28 deg of common error remain" in action or "0.29 deg of common error" in action
     few = replace(WIDE, forecast={2: (0.2, 1.5), 3: (0.14, 1.0), MOST_TIMES: (0.01, 0.1)})
     assert summarize(unsure, sources={"left": few}).actions == ("Record 3 times as many frames.",)
+
+
+def test_a_wide_bar_of_an_estimated_lens_advises_on_the_lens() -> None:
+    lens = replace(
+        WIDE, rotation={LENSES: 0.9, COMMON: 0.1}, translation={LENSES: 0.9, COMMON: 0.1}
+    )
+    unsure = {"left": Verdict((), ErrorProbability(0.0, 0.1))}
+    (action,) = summarize(unsure, sources={"left": lens}).actions
+    assert action.startswith("Estimate fewer parts of the lens (--estimate)")
 
 
 def test_a_failed_camera_has_no_error_bar_and_no_advice_about_it() -> None:
