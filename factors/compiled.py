@@ -85,7 +85,8 @@ def _name(function: Callable[..., Any], options: Mapping[str, Any]) -> str:
     """
     enclosed = [cell.cell_contents for cell in function.__closure__ or ()]
     values = [getattr(value, "__qualname__", repr(value)) for value in enclosed]
-    known = [*values, *(f"{option}={value}" for option, value in sorted(options.items()))]
+    in_order = {k: sorted(v) if isinstance(v, (set, frozenset)) else v for k, v in options.items()}
+    known = [*values, *(f"{option}={value}" for option, value in sorted(in_order.items()))]
     digest = hashlib.sha256(" ".join(known).encode()).hexdigest()[:8] if known else ""
     return "_".join(filter(None, (function.__qualname__, digest)))
 

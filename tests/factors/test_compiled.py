@@ -158,6 +158,12 @@ def test_kernels_of_two_kinds_of_lens_and_of_all_cores_are_kept_apart(tmp_path: 
         assert printed == f"{[3.0] * len(order)}\n{hits}"
 
 
+def test_a_name_is_the_same_in_every_process() -> None:
+    """Also of a set of options, whose order is not."""
+    code = "from factors.kernel_sums import sum_tile\nprint(sum_tile.py_func.__qualname__)"
+    assert len({run(code, PYTHONHASHSEED=str(seed)) for seed in range(4)}) == 1
+
+
 def test_threads_that_make_kernels_keep_them_in_the_folder(tmp_path: Path) -> None:
     code = (
         "import sys; sys.setswitchinterval(1e-6)\n"
