@@ -77,7 +77,7 @@ def match_in_rounds(
     as of :func:`calibgraph.calibrate`.
     """
     config = config or Config()
-    full = find_matcher(matcher, seed=config.seed)
+    full = find_matcher(matcher, seed=config.seed).with_estimate(config.estimate)
     data, guess = _open(dataset, rig, full.most_frames)
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
     with watch("inputs"):

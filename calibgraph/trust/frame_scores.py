@@ -18,7 +18,6 @@ from calibgraph.matching.structure.shift_scores import (
     concatenate_scores,
     score_frame,
 )
-from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
 
 Images = Sequence[NDArray[np.uint8]]
@@ -64,5 +63,7 @@ class FrameScorer:
         if other is None:
             return None
         most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
-        cloud, camera = self._cache.cloud(other), when_taken(camera, other.twist_per_s)
-        return score_frame(gray, cloud, camera, level, frame=frame.index, max_windows=most)
+        cloud, twist = self._cache.cloud(other), other.twist_per_s
+        return score_frame(
+            gray, cloud, camera, level, frame=frame.index, max_windows=most, twist_per_s=twist
+        )

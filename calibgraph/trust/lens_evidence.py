@@ -27,6 +27,7 @@ from calibgraph.trust.lens_parameter import (
     LensParameter,
     lens_fields_px,
     lens_variable,
+    units_of,
 )
 
 SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)
@@ -78,17 +79,11 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     if rest is None:
         return ()
     fine, parameters = rest.counted_from(moved), []
-    for name, number in zip(NAMES, (*searched, Free.SKEW), strict=True):
+    for name, number in zip(NAMES, (*searched, Free.SKEW), strict=False):  # not the time
         fit, others = fine if number in finer else rough, [n for n in finer if n != number]
-        parameters.append(LensParameter.of(name, camera, fit.free(*others, number), number))
+        of = LensParameter.of(name, units_of(camera, number), fit.free(*others, number))
+        parameters.append(of)
     return tuple(parameters)
-
-
-def _extend(scores: ShiftScores, camera: Camera) -> ShiftScores:
-    """The scores, with the derivatives of the shifts in steps by the lens, too."""
-    fields = lens_fields_px(camera, scores.points_lidar_m).transpose(2, 1, 0)
-    jacobian = np.concatenate([scores.jacobian, fields * scores.steps_per_px[:, None]], axis=2)
-    return replace(scores, jacobian=jacobian)
 
 
 def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: int) -> Array:
@@ -100,7 +95,8 @@ def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: in
         lens: numbers of its parameters that are searched. A skew moves pixels too little for it.
         seed: of the search.
     """
-    columns, extended = [*range(6), *(6 + number for number in lens)], _extend(scores, camera)
+    columns = [*range(6), *(6 + number for number in lens)]
+    extended = scores.with_unknowns(lens_fields_px(camera, scores.points_lidar_m))
     units = np.array([1.0, 1.0, camera.intrinsics_px.fx, 1.0]) * SEARCH_LENS
     sigmas = np.array(lens_variable(camera).free.sigmas)[[*lens]]
     smooth = replace(
@@ -120,7 +116,8 @@ def _fit_at_peaks(
     """Fit pose and lens to the groups' peaks next to a start, (12,)."""
     if not len(scores.weights):
         return None
-    table = extract_correspondences(_extend(scores, camera), start, "camera")
+    fields = lens_fields_px(camera, scores.points_lidar_m)
+    table = extract_correspondences(scores.with_unknowns(fields), start, "camera")
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
     variance = error_components().matchers["structure"].place_variance
     shared = variance * places.frames_per_place(block.frame_numbers)

@@ -8,7 +8,7 @@ half is a field of displacements of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -32,12 +32,14 @@ class Free(IntEnum):
     FOCAL, RADIAL, CENTRE_X, CENTRE_Y, ASPECT, SKEW = range(6)
 
 
+TIME = "time offset"
 NAMES = {
     "focal length": ("focal", "a focal length {} % longer", "a focal length {} % shorter"),
     "distortion": ("distortion", "a k1 larger by {}", "a k1 smaller by {}"),
     "principal point": ("centre", "a principal point off by ({}) px", ""),
     "aspect ratio": ("aspect", "a ratio fx / fy {} % larger", "a ratio fx / fy {} % smaller"),
     "skew": (None, "a skew of {} % of fx", "a skew of -{} % of fx"),
+    TIME: ("offset", "images taken {} ms later", "images taken {} ms earlier"),
 }
 """Parameters that are judged: what ``--estimate`` calls them, and a lens with more or less."""
 
@@ -69,6 +71,12 @@ def lens_variable(camera: Camera) -> LensVariable:
     return LensVariable(camera, free, np.zeros(len(free)))
 
 
+def units_of(camera: Camera, *numbers: int) -> list[float]:
+    """Standard deviations of a calibrated lens: relative, pixels, or of k1."""
+    units = *lens_variable(camera).free.sigmas, _SKEW_SIGMA
+    return [units[number] for number in numbers]
+
+
 def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
     """(6, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
     free, T, k = lens_variable(camera).free, camera.T_camera_lidar, camera.intrinsics_px
@@ -89,7 +97,7 @@ class LensParameter:
         values: (m,) change, in standard deviations of a calibrated lens.
         sigmas: (m,) their standard deviations, frames as clusters.
         twist: (6,) rotation [rad] and translation [m] by which the camera moves.
-        units: (m,) of the values: relative, pixels, or of k1.
+        units: (m,) of the values: relative, pixels, of k1, or seconds.
     """
 
     name: str
@@ -99,12 +107,12 @@ class LensParameter:
     units: Array
 
     @staticmethod
-    def of(name: str, camera: Camera, freed: Freed, *numbers: int) -> LensParameter:
-        """Of a fit whose last unknowns have these numbers; others may be free beside them."""
-        units = np.array([*lens_variable(camera).free.sigmas, _SKEW_SIGMA])[[*numbers]]
-        values, sigmas = (each[-len(numbers) :] for each in (freed.values, freed.sigmas))
-        twist = freed.compensating[:, -len(numbers) :] @ values
-        return LensParameter(name, values, sigmas, twist, units)
+    def of(name: str, units: Sequence[float], freed: Freed) -> LensParameter:
+        """Of a fit whose last unknowns have these units; others may be free beside them."""
+        count = len(units)
+        values, sigmas = (each[-count:] for each in (freed.values, freed.sigmas))
+        twist = freed.compensating[:, -count:] @ values
+        return LensParameter(name, values, sigmas, twist, np.array(units))
 
     @property
     def moved(self) -> tuple[float, float]:
@@ -151,7 +159,7 @@ class LensParameter:
     def describe(self) -> str:
         """The lens that would be right, in words."""
         _, more, less = NAMES[self.name]
-        units = 100 * self.units if "%" in more else self.units
+        units = self.units * (100 if "%" in more else 1000 if "ms" in more else 1)
         values = units * (np.abs(self.values) if less else self.values)
         numbers = ", ".join(map(_with_sigma, values, units * self.sigmas))
         return (less if less and self.values[0] < 0 else more).format(numbers)
@@ -181,7 +189,8 @@ def check_parameter(found: LensParameter, by: str) -> Check:
     status, (part, *_) = row.grade(probability), NAMES[found.name]
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
     if status != "PASS":
-        text += f": {row.advice}" + (f"; or run with --estimate {part}" if part else "")
+        advice = "correct the time stamps" if found.name == TIME else row.advice
+        text += f": {advice}" + (f"; or run with --estimate {part}" if part else "")
     check = row.describe(probability, status, text, name=f"{found.name} by the {by}: {row.name}")
     return replace(check, kind=KINDS[by][found.name])
 
