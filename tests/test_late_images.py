@@ -61,7 +61,8 @@ def test_offset_and_readout_are_found_with_the_pose() -> None:
 @pytest.mark.slow
 def test_a_fixed_clock_is_no_pass_and_names_the_offset() -> None:
     data, rig = late_sample(), truth()
-    result = calibrate(data, rig, StructureMatcher(search_deg=None, search_m=None))
+    matcher = StructureMatcher(search_deg=None, search_m=None)
+    result = calibrate(data, rig, matcher)
     verdict = result.camera_verdicts[CAMERA]
     assert verdict.status != "PASS"
     (check,) = (c for c in verdict.checks if c.kind == "time_offset")

@@ -35,7 +35,7 @@ class FrameScorer:
 
     def __init__(self, dataset: Dataset, frames: Sequence[Frame], pool: ThreadPoolExecutor) -> None:
         self.frames = frames
-        self._dataset = dataset
+        self.dataset = dataset
         self._pool = pool
         self._cache = cache_of(frames, FrameCache())
 
@@ -59,7 +59,7 @@ class FrameScorer:
     def _score_frame(
         self, gray: NDArray[np.uint8], frame: Frame, *, camera: Camera, level: Level, offset: int
     ) -> ShiftScores | None:
-        other = self._dataset.neighbour(frame, offset) if offset else frame
+        other = self.dataset.neighbour(frame, offset) if offset else frame
         if other is None:
             return None
         most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)

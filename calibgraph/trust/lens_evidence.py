@@ -12,9 +12,11 @@ import cv2
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.matching.run import with_motion
 from calibgraph.matching.structure.consensus import maximize_score
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.shift_scores import ShiftScores
+from calibgraph.model.clock import at_pixels
 from calibgraph.model.error_components import error_components
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera
@@ -66,7 +68,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     finer = Free.FOCAL, Free.RADIAL, along  # right shapes are nearer to zero without a finer fit
     searched = *finer, Free.ASPECT
     best = _search(camera, scores, searched, seed)
-    rough = _fit_at_peaks(camera, scores, best, places)
+    rough = _fit_at_peaks(scorer, camera, scores, best, places=places)
     if rough is None:
         return ()
     change, lens, moved = rough.free(*finer), lens_variable(camera), np.zeros(len(Free))
@@ -75,7 +77,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     moved[Free.RADIAL] = np.clip(moved[Free.RADIAL], -most, most)
     refined = lens.put_into(apply_twist(camera, change.twist), moved[:-1])
     again = scorer.score_together(images, refined, FINER)
-    rest = _fit_at_peaks(refined, again, np.zeros(len(best)), places)
+    rest = _fit_at_peaks(scorer, refined, again, np.zeros(len(best)), places=places)
     if rest is None:
         return ()
     fine, parameters = rest.counted_from(moved), []
@@ -111,13 +113,14 @@ def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: in
 
 
 def _fit_at_peaks(
-    camera: Camera, scores: ShiftScores, start: Array, places: Places
+    scorer: FrameScorer, camera: Camera, scores: ShiftScores, start: Array, *, places: Places
 ) -> LinearFit | None:
     """Fit pose and lens to the groups' peaks next to a start, (12,)."""
     if not len(scores.weights):
         return None
     fields = lens_fields_px(camera, scores.points_lidar_m)
     table = extract_correspondences(scores.with_unknowns(fields), start, "camera")
+    table = at_pixels(camera, with_motion(table, scorer.dataset))
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
     variance = error_components().matchers["structure"].place_variance
     shared = variance * places.frames_per_place(block.frame_numbers)

@@ -17,7 +17,7 @@ def make_grids(peaks: np.ndarray, reach: int = 12, sigma: float = 2.0) -> np.nda
 
 
 def make_scores(twist: np.ndarray, *, outlier_share: float, seed: int = 0) -> ShiftScores:
-    """Groups whose peaks a twist (and further unknowns) explains, but for a share that peak anywhere."""
+    """Groups whose peaks a twist explains, and further unknowns, but for a share of outliers."""
     rng = np.random.default_rng(seed)
     units = np.append([200, 200, 200, 40, 40, 40], np.full(len(twist) - 6, 4))
     jacobian = rng.uniform(-1, 1, (300, 2, len(twist))) * units
