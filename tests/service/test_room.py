@@ -70,7 +70,9 @@ def test_uploads_that_arrive_keep_their_room_and_leave_some_to_others(
     place, (first, second) = with_room
     with begin_upload(place, first, b"Content-Length: %d" % (120 * MB)) as held:
         held.sendall(BEGIN)
+        end = time.monotonic() + 60
         while not list((tmp_path / "data" / "arriving").glob("*/*/*")):
+            assert time.monotonic() < end
             time.sleep(0.01)
         with begin_upload(place, first, b"Content-Length: %d" % (120 * MB)) as connection:
             assert connection.recv(12) == b"HTTP/1.1 507"
