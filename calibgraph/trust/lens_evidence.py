@@ -81,7 +81,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     if rest is None:
         return ()
     fine, parameters = rest.counted_from(moved), []
-    for name, number in zip(NAMES, (*searched, Free.SKEW), strict=False):  # not the time
+    for name, number in zip(NAMES, (*searched, Free.SKEW), strict=True):
         fit, others = fine if number in finer else rough, [n for n in finer if n != number]
         of = LensParameter.of(name, units_of(camera, number), fit.free(*others, number))
         parameters.append(of)

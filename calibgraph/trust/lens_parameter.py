@@ -32,16 +32,16 @@ class Free(IntEnum):
     FOCAL, RADIAL, CENTRE_X, CENTRE_Y, ASPECT, SKEW = range(6)
 
 
-TIME = "time offset"
 NAMES = {
     "focal length": ("focal", "a focal length {} % longer", "a focal length {} % shorter"),
     "distortion": ("distortion", "a k1 larger by {}", "a k1 smaller by {}"),
     "principal point": ("centre", "a principal point off by ({}) px", ""),
     "aspect ratio": ("aspect", "a ratio fx / fy {} % larger", "a ratio fx / fy {} % smaller"),
     "skew": (None, "a skew of {} % of fx", "a skew of -{} % of fx"),
-    TIME: ("offset", "images taken {} ms later", "images taken {} ms earlier"),
 }
 """Parameters that are judged: what ``--estimate`` calls them, and a lens with more or less."""
+TIME = "time offset"
+_WORDS = {**NAMES, TIME: ("offset", "images taken {} ms later", "images taken {} ms earlier")}
 
 SHAPES = "aspect ratio", "skew"
 """Those that no lens has wrong by much."""
@@ -50,7 +50,7 @@ RESIDUALS, IMAGES = "residuals over the image", "images"
 """What an estimate is by."""
 
 KINDS = {
-    by: {name: prefix + name.replace(" ", "_") for name in NAMES}
+    by: {name: prefix + name.replace(" ", "_") for name in _WORDS}
     for by, prefix in ((RESIDUALS, "lens_"), (IMAGES, ""))
 }
 """Kinds of the checks."""
@@ -93,7 +93,7 @@ class LensParameter:
     """An estimate of one lens parameter together with the extrinsic.
 
     Attributes:
-        name: one of ``NAMES``.
+        name: one of ``NAMES``, or ``TIME``.
         values: (m,) change, in standard deviations of a calibrated lens.
         sigmas: (m,) their standard deviations, frames as clusters.
         twist: (6,) rotation [rad] and translation [m] by which the camera moves.
@@ -158,7 +158,7 @@ class LensParameter:
 
     def describe(self) -> str:
         """The lens that would be right, in words."""
-        _, more, less = NAMES[self.name]
+        _, more, less = _WORDS[self.name]
         units = self.units * (100 if "%" in more else 1000 if "ms" in more else 1)
         values = units * (np.abs(self.values) if less else self.values)
         numbers = ", ".join(map(_with_sigma, values, units * self.sigmas))
@@ -186,7 +186,7 @@ def check_parameter(found: LensParameter, by: str) -> Check:
         by: RESIDUALS or IMAGES.
     """
     row, probability, (deg, cm) = threshold("lens"), found.probability, found.moved
-    status, (part, *_) = row.grade(probability), NAMES[found.name]
+    status, (part, *_) = row.grade(probability), _WORDS[found.name]
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
     if status != "PASS":
         advice = "correct the time stamps" if found.name == TIME else row.advice
