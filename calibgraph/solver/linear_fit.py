@@ -36,8 +36,8 @@ class Freed:
     Attributes:
         twist: (6,) of the pose: T_camera_lidar = exp(twist) estimate [rad, m].
         values: (m,) of the unknowns.
-        sigmas: (m,) standard deviations, by the scatter of the frames and what they share; NaN with
-            one frame.
+        covariance: (m, m) of these, by the scatter of the frames and what they share; NaN with one
+            frame.
         compensating: (6, m) twists by which the pose makes up for a unit of each.
         independent_shares: (m,) share (0 to 1, root mean square) of an unknown's Jacobian that is
             independent of the pose and of the others. Near zero, the unknown is not observable.
@@ -45,9 +45,14 @@ class Freed:
 
     twist: Array
     values: Array
-    sigmas: Array
+    covariance: Array
     compensating: Array
     independent_shares: Array
+
+    @property
+    def sigmas(self) -> Array:
+        """(m,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +85,10 @@ class LinearFit:
         values = inverse @ (self.hessian @ self.values)[rows]
         scatter = with_pseudo_frames(pulls.T @ pulls, own, np.full(len(rows), float(frames)))
         scatter += _weak(len(rows)) if frames > 1 else np.nan
-        whole = np.diag(inverse @ scatter @ inverse + self.shared * inverse)
+        whole = inverse @ scatter @ inverse + self.shared * inverse
         shares = 1 / np.sqrt(np.diag(inverse) * np.diag(own))
         compensating = np.asarray(-np.linalg.solve(own[:6, :6], own[:6, 6:]))
-        return Freed(values[:6], values[6:], np.sqrt(whole[6:]), compensating, shares[6:])
+        return Freed(values[:6], values[6:], whole[6:, 6:], compensating, shares[6:])
 
 
 def fit_camera(

@@ -28,6 +28,7 @@ from calibgraph.trust.lens_parameter import (
     lens_fields_px,
     lens_variable,
 )
+from calibgraph.trust.thresholds import limit
 
 SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)
 """Half-widths of a search; a focal length wrong by 5 % displaces a result by up to 0.5 m."""
@@ -123,6 +124,7 @@ def _fit_at_peaks(
     table = extract_correspondences(_extend(scores, camera), start, "camera")
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
     variance = error_components().matchers["structure"].place_variance
-    shared = variance * places.frames_per_place(block.frame_numbers)
+    of_place = variance * places.frames_per_place(block.frame_numbers)
+    shared = max(of_place, limit("lens_match_share") * len(block))
     fields = lens_fields_px(camera, block.block.points_lidar_m)
     return fit_camera(camera, block, fields, shared_variance=shared)
