@@ -20,6 +20,7 @@ from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import apply_twist
 from calibgraph.solver.linear_fit import LinearFit, block_of, fit_camera
+from calibgraph.solver.scan_distortion import distortion_fields_px
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
 from calibgraph.trust.lens_parameter import (
     NAMES,
@@ -118,13 +119,19 @@ def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: in
 def _fit_at_peaks(
     camera: Camera, scores: ShiftScores, start: Array, places: Places
 ) -> LinearFit | None:
-    """Fit pose and lens to the groups' peaks next to a start, (12,)."""
+    """Fit pose and lens to the groups' peaks next to a start, (12,); the scan may be distorted."""
     if not len(scores.weights):
         return None
     table = extract_correspondences(_extend(scores, camera), start, "camera")
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
-    variance = error_components().matchers["structure"].place_variance
-    of_place = variance * places.frames_per_place(block.frame_numbers)
-    shared = max(of_place, limit("lens_match_share") * len(block))
-    fields = lens_fields_px(camera, block.block.points_lidar_m)
-    return fit_camera(camera, block, fields, shared_variance=shared)
+    known, points = error_components().matchers["structure"], block.block.points_lidar_m
+    of_place = known.place_variance * places.frames_per_place(block.frame_numbers)
+    of_scan = np.array([known.elevation_rad, known.elevation_stretch, known.scan_motion_m])
+    bends = distortion_fields_px(camera, points) * of_scan[:, None, None]
+    return fit_camera(
+        camera,
+        block,
+        np.concatenate([lens_fields_px(camera, points), bends]),
+        shared_variance=max(of_place, limit("lens_match_share") * len(block)),
+        considered=len(bends),
+    )

@@ -103,7 +103,7 @@ class LensParameter:
     def of(name: str, camera: Camera, freed: Freed, *numbers: int) -> LensParameter:
         """Of a fit whose last unknowns have these numbers; others may be free before them."""
         units = np.array([*lens_variable(camera).free.sigmas, _SKEW_SIGMA])[[*numbers]]
-        values, covariance = _beside_others(freed, len(freed.values) - len(numbers))
+        values, covariance = _beside_others(name, freed, len(freed.values) - len(numbers))
         twist = freed.compensating[:, -len(numbers) :] @ values
         return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, units)
 
@@ -158,20 +158,22 @@ class LensParameter:
         return (less if less and self.values[0] < 0 else more).format(numbers)
 
 
-def _beside_others(freed: Freed, others: int) -> tuple[Array, Array]:
+def _beside_others(name: str, freed: Freed, others: int) -> tuple[Array, Array]:
     """(m,) values and (m, m) covariance of unknowns beside others, each of them usual or wrong.
 
     A focal length that is 1 % off is no less rare beside a distortion than alone. So the other
     unknowns have the errors of lens parameters, too: the mean and the covariance over all of their
-    combinations of usual and wrong.
+    combinations of usual and wrong. Not beside a shape: a wrong fy alone is a wrong focal length,
+    too, which stays free.
 
     Args:
+        name: of the unknowns.
         freed: the fit, with all of them free.
         others: how many of its first unknowns are the others.
     """
     first, last = slice(others), slice(others, None)
     values, covariance = freed.values, freed.covariance
-    if not others or not np.isfinite(covariance).all():
+    if not others or name in SHAPES or not np.isfinite(covariance).all():
         return values[last], covariance[last, last]
     wrong = np.array([*product((False, True), repeat=others)])
     spreads = np.where(wrong, limit("lens_wrong"), 1.0)
