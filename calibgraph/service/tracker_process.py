@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from calibgraph.tracking.streams import Item
 
 RIG, CONFIG, STATE, HISTORY, EVENTS = (
-    "rig.yaml", "config.json", "state", "history.npz", "events.jsonl",
+    "rig.yaml", "config.json", "state", "history.state", "events.jsonl",
 )  # fmt: skip
 
 _MOST_OPEN = 256

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -10,6 +11,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
+from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES
@@ -59,9 +61,9 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
         closed: its closed epochs.
         window: of the frame before, if of the same epoch.
     """
-    sums = closed.posterior + state.epochs[-1].sums
+    sums = closed.all_sums(state)
     halves = closed.halves + in_its_half(state, state.epochs[-1], len(state.epochs) - 1)
-    window, conflicts = closed.with_open_epoch(state, sums, window)
+    window, conflicts = closed.with_open_epoch(state, window)
     keys, estimates = window.model.reported_keys, state.T_lidar_camera
     if state.config.preset == "auto":
         estimates = window.T_lidar_camera(keys)
@@ -171,6 +173,12 @@ def _counts(one: CameraState) -> dict[str, int]:
     return {**counts, "frames": frames, "frames_used": used, "frames_waiting": waiting}
 
 
+def rig_at(state: State, T_lidar_camera: Sequence[gtsam.Pose3]) -> Rig:
+    """The rig with these estimates."""
+    estimates = zip(state.names, T_lidar_camera, strict=True)
+    return state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
+
+
 def second_moments(assessment: Assessment) -> Array:
     """(6 n, 6 n) of the mounts about the estimates."""
     window, keys = assessment.window, assessment.window.model.camera_keys
@@ -181,11 +189,10 @@ def second_moments(assessment: Assessment) -> Array:
 
 def to_calibration(state: State, assessment: Assessment) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
-    estimates = zip(state.names, assessment.T_lidar_camera, strict=True)
     joint = assessment.joint_covariance
     known = None if np.isnan(joint).any() else joint
     mounts = None if known is None else second_moments(assessment)
-    rig = state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
+    rig = rig_at(state, assessment.T_lidar_camera)
     return Calibration(
         rig=rig,
         initial_rig=state.rig,
