@@ -108,8 +108,7 @@ def matcher_from(
 
 def _refuse_cmrnext_options(weights: list[Path] | None, given: dict[str, Any]) -> None:
     for option in (*(["weights"] if weights else []), *given):
-        value = f" {given[option]}" if option == "estimate" else ""
-        raise ValueError(f"{_flag(option)}{value} is for --matcher cmrnext only")
+        raise ValueError(f"{_flag(option)} is for --matcher cmrnext only")
 
 
 def _structure_matcher(search: dict[str, float | None], *, seed: int, all_frames: bool) -> Matcher:

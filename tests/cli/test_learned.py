@@ -66,8 +66,8 @@ def test_untrained_weights_fail_on_the_command_line(
         (("--matcher", "cmrnext"), "needs weights"),
         (("--matcher", "cmrnext", "--weights", "nowhere.tar"), "no such file of weights"),
         (("--weights", "a.tar"), "--weights is for --matcher cmrnext only"),
-        (("--estimate", "joint"), "--estimate joint is for --matcher cmrnext only"),
-        (("--matcher", "cmrnext", "--weights", "{w}", "--estimate", "both"), "known are frame"),
+        (("--start-from", "joint"), "--start-from is for --matcher cmrnext only"),
+        (("--matcher", "cmrnext", "--weights", "{w}", "--start-from", "both"), "known are frame"),
         (("--matcher", "cmrnext", "--weights", "{w}", "--device", "tpu"), "known are auto, cpu"),
     ],
 )
