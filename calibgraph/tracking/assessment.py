@@ -16,9 +16,9 @@ from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.tracking.closed_places import ClosedPlaces
+from calibgraph.tracking.epoch_sums import estimates_of_halves, in_its_half
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.optimum import Optimum
-from calibgraph.tracking.posterior import estimates_of_halves, in_its_half
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.tracking.sums import Sums, is_determined, step_between
 from calibgraph.tracking.window import Window

@@ -30,6 +30,7 @@ from calibgraph.tracking.contradictions import (
     pose_priors,
     poses_by_name,
 )
+from calibgraph.tracking.epoch_sums import split_halves, sum_closed_epochs
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
@@ -42,7 +43,6 @@ from calibgraph.tracking.place_model import (
     summary_factor,
 )
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
-from calibgraph.tracking.posterior import closed_posterior, split_halves
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, equation_5
 from calibgraph.tracking.window import Window
@@ -123,8 +123,8 @@ class ClosedPlaces:
         return split_halves(self.state)
 
     @cached_property
-    def _posterior(self) -> Sums:
-        return closed_posterior(self.state)
+    def _closed_sums(self) -> Sums:
+        return sum_closed_epochs(self.state)
 
     @cached_property
     def _priors(self) -> gtsam.NonlinearFactorGraph:
@@ -132,7 +132,7 @@ class ClosedPlaces:
 
     def all_sums(self, state: State) -> Sums:
         """(n,) over the summaries and all live frames."""
-        return self._posterior + state.epochs[-1].sums
+        return self._closed_sums + state.epochs[-1].sums
 
     def equation_5(
         self, state: State, more: Mapping[int, Sums] | None = None

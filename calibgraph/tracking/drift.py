@@ -11,8 +11,8 @@ from dataclasses import replace
 
 from calibgraph.tracking.cause import CLEARLY, find_cause, unexplained
 from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.posterior import posterior
 from calibgraph.tracking.state import DriftWatch, State
 from calibgraph.tracking.steps import steps_between
 from calibgraph.tracking.sums import Sums
@@ -49,7 +49,7 @@ def report_drift(state: State) -> tuple[State, list[Event]]:
     watch = state.drift
     if watch is None:
         return state, []
-    then, now = watch.anchors, posterior(state)
+    then, now = watch.anchors, sum_epochs(state)
     own, own_now = dict(enumerate(then.scatter)), dict(enumerate(now.scatter))
     steps, _ = steps_between(state, (then, own), (now, own_now))
     if watch.camera not in steps.cameras:

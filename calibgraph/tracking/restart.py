@@ -13,10 +13,10 @@ from calibgraph.solver.camera_block import CameraBlock, merge
 from calibgraph.tracking.cause import Cause, Steps, find_cause
 from calibgraph.tracking.drift import follow_drift
 from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
 from calibgraph.tracking.outlier_frames import refine
-from calibgraph.tracking.posterior import posterior
 from calibgraph.tracking.start import absorb_frames
 from calibgraph.tracking.state import DriftWatch, State, replace_item
 from calibgraph.tracking.step_detection import DetectedStep
@@ -224,7 +224,7 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
 
 def _measure_steps(state: State, detected: DetectedStep) -> Measured:
     """The steps of the cameras; and per camera its estimate now, from its reference."""
-    before, after = posterior(state, detected.since), _sums_since(state, detected)
+    before, after = sum_epochs(state, detected.since), _sums_since(state, detected)
     new = [c for c in range(len(state.cameras)) if state.frame_noise(c) is None]
     guessed = {camera: after.hessian[camera] * _GUESSED_OVERCONFIDENCE for camera in new}
     own = {camera: before.scatter[camera] for camera in (*new, *state.drifting)}

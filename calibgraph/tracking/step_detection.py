@@ -9,9 +9,9 @@ from itertools import accumulate
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
+from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
-from calibgraph.tracking.posterior import posteriors_before_epochs
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.tracking.steps import shift_since
 from calibgraph.tracking.sums import Sums
@@ -113,10 +113,11 @@ def detect_small_step(state: State) -> DetectedStep | None:
     if any(_is_pending(camera_state) for camera_state in state.cameras):
         return None
     afterwards = [*accumulate(epoch.sums for epoch in reversed(state.epochs))][::-1]
-    for place, before in posteriors_before_epochs(state):
-        if not state.epochs[place].frames:
+    for epoch, after in zip(state.epochs[1:], afterwards[1:], strict=True):
+        if not epoch.frames:
             continue
-        since, after = state.epochs[place].frames[0].number, afterwards[place]
+        since = epoch.frames[0].number
+        before = sum_epochs(state, since)
         for camera, camera_state in enumerate(state.cameras):
             if not camera_state.started or _shift_excess(state, camera, before, after) <= best:
                 continue  # by what places share it is less still
