@@ -14,13 +14,13 @@ from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_l
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
-from calibgraph.solver.covariance import ENOUGH_FRAMES
+from calibgraph.solver.covariance import ENOUGH_FRAMES, sigmas_of_hessian
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.epoch_sums import estimates_of_halves, in_its_half
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.state import CameraState, State
-from calibgraph.tracking.sums import Sums, is_determined, step_between
+from calibgraph.tracking.sums import Sums, step_between
 from calibgraph.tracking.window import Window
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.solution_checks import check_estimate
@@ -97,7 +97,7 @@ def _verdict(
         used=int(one.counts.get("used", 0)),
         frames=int(sums.frames[camera]),
         covariance=None if np.isnan(own).any() else own,
-        data_sigmas=_data_sigmas(sums.hessian[camera]),
+        data_sigmas=sigmas_of_hessian(sums.hessian[camera]),
         halves=halves,
         conflicts=conflicts,
         pull=None,
@@ -146,13 +146,6 @@ def recent_residuals(one: CameraState) -> Residuals:
         loss_scale_px=one.scale.loss_scale,
         gate_px=one.scale.gate_px,
     )
-
-
-def _data_sigmas(hessian: Array) -> Array:
-    """(6,) standard deviations if every match were independent: a lower bound."""
-    if not is_determined(hessian):
-        return np.full(6, np.inf)
-    return np.sqrt(np.diag(np.linalg.inv(hessian)))
 
 
 def covariance_by_camera(assessment: Assessment, names: tuple[str, ...]) -> dict[str, Array | None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,10 +9,11 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.files import write_atomically, write_bytes
+from calibgraph.files import write_bytes
 from calibgraph.model.geometry import twist_between
+from calibgraph.report.figure import save_picture
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.history_figure import DPI, Curve, history_figure, text_figure
+from calibgraph.tracking.history_figure import Curve, history_figure, text_figure
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.update import Update
 
@@ -126,10 +126,7 @@ class History:
         Raises:
             FileError: if it cannot be written there.
         """
-        figure = self.figure()
-        with warnings.catch_warnings():  # a name in letters that the font lacks: drawn as boxes
-            warnings.filterwarnings("ignore", "Glyph", UserWarning)
-            write_atomically(path, lambda part: figure.savefig(part, format="png", dpi=DPI))
+        save_picture(self.figure(), path)
 
     def save(self, path: Path) -> None:
         """Write the history to a file, atomically; see :meth:`load`."""
