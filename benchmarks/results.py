@@ -11,8 +11,6 @@ from pathlib import Path
 from benchmarks.tables import RESULTS, Entry
 
 PAGE = Path(__file__).parent / "notes" / "results.md"
-EARLIER = RESULTS / "earlier.md"
-"""Tables of before there were results files; they state where they come from."""
 
 _HEAD = """# Results of the benchmarks
 
@@ -24,7 +22,7 @@ uncommitted changes). What each benchmark measures: `benchmarks/README.md`."""
 def page() -> str:
     """The text of benchmarks/notes/results.md."""
     sections = (section for path in sorted(RESULTS.glob("*.jsonl")) for section in _sections(path))
-    return "\n\n".join([_HEAD, *sections, EARLIER.read_text("utf-8").strip()]) + "\n"
+    return "\n\n".join([_HEAD, *sections]) + "\n"
 
 
 def _sections(path: Path) -> Iterator[str]:

@@ -25,6 +25,7 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.cli import app as cli
+from calibgraph.cli import terminal
 from calibgraph.report import plots
 from calibgraph.trust import assess, image_checks, inputs
 
@@ -105,7 +106,8 @@ def stereo_relative_pose(rig: Rig, a: str = "left", b: str = "right") -> Relativ
 
 @pytest.fixture
 def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
-    """Run the command line in this process: exit code, stdout, stderr."""
+    """Run the command line in this process: exit code, stdout, stderr without lines of progress."""
+    monkeypatch.setattr(terminal, "LINE_EVERY_S", float("inf"))
 
     def run(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["calibgraph", *map(str, arguments)])

@@ -110,8 +110,7 @@ def matcher_from(
 
 def _refuse_cmrnext_options(weights: list[Path] | None, given: dict[str, Any]) -> None:
     for option in (*(["weights"] if weights else []), *given):
-        value = f" {given[option]}" if option == "estimate" else ""
-        raise ValueError(f"{_flag(option)}{value} is for --matcher cmrnext only")
+        raise ValueError(f"{_flag(option)} is for --matcher cmrnext only")
 
 
 def _structure_matcher(given: dict[str, Any], *, seed: int, all_frames: bool) -> Matcher:

@@ -32,6 +32,7 @@ def calibrate(
     tolerance_deg: options.ToleratedDegOption = None,
     tolerance_cm: options.ToleratedCmOption = None,
     of: options.OfOption = None,
+    estimate: options.EstimateOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
@@ -43,11 +44,11 @@ def calibrate(
             "tolerance_deg": tolerance_deg,
             "tolerance_cm": tolerance_cm,
             "of": of,
-            "estimate": matching.lens_parts,
+            "estimate": estimate,
         }
         settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
         checked_terms = terms_from(terms)
-        chosen = matching.find_matcher(seed=settings.seed, lens_too=True)
+        chosen = matching.find_matcher(seed=settings.seed)
     data = matching.load_dataset(dataset)
     with progress_bar() as progress:
         result = calibrate(

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import bag_options_from, dataset_from, matcher_from
@@ -34,7 +34,7 @@ class MatchingOptions:
     search_m: options.SearchMetresOption = None
     window_weights: options.WindowWeightsOption = None
     weights: options.WeightsOption = None
-    estimate: options.NetworkEstimateOption = None
+    start_from: options.StartFromOption = None
     device: options.DeviceOption = None
     iterations: options.IterationsOption = None
     half_resolution: options.HalfOption = None
@@ -52,27 +52,10 @@ class MatchingOptions:
         default = SEARCH_LIMIT_S if self.matcher == "structure" else None
         return default if self.time_limit_s is None else self.time_limit_s
 
-    @property
-    def lens_parts(self) -> str | None:
-        """What ``--estimate`` names of the lens; None where it names the start of a network."""
-        if self.estimate is None or self.estimate in ("frame", "joint"):
-            return None
-        from calibgraph.model.config import LensPart
-
-        of_lens = {*get_args(LensPart), "lens", "clock"}.issuperset(self.estimate.split(","))
-        return self.estimate if of_lens or self.matcher != "cmrnext" else None
-
-    def find_matcher(self, *, seed: int, lens_too: bool = False) -> Matcher:
-        """The matcher; see :func:`calibgraph.cli.arguments.matcher_from`.
-
-        Args:
-            seed: of everything random.
-            lens_too: whether ``--estimate`` may name parts of the lens.
-        """
+    def find_matcher(self, *, seed: int) -> Matcher:
+        """The matcher; see :func:`calibgraph.cli.arguments.matcher_from`."""
         own = ("rig", "matcher", "frames", "interval_s", "time_limit_s", "weights", *_OF_BAGS)
         others = {name: value for name, value in vars(self).items() if name not in own}
-        if self.lens_parts is not None and lens_too:
-            del others["estimate"]
         chosen = self.frames is not None or self.every_s is not None
         return matcher_from(self.matcher, self.weights, seed=seed, all_frames=chosen, **others)
 

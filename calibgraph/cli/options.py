@@ -74,15 +74,13 @@ WeightsOption = Annotated[
         rich_help_panel=_CMRNEXT,
     ),
 ]
-NetworkEstimateOption = Annotated[
+StartFromOption = Annotated[
     str | None,
     typer.Option(
-        "--estimate",
-        metavar="PART,...|frame|joint",
-        help="Parts of each camera's lens and clock that calibrate estimates too: focal, aspect, "
-        "centre, distortion, or lens for all but aspect; offset of the image to its cloud, readout "
-        "of a rolling shutter, or clock for both; or where a network of cmrnext starts: at each "
-        "frame's own pose from the previous one (default), or at the joint solve.",
+        metavar="frame|joint",
+        help="Where a network starts: at each frame's own pose by the network before, or at the "
+        "joint solve. (default: frame)",
+        rich_help_panel=_CMRNEXT,
     ),
 ]
 DeviceOption = Annotated[

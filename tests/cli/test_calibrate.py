@@ -17,7 +17,6 @@ from calibgraph import (
     load_rig,
     simulate_correspondences,
 )
-from calibgraph.cli.matching_options import MatchingOptions
 from tests.cli.conftest import save_problem
 from tests.conftest import SAMPLE, Call, CommandRun, make_camera, run_command
 
@@ -72,23 +71,6 @@ def test_solve_estimates_a_lens_and_its_files_have_it(solved: CommandRun, call: 
     assert {*result.lens} == {"left", "right"}
     assert "Lens of left" in (out / "report.html").read_text()
     assert load_calibration(solved.folder).lens == {}
-
-
-@pytest.mark.parametrize(
-    ("given", "matcher", "parts"),
-    [
-        (None, "structure", None),
-        ("focal,centre", "structure", "focal,centre"),
-        ("lens", "cmrnext", "lens"),
-        ("joint", "cmrnext", None),
-        ("focus", "structure", "focus"),  # refused by the settings
-        ("both", "cmrnext", None),  # refused by the matcher
-    ],
-)
-def test_estimate_names_the_lens_or_the_start_of_a_network(
-    given: str | None, matcher: str, parts: str | None
-) -> None:
-    assert MatchingOptions(matcher=matcher, estimate=given).lens_parts == parts
 
 
 def test_the_result_file_is_complete_and_returns_the_result(solved: CommandRun) -> None:

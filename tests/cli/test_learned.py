@@ -73,8 +73,8 @@ def test_untrained_weights_fail_on_the_command_line(
             ("--matcher", "cmrnext", "--weights", "{w}", "--window-weights", "a.json"),
             "--window-weights is for --matcher structure only",
         ),
-        (("--estimate", "joint"), "--estimate joint is for --matcher cmrnext only"),
-        (("--matcher", "cmrnext", "--weights", "{w}", "--estimate", "both"), "known are frame"),
+        (("--start-from", "joint"), "--start-from is for --matcher cmrnext only"),
+        (("--matcher", "cmrnext", "--weights", "{w}", "--start-from", "both"), "known are frame"),
         (("--matcher", "cmrnext", "--weights", "{w}", "--device", "tpu"), "known are auto, cpu"),
     ],
 )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +15,26 @@ from starlette.testclient import TestClient
 
 from calibgraph.service import connections
 from calibgraph.service.app import create_app
+from calibgraph.service.folders import DataFolder
 from calibgraph.service.settings import Settings
 from tests.service.conftest import URL, Make, Problem, make_tokens, service_folder
 from tests.service.hostile import zipped
 from tests.service.ports import on_a_port
 
 MB = 10**6
+With = tuple[tuple[str, int], list[dict[str, str]]]
 ROOM_BYTES = 300 * MB
 HEAD = b"Content-Type: multipart/form-data; boundary=b\r\n"
 BEGIN = b'--b\r\nContent-Disposition: form-data; name="recording"; filename="r"\r\n\r\n'
 
 
-@contextmanager
-def with_room(folder: Path) -> Iterator[tuple[tuple[str, int], list[dict[str, str]]]]:
-    """A server of two tenants on a disk with ROOM_BYTES, and their headers."""
-    headers = make_tokens(folder / "tokens.yaml", ("a", "submit"), ("b", "submit"))
-    free = shutil.disk_usage(folder).free - ROOM_BYTES
-    settings = Settings(
-        data=folder / "data", tokens=folder / "tokens.yaml", jobs_at_once=0, free_bytes=free
-    )
+@pytest.fixture
+def with_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[With]:
+    """A server of two tenants and their headers, on a disk with ROOM_BYTES that nobody shares."""
+    headers = make_tokens(tmp_path / "tokens.yaml", ("a", "submit"), ("b", "submit"))
+    data = tmp_path / "data"
+    monkeypatch.setattr(DataFolder, "free_bytes", lambda _: ROOM_BYTES - size_of(data))
+    settings = Settings(data=data, tokens=tmp_path / "tokens.yaml", jobs_at_once=0, free_bytes=0)
     with on_a_port(settings) as (host, port, _):
         yield (host, port), headers
 
@@ -54,42 +55,44 @@ def submit(place: tuple[str, int], token: dict[str, str], small: Problem) -> int
 
 @pytest.mark.parametrize("size", [1000 * MB, 200 * MB, 10**15, 10**30])
 def test_an_upload_without_room_is_refused_before_it_is_sent_and_others_are_not(
-    tmp_path: Path, small: Problem, size: int
+    with_room: With, small: Problem, size: int
 ) -> None:
-    length = b"Content-Length: %d" % size
-    with (
-        with_room(tmp_path) as (place, (first, second)),
-        begin_upload(place, first, length) as connection,
-    ):
+    place, (first, second) = with_room
+    with begin_upload(place, first, b"Content-Length: %d" % size) as connection:
         assert connection.recv(12) in (b"HTTP/1.1 507", b"HTTP/1.1 413", b"HTTP/1.1 400")
         assert submit(place, second, small) == 202
 
 
 def test_uploads_that_arrive_keep_their_room_and_leave_some_to_others(
-    tmp_path: Path, small: Problem, monkeypatch: pytest.MonkeyPatch
+    with_room: With, small: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connections, "BODY_S", 600.0)
-    with with_room(tmp_path) as (place, (first, second)):
-        held = begin_upload(place, first, b"Content-Length: %d" % (120 * MB))
+    place, (first, second) = with_room
+    with begin_upload(place, first, b"Content-Length: %d" % (120 * MB)) as held:
         held.sendall(BEGIN)
+        end = time.monotonic() + 60
+        while not list((tmp_path / "data" / "arriving").glob("*/*/*")):
+            assert time.monotonic() < end
+            time.sleep(0.01)
         with begin_upload(place, first, b"Content-Length: %d" % (120 * MB)) as connection:
             assert connection.recv(12) == b"HTTP/1.1 507"
         assert submit(place, second, small) == 202
-        held.close()
 
 
-def test_a_body_without_a_length_ends_where_its_room_does(tmp_path: Path, small: Problem) -> None:
-    with with_room(tmp_path) as (place, (first, second)):
-        with begin_upload(place, first, b"Transfer-Encoding: chunked") as connection:
-            connection.sendall(b"%x\r\n%s\r\n" % (len(BEGIN), BEGIN))
-            sent, piece = 0, bytes(MB)
-            with suppress(OSError):
-                while sent < ROOM_BYTES:
-                    connection.sendall(b"%x\r\n%s\r\n" % (len(piece), piece))
-                    sent += len(piece)
-            assert connection.recv(12) == b"HTTP/1.1 507"
-            assert submit(place, second, small) == 202
-        assert not list((tmp_path / "data" / "arriving").iterdir())
+def test_a_body_without_a_length_ends_where_its_room_does(
+    with_room: With, small: Problem, tmp_path: Path
+) -> None:
+    place, (first, second) = with_room
+    with begin_upload(place, first, b"Transfer-Encoding: chunked") as connection:
+        connection.sendall(b"%x\r\n%s\r\n" % (len(BEGIN), BEGIN))
+        sent, piece = 0, bytes(MB)
+        with suppress(OSError):
+            while sent < ROOM_BYTES:
+                connection.sendall(b"%x\r\n%s\r\n" % (len(piece), piece))
+                sent += len(piece)
+        assert connection.recv(12) == b"HTTP/1.1 507"
+        assert submit(place, second, small) == 202
+    assert not list((tmp_path / "data" / "arriving").iterdir())
 
 
 def test_frames_of_one_tenant_leave_memory_to_others(

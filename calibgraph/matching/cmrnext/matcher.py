@@ -40,9 +40,9 @@ class CmrNextMatcher:
     Args:
         weights: files of weights, in the order in which the networks are run; a file may be given
             more than once.
-        estimate: the estimate from which a network starts. ``frame``: from the matches of the
-            network before in the same image, by PnP, as in the original; frames that fail are left
-            out. ``joint``: from the joint solve over all frames and cameras.
+        start_from: where a network starts. ``frame``: the pose of the same image by the network
+            before, by PnP, as in the original; frames that fail are left out. ``joint``: the joint
+            solve over all frames and cameras.
         device: ``cpu``, ``cuda``, or ``auto``.
         iterations: of the recurrent update.
         half_resolution: whether images are halved; None: as the weights choose, or from 1400
@@ -65,7 +65,7 @@ class CmrNextMatcher:
         self,
         weights: Sequence[Path | str],
         *,
-        estimate: Literal["frame", "joint"] = "frame",
+        start_from: Literal["frame", "joint"] = "frame",
         device: str = "auto",
         iterations: int = 12,
         half_resolution: bool | None = None,
@@ -75,12 +75,12 @@ class CmrNextMatcher:
     ) -> None:
         if not weights:
             raise ValueError("no weights given: --weights iter1.tar iter5.tar iter6.tar")
-        if estimate not in ("frame", "joint"):
-            raise ValueError(f"estimate {estimate!r}: known are frame, joint")
+        if start_from not in ("frame", "joint"):
+            raise ValueError(f"start_from {start_from!r}: known are frame, joint")
         if iterations < 1 or (batch is not None and batch < 1):
             raise ValueError(f"iterations {iterations}, batch {batch}: expected at least 1")
         self.device = torch_device(device)
-        self.estimate = estimate
+        self.start_from = start_from
         self.iterations = iterations
         self.half_resolution = half_resolution
         self.occlusion_filter = occlusion_filter
@@ -88,7 +88,7 @@ class CmrNextMatcher:
         self.seed = seed
         loaded = {path: self._load(path) for path in dict.fromkeys(map(str, weights))}
         self.networks = [loaded[str(path)] for path in weights]
-        self.rounds = len(self.networks) if estimate == "joint" else 1
+        self.rounds = len(self.networks) if start_from == "joint" else 1
 
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
@@ -101,7 +101,7 @@ class CmrNextMatcher:
     ) -> Correspondences:
         """Match every camera in every frame, from the rig's extrinsics."""
         schedule = self.networks
-        if self.estimate == "joint":
+        if self.start_from == "joint":
             schedule = schedule[round_index : round_index + 1]
         is_last = round_index == self.rounds - 1
         probed = spread_out(dataset.frames, _PROBED_FRAMES) if is_last else []
@@ -203,7 +203,7 @@ class CmrNextMatcher:
                  "range_deg_m": n.checkpoint.range_deg_m}
                 for n in self.networks
             ],
-            "estimate": self.estimate,
+            "start_from": self.start_from,
             "iterations": self.iterations,
             "half_resolution": self.half_resolution,
             "occlusion_filter": self.occlusion_filter,

@@ -69,18 +69,18 @@ def check_true_poses(result: Calibration, table: Correspondences, dataset: Datas
 
 
 @pytest.mark.parametrize(
-    ("estimate", "rounds"), [pytest.param("frame", 1, marks=pytest.mark.slow), ("joint", 2)]
+    ("start_from", "rounds"), [pytest.param("frame", 1, marks=pytest.mark.slow), ("joint", 2)]
 )
 def test_true_flow_gives_the_true_poses(
     sample: Dataset,
     far_weights: Path,
     monkeypatch: pytest.MonkeyPatch,
-    estimate: str,
+    start_from: str,
     rounds: int,
 ) -> None:
     replace_networks(monkeypatch, load_rig(SAMPLE / "reference.yaml").T_camera_lidar)
     data = sample.select("0:5")
-    matcher = CmrNextMatcher([far_weights, far_weights], estimate=estimate)
+    matcher = CmrNextMatcher([far_weights, far_weights], start_from=start_from)
     assert matcher.rounds == rounds
     rig = data.rig
     for index in range(rounds):
@@ -91,15 +91,15 @@ def test_true_flow_gives_the_true_poses(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("estimate", ["frame", "joint"])
+@pytest.mark.parametrize("start_from", ["frame", "joint"])
 def test_true_flow_passes_the_checks_on_images(
-    sample: Dataset, far_weights: Path, monkeypatch: pytest.MonkeyPatch, estimate: str
+    sample: Dataset, far_weights: Path, monkeypatch: pytest.MonkeyPatch, start_from: str
 ) -> None:
     """Images of overlapping cameras may move it, by no more than their own error."""
     truth = load_rig(SAMPLE / "reference.yaml")
     replace_networks(monkeypatch, truth.T_camera_lidar)
     data = sample.select("0:5")
-    matcher = CmrNextMatcher([far_weights, far_weights], estimate=estimate)
+    matcher = CmrNextMatcher([far_weights, far_weights], start_from=start_from)
     result = calibgraph.calibrate(data, matcher=matcher)
     assert result.correspondences is not None
     for error in evaluate(result.rig, truth).cameras.values():
