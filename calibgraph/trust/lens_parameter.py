@@ -8,7 +8,7 @@ half is a field of displacements of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from itertools import product
@@ -41,6 +41,8 @@ NAMES = {
     "skew": (None, "a skew of {} % of fx", "a skew of -{} % of fx"),
 }
 """Parameters that are judged: what ``--estimate`` calls them, and a lens with more or less."""
+TIME = "time offset"
+_WORDS = {**NAMES, TIME: ("offset", "images taken {} ms later", "images taken {} ms earlier")}
 
 SHAPES = "aspect ratio", "skew"
 """Those that no lens has wrong by much."""
@@ -49,7 +51,7 @@ RESIDUALS, IMAGES = "residuals over the image", "images"
 """What an estimate is by."""
 
 KINDS = {
-    by: {name: prefix + name.replace(" ", "_") for name in NAMES}
+    by: {name: prefix + name.replace(" ", "_") for name in _WORDS}
     for by, prefix in ((RESIDUALS, "lens_"), (IMAGES, ""))
 }
 """Kinds of the checks."""
@@ -70,6 +72,12 @@ def lens_variable(camera: Camera) -> LensVariable:
     return LensVariable(camera, free, np.zeros(len(free)))
 
 
+def units_of(camera: Camera, *numbers: int) -> list[float]:
+    """Standard deviations of a calibrated lens: relative, pixels, or of k1."""
+    units = *lens_variable(camera).free.sigmas, _SKEW_SIGMA
+    return [units[number] for number in numbers]
+
+
 def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
     """(6, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
     free, T, k = lens_variable(camera).free, camera.T_camera_lidar, camera.intrinsics_px
@@ -86,11 +94,11 @@ class LensParameter:
     """An estimate of one lens parameter together with the extrinsic.
 
     Attributes:
-        name: one of ``NAMES``.
+        name: one of ``NAMES``, or ``TIME``.
         values: (m,) change, in standard deviations of a calibrated lens.
         sigmas: (m,) their standard deviations, frames as clusters.
         twist: (6,) rotation [rad] and translation [m] by which the camera moves.
-        units: (m,) of the values: relative, pixels, or of k1.
+        units: (m,) of the values: relative, pixels, of k1, or seconds.
     """
 
     name: str
@@ -100,12 +108,12 @@ class LensParameter:
     units: Array
 
     @staticmethod
-    def of(name: str, camera: Camera, freed: Freed, *numbers: int) -> LensParameter:
-        """Of a fit whose last unknowns have these numbers; others may be free before them."""
-        units = np.array([*lens_variable(camera).free.sigmas, _SKEW_SIGMA])[[*numbers]]
-        values, covariance = _beside_others(name, freed, len(freed.values) - len(numbers))
-        twist = freed.compensating[:, -len(numbers) :] @ values
-        return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, units)
+    def of(name: str, units: Sequence[float], freed: Freed) -> LensParameter:
+        """Of a fit whose last unknowns have these units; others may be free before them."""
+        count = len(units)
+        values, covariance = _beside_others(name, freed, len(freed.values) - count)
+        twist = freed.compensating[:, -count:] @ values
+        return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, np.array(units))
 
     @property
     def moved(self) -> tuple[float, float]:
@@ -151,8 +159,8 @@ class LensParameter:
 
     def describe(self) -> str:
         """The lens that would be right, in words."""
-        _, more, less = NAMES[self.name]
-        units = 100 * self.units if "%" in more else self.units
+        _, more, less = _WORDS[self.name]
+        units = self.units * (100 if "%" in more else 1000 if "ms" in more else 1)
         values = units * (np.abs(self.values) if less else self.values)
         numbers = ", ".join(map(_with_sigma, values, units * self.sigmas))
         return (less if less and self.values[0] < 0 else more).format(numbers)
@@ -212,10 +220,11 @@ def check_parameter(found: LensParameter, by: str) -> Check:
         by: RESIDUALS or IMAGES.
     """
     row, probability, (deg, cm) = threshold("lens"), found.probability, found.moved
-    status, (part, *_) = row.grade(probability), NAMES[found.name]
+    status, (part, *_) = row.grade(probability), _WORDS[found.name]
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
     if status != "PASS":
-        text += f": {row.advice}" + (f"; or run with --estimate {part}" if part else "")
+        advice = "correct the time stamps" if found.name == TIME else row.advice
+        text += f": {advice}" + (f"; or run with --estimate {part}" if part else "")
     check = row.describe(probability, status, text, name=f"{found.name} by the {by}: {row.name}")
     return replace(check, kind=KINDS[by][found.name])
 
