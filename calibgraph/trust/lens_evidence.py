@@ -22,6 +22,7 @@ from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import apply_twist
 from calibgraph.solver.linear_fit import LinearFit, block_of, fit_camera
+from calibgraph.solver.scan_distortion import distortion_fields_px
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
 from calibgraph.trust.lens_parameter import (
     NAMES,
@@ -31,6 +32,7 @@ from calibgraph.trust.lens_parameter import (
     lens_variable,
     units_of,
 )
+from calibgraph.trust.thresholds import limit
 
 SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)
 """Half-widths of a search; a focal length wrong by 5 % displaces a result by up to 0.5 m."""
@@ -115,14 +117,21 @@ def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: in
 def _fit_at_peaks(
     scorer: FrameScorer, camera: Camera, scores: ShiftScores, start: Array, *, places: Places
 ) -> LinearFit | None:
-    """Fit pose and lens to the groups' peaks next to a start, (12,)."""
+    """Fit pose and lens to the groups' peaks next to a start, (12,); the scan may be distorted."""
     if not len(scores.weights):
         return None
     fields = lens_fields_px(camera, scores.points_lidar_m)
     table = extract_correspondences(scores.with_unknowns(fields), start, "camera")
     table = at_pixels(camera, with_motion(table, scorer.dataset))
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
-    variance = error_components().matchers["structure"].place_variance
-    shared = variance * places.frames_per_place(block.frame_numbers)
-    fields = lens_fields_px(camera, block.block.points_lidar_m)
-    return fit_camera(camera, block, fields, shared_variance=shared)
+    known, points = error_components().matchers["structure"], block.block.points_lidar_m
+    of_place = known.place_variance * places.frames_per_place(block.frame_numbers)
+    of_scan = np.array([known.elevation_rad, known.elevation_stretch, known.scan_motion_m])
+    bends = distortion_fields_px(camera, points) * of_scan[:, None, None]
+    return fit_camera(
+        camera,
+        block,
+        np.concatenate([lens_fields_px(camera, points), bends]),
+        shared_variance=max(of_place, limit("lens_match_share") * len(block)),
+        considered=len(bends),
+    )

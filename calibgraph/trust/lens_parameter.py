@@ -11,9 +11,10 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from itertools import product
 
 import numpy as np
-from scipy.special import expit, logit, ndtr
+from scipy.special import expit, logit, ndtr, softmax
 
 from calibgraph.arrays import Array
 from calibgraph.graph.lens import LensSigmas, LensVariable
@@ -108,11 +109,11 @@ class LensParameter:
 
     @staticmethod
     def of(name: str, units: Sequence[float], freed: Freed) -> LensParameter:
-        """Of a fit whose last unknowns have these units; others may be free beside them."""
+        """Of a fit whose last unknowns have these units; others may be free before them."""
         count = len(units)
-        values, sigmas = (each[-count:] for each in (freed.values, freed.sigmas))
+        values, covariance = _beside_others(name, freed, len(freed.values) - count)
         twist = freed.compensating[:, -count:] @ values
-        return LensParameter(name, values, sigmas, twist, np.array(units))
+        return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, np.array(units))
 
     @property
     def moved(self) -> tuple[float, float]:
@@ -163,6 +164,39 @@ class LensParameter:
         values = units * (np.abs(self.values) if less else self.values)
         numbers = ", ".join(map(_with_sigma, values, units * self.sigmas))
         return (less if less and self.values[0] < 0 else more).format(numbers)
+
+
+def _beside_others(name: str, freed: Freed, others: int) -> tuple[Array, Array]:
+    """(m,) values and (m, m) covariance of unknowns beside others, each of them usual or wrong.
+
+    A focal length that is 1 % off is no less rare beside a distortion than alone. So the other
+    unknowns have the errors of lens parameters, too: the mean and the covariance over all of their
+    combinations of usual and wrong. Not beside a shape: a wrong fy alone is a wrong focal length,
+    too, which stays free.
+
+    Args:
+        name: of the unknowns.
+        freed: the fit, with all of them free.
+        others: how many of its first unknowns are the others.
+    """
+    first, last = slice(others), slice(others, None)
+    values, covariance = freed.values, freed.covariance
+    if not others or name in SHAPES or not np.isfinite(covariance).all():
+        return values[last], covariance[last, last]
+    wrong = np.array([*product((False, True), repeat=others)])
+    spreads = np.where(wrong, limit("lens_wrong"), 1.0)
+    total = covariance[first, first] + spreads[:, :, None] ** 2 * np.eye(others)
+    gain, misfit = (
+        np.linalg.solve(total, each) for each in (covariance[first, last], values[first, None])
+    )
+    odds = logit(limit("lens_wrong_share")) * wrong.sum(axis=1)
+    fits = values[first] @ misfit[..., 0].T + np.linalg.slogdet(total).logabsdet
+    weights = softmax(odds - fits / 2)
+    means = values[last] - values[first] @ gain
+    within = covariance[last, last] - covariance[last, first] @ gain
+    mean = weights @ means
+    apart = (means - mean)[:, :, None] * (means - mean)[:, None]
+    return mean, np.tensordot(weights, within + apart, axes=1)
 
 
 def _share_beyond(size: float, mean: Array | float, sigma: Array) -> Array:

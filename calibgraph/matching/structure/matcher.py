@@ -4,8 +4,9 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from copy import copy
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from calibgraph.matching.structure.shift_scores import (
     concatenate_scores,
     score_frame,
 )
+from calibgraph.matching.structure.window_weights import load_window_network, window_network
 from calibgraph.model.clock import clock_of
 from calibgraph.model.config import LensPart, Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
@@ -70,8 +72,11 @@ class StructureMatcher:
         search_m: the same of the translation [m].
         most_frames: most frames of a dataset that are used, chosen of more; None for all.
         levels: the rounds, coarse to fine.
+        window_weights: file of a network that weighs the windows, of ``train_windows``; None for
+            the package's.
 
     Raises:
+        FileError: if that file is missing or malformed.
         ValueError: if only one of the ranges is None, or one is out of bounds, or no frame is left.
     """
 
@@ -86,13 +91,15 @@ class StructureMatcher:
         search_m: float | None = SEARCH_M,
         most_frames: int | None = MOST_FRAMES,
         levels: Sequence[Level] = LEVELS,
+        window_weights: Path | str | None = None,
     ) -> None:
         if most_frames is not None and most_frames < 1:
             raise ValueError(f"at least one frame must be used, found most_frames={most_frames}")
         self.seed = seed
         self.search_range = _to_search_range(search_deg, search_m)
         self.most_frames = most_frames
-        self.levels = levels
+        own = None if window_weights is None else load_window_network(window_weights)
+        self.levels = levels if own is None else [replace(level, network=own) for level in levels]
         self.estimate: tuple[LensPart, ...] = ()
         self.rounds = len(levels)
         self._cache = FrameCache()
@@ -254,7 +261,13 @@ class StructureMatcher:
             range_rotation_deg=reach.rotation_deg,
             range_translation_m=reach.translation_m,
         )
-        settings = {"matcher": "structure", "round": round_index, "seed": self.seed}
+        network = self.levels[round_index].network or window_network()
+        settings = {
+            "matcher": "structure",
+            "round": round_index,
+            "seed": self.seed,
+            "window_weights": {"sha256": network.sha256, "how": network.how},
+        }
         return {STAGE1: self.stage1, **settings, **findings.to_metadata()}
 
 

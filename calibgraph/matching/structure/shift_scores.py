@@ -14,6 +14,7 @@ from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import Level
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.visibility import find_in_view, find_places, find_visible
+from calibgraph.matching.structure.window_weights import window_network
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.memory import mmap_zeros
 from calibgraph.model.clock import seen_at_rows, when_taken
@@ -87,7 +88,7 @@ def score_frame(  # noqa: PLR0913 - what is scored, and how
     windows = select_windows(cloud, camera, level, max_windows=max_windows)
     T, viewpoint_m = camera.T_camera_lidar, cloud.viewpoint_lidar_m(camera)
     centres_lidar_m = windows.rays_m[:, 0] + viewpoint_m
-    kept, group, groups = _group_windows(centres_lidar_m @ T[:3, :3].T + T[:3, 3], level.group_rad)
+    kept, group, groups = group_windows(centres_lidar_m @ T[:3, :3].T + T[:3, 3], level.group_rad)
     windows, centres_lidar_m = windows.select(kept), centres_lidar_m[kept]
     rays_m, seen_m = windows.rays_m, centres_lidar_m
     if twist_per_s is not None and camera.readout_s:
@@ -128,7 +129,7 @@ def select_windows(
     )
     max_covered = 0.0 if level.fine else MAX_COVERED
     windows = table.cut(in_view, clear, max_covered=max_covered, max_windows=max_windows)
-    return windows.weighed() if level.weighed else windows.unweighed()
+    return windows.weighed(level.network or window_network()) if level.weighed else windows
 
 
 def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
@@ -168,7 +169,7 @@ def downscale_log_gray(
     return np.ascontiguousarray(small, dtype=np.float32), scale
 
 
-def _group_windows(
+def group_windows(
     centres_camera_m: Array, cell_rad: float
 ) -> tuple[NDArray[np.intp], NDArray[np.int32], int]:
     """Group windows by direction and depth; groups of too few windows are dropped.
