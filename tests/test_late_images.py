@@ -54,7 +54,7 @@ def test_offset_and_readout_are_found_with_the_pose() -> None:
     assert abs(offset.value - OFFSET_S) < 4 * offset.sigma < 0.012
     assert abs(readout.value - READOUT_S) < 4 * readout.sigma < 0.04
     error = evaluate(result.rig, rig).cameras[CAMERA]
-    assert error.translation_error_cm < 5.0  # with a fixed clock 20
+    assert error.translation_error_cm < 3.0  # with a fixed clock 11
     assert error.rotation_error_deg < 0.2
 
 
