@@ -19,6 +19,7 @@ AUDIT_PAGE_MARK = b'<meta name="generator" content="calibgraph check">'
 DOT_MARK = "// calibgraph graph"
 VIEW_MARK = "calibgraph-view"
 WEIGHTS_MARK = "calibgraph-cmrnext/1"
+WINDOW_WEIGHTS_MARK = "calibgraph-window-weights/1"
 _DATA_FOLDERS = ("cameras", "lidar", "velodyne", "image_2", "image_3")
 
 

@@ -45,6 +45,13 @@ def training_settings() -> str:
     return settings_table(TrainSettings)
 
 
+def window_settings() -> str:
+    """The settings of `calibgraph train-windows`."""
+    from calibgraph.matching.structure.training.settings import WindowSettings
+
+    return settings_table(WindowSettings)
+
+
 def presets() -> str:
     """The settings in which the presets differ."""
     from calibgraph.model.config import PRESETS, preset
@@ -80,6 +87,7 @@ GENERATED: Mapping[str, Callable[..., str]] = {
     "settings": settings,
     "tracking settings": tracking_settings,
     "training settings": training_settings,
+    "window settings": window_settings,
     "presets": presets,
     "commands": commands,
     "api": api,

@@ -25,7 +25,7 @@ from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
 from calibgraph.cli.guess import bag, guess, init
 from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
-from calibgraph.cli.learned import train, weights
+from calibgraph.cli.learned import train, train_windows, weights
 from calibgraph.cli.serve import pick, serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
@@ -88,6 +88,7 @@ COMMANDS: dict[Callable[..., None], outputs.Outputs] = {
     simulate: outputs.nothing,
     weights: outputs.weights,
     train: outputs.training,
+    train_windows: outputs.window_weights,
     track: outputs.result,
     pick: outputs.picked,
     fleet: outputs.nothing,

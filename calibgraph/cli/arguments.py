@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from calibgraph.model.config import Config, Terms
 
 _SEARCH_OPTIONS = ("search_deg", "search_m")
+_OF_STRUCTURE = (*_SEARCH_OPTIONS, "window_weights")
 
 
 @contextmanager
@@ -87,12 +88,13 @@ def matcher_from(
         weights: of cmrnext.
         seed: of everything random.
         all_frames: match all frames, as when the user has selected them.
-        options: of cmrnext, and the search_deg and search_m of structure; None if not given.
+        options: of cmrnext, and the search_deg, search_m and window_weights of structure; None if
+            not given.
     """
     given = {key: value for key, value in options.items() if value is not None}
-    search = {key: _parse_range(key, given.pop(key)) for key in _SEARCH_OPTIONS if key in given}
-    if search and name != "structure":
-        raise ValueError(f"{_flag(next(iter(search)))} is for --matcher structure only")
+    own = {key: given.pop(key) for key in _OF_STRUCTURE if key in given}
+    if own and name != "structure":
+        raise ValueError(f"{_flag(next(iter(own)))} is for --matcher structure only")
     if name == "cmrnext" and weights:
         from calibgraph.matching.cmrnext import CmrNextMatcher
 
@@ -100,7 +102,7 @@ def matcher_from(
     if name != "cmrnext":
         _refuse_cmrnext_options(weights, given)
     if name == "structure":
-        return _structure_matcher(search, seed=seed, all_frames=all_frames)
+        return _structure_matcher(own, seed=seed, all_frames=all_frames)
     from calibgraph.matching.named import find_matcher
 
     return find_matcher(name, seed=seed)
@@ -111,14 +113,15 @@ def _refuse_cmrnext_options(weights: list[Path] | None, given: dict[str, Any]) -
         raise ValueError(f"{_flag(option)} is for --matcher cmrnext only")
 
 
-def _structure_matcher(search: dict[str, float | None], *, seed: int, all_frames: bool) -> Matcher:
+def _structure_matcher(given: dict[str, Any], *, seed: int, all_frames: bool) -> Matcher:
     from calibgraph.matching.structure import StructureMatcher
 
+    search = {key: _parse_range(key, given[key]) for key in _SEARCH_OPTIONS if key in given}
     if len(search) == len(_SEARCH_OPTIONS) and len({n is None for n in search.values()}) > 1:
         raise ValueError("--search-deg and --search-m: give numbers, or none for no search")
-    settings: dict[str, Any] = dict(search)
+    settings: dict[str, Any] = {**given, **search}
     if None in search.values():
-        settings = dict.fromkeys(_SEARCH_OPTIONS)
+        settings.update(dict.fromkeys(_SEARCH_OPTIONS))
     if all_frames:
         settings["most_frames"] = None
     return StructureMatcher(seed=seed, **settings)

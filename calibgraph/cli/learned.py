@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.options import JsonOption
+from calibgraph.cli.options import ConfigSeedOption, JsonOption
 from calibgraph.cli.terminal import print_json, progress_bar, terminal
 
 
@@ -45,8 +45,9 @@ def train(
         list[Path],
         typer.Argument(
             metavar="DATASET...",
-            help="Folders with a trusted extrinsic: KITTI sequences, or datasets with a "
-            "reference.yaml; they may be of different rigs.",
+            help="Folders with a trusted extrinsic: KITTI sequences, datasets with a "
+            "reference.yaml, or results, of which PASS cameras count; they may be of different "
+            "rigs.",
         ),
     ],
     out: Annotated[
@@ -102,8 +103,8 @@ def train(
     from calibgraph.cli.tables import print_validation
     from calibgraph.io.rigs import load_rig
     from calibgraph.matching.cmrnext import TrainSettings, train
-    from calibgraph.matching.cmrnext.training.scenes import load_trusted_dataset, split
     from calibgraph.matching.cmrnext.training.settings import load_settings
+    from calibgraph.matching.trusted_data import load_trusted_dataset, split
 
     given = {"config": config, "seed": seed, "from": start}
     with checked_arguments():
@@ -135,3 +136,61 @@ def train(
             progress=progress,
         )
     console.print(f"{out}: trained", soft_wrap=True, markup=False)
+
+
+def train_windows(
+    recording: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RESULT...",
+            help="Results of calibrate, whose frames and PASS cameras are learned from; or KITTI "
+            "sequences or datasets with a reference.yaml.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE.json", help="Weights to write.")],
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Settings of the training, YAML.")
+    ] = None,
+    held_out: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="RESULT",
+            help="Recording that only measures; may be repeated. (default: the last fifth of each "
+            "RESULT)",
+        ),
+    ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="FILE", help="Weights to begin with. (default: shipped)"),
+    ] = None,
+    seed: ConfigSeedOption = None,
+) -> None:
+    """Train the weights of the matcher structure's windows on the poses of your own recordings."""
+    from calibgraph.matching.structure.training import (
+        WindowSettings,
+        load_window_settings,
+        train_windows,
+    )
+    from calibgraph.matching.structure.window_weights import load_window_network
+    from calibgraph.matching.trusted_data import load_trusted_dataset, split
+
+    chosen = WindowSettings() if config is None else load_window_settings(config)
+    chosen = chosen if seed is None else chosen.model_copy(update={"seed": seed})
+    begun = None if start is None else load_window_network(start)
+    data = [load_trusted_dataset(folder) for folder in recording]
+    others = [load_trusted_dataset(folder) for folder in held_out or ()]
+    if not others:
+        data, others = split(data)
+    with progress_bar() as progress:
+        found = train_windows(data, others, chosen, start=begun, progress=progress)
+    found.network.save(out)
+    better = "better" if found.held_out[1] < found.held_out[0] else "no better: do not use them"
+    terminal().print(
+        f"{out}: negative log-likelihood of a camera's pose {_change(found.loss)}, held out "
+        f"{_change(found.held_out)}, {better}",
+        soft_wrap=True, markup=False,
+    )  # fmt: skip
+
+
+def _change(values: tuple[float, float]) -> str:
+    return f"{values[0]:.2f} -> {values[1]:.2f}"

@@ -32,6 +32,7 @@ class MatchingOptions:
     time_limit_s: options.TimeLimitOption = None
     search_deg: options.SearchDegOption = None
     search_m: options.SearchMetresOption = None
+    window_weights: options.WindowWeightsOption = None
     weights: options.WeightsOption = None
     start_from: options.StartFromOption = None
     device: options.DeviceOption = None

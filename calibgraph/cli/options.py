@@ -47,6 +47,14 @@ SearchMetresOption = Annotated[
         rich_help_panel=_STRUCTURE,
     ),
 ]
+WindowWeightsOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Weights of windows of train-windows, in place of the package's.",
+        rich_help_panel=_STRUCTURE,
+    ),
+]
 TimeLimitOption = Annotated[
     float | None,
     typer.Option(

@@ -12,6 +12,7 @@ from calibgraph.outputs import (
     PAGE_MARK,
     VIEW_MARK,
     WEIGHTS_MARK,
+    WINDOW_WEIGHTS_MARK,
     Output,
     marked_yaml,
     png_mark,
@@ -46,6 +47,7 @@ plot_of_drift = named("plot", "drift", png_mark("drift"), ".png")
 page_of_audit = named("page", "check", AUDIT_PAGE_MARK, *PAGE_SUFFIXES)
 fleet_page = named("out", "fleet-report", PAGE_MARK, *PAGE_SUFFIXES)
 weights = named("out", "weights", WEIGHTS_MARK, ".safetensors")
+window_weights = named("out", "train-windows", WINDOW_WEIGHTS_MARK, ".json")
 _graph = named("graph", "solve --graph", DOT_MARK, ".dot")
 _rerun = named("rerun", "view", VIEW_MARK, ".rrd")
 _mcap = named("mcap", "view", VIEW_MARK, ".mcap")

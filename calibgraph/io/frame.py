@@ -179,6 +179,17 @@ def twist_by_scans(frame: Frame, beside: Sequence[tuple[Frame, float]]) -> Array
     return np.asarray(np.mean(twists, axis=0))
 
 
+def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
+    """The frame that a result's entry names, its cloud corrected as it was."""
+    images = {name: Path(path) for name, path in entry["images"].items()}
+    files = entry["frame"], entry["name"], Path(entry["cloud"]), images
+    motion = entry.get(_MOTION)
+    if motion is None:
+        return Frame(*files)
+    found = ScanMotion.of_entry(motion)
+    return MovingFrame(*files, find_motion=lambda: found)
+
+
 def load_entry_cloud(entry: Mapping[str, Any]) -> NDArray[np.float32]:
     """(n, 4) the cloud that a result's entry of a frame names, corrected as it was."""
     motion = entry.get(_MOTION)

@@ -166,6 +166,6 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
     for command in (
         "calibrate", "match", "solve", "report", "evaluate", "perturb", "export", "import",
-        "simulate", "weights", "train", "track",
+        "simulate", "weights", "train", "train-windows", "track",
     ):  # fmt: skip
         assert command in done.stdout

@@ -1,4 +1,4 @@
-"""The commands `weights` and `train`, and `calibrate` with the matcher cmrnext."""
+"""The commands `weights`, `train` and `train-windows`, and `calibrate` with the matcher cmrnext."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import yaml
 import calibgraph
 from calibgraph import Rig, load_rig
 from calibgraph.matching.cmrnext import TrainSettings, load_checkpoint
+from calibgraph.matching.structure.window_weights import PACKAGE_FILE, load_window_network
 from tests.conftest import SAMPLE, Call
 from tests.matching.cmrnext.builders import good_content, saved
 
@@ -66,6 +67,12 @@ def test_untrained_weights_fail_on_the_command_line(
         (("--matcher", "cmrnext"), "needs weights"),
         (("--matcher", "cmrnext", "--weights", "nowhere.tar"), "no such file of weights"),
         (("--weights", "a.tar"), "--weights is for --matcher cmrnext only"),
+        (("--window-weights", "nowhere.json"), "nowhere.json: no such file"),
+        (("--window-weights", "{w}"), "is not a text file"),
+        (
+            ("--matcher", "cmrnext", "--weights", "{w}", "--window-weights", "a.json"),
+            "--window-weights is for --matcher structure only",
+        ),
         (("--start-from", "joint"), "--start-from is for --matcher cmrnext only"),
         (("--matcher", "cmrnext", "--weights", "{w}", "--start-from", "both"), "known are frame"),
         (("--matcher", "cmrnext", "--weights", "{w}", "--device", "tpu"), "known are auto, cpu"),
@@ -136,3 +143,30 @@ def test_default_settings_are_printed(call: Call) -> None:
     code, printed, _ = call("train", "--print-settings")
     assert code == 0
     assert TrainSettings.model_validate(yaml.safe_load(printed)) == TrainSettings()
+
+
+def test_windows_are_trained_on_the_command_line(tmp_path: Path, call: Call) -> None:
+    out, settings = tmp_path / "own.json", tmp_path / "small.yaml"
+    settings.write_text("epochs: 1\nframes: 2\n")
+    code, _, text = call("train-windows", SAMPLE, "--out", out, "--config", settings, "--seed", 2)
+    assert code == 0
+    assert re.search(r"pose -?\d+\.\d\d -> .*, held out .*, (no )?better", text)
+    network = load_window_network(out)
+    assert "seed 2" in network.how and "3 cameras" in network.how
+    # Its own file may be replaced, and begun with; another one may not.
+    given = ("--out", tmp_path / "next.json", "--config", settings)
+    assert call("train-windows", SAMPLE, *given, "--from", out)[0] == 0
+    other = tmp_path / "mine.json"
+    other.write_text("{}")
+    for arguments, message in (
+        ((SAMPLE, "--out", other), "was not written by calibgraph train-windows"),
+        ((SAMPLE, "--out", out, "--from", out), "is read by this command"),
+        ((SAMPLE, "--out", tmp_path / "a.json", "--from", other), "key '\\w+' is missing"),
+        ((SAMPLE, "--out", tmp_path / "a.pt"), ".json"),
+        ((SAMPLE, "--out", tmp_path / "a.json", "--config", other.with_name("no.yaml")), "no such"),
+        ((tmp_path / "nothing", "--out", tmp_path / "a.json"), "nothing"),
+    ):
+        code, _, line = call("train-windows", *arguments)
+        assert code == 2 and line.count("\n") == 1
+        assert re.search(message, line), line
+    assert PACKAGE_FILE.read_bytes() != out.read_bytes()

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from calibgraph.arrays import Array, Mask
 from calibgraph.matching.structure.window_features_kernel import FEATURES, fill_features
 from calibgraph.matching.structure.window_kernel import describe_windows
-from calibgraph.matching.structure.window_weights import window_network
+from calibgraph.matching.structure.window_weights import WindowNetwork
 
 Rows = NDArray[np.intp]
 
@@ -46,7 +46,9 @@ class Windows:
         basis: (w, WINDOW_POINTS, 4) columns: inverse range and intensity (orthonormal, shrunk where
             they are flat), and the two linear functions of direction; these are zero where a
             window keeps its linear parts.
-        weight: (w,) how much a window tells where it is, 0 to 1.
+        features: (w, f) what its weight depends on, see ``FEATURES``; zeros where a window does
+            not keep its linear parts.
+        weight: (w,) how much a window tells where it is, 0 to 1; 1 until it is weighed.
     """
 
     rays_m: NDArray[np.float32]
@@ -54,6 +56,7 @@ class Windows:
     front: Mask
     counts: NDArray[np.int32]
     basis: NDArray[np.float32]
+    features: NDArray[np.float32]
     weight: NDArray[np.float32]
 
     @staticmethod
@@ -66,6 +69,7 @@ class Windows:
             front=make(shape, np.bool_),
             counts=make((count,), np.int32),
             basis=make((*shape, 4), np.float32),
+            features=make((count, len(FEATURES)), np.float32),
             weight=make((count,), np.float32),
         )
 
@@ -73,17 +77,14 @@ class Windows:
         """Some of the windows."""
         return Windows(**{name: values[rows] for name, values in vars(self).items()})
 
-    def weighed(self) -> Windows:
+    def weighed(self, network: WindowNetwork) -> Windows:
         """Those that tell something, with the shares of variation they explain times the weights.
 
         What is left out, a fifth of all, changes no z-score by more than a fiftieth.
         """
-        kept = self.select(self.weight > MIN_WEIGHT)
+        weight = network.weights(self.features)
+        kept = replace(self, weight=weight).select(weight > MIN_WEIGHT)
         return replace(kept, basis=kept.basis * np.sqrt(kept.weight)[:, None, None])
-
-    def unweighed(self) -> Windows:
-        """The same, all of one weight."""
-        return replace(self, weight=np.ones_like(self.weight))
 
     def put(self, first: int, others: Windows) -> None:
         """Write others in place of the windows from a row on."""
@@ -110,7 +111,7 @@ def cut_windows(
             [m]; (n,) their intensity ranks.
         centres: (w,) of the neighbours' rays, those that are the windows' centres.
         neighbours: of the thinned rays.
-        keep_linear: keep the linear parts of the variation, and weigh the windows.
+        keep_linear: keep the linear parts of the variation, and describe it.
 
     Returns:
         The windows; (w,) how reliably each can be seen in an image: 0 where it is too small or
@@ -123,17 +124,12 @@ def cut_windows(
         windows.rays_m, windows.front, windows.basis, reliability,
     )  # fmt: skip
     reliability[windows.counts < MIN_WINDOW_POINTS] = 0.0
-    windows.weight[:] = 1.0
+    windows.weight[:], windows.features[:] = 1.0, 0.0
     if keep_linear:
-        weigh_windows(cloud, windows)
+        fill_features(
+            cloud, windows.members, windows.counts, windows.front, windows.basis, windows.features
+        )
     return windows, reliability
-
-
-def weigh_windows(cloud: tuple[Array, Array], windows: Windows) -> None:
-    """Fill the weights of windows of a cloud."""
-    features = np.zeros((len(windows.counts), len(FEATURES)))
-    fill_features(cloud, windows.members, windows.counts, windows.front, windows.basis, features)
-    windows.weight[:] = window_network().weights(features)
 
 
 class Neighbours:

@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import itertools
+import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 import calibgraph
-from calibgraph import Rig
+from calibgraph import FileError, Rig, StructureMatcher
+from calibgraph.files import sha256
 from calibgraph.matching.structure.consensus import z_score
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.shift_scores import score_frame
 from calibgraph.matching.structure.window_features_kernel import FEATURES, fill_features
-from calibgraph.matching.structure.window_weights import WindowNetwork, window_network
+from calibgraph.matching.structure.window_weights import (
+    PACKAGE_FILE,
+    WindowNetwork,
+    load_window_network,
+    window_network,
+)
 from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows
-from tests.conftest import make_camera
+from tests.conftest import SAMPLE, make_camera
 
 Array = NDArray[np.float64]
 
@@ -80,7 +89,7 @@ def test_a_weight_lessens_the_share_that_a_window_explains() -> None:
     image = rng.normal(0, 0.3, (40, 60)).astype(np.float32)
     places = np.stack(np.meshgrid(np.arange(20, 25), np.arange(15, 20)), axis=2)
     windows = Windows.empty(1)
-    windows.counts[:], windows.weight[:] = WINDOW_POINTS, 0.3
+    windows.counts[:], windows.features[:] = WINDOW_POINTS, 0.0
     basis = np.linalg.qr(rng.normal(size=(WINDOW_POINTS, 3)) - [[1, 0, 0]])[0][:, 1:]
     basis -= basis.mean(axis=0)
     windows.basis[:] = 0.0
@@ -93,7 +102,9 @@ def test_a_weight_lessens_the_share_that_a_window_explains() -> None:
         score_windows(image, at, of.counts, of.basis, group, first, True, grids)
         return grids[0].astype(float)
 
-    whole, weighed = scores(windows), scores(windows.weighed())
+    always = np.zeros((len(FEATURES), 1)), np.array([np.log(0.3 / 0.7)])
+    network = WindowNetwork(np.zeros(len(FEATURES)), np.ones(len(FEATURES)), (always,))
+    whole, weighed = scores(windows), scores(windows.weighed(network))
     # Single precision, and a product of factors near 1: some 1e-6 of a logarithm.
     np.testing.assert_allclose(weighed, -np.log(1 - 0.3 * (1 - np.exp(-whole))), atol=1e-5)
     assert np.ptp(whole) > 0.1
@@ -137,3 +148,73 @@ def test_weights_stay_within_0_and_1() -> None:
     network = WindowNetwork(np.zeros(1), np.ones(1), (layer,))
     weights = network.weights(np.array([[-9.0], [0.0], [9.0]]))
     assert 0 < weights[0] < 1e-4 and weights[1] == 0.5 and 1 - 1e-4 < weights[2] <= 1
+
+
+def test_a_network_is_read_as_it_was_written(tmp_path: Path) -> None:
+    rng, path = np.random.default_rng(4), tmp_path / "own.json"
+    layers = tuple((rng.normal(size=size), rng.normal(size=size[1])) for size in ((14, 5), (5, 1)))
+    WindowNetwork(rng.normal(size=14), rng.uniform(1, 2, 14), layers, how="a test").save(path)
+    read = load_window_network(path)
+    read.save(tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_bytes() == path.read_bytes()
+    assert read.how == "a test" and read.sha256 == sha256(path)
+    assert [matrix.shape for matrix, _ in read.layers] == [(14, 5), (5, 1)]
+
+
+HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "other features": (lambda c: c["features"].reverse(), "features are not those"),
+    "a number that is none": (lambda c: c["mean"].__setitem__(3, float("nan")), "mean.3"),
+    "a number beyond": (lambda c: c["layers"][1]["bias"].__setitem__(0, 1e300), "layers.1.bias.0"),
+    "a spread of 0": (lambda c: c["spread"].__setitem__(0, 0), "spread.0"),
+    "a layer cut off": (lambda c: c["layers"].pop(), "do not fit"),
+    "a ragged matrix": (lambda c: c["layers"][0]["matrix"][2].pop(), "do not fit"),
+    "a short mean": (lambda c: c["mean"].pop(), "do not fit"),
+    "a wide layer": (lambda c: c["layers"][0]["bias"].extend([0.0] * 300), "layers.0.bias"),
+    "no layers": (lambda c: c.update(layers=[]), "layers"),
+    "an unknown key": (lambda c: c.update(exec="rm"), "unknown key 'exec'"),
+    "another format": (lambda c: c.update(format="calibgraph-window-weights/9"), "format"),
+    "control characters": (lambda c: c.update(how="\x1b[2J"), "control characters"),
+    "text for a number": (lambda c: c["layers"][0]["bias"].__setitem__(0, "x"), "layers.0.bias.0"),
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_a_hostile_file_is_refused_in_one_line(tmp_path: Path, kind: str) -> None:
+    change, message = HOSTILE[kind]
+    content, path = json.loads(PACKAGE_FILE.read_text()), tmp_path / "bad.json"
+    change(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(FileError) as caught:
+        load_window_network(path)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x00\xff" * 50, b"[" * 100_000, b"[1]", b'{"format": 1e999}']
+)
+def test_a_file_that_is_no_network_is_refused(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "bad.json"
+    path.write_bytes(data)
+    with pytest.raises(FileError) as caught:
+        load_window_network(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_matcher_uses_and_names_the_network_of_a_file(tmp_path: Path) -> None:
+    path, shipped = tmp_path / "own.json", window_network()
+    matrix, bias = shipped.layers[-1]
+    opposite = replace(shipped, layers=(*shipped.layers[:-1], (-matrix, -bias)), how="opposite")
+    opposite.save(path)
+    data = calibgraph.load_dataset(SAMPLE).select("0")
+    tables = [
+        StructureMatcher(window_weights=file).match(
+            data, calibgraph.load_rig(SAMPLE / "reference.yaml"), round_index=5,
+            progress=lambda *_: None,
+        )
+        for file in (None, PACKAGE_FILE, path)
+    ]  # fmt: skip
+    named = [table.metadata["window_weights"] for table in tables]
+    assert named[0] == named[1] == {"sha256": sha256(PACKAGE_FILE), "how": shipped.how}
+    assert named[2] == {"sha256": sha256(path), "how": "opposite"}
+    np.testing.assert_array_equal(tables[0].pixels_px, tables[1].pixels_px)
+    assert tables[2].findings.z_score != tables[0].findings.z_score

@@ -6,7 +6,7 @@ import pytest
 
 from calibgraph import Dataset
 from calibgraph.matching.cmrnext import train
-from calibgraph.matching.cmrnext.training.scenes import load_trusted_dataset
+from calibgraph.matching.trusted_data import load_trusted_dataset
 from tests.conftest import SAMPLE
 from tests.matching.cmrnext.training.tiny import TINY
 

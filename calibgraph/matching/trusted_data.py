@@ -1,0 +1,87 @@
+"""Recordings to learn from: their extrinsics are trusted."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from calibgraph.errors import DatasetError
+from calibgraph.io import kitti
+from calibgraph.io.calibrations import load_calibration
+from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.frame import Frame, frame_of_entry, hash_source
+from calibgraph.io.rigs import load_rig
+from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
+from calibgraph.model.rig import Rig
+
+REFERENCE_NAME = "reference.yaml"
+
+
+def load_trusted_dataset(folder: Path, rig: Rig | None = None) -> Dataset:
+    """Load a dataset with extrinsics to train on.
+
+    Args:
+        folder: a result of ``calibrate``, whose frames and PASS cameras are taken; a KITTI odometry
+            sequence; or a dataset folder.
+        rig: with the trusted extrinsics; if None, those of the result, the sequence's calib.txt or
+            the folder's reference.yaml.
+
+    Raises:
+        DatasetError: if there is none of these: the folder's rig.yaml is only a guess; or if no
+            camera of the result is PASS, or its files have changed.
+    """
+    result = folder / CALIBRATION_FILE if folder.is_dir() else folder
+    if rig is None and is_calibration_file(result):
+        return _of_result(folder)
+    if rig is None and not (folder / kitti.CALIBRATION_NAME).is_file():
+        reference = folder / REFERENCE_NAME
+        if folder.is_dir() and not reference.is_file():
+            raise DatasetError(
+                f"{folder}: has no {REFERENCE_NAME}, and its rig.yaml is a guess; give the trusted "
+                "extrinsic with --rig"
+            )
+        rig = load_rig(reference) if folder.is_dir() else None
+    return load_dataset(folder, rig)
+
+
+def _of_result(folder: Path) -> Dataset:
+    result = load_calibration(folder)
+    passed = {n: c for n, c in result.rig.cameras.items()
+              if result.camera_verdicts[n].status == "PASS"}  # fmt: skip
+    if not passed or not result.frames:
+        what = "names no images" if passed else "has no camera that is PASS"
+        raise DatasetError(f"{folder}: {what}; learn from results of calibrate that are")
+    frames = tuple(frame_of_entry(entry) for entry in result.frames)
+    for frame in frames:
+        _require_same(frame, result.inputs)
+    source = Path(os.path.commonpath([frame.cloud_path for frame in frames]))
+    return Dataset(Rig(cameras=passed), frames, (source,))
+
+
+def _require_same(frame: Frame, hashes: dict[str, str]) -> None:
+    for path in (frame.cloud_path, *frame.image_paths.values()):
+        known = hashes.get(str(path))
+        if known is not None and known != hash_source(path):
+            raise DatasetError(
+                f"{path}: has changed since it was calibrated; calibrate again", frame=frame.index
+            )
+
+
+def split(datasets: Sequence[Dataset]) -> tuple[list[Dataset], list[Dataset]]:
+    """Split each dataset's frames into the first four fifths and the last; neighbours look alike.
+
+    Raises:
+        DatasetError: if one has a single frame.
+    """
+    for dataset in datasets:
+        if len(dataset.frames) < 2:  # noqa: PLR2004
+            raise DatasetError(
+                f"{dataset.folders[0]}: one frame cannot be split; name others with --held-out"
+            )
+    cuts = [min(len(d.frames) - 1, -(-4 * len(d.frames) // 5)) for d in datasets]
+    return (
+        [replace(d, frames=d.frames[:cut]) for d, cut in zip(datasets, cuts, strict=True)],
+        [replace(d, frames=d.frames[cut:]) for d, cut in zip(datasets, cuts, strict=True)],
+    )
