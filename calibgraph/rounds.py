@@ -43,7 +43,6 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.inputs import check_inputs
 from calibgraph.trust.rematch_checks import REMATCH_DEG, REMATCH_M, compare_ends
-from factors.free_lens import CLOCK
 
 Datasets = Dataset | Path | str | Sequence[Path | str]
 AnyMatcher = Matcher | Correspondences | Path | str
@@ -56,9 +55,9 @@ _BETTER = 1.03
 percent."""
 
 
-_OF_LENS, _OF_CLOCK = (0.5, 4), (0.1, 12)
-"""Change of a lens, in its standard deviations, from which the last round is repeated; how often.
-Of a clock more: matches follow a wrong time in part, on KITTI 05 by four fifths."""
+_STANDS, _REPEATS = 0.5, 4
+"""Change of a lens or clock, in standard deviations, from which the last round is repeated; how
+often."""
 
 
 def match_in_rounds(
@@ -77,7 +76,7 @@ def match_in_rounds(
     as of :func:`calibgraph.calibrate`.
     """
     config = config or Config()
-    full = find_matcher(matcher, seed=config.seed)
+    full = find_matcher(matcher, seed=config.seed).with_estimate(config.estimate)
     data, guess = _open(dataset, rig, full.most_frames)
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
     with watch("inputs"):
@@ -87,11 +86,12 @@ def match_in_rounds(
     with watch("locate"):
         start = full.locate(data, guess, out_of_time=out_of_time, progress=progress)
     estimate = start.rig
-    stands, more = _OF_CLOCK if {*CLOCK} & {*config.estimate} else _OF_LENS
     indices, lens = [*range(start.first_round, full.rounds)], dict[str, tuple[LensEstimate, ...]]()
     for index in indices:
         repeat = len(rounds) + 1 - (full.rounds - start.first_round)
-        told = with_note(progress, f"lens: repeat {repeat}, at most {more}" if repeat > 0 else "")
+        told = with_note(
+            progress, f"lens: repeat {repeat}, at most {_REPEATS}" if repeat > 0 else ""
+        )
         with watch("match"):
             table = full.match(data, estimate, round_index=index, progress=told)
             table = with_motion(table, data).with_findings(start.findings).with_places(places)
@@ -101,7 +101,7 @@ def match_in_rounds(
         _log.info("round %d: %s", index, round_in_words(rounds[-1]))
         moved, lens = change_of_lens(lens, solution.lens), solution.lens
         estimate = solution.solved_rig
-        if indices[-1] == index and moved > stands and len(indices) < full.rounds + more:
+        if indices[-1] == index and moved > _STANDS and len(indices) < full.rounds + _REPEATS:
             indices.append(index)  # with the new lens
         if out_of_time():
             break

@@ -111,7 +111,8 @@ class FreeLens:
         Args:
             lens: at the values.
             points_camera_m: (n, 3).
-            columns: (k, 2, n), filled; zero where a point is not projectable, and of the clock.
+            columns: (k, 2, n), filled; zero where a point is not projectable, and of the clock,
+                which :meth:`fill_clock_columns` fills.
         """
         pixels, projectable = lens.project(points_camera_m)
         off_centre = pixels.T - lens.packed[2:4, None]
@@ -128,6 +129,31 @@ class FreeLens:
             if field is None:
                 field = lens.packed[:2, None] * _by_coefficient(lens, name, plane, squared)
             columns[row] = field * (sigma * projectable)
+
+    def fill_clock_columns(self, by_time: Array, rows_px: Array, columns: Array) -> None:
+        """Derivatives by the values of the clock.
+
+        Args:
+            by_time: (2, n) derivatives of the pixels by the time when they are taken.
+            rows_px: (n,) of the pixels.
+            columns: (k, 2, n), those of the clock are filled.
+        """
+        shares: dict[str, float | Array] = {OFFSET: 1.0, READOUT: self.clock.shares(rows_px)}
+        for row, (name, sigma) in enumerate(zip(self.parameters, self.sigmas, strict=True)):
+            if name in CLOCK:
+                columns[row] = by_time * (sigma * shares[name])
+
+
+def time_derivative(T_camera_lidar: Array, by_pose: Array, twists_per_s: Array) -> Array:
+    """(2, n) derivatives of pixels by the time: a camera that waits moves by the LiDAR's twist.
+
+    Args:
+        T_camera_lidar: (4, 4).
+        by_pose: (6, 2, n) derivatives in the tangent of T_lidar_camera.
+        twists_per_s: (n, 6) of the LiDAR.
+    """
+    twists = twists_per_s @ gtsam.Pose3(T_camera_lidar).AdjointMap().T
+    return np.asarray((by_pose * twists.T[:, None]).sum(axis=0))
 
 
 def _on_plane(lens: Lens, points: Array) -> tuple[Array, Array]:
@@ -205,18 +231,9 @@ class FreeLensBlock:
     def _fill_clock_columns(self, T_camera_lidar: Array, columns: Array) -> None:
         """Derivatives by the clock: a camera that waits has moved by the twist of the LiDAR."""
         motion = self.block.motion
-        if motion is None or not {*CLOCK} & {*self.lens.parameters}:
-            return
-        twists = motion[:, :6] @ gtsam.Pose3(T_camera_lidar).AdjointMap().T
-        by_time = (columns[:6] * twists.T[:, None]).sum(axis=0)
-        shares: dict[str, float | Array] = {
-            OFFSET: 1.0,
-            READOUT: self.lens.clock.shares(self.block.pixels_px[:, 1]),
-        }
-        names = zip(self.lens.parameters, self.lens.sigmas, strict=True)
-        for row, (name, sigma) in enumerate(names, start=6):
-            if name in CLOCK:
-                columns[row] = by_time * (sigma * shares[name])
+        if motion is not None and {*CLOCK} & {*self.lens.parameters}:
+            by_time = time_derivative(T_camera_lidar, columns[:6], motion[:, :6])
+            self.lens.fill_clock_columns(by_time, self.block.pixels_px[:, 1], columns[6:-1])
 
     def loss(self, columns: Array) -> tuple[Array, Array]:
         """(n,) robust loss of the residuals of some columns, and its weight."""

@@ -37,6 +37,17 @@ def test_what_is_not_a_mapping_is_refused(text: str, tmp_path: Path) -> None:
         load_rig(path)
 
 
+def test_a_number_in_the_place_of_a_mapping_names_no_class(pair: Rig, tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    pair.save(path)
+    content = parse_yaml(path.read_text(), path)
+    content["cameras"]["left"]["intrinsics_sigma_px"] = 3
+    write_yaml(path, content)
+    message = r"left.intrinsics_sigma_px: expected keys with values, as in \{key: value\}, found 3"
+    with pytest.raises(FileError, match=message):
+        load_rig(path)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

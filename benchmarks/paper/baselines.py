@@ -178,8 +178,7 @@ def per_camera_adjustment(
     T_camera_lidar: Transforms = {}
     for name, camera in rig.cameras.items():
         alone = Rig(lidar=rig.lidar, cameras={name: camera})
-        rows = table.of_camera(name)
-        own = replace(rows, cameras=(name,), camera_index=np.zeros_like(rows.camera_index))
+        own = table.of_camera(name)
         solution = solve_joint(alone, own, config, "reprojection", pairwise=pairwise)
         T_camera_lidar |= solution.T_camera_lidar
     return T_camera_lidar

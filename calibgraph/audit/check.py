@@ -106,8 +106,11 @@ def check(
         lidar = None
     finally:
         full.release()
-    numbers = tolerance_deg, tolerance_cm, len(data.frames), watch.seconds
-    return Audit(cameras, lidar, *numbers, package_versions()).of_recording(deployed, data)
+    middle, sources = data.frames[len(data.frames) // 2], tuple(map(str, data.folders))
+    return Audit(
+        cameras, lidar, deployed, middle, sources,
+        tolerance_deg, tolerance_cm, len(data.frames), watch.seconds, package_versions(),
+    )  # fmt: skip
 
 
 def _open(dataset: Datasets, deployed: Rig, matcher: FullMatcher) -> Dataset:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calibgraph.audit.drift_result import CameraDrift, Drift
-from calibgraph.files import write_atomically
+from calibgraph.report.figure import new_picture, save_picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-_DPI = 100
 _ROW_IN, _FRAME_IN, _RESULT_IN = 2.2, 1.2, 0.55
 _NARROWEST_IN, _WIDEST_IN = 9.0, 30.0
 _COLUMNS = (
@@ -36,27 +34,14 @@ def draw_drift(drift: Drift, path: Path) -> None:
     Raises:
         FileError: if it cannot be written there.
     """
-    figure = drift_figure(drift)
-    with warnings.catch_warnings():  # a name in letters that the font lacks: drawn as boxes
-        warnings.filterwarnings("ignore", "Glyph", UserWarning)
-        write_atomically(
-            path,
-            lambda part: figure.savefig(
-                part, format="png", dpi=_DPI, metadata={"Software": "calibgraph drift"}
-            ),
-        )
+    save_picture(drift_figure(drift), path, {"Software": "calibgraph drift"})
 
 
 def drift_figure(drift: Drift) -> Figure:
     """A row per camera: rotations and translations of its results."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     rows = len(drift.cameras)
     width_in = float(np.clip(2 * _RESULT_IN * len(drift.results), _NARROWEST_IN, _WIDEST_IN))
-    size = (width_in, _FRAME_IN + _ROW_IN * rows)
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = new_picture(width_in, _FRAME_IN + _ROW_IN * rows)
     grid = figure.subplots(rows, 2, sharex=True, squeeze=False)
     tolerances = (drift.tolerance_deg, drift.tolerance_cm)
     for row, (name, entries) in enumerate(drift.cameras.items()):

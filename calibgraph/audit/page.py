@@ -202,7 +202,7 @@ class Section:
     Attributes:
         charts: rotations and translations; none where nothing was measured.
         pictures: None if they cannot be drawn.
-        deployed, measured: the camera; None if it is not known, or nothing was measured.
+        deployed, measured: the camera; None if nothing was measured.
     """
 
     name: str
@@ -210,17 +210,16 @@ class Section:
     audit: CameraAudit
     charts: tuple[Chart, ...]
     pictures: Pictures | None
-    deployed: Camera | None
+    deployed: Camera
     measured: Camera | None
 
 
 def camera_sections(audit: Audit) -> tuple[list[Section], str | None]:
     """The sections of all cameras; the reason why pictures are missing, None if none are."""
     pictures, left_out = _draw(audit)
-    cameras = {} if audit.deployed is None else audit.deployed.cameras
     sections = []
     for number, (name, camera) in enumerate(audit.cameras.items()):
-        deployed = cameras.get(name)
+        deployed = audit.deployed.cameras[name]
         sections.append(
             Section(
                 name=name,
@@ -229,7 +228,7 @@ def camera_sections(audit: Audit) -> tuple[list[Section], str | None]:
                 charts=charts_of(camera, audit.tolerance_deg, audit.tolerance_cm),
                 pictures=pictures.get(name),
                 deployed=deployed,
-                measured=None if deployed is None else measured_camera(deployed, camera),
+                measured=measured_camera(deployed, camera),
             )
         )
     return sections, left_out
@@ -245,8 +244,6 @@ def measured_camera(deployed: Camera, audit: CameraAudit) -> Camera | None:
 
 def _draw(audit: Audit) -> tuple[dict[str, Pictures], str | None]:
     """Per camera its pictures; the reason why the others are missing, None if none are."""
-    if audit.deployed is None or audit.shown is None:
-        return {}, "the audit names no recording"
     drawn: dict[str, Pictures] = {}
     budget = PICTURES_BYTES // (2 * len(audit.cameras))
     try:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Rig
 
@@ -70,39 +69,28 @@ class Audit:
     Attributes:
         cameras: per camera.
         lidar: its motion where it explains all deviations; None otherwise.
+        deployed: the rig that was compared.
+        shown: the frame that a page shows, in the middle of the recording.
+        recording: the sources of the frames.
         tolerance_deg, tolerance_cm: largest deviation per axis that is OK.
         frames: number of frames that were matched.
         timings_s: wall time per stage.
         versions: of this package and the libraries that matter.
-        deployed: the rig that was compared; None if only the numbers are known.
-        shown: the frame that a page shows, in the middle of the recording; None if unknown.
-        recording: the sources of the frames.
         same_recording: whether the deployed calibration was made from these very frames, so that
             errors that they repeat cannot be seen.
     """
 
     cameras: Mapping[str, CameraAudit]
     lidar: LidarAudit | None
+    deployed: Rig
+    shown: Frame
+    recording: tuple[str, ...]
     tolerance_deg: float
     tolerance_cm: float
     frames: int
     timings_s: Mapping[str, float] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
-    deployed: Rig | None = None
-    shown: Frame | None = None
-    recording: tuple[str, ...] = ()
     same_recording: bool = False
-
-    def of_recording(self, deployed: Rig, data: Dataset) -> Audit:
-        """The audit with the rig and the frame that its page shows.
-
-        Args:
-            deployed: the rig that was compared.
-            data: the frames that it was compared with.
-        """
-        middle = data.frames[len(data.frames) // 2]
-        sources = tuple(str(folder) for folder in data.folders)
-        return replace(self, deployed=deployed, shown=middle, recording=sources)
 
     @property
     def status(self) -> AuditStatus:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -141,9 +140,8 @@ def lens_table(result: Calibration) -> Table:
     table.add_column("with the pose")
     for name, parameters in result.lens.items():
         for one in parameters:
-            decimals = max(0, 1 - math.floor(math.log10(one.sigma)))  # two digits of the sigma
             values = one.value, one.sigma, one.prior, one.prior_sigma
-            numbers = (f"{value:.{decimals}f}" for value in values)
+            numbers = (f"{value:.{one.decimals}f}" for value in values)
             label = f"{one.name} {one.unit}".strip()
             table.add_row(escape(name), label, *numbers, one.describe())
     return table

@@ -27,11 +27,15 @@ class KeptFrame(Frame):
     """A frame whose gray images, cloud and what derives of them are kept, unless others came since.
 
     None of them may be written to.
+
+    Attributes:
+        twist: (6,) of the LiDAR, in the place of that of the frame.
     """
 
     frame: Frame
     kept: KeyedCache[tuple[int, Hashable], Any]
     common: KeyedCache[Hashable, Any]
+    twist: NDArray[np.float64] | None = None
 
     @property
     def motion(self) -> ScanMotion | None:
@@ -46,7 +50,7 @@ class KeptFrame(Frame):
     @property
     def twist_per_s(self) -> NDArray[np.float64] | None:
         """(6,) of the LiDAR."""
-        return self.frame.twist_per_s
+        return self.frame.twist_per_s if self.twist is None else self.twist
 
     def load_cloud(self) -> Cloud:
         """(n, 4) x y z [m], intensity."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CalibrationError, DatasetError
+from calibgraph.errors import DatasetError
 from calibgraph.model.geometry import invert
 from factors import displace
 
@@ -63,14 +63,9 @@ def register(target_m: Array, source_m: Array, where: Path) -> Array:
 
     Raises:
         DatasetError: if they do not fit.
-        CalibrationError: if small_gicp is missing.
     """
-    try:
-        import small_gicp
-    except ImportError as error:
-        raise CalibrationError(
-            f"the motion by scans needs small_gicp: pip install 'calibgraph[motion]' ({error})"
-        ) from error
+    import small_gicp
+
     T = np.eye(4)
     for size_m, reach_m in ((_COARSE_M, _REACH_M), (_FINE_M, _COARSE_M)):
         found = small_gicp.align(

@@ -1,4 +1,4 @@
-"""The matcher protocol: three members that every matcher has, and five more that it may have.
+"""The matcher protocol: three members that every matcher has, and six more that it may have.
 
 `Matcher` is the interface of a custom matcher. The program works with `FullMatcher`, which has all
 members; `to_full_matcher` adds defaults for missing ones. In calibration they are used in this
@@ -12,12 +12,12 @@ order:
 6. `image_checks_can_fail`: whether the checks on images may FAIL the result.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
 from calibgraph.io.dataset import Dataset
-from calibgraph.model.config import Stage1Source
+from calibgraph.model.config import LensPart, Stage1Source
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import STAGE1, MatcherFindings
 from calibgraph.model.rig import Rig
@@ -99,6 +99,10 @@ class FullMatcher(Matcher, Protocol):
         """
         ...
 
+    def with_estimate(self, parts: Sequence[LensPart]) -> "FullMatcher":
+        """The matcher for solves that estimate these parts of lens and clock; itself by default."""
+        ...
+
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
     ) -> Start:
@@ -122,6 +126,11 @@ class MatcherWithDefaults:
         self.image_checks_can_fail = bool(getattr(matcher, "image_checks_can_fail", False))
         self._locate = getattr(matcher, "locate", None)
         self._release = getattr(matcher, "release", None)
+
+    def with_estimate(self, parts: Sequence[LensPart]) -> FullMatcher:
+        """The matcher's own way, or the same matcher."""
+        make = getattr(self._matcher, "with_estimate", None)
+        return self if make is None else MatcherWithDefaults(make(parts))
 
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress

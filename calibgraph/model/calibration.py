@@ -182,12 +182,13 @@ class Calibration:
     @property
     def not_included(self) -> str:
         """Sentence about errors that the bars leave out: relative poses show the clouds' scale."""
-        scale = "" if self.rig.relative_poses else ", and of the clouds' scale,"
         free = self.lens and {*self.config.estimate} - {"offset", "readout"}
         fixed = "errors of the other intrinsics" if free else "errors of the intrinsics"
         if self.config.of == "mount" and self.config.preset == "auto":
             fixed += " beyond what the rig states, or a calibration with a target leaves"
-        return f"{fixed}{scale} are not included"
+        others = [] if "offset" in self.config.estimate else ["of the time of the images"]
+        others += [] if self.rig.relative_poses else ["of the clouds' scale"]
+        return f"{' and '.join([fixed, *others])} are not included"
 
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.

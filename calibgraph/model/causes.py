@@ -52,7 +52,9 @@ CAUSES: dict[str, Cause] = {
     "time": Cause(
         "images and clouds of different times",
         "Pair each image with the cloud of its own instant: correct the time stamps or the offset.",
-        {"own_clouds": "", "time_offset": "", "clouds of another time": "", "repeated frames": ""},
+        {"own_clouds": "", "clouds of another time": "", "repeated frames": "",
+         **dict.fromkeys(("time_offset", "lens_time_offset"), "Correct the time stamps, or "
+                         "estimate the time of the images: --estimate offset.")},
     ),
     "lens": Cause(
         "the intrinsics",

@@ -16,6 +16,8 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
 from factors import Clock, displace
 
+_ROW_STEPS = 2  # a point 20 rows further is seen 2 ms later, and moves by 2 rows in these at most
+
 
 def clock_of(camera: Camera) -> Clock:
     """The clock of a camera; what its rig does not state is zero."""
@@ -50,3 +52,25 @@ def when_taken(camera: Camera, twist_per_s: Array | None) -> Camera:
         return camera
     step = gtsam.Pose3.Expmap(-camera.time_offset_s * twist_per_s)
     return camera.moved_to(camera.T_camera_lidar @ step.matrix())
+
+
+def seen_at_rows(camera: Camera, points_lidar_m: Array, twist_per_s: Array | None) -> Array:
+    """Where points are when a rolling shutter takes the rows that they are seen in.
+
+    Args:
+        camera: where it is when it takes the middle row, see :func:`when_taken`.
+        points_lidar_m: (w, l, 3), w bundles; all points of one are seen as late as its first.
+        twist_per_s: (6,) of the LiDAR; None: unknown.
+
+    Returns:
+        (w, l, 3) in the LiDAR frame.
+    """
+    if twist_per_s is None or not camera.readout_s:
+        return points_lidar_m
+    T, seen, clock = camera.T_camera_lidar, points_lidar_m, replace(clock_of(camera), offset_s=0.0)
+    for _ in range(_ROW_STEPS):
+        pixels, _ = camera.lens.project(seen[:, 0] @ T[:3, :3].T + T[:3, 3])
+        times_s = np.repeat(clock.times_s(np.nan_to_num(pixels[:, 1])), seen.shape[1])
+        flat = displace(points_lidar_m.reshape(-1, 3), twist_per_s, -times_s)
+        seen = flat.reshape(points_lidar_m.shape)
+    return seen

@@ -164,10 +164,12 @@ class Correspondences:
         return kept
 
     def of_camera(self, name: str) -> Correspondences:
-        """The rows of one camera (none, if the camera is not in the table)."""
-        if name not in self.cameras:
-            return self.select(slice(0, 0))
-        return self.select(rows_where(self.camera_index == self.cameras.index(name)))
+        """The table of one camera alone (without rows, if it is not in this table)."""
+        number = self.cameras.index(name) if name in self.cameras else -1
+        own = self.select(rows_where(self.camera_index == number))
+        object.__setattr__(own, "cameras", (name,))
+        object.__setattr__(own, "camera_index", np.zeros_like(own.camera_index))
+        return own
 
     def without_cameras(self, names: Collection[str]) -> Correspondences:
         """The rows of all other cameras."""

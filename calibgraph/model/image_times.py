@@ -14,7 +14,7 @@ class ImageTimes(StrictNumbers):
     """When a camera takes its images, as far as it is known, and how well.
 
     ``time_offset_s``: how long after the points of a frame the middle row is taken. ``readout_s``:
-    from the first row to the last, of a rolling shutter.
+    from the first row to the last, of a rolling shutter; negative where the last row is first.
     """
 
     time_offset_s: Seconds | None = None

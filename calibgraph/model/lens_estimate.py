@@ -46,6 +46,18 @@ class LensEstimate:
         share = _PRIOR_SHARE if self.correlation < _TIED else _TIED_SHARE
         return left or self.sigma < share * self.prior_sigma
 
+    @property
+    def decimals(self) -> int:
+        """So many show two digits of the standard deviation."""
+        return max(0, 1 - math.floor(math.log10(self.sigma)))
+
+    @property
+    def change(self) -> str:
+        """The estimate, its standard deviation and the value that the rig states, in words."""
+        new, sigma, old = (f"{v:.{self.decimals}f}" for v in (self.value, self.sigma, self.prior))
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{self.name} {new} +- {sigma}{unit}, before {old}{unit}"
+
     def describe(self) -> str:
         """Whether the data determine it, and what it cannot be told from."""
         pair = f"with {self.direction} {self.correlation:.2f}" if self.correlation > _NONE else ""

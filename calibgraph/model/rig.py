@@ -40,6 +40,7 @@ MAX_PIXELS = 200_000_000
 
 ROUNDING = 1e-3
 """Largest deviation of R^T R from the identity that counts as rounded digits, not as an error."""
+_EXACT = 1e-14  # of a rotation in double precision
 
 
 def rigid_transform(value: Any) -> Array:
@@ -68,8 +69,9 @@ def rigid_transform(value: Any) -> Array:
         )
     if np.linalg.det(T[:3, :3]) < 0:
         raise ValueError("the upper left 3x3 has determinant -1: it mirrors; check the axes' signs")
-    u, _, vt = np.linalg.svd(T[:3, :3])
-    T[:3, :3] = u @ vt
+    if deviation > _EXACT:  # so that what has been written is read bit by bit
+        u, _, vt = np.linalg.svd(T[:3, :3])
+        T[:3, :3] = u @ vt
     T.setflags(write=False)
     return T
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from calibgraph.tracking.streams import Item
 
 RIG, CONFIG, STATE, HISTORY, EVENTS = (
-    "rig.yaml", "config.json", "state", "history.npz", "events.jsonl",
+    "rig.yaml", "config.json", "state", "history.state", "events.jsonl",
 )  # fmt: skip
 
 _MOST_OPEN = 256
@@ -242,10 +242,8 @@ def _state(tracker: _Open) -> dict[str, Any]:
 
 def _plot(tracker: _Open) -> bytes:
     """The extrinsics against time, PNG."""
-    from calibgraph.tracking.history_figure import DPI
-
     held = io.BytesIO()
-    tracker.history.figure().savefig(held, format="png", dpi=DPI)
+    tracker.history.figure().savefig(held, format="png")
     return held.getvalue()
 
 

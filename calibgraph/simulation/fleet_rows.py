@@ -164,23 +164,22 @@ def errors_of(T_camera_lidar: Array, truth: Array) -> Array:
     return np.asarray(np.arccos(np.clip(cosine, -1, 1)), np.float64)
 
 
-def write_fleet(
-    folder: Path, vehicles: int, *, frames: int = 6, matches: int = 60, rig: str = "kitti"
-) -> Path:
+def write_fleet(folder: Path, vehicles: int, *, frames: int = 6, matches: int = 60) -> Path:
     """Write the tables of a fleet, each of its own rig, and their manifest.
+
+    Each vehicle is 0.3 degrees and 2 cm off the nominal rig ``kitti``.
 
     Args:
         folder: for all files.
         vehicles: how many.
         frames: of each table.
         matches: per camera and frame.
-        rig: name of the nominal one, from which each vehicle is 0.3 degrees and 2 cm off.
 
     Returns:
         The manifest, CSV.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    nominal = rig_of(rig)
+    nominal = rig_of("kitti")
     nominal.save(folder / "nominal.yaml")
     names = [f"car-{number:05d}" for number in range(vehicles)]
     for seed, name in enumerate(names):

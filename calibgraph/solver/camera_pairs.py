@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -27,16 +27,12 @@ from calibgraph.solver.whitening import MEDIAN_NORM
 from factors import (
     BlockSums,
     EpipolarBlock,
-    PairBlock,
-    ProjectionBlock,
     SurfaceBlock,
     pair_block_factor,
     pair_chain,
     pair_sums,
     unproject,
 )
-
-Kind = Literal["surface", "point"]
 
 MIN_PAIR_MATCHES = 12
 """Of fewer matches the residuals' spread, and with it their weight, is not known."""
@@ -61,7 +57,7 @@ class PairTerm:
 
     a: str
     b: str
-    block: PairBlock
+    block: SurfaceBlock | EpipolarBlock
     frame: NDArray[np.int64]
 
     @cached_property
@@ -90,11 +86,8 @@ class PairTerm:
         poses = self._poses(T_camera_lidar)
         if isinstance(self.block, SurfaceBlock):
             residuals, projectable = self.block.residuals(*poses)
-        elif isinstance(self.block, ProjectionBlock):
-            residuals, projectable = self.block.residuals(poses[0].between(poses[1]))
-        else:
-            return np.abs(self.block.residuals(poses[0].between(poses[1])))
-        return np.where(projectable, np.hypot(*residuals.T), np.inf)
+            return np.where(projectable, np.hypot(*residuals.T), np.inf)
+        return np.abs(self.block.residuals(poses[0].between(poses[1])))
 
     def sigma_px(self, T_camera_lidar: Mapping[str, Array]) -> float:
         """Robust spread of the residuals, per axis."""
@@ -142,27 +135,23 @@ def usual_excess(terms: Sequence[PairTerm]) -> float:
     return 1 + error_components().pair_correlation * max(0.0, len(numbers) / frames - 1)
 
 
-def pair_terms(
-    rig: Rig, table: CameraMatches, config: Config, *, kind: Kind = "surface"
-) -> tuple[PairTerm, ...]:
+def pair_terms(rig: Rig, table: CameraMatches, config: Config) -> tuple[PairTerm, ...]:
     """The terms of all pairs of a table: A's features in B, B's in A, and epipolar.
 
     The epipolar residual is that of features without a surface in either camera, of pairs that have
     few with one.
 
     Args:
-        rig: lenses and, with ``point``, the extrinsics under which points are fixed.
+        rig: lenses, and extrinsics at which surfaces are ahead of a camera.
         table: with surfaces.
         config: the loss.
-        kind: ``surface``: a feature's range follows from the pose of its camera; ``point``: its
-            place X_a is fixed in the frame of its camera.
     """
     terms = []
     for a, b in table.pairs():
         rows = table.of_pair(a, b)
         rows = rows.select(np.argsort(rows.frame, kind="stable"))
         sides = [
-            _term_of_side(rig, names, side, rows, kind=kind, config=config)
+            _term_of_side(rig, names, side, rows, config=config)
             for side, names in enumerate(((a, b), (b, a)))
         ]
         terms += sides
@@ -214,22 +203,17 @@ def match_errors_px(rig: Rig, table: CameraMatches) -> Array:
 
 
 def _term_of_side(
-    rig: Rig, names: tuple[str, str], side: int, rows: CameraMatches, *, kind: Kind, config: Config
+    rig: Rig, names: tuple[str, str], side: int, rows: CameraMatches, *, config: Config
 ) -> PairTerm:
     """The features of one side with their surfaces, predicted in the other camera."""
     a, b = (rig.cameras[name] for name in names)
     rows = rows.select(np.isfinite(rows.planes_lidar_per_m[:, side, 0]))
     rays = unproject(a.lens, rows.pixels_px[:, side])[0]
     planes = rows.planes_lidar_per_m[:, side]
-    inverse = inverse_ranges(rays, planes, a.T_camera_lidar)
-    ahead = inverse > 0
-    rows, rays, pixels = rows.select(ahead), rays[ahead], rows.pixels_px[ahead, 1 - side]
-    block: PairBlock
-    if kind == "surface":
-        block = SurfaceBlock(b.lens, rays, planes[ahead], pixels, config.loss)
-    else:
-        points = rays / inverse[ahead, None]
-        block = ProjectionBlock(b.lens, points, pixels, loss=config.loss)
+    ahead = inverse_ranges(rays, planes, a.T_camera_lidar) > 0
+    rows = rows.select(ahead)
+    pixels = rows.pixels_px[:, 1 - side]
+    block = SurfaceBlock(b.lens, rays[ahead], planes[ahead], pixels, config.loss)
     return PairTerm(*names, block, rows.frame)
 
 

@@ -164,9 +164,14 @@ def data_sigmas(at: FittedObjective) -> Array:
         rows = pose_rows(cameras.index(name))
         hessian[rows, rows] += block.sums(at.pose(name)).hessian
     add_pair_hessians(hessian, objective.pairs, T_camera_lidar)
+    return sigmas_of_hessian(hessian).reshape(-1, 6)
+
+
+def sigmas_of_hessian(hessian: Array) -> Array:
+    """(n,) standard deviations by an (n, n) Hessian; infinite in undetermined directions."""
     scaled, units = unit_diagonal(hessian)
     values, vectors = np.linalg.eigh(scaled)
     free = values < _FREE
     variances = (vectors**2 / np.where(free, np.inf, values)).sum(axis=1) / units**2
     loose = (vectors[:, free] ** 2).sum(axis=1) > _FREE
-    return np.sqrt(np.where(loose, np.inf, variances)).reshape(-1, 6)
+    return np.asarray(np.sqrt(np.where(loose, np.inf, variances)))

@@ -36,8 +36,8 @@ class Freed:
     Attributes:
         twist: (6,) of the pose: T_camera_lidar = exp(twist) estimate [rad, m].
         values: (m,) of the unknowns.
-        sigmas: (m,) standard deviations, by the scatter of the frames and what they share; NaN with
-            one frame.
+        covariance: (m, m) of these, by the scatter of the frames and what they share; NaN with one
+            frame.
         compensating: (6, m) twists by which the pose makes up for a unit of each.
         independent_shares: (m,) share (0 to 1, root mean square) of an unknown's Jacobian that is
             independent of the pose and of the others. Near zero, the unknown is not observable.
@@ -45,9 +45,14 @@ class Freed:
 
     twist: Array
     values: Array
-    sigmas: Array
+    covariance: Array
     compensating: Array
     independent_shares: Array
+
+    @property
+    def sigmas(self) -> Array:
+        """(m,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,16 +65,20 @@ class LinearFit:
         gradients: (f, 6 + k) of the frames, there.
         shared: variance of what all frames share, which their scatter does not show, over that of
             independent matches.
+        considered: so many of the last unknowns are never estimated. They are zero give or take one
+            standard deviation, which is their unit, and so widen the others.
     """
 
     values: Array
     hessian: Array
     gradients: Array
     shared: float
+    considered: int = 0
 
     def counted_from(self, start: Array) -> LinearFit:
-        """The same fit; the unknowns were linearized at (k,) values."""
-        return replace(self, values=self.values + np.append(np.zeros(6), start))
+        """The same fit; the first unknowns were linearized at (k,) values."""
+        rest = len(self.values) - 6 - len(start)
+        return replace(self, values=self.values + np.pad(start, (6, rest)))
 
     def free(self, *unknowns: int) -> Freed:
         """The fit of the pose and some unknowns, with their numbers; the others are zero."""
@@ -80,10 +89,11 @@ class LinearFit:
         values = inverse @ (self.hessian @ self.values)[rows]
         scatter = with_pseudo_frames(pulls.T @ pulls, own, np.full(len(rows), float(frames)))
         scatter += _weak(len(rows)) if frames > 1 else np.nan
-        whole = np.diag(inverse @ scatter @ inverse + self.shared * inverse)
+        follow = inverse @ self.hessian[rows, len(self.hessian) - self.considered :]
+        whole = inverse @ scatter @ inverse + self.shared * inverse + follow @ follow.T
         shares = 1 / np.sqrt(np.diag(inverse) * np.diag(own))
         compensating = np.asarray(-np.linalg.solve(own[:6, :6], own[:6, 6:]))
-        return Freed(values[:6], values[6:], np.sqrt(whole[6:]), compensating, shares[6:])
+        return Freed(values[:6], values[6:], whole[6:, 6:], compensating, shares[6:])
 
 
 def fit_camera(
@@ -93,6 +103,7 @@ def fit_camera(
     *,
     loss_scale: float | None = None,
     shared_variance: float = 0.0,
+    considered: int = 0,
 ) -> LinearFit | None:
     """Fit pose and unknowns with a Cauchy loss on the norm of each match's error.
 
@@ -104,6 +115,7 @@ def fit_camera(
             third of outliers.
         shared_variance: of what all frames share, over that of all matches if these were
             independent.
+        considered: see :class:`LinearFit`.
 
     Returns:
         The fit, or None of fewer than ``MIN_ROWS`` matches, or where it has no derivative.
@@ -128,7 +140,7 @@ def fit_camera(
     pulls = (weighted * left).reshape(size, 2, -1).sum(axis=1)
     gradients = np.add.reduceat(pulls, block.frame_edges[:-1], axis=1).T
     variance = float(weights @ left**2 / weights.sum())
-    return LinearFit(values, hessian, gradients, shared_variance * variance)
+    return LinearFit(values, hessian, gradients, shared_variance * variance, considered)
 
 
 def _linearize(camera: Camera, block: ProjectionBlock, fields_px: Array) -> Array:

@@ -18,7 +18,7 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
 )
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_pairs import Kind, PairTerm, pair_graph, pair_terms, usual_excess
+from calibgraph.solver.camera_pairs import PairTerm, pair_graph, pair_terms, usual_excess
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum, optimize
@@ -30,14 +30,13 @@ _HELD_RAD, _HELD_M = np.radians(1.0), 0.2  # of the first camera, while its pair
 
 
 def refine_with_pairs(
-    at: FittedObjective, matches: CameraMatches, *, kind: Kind = "surface"
+    at: FittedObjective, matches: CameraMatches
 ) -> tuple[Objective, Optimum] | None:
     """Minimize again with the terms of camera pairs, their sigmas narrowed step by step; gate; fit.
 
     Args:
         at: the minimum without pairs.
         matches: with surfaces, taken near the optimum.
-        kind: see ``pair_terms``.
 
     Returns:
         The objective with the pairs' inliers, and its minimum; None where no pair of cameras has
@@ -45,7 +44,7 @@ def refine_with_pairs(
     """
     inliers, T = at.objective, at.T_camera_lidar
     rig = inliers.rig.moved_to(T)
-    terms = pair_terms(rig, matches, inliers.config, kind=kind)
+    terms = pair_terms(rig, matches, inliers.config)
     if not terms or not inliers.uses_correspondences:
         return None
     least = _least_sigmas(terms, T)

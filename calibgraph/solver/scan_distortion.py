@@ -21,6 +21,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.by_place import place_of
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import adjoints, to_T_camera_lidar
+from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
 from factors import FreeLensBlock, ProjectionBlock
@@ -48,6 +49,14 @@ def distortions_at(points_lidar_m: Array) -> Array:
     motion[:, 0] = heading / (2 * np.pi)
     stretch = elevation * np.arctan2(z, level)[:, None]
     return np.stack([elevation, stretch, motion])
+
+
+def distortion_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
+    """(3, 2, n) derivatives of the pixels of points (n, 3) by a unit of each distortion."""
+    T = camera.T_camera_lidar
+    _, by_point = camera.lens.project_with_jacobian(points_lidar_m @ T[:3, :3].T + T[:3, 3])
+    moved = distortions_at(points_lidar_m) @ T[:3, :3].T
+    return np.asarray(np.einsum("nij,knj->kin", by_point, moved))
 
 
 @dataclass(frozen=True, eq=False)

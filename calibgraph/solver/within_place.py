@@ -88,12 +88,9 @@ def within_place(at: FittedObjective, name: str, placed: BlockByPlace) -> Within
     robust = robust_hessian(at.projections[name], pose)
     true = convex_hessian(robust + at.objective.gate_hessian.get(name, 0.0), robust) + WEAK
     scatter = frame_scatter(block, block.frame_gradients(pose, scale), placed, true)
-    inverse = np.linalg.inv(true)
-    covariance = root.T @ inverse @ scatter @ inverse @ root
     frames = placed.frames.astype(np.float64)
     return WithinPlace.of(
-        covariance,
-        float(np.trace(root.T @ inverse @ root)) / 6,
+        *relative_covariance(scatter, root, true),
         roots=np.asarray(np.linalg.cholesky(hessians + WEAK)),
         frames=frames,
         alike=float(np.square(frames).sum() / max(frames.sum(), 1)),
@@ -114,10 +111,39 @@ def frame_scatter(block: CameraBlock, gradients: Array, placed: BlockByPlace, tr
     np.add.at(total, place, gradients)
     share = counts / np.bincount(place, counts, len(placed.frames))[place]
     apart = gradients - share[:, None] * total[place]
-    frames, free = len(gradients), len(gradients) - len(np.unique(place))
-    usual = 1 + error_components().frame_correlation * (len(block) / frames - 1)
-    count = free + 1.0  # as many frames of one place
-    scatter = with_pseudo_frames(
-        apart.T @ apart, true, np.full(6, count), usual * true * count / frames
+    free = len(gradients) - len(np.unique(place))
+    return allow_for_few_frames(
+        apart.T @ apart, true, free, frames=len(gradients), matches=len(block)
     )
-    return scatter * frames / count
+
+
+def allow_for_few_frames(
+    scatter: Array, true: Array, free: float, *, frames: float, matches: float
+) -> Array:
+    """(6, 6) covariance of the sum of all frames' gradients, by their scatter.
+
+    Args:
+        scatter: (6, 6) sum of the outer products about the means of places.
+        true: (6, 6) Hessian.
+        free: frames that the means leave.
+        frames: all of them.
+        matches: in them.
+    """
+    usual = 1.0 + error_components().frame_correlation * (matches / frames - 1.0)
+    count = free + 1.0  # as many frames of one place
+    usual_scatter = usual * true * count / frames
+    whole = with_pseudo_frames(scatter, true, np.full(6, count), usual_scatter)
+    return whole * frames / count
+
+
+def relative_covariance(scatter: Array, root: Array, true: Array) -> tuple[Array, float]:
+    """(6, 6) K of the module's text; the true variance of independent matches over that of H.
+
+    Args:
+        scatter: (6, 6) covariance of the gradients' sum.
+        root: (6, 6) L.
+        true: (6, 6) H_t.
+    """
+    inverse = np.linalg.inv(true)
+    covariance: Array = root.T @ inverse @ scatter @ inverse @ root
+    return covariance, float(np.trace(root.T @ inverse @ root)) / 6

@@ -9,16 +9,13 @@ import numpy as np
 
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import (
-    MIN_MATCHES,
-    BlockResiduals,
     CameraBlock,
     camera_blocks,
 )
 from calibgraph.solver.elimination import Linearization
 from calibgraph.solver.preprocess import preprocess
+from calibgraph.tracking.assessment import rig_at
 from calibgraph.tracking.cause import chance_limit, squared_sigmas
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.events import Event
@@ -27,7 +24,7 @@ from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
 from calibgraph.tracking.place_model import states_places
 from calibgraph.tracking.start import count_residuals
 from calibgraph.tracking.state import State
-from calibgraph.tracking.sums import Sums, minimum, sums_of_frame, sums_of_matches
+from calibgraph.tracking.sums import Gated, Sums, minimum, sums_of_matches
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
@@ -41,17 +38,16 @@ def with_open_frame(state: State, frame: LiveFrame) -> State:
     return replace(state, epochs=(*state.epochs[:-1], replace(last, frames=(*others, frame))))
 
 
-def blocks_by_camera(state: State, rig: Rig, table: Correspondences) -> dict[int, CameraBlock]:
+def blocks_by_camera(state: State, table: Correspondences) -> dict[int, CameraBlock]:
     """The preprocessed matches of each camera that has enough.
 
     Args:
         state: before the frame.
-        rig: with the estimates.
         table: of the frame.
     """
     if not len(table):
         return {}
-    kept = preprocess(rig, table, state.config)
+    kept = preprocess(rig_at(state, state.T_lidar_camera), table, state.config)
     blocks = camera_blocks(state.rig, kept.table, state.config)
     return {state.names.index(name): block for name, block in blocks.items()}
 
@@ -114,11 +110,11 @@ def agrees_at_its_place(state: State, closed: ClosedPlaces, camera: int, own: Ou
     one, frame = state.cameras[camera], state.live_frames[-1]
     if one.summary.walk or state.config.preset != "auto" or not states_places(state):
         return False
-    residuals = own.raw.at(to_T_camera_lidar(own.T_lidar_camera))
-    inliers = residuals.inliers(one.scale)
-    sums = sums_of_frame(residuals, inliers, one.scale, state.references[camera])
-    state = with_open_frame(state, frame.add(camera, own.raw, inliers, sums))
-    window, _ = closed.with_open_epoch(state, closed.posterior + state.epochs[-1].sums, None)
+    gated = Gated.at(own.T_lidar_camera, own.raw, one.scale, state.references[camera])
+    if gated is None:
+        return False
+    state = with_open_frame(state, frame.add(camera, own.raw, gated))
+    window, _ = closed.with_open_epoch(state, None)
     place = window.places.index(frame.place)
     displaced = Linearization.at(window.model, window.values).distances[place, [0, 1 + camera]]
     if displaced @ displaced > chance_limit():
@@ -145,8 +141,8 @@ def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> State:
 
 def absorb(
     state: State, closed: ClosedPlaces, blocks: Mapping[int, CameraBlock]
-) -> tuple[State, dict[int, CameraBlock]]:
-    """The state with the inliers of its last frame, and these.
+) -> tuple[State, dict[int, int]]:
+    """The state with the inliers of its last frame, and how many each camera has.
 
     In two passes: the gate is drawn at the minimum with all matches of the blocks.
     """
@@ -162,36 +158,26 @@ def absorb(
         for camera, block in blocks.items()
     }
     state = at_minimum(state, closed, everything)
-    frame, used = state.epochs[-1].frames[-1], {}
+    frame, used = state.epochs[-1].frames[-1], dict[int, int]()
     for camera, block in blocks.items():
-        scale = state.cameras[camera].scale
-        residuals = block.at(to_T_camera_lidar(state.T_lidar_camera[camera]))
-        rows = residuals.inliers(scale)
-        if np.count_nonzero(rows) < MIN_MATCHES:
+        scale, reference = state.cameras[camera].scale, state.references[camera]
+        gated = Gated.at(state.T_lidar_camera[camera], block, scale, reference)
+        if gated is None:
             continue
-        sums = sums_of_frame(residuals, rows, scale, state.references[camera])
-        frame = frame.add(camera, block, rows, sums)
-        state = count_absorbed(state, camera, residuals, int(np.count_nonzero(rows)))
-        used[camera] = block.select(rows)
+        frame = frame.add(camera, block, gated)
+        state = _count_absorbed(state, camera, gated)
+        used[camera] = gated.used
     state = add_to_totals(with_open_frame(state, frame), frame)
     return at_minimum(state, closed), used
 
 
-def count_absorbed(state: State, camera: int, residuals: BlockResiduals, used: int) -> State:
-    """The state with a camera's block counted as absorbed, and its residuals counted.
-
-    Args:
-        state: after the block was absorbed.
-        camera: its place in the rig.
-        residuals: of all matches of the frame, at the estimate.
-        used: how many of them were absorbed.
-    """
-    camera_state = count_residuals(state.cameras[camera], residuals)
-    agreements = (*camera_state.agreements, (state.frame or 0, True))[-_LAST_FRAMES:]
-    camera_state = replace(camera_state, agreements=agreements)
-    return state.with_camera(
-        camera, camera_state.count(absorbed=1, given=len(residuals.errors_px), used=used)
-    )
+def _count_absorbed(state: State, camera: int, gated: Gated) -> State:
+    """The state with a camera's block counted as absorbed, and its residuals counted."""
+    one = count_residuals(state.cameras[camera], gated.residuals)
+    agreements = (*one.agreements, (state.frame or 0, True))[-_LAST_FRAMES:]
+    one = replace(one, agreements=agreements)
+    given = len(gated.residuals.errors_px)
+    return state.with_camera(camera, one.count(absorbed=1, given=given, used=gated.used))
 
 
 def add_to_totals(state: State, frame: LiveFrame) -> State:

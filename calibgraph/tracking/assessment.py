@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -10,15 +11,16 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
+from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
-from calibgraph.solver.covariance import ENOUGH_FRAMES
+from calibgraph.solver.covariance import ENOUGH_FRAMES, sigmas_of_hessian
 from calibgraph.tracking.closed_places import ClosedPlaces
+from calibgraph.tracking.epoch_sums import estimates_of_halves, in_its_half
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.optimum import Optimum
-from calibgraph.tracking.posterior import estimates_of_halves, in_its_half
 from calibgraph.tracking.state import CameraState, State
-from calibgraph.tracking.sums import Sums, is_determined, step_between
+from calibgraph.tracking.sums import Sums, step_between
 from calibgraph.tracking.window import Window
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.solution_checks import check_estimate
@@ -59,9 +61,9 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
         closed: its closed epochs.
         window: of the frame before, if of the same epoch.
     """
-    sums = closed.posterior + state.epochs[-1].sums
+    sums = closed.all_sums(state)
     halves = closed.halves + in_its_half(state, state.epochs[-1], len(state.epochs) - 1)
-    window, conflicts = closed.with_open_epoch(state, sums, window)
+    window, conflicts = closed.with_open_epoch(state, window)
     keys, estimates = window.model.reported_keys, state.T_lidar_camera
     if state.config.preset == "auto":
         estimates = window.T_lidar_camera(keys)
@@ -95,7 +97,7 @@ def _verdict(
         used=int(one.counts.get("used", 0)),
         frames=int(sums.frames[camera]),
         covariance=None if np.isnan(own).any() else own,
-        data_sigmas=_data_sigmas(sums.hessian[camera]),
+        data_sigmas=sigmas_of_hessian(sums.hessian[camera]),
         halves=halves,
         conflicts=conflicts,
         pull=None,
@@ -146,13 +148,6 @@ def recent_residuals(one: CameraState) -> Residuals:
     )
 
 
-def _data_sigmas(hessian: Array) -> Array:
-    """(6,) standard deviations if every match were independent: a lower bound."""
-    if not is_determined(hessian):
-        return np.full(6, np.inf)
-    return np.sqrt(np.diag(np.linalg.inv(hessian)))
-
-
 def covariance_by_camera(assessment: Assessment, names: tuple[str, ...]) -> dict[str, Array | None]:
     """Per camera (6, 6); None with too few frames."""
     covariance: dict[str, Array | None] = {}
@@ -171,6 +166,12 @@ def _counts(one: CameraState) -> dict[str, int]:
     return {**counts, "frames": frames, "frames_used": used, "frames_waiting": waiting}
 
 
+def rig_at(state: State, T_lidar_camera: Sequence[gtsam.Pose3]) -> Rig:
+    """The rig with these estimates."""
+    estimates = zip(state.names, T_lidar_camera, strict=True)
+    return state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
+
+
 def second_moments(assessment: Assessment) -> Array:
     """(6 n, 6 n) of the mounts about the estimates."""
     window, keys = assessment.window, assessment.window.model.camera_keys
@@ -181,11 +182,10 @@ def second_moments(assessment: Assessment) -> Array:
 
 def to_calibration(state: State, assessment: Assessment) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
-    estimates = zip(state.names, assessment.T_lidar_camera, strict=True)
     joint = assessment.joint_covariance
     known = None if np.isnan(joint).any() else joint
     mounts = None if known is None else second_moments(assessment)
-    rig = state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
+    rig = rig_at(state, assessment.T_lidar_camera)
     return Calibration(
         rig=rig,
         initial_rig=state.rig,

@@ -15,13 +15,12 @@ import numpy as np
 
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import join
-from calibgraph.model.findings import MatcherFindings
 from calibgraph.solver.elimination import (
     LatentPoseFit,
     Linearization,
     start_values,
 )
-from calibgraph.solver.variance_components import VarianceRatios, estimate_variance_ratios
+from calibgraph.solver.variance_components import estimate_variance_ratios
 from calibgraph.tracking.contradictions import (
     Conflicts,
     Rows,
@@ -31,6 +30,7 @@ from calibgraph.tracking.contradictions import (
     pose_priors,
     poses_by_name,
 )
+from calibgraph.tracking.epoch_sums import split_halves, sum_closed_epochs
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
@@ -43,12 +43,9 @@ from calibgraph.tracking.place_model import (
     summary_factor,
 )
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
-from calibgraph.tracking.posterior import closed_posterior, split_halves
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, equation_5
 from calibgraph.tracking.window import Window
-
-NO_ROWS: Rows = ()
 
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
 STEPS = 5  # fits, and estimates of the variance ratios between them
@@ -59,30 +56,20 @@ class ClosedPlaces:
     """The frames of closed epochs, and the graph of their places.
 
     Attributes:
+        state: of the tracker, with the findings and variance ratios of the graph.
         sums: per place; of a camera that drifts, none.
-        posterior: (n,) over summaries and frames.
-        halves: (n, 2) over every other epoch.
-        findings: with which the rest was made.
         seen: by the frames of each camera.
         data: of the places of the graph.
         fit: the graph near its optimum.
-        quadratics: of its matches there.
         contradicting: places in ``rig.relative_poses`` of those that take no part.
-        priors: those of all cameras, and the relative poses.
-        sizes: the variance ratios of the graph.
     """
 
+    state: State
     sums: PlaceSums
-    posterior: Sums
-    halves: Sums
-    findings: MatcherFindings
     seen: FrameSpread
     data: PlaceData
     fit: LatentPoseFit
-    quadratics: Quadratics
     contradicting: Rows
-    priors: gtsam.NonlinearFactorGraph
-    sizes: VarianceRatios
     _pose_graphs: dict[tuple[Rows, Rows | None], gtsam.NonlinearFactorGraph] = field(
         default_factory=dict
     )
@@ -105,24 +92,14 @@ class ClosedPlaces:
             dropped = state.optimum.contradicting
             model = replace(model, pose_graph=pose_priors(state, dropped))
             fit = LatentPoseFit(Linearization.at(model, values), 0, True)
-        return ClosedPlaces(
-            sums, closed_posterior(state), split_halves(state), state.findings, seen, data,
-            fit, linearized(data, fit), dropped, pose_priors(state), state.sizes,
-        )  # fmt: skip
+        return ClosedPlaces(state, sums, seen, data, fit, dropped)
 
     def fitted(self, state: State) -> ClosedPlaces:
         """At the optimum for the variance ratios of the state."""
         model = place_model(state, self.sums, self.seen, self.data)
         values = self.fit.linear.values
         fit, dropped = fit_without_contradictions(state, self.sums, model, values)
-        return replace(
-            self,
-            fit=fit,
-            quadratics=linearized(self.data, fit),
-            contradicting=dropped,
-            sizes=state.sizes,
-            _pose_graphs={},
-        )
+        return ClosedPlaces(state, self.sums, self.seen, self.data, fit, dropped)
 
     @property
     def optimum(self) -> Optimum:
@@ -131,57 +108,79 @@ class ClosedPlaces:
         return Optimum.of(linear.model, linear.values, self.data.names, self.contradicting)
 
     @cached_property
+    def quadratics(self) -> Quadratics:
+        """The matches of the graph near its optimum."""
+        return linearized(self.data, self.fit)
+
+    @cached_property
     def marginals(self) -> list[gtsam.GaussianFactorGraph]:
         """Per place, on what all places share."""
         return marginals_of_places(self.fit)
+
+    @cached_property
+    def halves(self) -> Sums:
+        """(n, 2) sums over every other closed epoch."""
+        return split_halves(self.state)
+
+    @cached_property
+    def _closed_sums(self) -> Sums:
+        return sum_closed_epochs(self.state)
+
+    @cached_property
+    def _priors(self) -> gtsam.NonlinearFactorGraph:
+        return pose_priors(self.state)
+
+    def all_sums(self, state: State) -> Sums:
+        """(n,) over the summaries and all live frames."""
+        return self._closed_sums + state.epochs[-1].sums
 
     def equation_5(
         self, state: State, more: Mapping[int, Sums] | None = None
     ) -> gtsam.NonlinearFactorGraph:
         """Eq. 5 of the paper with the sums of all frames, and more of some cameras."""
-        sums = self.posterior + state.epochs[-1].sums
+        sums = self.all_sums(state)
         for camera, own in (more or {}).items():
             sums = sums.replace_at(camera, sums[camera] + own)
-        return equation_5(self.priors, state.references, sums)
+        return equation_5(self._priors, state.references, sums)
 
-    def shows_ratios(self, state: State) -> bool:
+    @property
+    def shows_ratios(self) -> bool:
         """Whether anything is measured twice."""
-        return not self.sums.is_of_one_place or bool(state.rig.relative_poses)
+        return not self.sums.is_of_one_place or bool(self.state.rig.relative_poses)
 
-    def is_settled(self, state: State) -> bool:
+    @property
+    def is_settled(self) -> bool:
         """Whether an epoch's frames more would hardly change the scatter of frames."""
         frames = self.sums.frames.sum(axis=0)
-        cameras = zip(state.cameras, frames, strict=True)
+        cameras = zip(self.state.cameras, frames, strict=True)
         return all(count >= _SETTLED for one, count in cameras if one.started)
 
-    def with_open_epoch(
-        self, state: State, sums: Sums, window: Window | None
-    ) -> tuple[Window, Conflicts]:
+    def with_open_epoch(self, state: State, window: Window | None) -> tuple[Window, Conflicts]:
         """The whole graph in iSAM2, and the conflicts of relative poses with correspondences.
 
         Args:
             state: of the tracker.
-            sums: over its summaries and live frames.
             window: of the frame before, if of the same epoch; it goes on if its graph allows.
         """
         frames = state.epochs[-1].frames
         every = self.sums.add(sums_by_place(frames))
         for camera in state.drifting:  # its sums are as if of the present place
-            every = every.with_camera_at(state.live_frames[-1].place, camera, sums[camera])
+            own = self.all_sums(state)[camera]
+            every = every.with_camera_at(state.live_frames[-1].place, camera, own)
         earlier = self.quadratics | quadratics_of(state, every, state.drifting)
-        seen = self.seen if self.is_settled(state) else FrameSpread.of(state, every)
+        seen = self.seen if self.is_settled else FrameSpread.of(state, every)
         if state.config.preset == "auto":
             kept, rows = self._split(every, {f.place for f in (*frames, *state.live_frames[-1:])})
         else:  # the weights of a preset of the paper
             every = every.bounded(most=0)
             earlier = quadratics_of(state, every)
-            frames, kept, rows = (), NO_ROWS, [0] if every.frames.any() else []
+            frames, kept, rows = (), (), [0] if every.frames.any() else []
         data = PlaceData.of(state, earlier, frames, {every.names[row]: row for row in rows})
         model = place_model(state, every, seen, data)
         start = _start(state, model, data.names)
         model = replace(model, pose_graph=self._summary(kept))
         conflicts = find_conflicts(state, every, model, start)
-        model = replace(model, pose_graph=self._pose_graph(state, kept, contradicting(conflicts)))
+        model = replace(model, pose_graph=self._pose_graph(kept, contradicting(conflicts)))
         if window is not None and window.has_graph_of(model, data.names):
             window.exchange(model)
         else:
@@ -195,10 +194,10 @@ class ClosedPlaces:
             self._pose_graphs[kept, None] = summary_factor(chosen, self.fit.linear.values)
         return self._pose_graphs[kept, None]
 
-    def _pose_graph(self, state: State, kept: Rows, dropped: Rows) -> gtsam.NonlinearFactorGraph:
+    def _pose_graph(self, kept: Rows, dropped: Rows) -> gtsam.NonlinearFactorGraph:
         """The same with the priors, without some relative poses."""
         if (kept, dropped) not in self._pose_graphs:
-            graph = join(pose_priors(state, dropped), self._summary(kept))
+            graph = join(pose_priors(self.state, dropped), self._summary(kept))
             self._pose_graphs[kept, dropped] = graph
         return self._pose_graphs[kept, dropped]
 
@@ -224,7 +223,7 @@ def settle(state: State) -> tuple[State, ClosedPlaces]:
     Later an epoch changes little, and the frames after it do the work step by step.
     """
     closed = ClosedPlaces.of(state)
-    if closed.is_settled(state):
+    if closed.is_settled:
         return state, closed
     for step in range(1, STEPS + 1):
         state, closed = refine(state, closed, step)
@@ -238,10 +237,10 @@ def refine(state: State, closed: ClosedPlaces, step: int) -> tuple[State, Closed
     next epoch goes on from there.
     """
     if step % 2:
-        if step == 1 or closed.sizes != state.sizes:
+        if step == 1 or closed.state.sizes != state.sizes:
             closed = closed.fitted(state)
             state = replace(state, optimum=closed.optimum)
-    elif closed.sizes == state.sizes and closed.shows_ratios(state):
+    elif closed.state.sizes == state.sizes and closed.shows_ratios:
         found = estimate_variance_ratios(closed.fit, state.sizes)
         if not found.is_near(state.sizes):
             state = replace(state, sizes=found)
@@ -250,6 +249,7 @@ def refine(state: State, closed: ClosedPlaces, step: int) -> tuple[State, Closed
 
 def _start(state: State, model: LatentPoseModel, names: Sequence[str]) -> gtsam.Values:
     """Values near the optimum of a model, of places of these names."""
+    guess = poses_by_name(state)
     if state.optimum is None:
-        return start_values(model, poses_by_name(state))
-    return state.optimum.values(model, names, state.references)
+        return start_values(model, guess)
+    return state.optimum.values(model, names, guess)

@@ -7,27 +7,19 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 from types import FrameType
 
 from calibgraph.errors import FileError
 from calibgraph.io.dataset import load_dataset
-from calibgraph.matching.places import PlaceFinder
 from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
 from calibgraph.report.as_json import print_line, require_stdout
-from calibgraph.tracking.dataset_frames import (
-    first_frames,
-    frames_of_batch,
-    matched_frames,
-    with_places,
-)
+from calibgraph.tracking.dataset_frames import DatasetDrive
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
-from calibgraph.tracking.place_sums import MOST_PLACES
 from calibgraph.tracking.preload import warm_up_tracker
 from calibgraph.tracking.run import Notify, RunCounts, follow
 from calibgraph.tracking.streams import Item, frames_of
@@ -121,45 +113,33 @@ def _opened(
     folder = settings.out / STATE_FOLDER
     if settings.matcher is None:
         items = frames_of(str(source[0]), follow=settings.follow, stop=stop)
-        return items, _report_recovery(
-            DurableCalibrator(folder, settings.rig, settings.config), notify
+        calibrator = DurableCalibrator(folder, settings.rig, settings.config)
+    else:
+        drive = _drive(settings, settings.matcher, source)
+        calibrator = DurableCalibrator(
+            folder, settings.rig, drive.config, begin=lambda: _first_rig(drive, notify)
         )
-    matcher = to_full_matcher(settings.matcher)
-    data = load_dataset(source, settings.rig)
-    data = replace(data, frames=data.frames[:: settings.every])
-    config = settings.config.changed(stage1=matcher.stage1)
-    first: list[Calibration] = []
-
-    def begin() -> Rig:
-        first.append(first_frames(data, matcher, config))
-        if first[0].verdict.status == "FAIL":
-            reasons = "; ".join(first[0].verdict.reasons)
-            notify(f"warning: the first frames give no reliable start: {reasons}")
-        return first[0].rig
-
-    calibrator = _report_recovery(
-        DurableCalibrator(folder, settings.rig, config, begin=begin), notify
-    )
-    taken, count = calibrator.tracker.frame, config.tracking.start_frames
-    head: Iterator[Item] = iter(())
-    if taken is None or taken < data.frames[:count][-1].index:
-        # Also after a crash among the first frames: they continue from the same batch.
-        head = frames_of_batch(first[0] if first else first_frames(data, matcher, config))
-    rest = [f for f in data.frames[count:] if taken is None or f.index > taken]
-    later = matched_frames(
-        replace(data, frames=tuple(rest)), matcher, config, lambda: calibrator.tracker.rig
-    )
-    rig = calibrator.tracker.initial_rig
-    finder = PlaceFinder(rig, most_places=MOST_PLACES, seed=config.seed)
-    return with_places(chain(head, later), data, finder, calibrator.tracker.places), calibrator
-
-
-def _report_recovery(calibrator: DurableCalibrator, notify: Notify) -> DurableCalibrator:
+        items = drive.items(calibrator.tracker)
     for damage in calibrator.damages:
         notify(f"warning: {damage}")
     if calibrator.resumed:
         notify(f"going on after frame {calibrator.tracker.frame}")
-    return calibrator
+    return items, calibrator
+
+
+def _drive(settings: Tracking, matcher: Matcher, source: Sequence[Path]) -> DatasetDrive:
+    data, full = load_dataset(source, settings.rig), to_full_matcher(matcher)
+    data = replace(data, frames=data.frames[:: settings.every])
+    return DatasetDrive(data, full, settings.config.changed(stage1=full.stage1))
+
+
+def _first_rig(drive: DatasetDrive, notify: Notify) -> Rig:
+    """The rig of the first frames' batch; a warning if it is not reliable."""
+    verdict = drive.start.verdict
+    if verdict.status == "FAIL":
+        reasons = "; ".join(verdict.reasons)
+        notify(f"warning: the first frames give no reliable start: {reasons}")
+    return drive.start.rig
 
 
 @contextmanager

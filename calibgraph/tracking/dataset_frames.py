@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset
+from calibgraph.io.frame import Frame
 from calibgraph.matching.places import PlaceFinder
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import with_motion
@@ -20,50 +22,73 @@ from calibgraph.pipeline import calibrate
 from calibgraph.progress import no_progress
 from calibgraph.solver.joint import solve_joint
 from calibgraph.tracking.frame_order import with_place
+from calibgraph.tracking.place_sums import MOST_PLACES
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
+from calibgraph.tracking.tracker import IncrementalCalibrator
 
 MOST_AGAIN = 200
 """Frames that a restart looks at again, at 0.1 s each, to find where the vehicle is."""
 
 
-def first_frames(dataset: Dataset, matcher: FullMatcher, config: Config) -> Calibration:
-    """The first frames calibrated as a batch: several frames give far more matches than one.
+@dataclass(frozen=True, eq=False)
+class DatasetDrive:
+    """A dataset as a drive: its first frames as a batch, the others one by one.
 
-    Raises:
-        CalibrationError: if that fails.
-    """
-    count = config.tracking.start_frames
-    head = replace(dataset, frames=dataset.frames[:count])
-    return calibrate(head, rig=dataset.rig, matcher=matcher, config=config)
-
-
-def frames_of_batch(result: Calibration) -> Iterator[Item]:
-    """The frames of a batch's matches, one by one."""
-    table = result.correspondences
-    assert table is not None  # calibrate keeps those of its last round
-    for frame in np.unique(table.frame):
-        yield _stream_frame(int(frame), table.select(table.frame == frame))
-
-
-def matched_frames(
-    dataset: Dataset, matcher: FullMatcher, config: Config, current_rig: Callable[[], Rig]
-) -> Iterator[Item]:
-    """Match each frame from the present estimate.
-
-    Args:
+    Attributes:
         dataset: its frames, in order of time.
         matcher: its rounds for tracking are run, see ``Matcher``.
         config: settings of the solves between its rounds.
-        current_rig: returns the rig with the present estimate; called before each frame.
     """
-    for frame in dataset.frames:
-        alone = replace(dataset, frames=(frame,))
+
+    dataset: Dataset
+    matcher: FullMatcher
+    config: Config
+
+    @cached_property
+    def start(self) -> Calibration:
+        """The first frames calibrated as a batch: several give far more matches than one.
+
+        Raises:
+            CalibrationError: if that fails.
+        """
+        head = replace(self.dataset, frames=self._head)
+        return calibrate(head, rig=head.rig, matcher=self.matcher, config=self.config)
+
+    @property
+    def _head(self) -> tuple[Frame, ...]:
+        return self.dataset.frames[: self.config.tracking.start_frames]
+
+    def items(self, tracker: IncrementalCalibrator) -> Iterator[Item]:
+        """The frames that a tracker has not had, each with its place."""
+        seed = self.config.seed
+        finder = PlaceFinder(tracker.initial_rig, most_places=MOST_PLACES, seed=seed)
+        return with_places(self._frames(tracker), self.dataset, finder, tracker.places)
+
+    def _frames(self, tracker: IncrementalCalibrator) -> Iterator[Item]:
+        head, taken = self._head, tracker.frame
+        if taken is None or taken < head[-1].index:
+            # Also after a crash among the first frames: they continue from the same batch.
+            table = self.start.correspondences
+            assert table is not None  # calibrate keeps those of its last round
+            for number in np.unique(table.frame):
+                yield StreamFrame(int(number), table.select(table.frame == number))
+        for frame in self.dataset.frames[len(head) :]:
+            if taken is None or frame.index > taken:
+                yield self._match(frame, tracker.rig)
+
+    def _match(self, frame: Frame, rig: Rig) -> Item:
+        """A frame's matches: coarse from the present estimate, then finer from the solved rig."""
+        alone = replace(self.dataset, frames=(frame,))
+        rounds = self.matcher.tracking_rounds or tuple(range(self.matcher.rounds))
         try:
-            table = _matched(alone, matcher, config, current_rig())
+            for index in rounds:
+                table = self.matcher.match(alone, rig, round_index=index, progress=no_progress)
+                table = with_motion(table, alone)
+                if index != rounds[-1]:
+                    rig = _refined(rig, table, self.config)
         except (CalibrationError, OSError) as error:
-            yield Refused(f"frame {frame.name} ({frame.index}): {error}")
-        else:
-            yield _stream_frame(frame.index, table)
+            return Refused(f"frame {frame.name} ({frame.index}): {error}")
+        return StreamFrame(frame.index, table)
 
 
 def with_places(
@@ -98,35 +123,12 @@ def with_places(
         yield replace(item, table=with_place(item.table, place))
 
 
-def _matched(alone: Dataset, matcher: FullMatcher, config: Config, rig: Rig) -> Correspondences:
-    """One frame's matches: coarse from the estimate, then finer from the solved rig."""
-    *coarse, last = tracking_rounds(matcher)
-    settings = config.changed(stage1=matcher.stage1)
-    for index in coarse:
-        table = matcher.match(alone, rig, round_index=index, progress=no_progress)
-        rig = _refined(rig, with_motion(table, alone), settings)
-    table = matcher.match(alone, rig, round_index=last, progress=no_progress)
-    return with_motion(table, alone)
-
-
-def tracking_rounds(matcher: FullMatcher) -> tuple[int, ...]:
-    """The matcher's rounds for a single frame: its own choice, or all."""
-    return matcher.tracking_rounds or tuple(range(matcher.rounds))
-
-
 def _refined(rig: Rig, table: Correspondences, config: Config) -> Rig:
     """The rig with each camera solved from one frame, where it has enough matches."""
     for name in table.cameras:
-        own = table.of_camera(name)
-        own = replace(own, cameras=(name,), camera_index=np.zeros_like(own.camera_index))
         one = Rig(cameras={name: rig.cameras[name]})
         try:
-            rig = rig.moved_to(solve_joint(one, own, config).T_camera_lidar)
+            rig = rig.moved_to(solve_joint(one, table.of_camera(name), config).T_camera_lidar)
         except CorrespondenceError:  # too few matches: the next round starts from the same rig
             continue
     return rig
-
-
-def _stream_frame(number: int, table: Correspondences) -> StreamFrame:
-    stamp = None if table.stamp_ns is None or not len(table) else int(table.stamp_ns.max())
-    return StreamFrame(number, stamp, table)

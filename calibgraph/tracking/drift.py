@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
-from calibgraph.tracking.cause import CLEARLY, Steps, alarm_limit, find_cause, unexplained
+from calibgraph.tracking.cause import CLEARLY, find_cause, unexplained
 from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.posterior import posterior
-from calibgraph.tracking.state import DriftWatch, State, block_diagonal
+from calibgraph.tracking.state import DriftWatch, State
+from calibgraph.tracking.steps import steps_between
 from calibgraph.tracking.sums import Sums
 
 _QUIET = 1000  # frames in which a drift of the same camera is not reported again
@@ -50,7 +49,9 @@ def report_drift(state: State) -> tuple[State, list[Event]]:
     watch = state.drift
     if watch is None:
         return state, []
-    steps = _steps(state, watch)
+    then, now = watch.anchors, sum_epochs(state)
+    own, own_now = dict(enumerate(then.scatter)), dict(enumerate(now.scatter))
+    steps, _ = steps_between(state, (then, own), (now, own_now))
     if watch.camera not in steps.cameras:
         return replace(state, drift=None), []
     by_lidar, by_camera = unexplained(steps)
@@ -68,24 +69,3 @@ def report_drift(state: State) -> tuple[State, list[Event]]:
         camera_state = replace(state.cameras[camera], drift_reported_at=state.updates)
         state = state.with_camera(camera, camera_state)
     return replace(state, drift=None), [event]
-
-
-def _steps(state: State, watch: DriftWatch) -> Steps:
-    """The step of each camera since its anchor."""
-    sums = posterior(state)
-    cameras, steps, covariances = [], [], []
-    for camera in range(len(state.cameras)):
-        now, then = sums.step(camera), watch.anchors.step(camera)
-        if now is None or then is None:
-            continue
-        both = sums.covariance(camera) + watch.anchors.covariance(camera)
-        cameras.append(camera)
-        steps.append(now - then)
-        covariances.append(both * state.inflation(camera))
-    return Steps(
-        tuple(cameras),
-        np.ravel(steps),
-        block_diagonal(np.array(covariances).reshape(-1, 6, 6)),
-        np.array([alarm_limit(state.total_frames[c]) for c in cameras]),
-        tuple(state.references[c] for c in cameras),
-    )

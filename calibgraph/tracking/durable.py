@@ -8,11 +8,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.errors import FileError
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.tracking.frame_order import with_place
+from calibgraph.tracking.frame_order import with_metadata_per_frame, with_place
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.state_database import StateDatabase
 from calibgraph.tracking.tracker import IncrementalCalibrator
@@ -80,12 +80,11 @@ class DurableCalibrator:
         """Take in one frame, see :meth:`IncrementalCalibrator.update`; it is on disk then.
 
         Raises:
-            CorrespondenceError: as there; or if the metadata cannot be written. Nothing has
-                changed then.
+            CorrespondenceError: as there. Nothing has changed then.
             OSError: if it cannot be written; then close this, and make a new one.
         """
-        table = with_place(table, place)
-        record = _encode_input(table, frame, self.tracker.initial_rig)
+        table = with_metadata_per_frame(with_place(table, place))
+        record = encode((None if frame is None else index(frame), table))
         self._continue_snapshot()  # before this update: the journal always holds the last one
         update = self.tracker.update(table, frame=frame)
         self._database.append(record)
@@ -134,16 +133,6 @@ class DurableCalibrator:
             self.close()
         else:
             self.abandon()
-
-
-def _encode_input(table: Correspondences, frame: int | None, rig: Rig) -> bytes:
-    number = None if frame is None else index(frame)
-    try:
-        return encode((number, table), rig)
-    except (TypeError, ValueError, RecursionError) as error:
-        raise CorrespondenceError(
-            f"the table cannot be kept ({error}); give plain values as metadata", frame=number
-        ) from error
 
 
 def _restore(folder: Path, snapshot: bytes) -> IncrementalCalibrator:

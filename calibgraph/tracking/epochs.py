@@ -17,9 +17,9 @@ from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, inliers_of
-from calibgraph.tracking.place_shift import shift_between
 from calibgraph.tracking.place_sums import sums_by_place
 from calibgraph.tracking.state import CameraState, State
+from calibgraph.tracking.steps import shift_between
 from calibgraph.tracking.sums import Sums, step_between, sums_of_matches
 from factors import to_runs
 

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import warnings
-from collections import deque
-from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.files import write_atomically
+from calibgraph.files import write_bytes
 from calibgraph.model.geometry import twist_between
-from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.history_figure import DPI, Curve, history_figure, text_figure
+from calibgraph.report.figure import save_picture
+from calibgraph.tracking.events import Event
+from calibgraph.tracking.history_figure import Curve, history_figure, text_figure
+from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.update import Update
 
 if TYPE_CHECKING:
@@ -49,7 +44,7 @@ class History:
         self._begun: set[str] = set()
         self._frames = np.empty(0, dtype=np.int64)
         self._entries = np.empty((0, 0, 2 * _POSE))  # per camera xi, sigma; NaN: not known
-        self._events: deque[Event] = deque(maxlen=_MOST_EVENTS)
+        self._events: tuple[Event, ...] = ()
 
     def __len__(self) -> int:
         """How many entries are held."""
@@ -58,7 +53,7 @@ class History:
     @property
     def events(self) -> tuple[Event, ...]:
         """All events, or the last 1000."""
-        return tuple(self._events)
+        return self._events
 
     def add(self, update: Update) -> None:
         """Add the estimates after a frame.
@@ -73,7 +68,7 @@ class History:
                 f"frame {update.frame}: the update is of cameras {[*update.T_camera_lidar]}, those "
                 f"before of {[*self._origins]}; keep one history per rig"
             )
-        self._events.extend(update.events)
+        self._events = (*self._events, *update.events)[-_MOST_EVENTS:]
         self._begun |= {e.camera for e in update.events if e.kind == "started" and e.camera}
         self._make_place()
         self._frames[self._held] = update.frame
@@ -131,23 +126,12 @@ class History:
         Raises:
             FileError: if it cannot be written there.
         """
-        figure = self.figure()
-        with warnings.catch_warnings():  # a name in letters that the font lacks: drawn as boxes
-            warnings.filterwarnings("ignore", "Glyph", UserWarning)
-            write_atomically(path, lambda part: figure.savefig(part, format="png", dpi=DPI))
+        save_picture(self.figure(), path)
 
     def save(self, path: Path) -> None:
         """Write the history to a file, atomically; see :meth:`load`."""
-        arrays = {"frames": self._frames[: self._held], "entries": self._entries[: self._held]}
-        content = {
-            "most": self._most,
-            "stride": self._stride,
-            "updates": self._updates,
-            "origins": {name: T.tolist() for name, T in self._origins.items()},
-            "begun": sorted(self._begun),
-            "events": [asdict(event) for event in self._events],
-        }
-        write_atomically(path, lambda part: _save(part, json.dumps(content), arrays))
+        held = {"_frames": self._frames[: self._held], "_entries": self._entries[: self._held]}
+        write_bytes(path, encode({**vars(self), **held, "_begun": [*self._begun]}))
 
     @staticmethod
     def load(path: Path) -> History:
@@ -155,24 +139,18 @@ class History:
 
         A file that cannot be read gives an empty history too: it is for the eye alone.
         """
+        history = History()
         try:
-            with np.load(path, allow_pickle=False) as held:
-                content, frames, entries = (
-                    json.loads(held["json"].item()),
-                    held["frames"],
-                    held["entries"],
-                )
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-            return History()
-        history = History(content["most"])
-        history._stride, history._updates = content["stride"], content["updates"]
-        history._origins = {name: np.array(T) for name, T in content["origins"].items()}
-        history._begun = set(content["begun"])
-        history._events.extend(_event(each) for each in content["events"])
-        history._held = len(frames)
-        history._frames = np.empty(history._most, dtype=np.int64)
-        history._entries = np.full((history._most, *entries.shape[1:]), np.nan)
-        history._frames[: len(frames)], history._entries[: len(frames)] = frames, entries
+            content = decode(path.read_bytes())
+        except (OSError, StateError):
+            return history
+        vars(history).update(content)
+        history._begun = set(history._begun)
+        for name in ("_frames", "_entries"):
+            held = content[name]
+            room = np.empty((history._most, *held.shape[1:]), held.dtype)
+            room[: len(held)] = held
+            setattr(history, name, room)
         return history
 
     def figure(self) -> Figure:
@@ -181,13 +159,3 @@ class History:
             return text_figure(f"Nothing to draw: {len(self)} frames so far.")
         first, newest = int(self._frames[0]), int(self._frames[self._held - 1])
         return history_figure(self.curves(), self.events, first, newest)
-
-
-def _save(path: Path, text: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    with path.open("wb") as file:
-        np.savez(file, json=np.array(text), **arrays)  # type: ignore[arg-type]
-
-
-def _event(content: dict[str, Any]) -> Event:
-    size = content.pop("size")
-    return Event(**content, size=None if size is None else Size(**size))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
+from calibgraph.report.figure import new_picture
 from calibgraph.tracking.events import Event, Kind
 
 if TYPE_CHECKING:
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
-DPI = 100
 
 # Colours that differ for the colour-blind too (Okabe and Ito, "Color universal design").
 _AXES = {"x": "#0072B2", "y": "#E69F00", "z": "#009E73"}
@@ -59,20 +58,9 @@ class Curve:
     sigma: Array
 
 
-def _new_figure(rows: int) -> Figure:
-    """An empty figure outside matplotlib's global state."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    size = (_WIDTH_IN, _FRAME_IN + _ROW_IN * rows)
-    figure = Figure(figsize=size, dpi=DPI, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def text_figure(text: str) -> Figure:
     """A picture of one sentence."""
-    figure = _new_figure(1)
+    figure = new_picture(_WIDTH_IN, _FRAME_IN + _ROW_IN)
     figure.text(0.5, 0.5, text, ha="center", va="center", fontsize=14)
     return figure
 
@@ -81,7 +69,7 @@ def history_figure(
     curves: dict[str, Curve | None], events: Sequence[Event], first: int, newest: int
 ) -> Figure:
     """A row per camera: rotation, translation."""
-    figure = _new_figure(len(curves))
+    figure = new_picture(_WIDTH_IN, _FRAME_IN + _ROW_IN * len(curves))
     panels = figure.subplots(len(curves), 2, sharex=True, squeeze=False)
     zero = first if newest >= _LARGE_NUMBER else 0
     for (name, curve), row in zip(curves.items(), panels, strict=True):

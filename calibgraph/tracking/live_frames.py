@@ -14,7 +14,7 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
-from calibgraph.tracking.sums import Sums
+from calibgraph.tracking.sums import Gated, Sums
 
 NO_DISTORTION = DistortionEvidence.none(WEAK, places=1)
 """Without matches."""
@@ -45,15 +45,13 @@ class LiveFrame:
         sums = self.sums.replace_at(camera, Sums.zeros())
         return replace(self, raw=raw, inliers=inliers, sums=sums)
 
-    def add(
-        self, camera: int, raw: CameraBlock, inliers: NDArray[np.bool_], sums: Sums
-    ) -> LiveFrame:
-        """The frame with a camera's matches, and their sums."""
+    def add(self, camera: int, raw: CameraBlock, gated: Gated) -> LiveFrame:
+        """The frame with a camera's matches."""
         return replace(
             self,
             raw={**self.raw, camera: raw},
-            inliers={**self.inliers, camera: inliers},
-            sums=self.sums.replace_at(camera, sums),
+            inliers={**self.inliers, camera: gated.inliers},
+            sums=self.sums.replace_at(camera, gated.sums),
         )
 
     @staticmethod

@@ -6,19 +6,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
-import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
-    aligned_key,
-    camera_key,
     cloud_at_key,
     matched_at_key,
     matched_key,
 )
+from calibgraph.solver.elimination import start_values
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +67,7 @@ class Optimum:
         )
 
     def values(
-        self, model: LatentPoseModel, names: Sequence[str], guess: Sequence[gtsam.Pose3]
+        self, model: LatentPoseModel, names: Sequence[str], guess: Mapping[str, Array]
     ) -> gtsam.Values:
         """Values of all variables of a model, near its optimum.
 
@@ -78,27 +76,20 @@ class Optimum:
         Args:
             model: with these or other places.
             names: of its places.
-            guess: per camera, T_lidar_camera.
+            guess: per camera, (4, 4) T_camera_lidar.
         """
-        values, cloud = gtsam.Values(), self.shared[CLOUD]
-        values.insert(CLOUD, cloud)
-        for camera, pose in enumerate(guess):
-            values.insert(camera_key(camera), self.shared.get(camera_key(camera), pose))
-        keys = {aligned_key(camera): camera for camera in model.aligned}
-        keys |= {matched_key(camera): camera for camera in model.matched}
-        for key, camera in keys.items():
-            values.insert(key, self.shared.get(key, guess[camera]))
+        values, known = start_values(model, guess), dict(self.shared)
         for place, name in enumerate(names):
-            values.insert(cloud_at_key(place), self.clouds.get(name, cloud))
+            known[cloud_at_key(place)] = self.clouds.get(name, self.shared[CLOUD])
         for place, camera in model.matched_places():
-            expected = values.atPose3(matched_key(camera))
-            pose = self.matched.get(names[place], {}).get(camera, expected)
-            values.insert(matched_at_key(place, camera), pose)
-        if model.is_distorted:
-            size = model.components.distortion_jacobian.shape[2]
-            values.insert(
-                DISTORTION, np.zeros(size) if self.distortion is None else self.distortion
-            )
+            expected = self.shared.get(matched_key(camera), values.atPose3(matched_key(camera)))
+            of_place = self.matched.get(names[place], {})
+            known[matched_at_key(place, camera)] = of_place.get(camera, expected)
+        for key, pose in known.items():
+            if values.exists(key):
+                values.update(key, pose)
+        if model.is_distorted and self.distortion is not None:
+            values.update(DISTORTION, self.distortion)
         return values
 
     def pose_at(self, name: str, camera: int) -> gtsam.Pose3 | None:

@@ -21,13 +21,17 @@ from calibgraph.graph.linear_data import poses_of
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import invert_each, pose_rows, to_T_lidar_camera
-from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.curvature import convex_hessian
 from calibgraph.solver.data_by_place import block_by_place
 from calibgraph.solver.elimination import LatentPoseFit, join_linear
 from calibgraph.solver.prior_components import variance_components
 from calibgraph.solver.scan_distortion import DistortionEvidence
-from calibgraph.solver.within_place import WEAK, WithinPlace
+from calibgraph.solver.within_place import (
+    WEAK,
+    WithinPlace,
+    allow_for_few_frames,
+    relative_covariance,
+)
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
@@ -64,22 +68,18 @@ class FrameSpread:
         """
         (scatter, left), every = sums.within_places, sums.rows.total()
         hessian, reweighted, frames = every.hessian, every.reweighted, every.frames
-        matches = every.matches
         found = FrameSpread(np.tile(np.eye(6), (len(frames), 1, 1)), np.ones(len(frames)))
-        correlation = error_components().frame_correlation
-        for camera in np.flatnonzero(frames):
-            count, seen = frames[camera], left[camera] + 1.0
-            own = _usual_while_few(state, int(camera), scatter[camera], count)
+        for camera in map(int, np.flatnonzero(frames)):
+            own = _usual_while_few(state, camera, scatter[camera], frames[camera])
             if not states_places(state):
-                own = state.widen(int(camera), own)
-            true = convex_hessian(hessian[camera], reweighted[camera])
-            usual = 1.0 + correlation * (matches[camera] / count - 1.0)
-            usual = usual * true * seen / count
-            whole = with_pseudo_frames(own, true, np.full(6, seen), usual) * count / seen
-            outer = np.linalg.cholesky(reweighted[camera] + WEAK)
-            inverse = np.linalg.inv(true + WEAK)
-            found.efficiency[camera] = np.trace(outer.T @ inverse @ outer) / 6
-            found.covariance[camera] = outer.T @ inverse @ whole @ inverse @ outer
+                own = state.widen(camera, own)
+            true = convex_hessian(hessian[camera], reweighted[camera]) + WEAK
+            own = allow_for_few_frames(
+                own, true, left[camera], frames=frames[camera], matches=every.matches[camera]
+            )
+            root = np.linalg.cholesky(reweighted[camera] + WEAK)
+            of_camera = relative_covariance(own, root, true)
+            found.covariance[camera], found.efficiency[camera] = of_camera
         return found
 
     def within(self, sums: PlaceSums, camera: int, rows: Numbers) -> WithinPlace:

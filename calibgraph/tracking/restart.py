@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
-from calibgraph.tracking.cause import Cause, Steps, alarm_limit, find_cause
+from calibgraph.solver.camera_block import CameraBlock, merge
+from calibgraph.tracking.cause import Cause, Steps, find_cause
 from calibgraph.tracking.drift import follow_drift
 from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
 from calibgraph.tracking.outlier_frames import refine
-from calibgraph.tracking.place_shift import shift_since
-from calibgraph.tracking.posterior import posterior
 from calibgraph.tracking.start import absorb_frames
-from calibgraph.tracking.state import DriftWatch, State, block_diagonal, replace_item
+from calibgraph.tracking.state import DriftWatch, State, replace_item
 from calibgraph.tracking.step_detection import DetectedStep
-from calibgraph.tracking.sums import Sums, step_between, sums_of_frame
+from calibgraph.tracking.steps import shift_since, steps_between
+from calibgraph.tracking.sums import Gated, Sums, step_between
 
 Measured = tuple[Steps, dict[int, Array]]
 
@@ -216,61 +215,18 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         start = near[-1].T_lidar_camera if near else state.T_lidar_camera[camera]
         raw = merge(parts)
         T_lidar_camera = refine(raw, start, camera_state.scale, state.config)
-        residuals = raw.at(to_T_camera_lidar(T_lidar_camera))
-        inliers = residuals.inliers(camera_state.scale)
-        if np.count_nonzero(inliers) >= MIN_MATCHES:
-            reference = state.references[camera]
-            own = sums_of_frame(residuals, inliers, camera_state.scale, reference)
-            found = found.replace_at(camera, replace(own, frames=np.array(float(len(parts)))))
+        own = Gated.at(T_lidar_camera, raw, camera_state.scale, state.references[camera])
+        if own is not None:
+            sums = replace(own.sums, frames=np.array(float(len(parts))))
+            found = found.replace_at(camera, sums)
     return found
 
 
 def _measure_steps(state: State, detected: DetectedStep) -> Measured:
     """The steps of the cameras; and per camera its estimate now, from its reference."""
-    before, after = posterior(state, detected.since), _sums_since(state, detected)
-    cameras, steps, now = [], [], {}
-    for camera, camera_state in enumerate(state.cameras):
-        one, two = before.step(camera), after.step(camera)
-        if camera_state.started and one is not None and two is not None:
-            cameras.append(camera)
-            steps.append(two - one)
-            now[camera] = two
-    covariance = _covariance(state, before, after, cameras, since=detected.since)
-    limits = np.array([alarm_limit(state.total_frames[c]) for c in cameras])
-    references = tuple(state.references[c] for c in cameras)
-    return Steps(tuple(cameras), np.ravel(steps), covariance, limits, references), now
-
-
-def _covariance(
-    state: State, before: Sums, after: Sums, cameras: list[int], *, since: int
-) -> Array:
-    """(6 m, 6 m) covariance of the difference between the estimates before and after."""
-    rows = np.concatenate([6 * c + np.arange(6) for c in cameras] or [np.empty(0, np.intp)])
-    covariance = np.zeros((len(rows), len(rows)))
-    new = [camera for camera in cameras if state.frame_noise(camera) is None]
+    before, after = sum_epochs(state, detected.since), _sums_since(state, detected)
+    new = [c for c in range(len(state.cameras)) if state.frame_noise(c) is None]
     guessed = {camera: after.hessian[camera] * _GUESSED_OVERCONFIDENCE for camera in new}
     own = {camera: before.scatter[camera] for camera in (*new, *state.drifting)}
-    for sums, known in ((before, own), (after, guessed)):
-        by_gradient = block_diagonal(np.asarray(np.linalg.inv(sums.hessian[cameras])))
-        scatter = _scatter(state, sums.frames, known)[np.ix_(rows, rows)]
-        covariance += by_gradient @ scatter @ by_gradient
-    inflation = np.repeat([np.sqrt(state.inflation(camera)) for camera in cameras], 6)
-    by_places = shift_since(state, since)[np.ix_(rows, rows)]
-    return np.asarray(covariance * np.outer(inflation, inflation) + by_places)
-
-
-def _scatter(state: State, frames: Array, own: Mapping[int, Array]) -> Array:
-    """(6 n, 6 n) scatter of the gradients of (n,) numbers of frames, as that of all frames is.
-
-    Args:
-        state: of the tracker.
-        frames: of each camera.
-        own: per camera for which that does not hold, its (6, 6) scatter.
-    """
-    share = np.repeat(np.sqrt(frames / np.maximum(state.total_frames, 1.0)), 6)
-    found = state.total * np.outer(share, share)
-    for camera, scatter in own.items():
-        rows = pose_rows(camera)
-        found[rows], found[:, rows] = 0.0, 0.0
-        found[rows, rows] = scatter
-    return found
+    by_places = shift_since(state, detected.since)
+    return steps_between(state, (before, own), (after, guessed), by_places)

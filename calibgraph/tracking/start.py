@@ -15,17 +15,16 @@ from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
 from calibgraph.solver.camera_block import (
-    MIN_MATCHES,
     BlockResiduals,
     CameraBlock,
     camera_blocks,
 )
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.live_frames import Epoch, LiveFrame
+from calibgraph.tracking.live_frames import Epoch
 from calibgraph.tracking.noise import ResidualHistogram, median
 from calibgraph.tracking.state import HISTORY, CameraState, State, replace_item
-from calibgraph.tracking.sums import sums_of_frame
+from calibgraph.tracking.sums import Gated
 
 _TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt
 
@@ -52,9 +51,7 @@ def start_cameras(
 
 def _try_to_start(state: State, camera: int, table: Correspondences) -> State:
     camera_state, name = state.cameras[camera], state.names[camera]
-    own = table.of_camera(name)
-    table = replace(own, cameras=(name,), camera_index=np.zeros_like(own.camera_index))
-    waiting = (*camera_state.waiting, table)[-HISTORY:]
+    waiting = (*camera_state.waiting, table.of_camera(name))[-HISTORY:]
     state = state.with_camera(camera, replace(camera_state, waiting=waiting))
     if not _is_attempt_due(len(camera_state.waiting) + 1, state.config.tracking.start_frames):
         return state
@@ -107,21 +104,18 @@ def absorb_frames(
     Blocks of live frames are added to them; older ones are left out.
     """
     by_number = {int(part.frame[0]): part for part in blocks}
+    scale, reference = state.cameras[camera].scale, state.references[camera]
     epochs: list[Epoch] = []
     counts: Counter[str] = Counter()
     for epoch in state.epochs:
         frames = []
-        for frame in epoch.frames:
-            raw = by_number.get(frame.number)
-            absorbed = (
-                None
-                if raw is None
-                else _absorb(state, frame, camera, raw, T_lidar_camera=T_lidar_camera)
-            )
-            frames.append(absorbed or frame)
-            if raw is not None and absorbed is not None:
-                used = np.count_nonzero(absorbed.inliers[camera])
-                counts.update(absorbed=1, given=len(raw.frame), used=int(used))
+        for before in epoch.frames:
+            frame, raw = before, by_number.get(before.number)
+            found = None if raw is None else Gated.at(T_lidar_camera, raw, scale, reference)
+            if raw is not None and found is not None:
+                frame = frame.add(camera, raw, found)
+                counts.update(absorbed=1, given=len(raw.frame), used=found.used)
+            frames.append(frame)
         epochs.append(
             replace(
                 epoch,
@@ -130,22 +124,9 @@ def absorb_frames(
             )
         )
     if any(state.findings.bend_sigmas):
-        epochs = [epoch.with_distortion(camera, state.cameras[camera].scale) for epoch in epochs]
+        epochs = [epoch.with_distortion(camera, scale) for epoch in epochs]
     state = replace(state, epochs=tuple(epochs), optimum=None)
     return state.with_camera(camera, state.cameras[camera].count(**counts))
-
-
-def _absorb(
-    state: State, frame: LiveFrame, camera: int, raw: CameraBlock, *, T_lidar_camera: gtsam.Pose3
-) -> LiveFrame | None:
-    """The frame with a camera's matches, None if too few are within the gate."""
-    scale = state.cameras[camera].scale
-    residuals = raw.at(to_T_camera_lidar(T_lidar_camera))
-    inliers = residuals.inliers(scale)
-    if np.count_nonzero(inliers) < MIN_MATCHES:
-        return None
-    sums = sums_of_frame(residuals, inliers, scale, state.references[camera])
-    return frame.add(camera, raw, inliers, sums)
 
 
 def count_residuals(camera_state: CameraState, residuals: BlockResiduals) -> CameraState:

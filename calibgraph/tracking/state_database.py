@@ -17,7 +17,6 @@ import errno
 import fcntl
 import os
 import sqlite3
-import struct
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -29,20 +28,15 @@ from calibgraph.files import (
     sync_folder,
     write_atomically,
 )
-from calibgraph.tracking.state_recovery import checksum, log_of, read
+from calibgraph.tracking.state_recovery import APPLICATION, LAYOUT, checksum, log_of, read
 
 DATABASE = "state.sqlite"
-LAYOUT = 2  # 1 was a folder of files snapshot-*.state and journal-*.log
-
-_APPLICATION = 0x43474254  # "CGBT", in the header of the database
-_HEADER = struct.Struct(">16s44xI4xI28x")  # text, user_version, application_id
 _PAGE_BYTES = 32768  # a snapshot takes half the time of SQLite's 4096
 _LOG_PAGES = 128  # in the log, before they are copied to the database: 4 MB, as by default
-_EARLIER_FILES = ("snapshot-*.state", "journal-*.log")
 _TABLES = f"""
     PRAGMA page_size={_PAGE_BYTES};
     PRAGMA journal_mode=WAL;
-    PRAGMA application_id={_APPLICATION};
+    PRAGMA application_id={APPLICATION};
     PRAGMA user_version={LAYOUT};
     CREATE TABLE snapshot (number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL);
     CREATE TABLE journal (number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL);
@@ -74,7 +68,6 @@ class StateDatabase:
         self._connection: sqlite3.Connection | None = None  # opened by the first write
         self._failed = False
         try:
-            _require_layout(folder)
             if not self._path.exists():
                 _create(self._path)
             self.recovered, self._number = read(self._path)
@@ -169,31 +162,10 @@ def _lock(folder: Path) -> int:
     return descriptor
 
 
-def _require_layout(folder: Path) -> None:
-    """Refuse a folder that anything but this layout has written, before a byte is changed."""
-    path = folder / DATABASE
-    for pattern in _EARLIER_FILES:
-        for found in folder.glob(pattern):
-            message = "is state of the earlier layout calibgraph-tracker/1; choose another folder"
-            raise FileError(found, f"{message}, or continue with the calibgraph that wrote it")
-    if not path.exists():
-        if log_of(path).exists():
-            raise FileError(path, "is missing, and its log is there; restore it from a copy")
-        return
-    with path.open("rb") as file:
-        header = file.read(_HEADER.size)
-    if len(header) < _HEADER.size or not header.startswith(b"SQLite format 3\0"):
-        raise FileError(path, "is damaged or no tracker's state; choose another folder")
-    _, layout, application = _HEADER.unpack(header)
-    if application != _APPLICATION:
-        raise FileError(path, "is a database of another program; choose another folder")
-    if layout != LAYOUT:
-        message = f"is state of layout {layout}, expected {LAYOUT}; choose another folder"
-        raise FileError(path, f"{message}, or continue with the calibgraph that wrote it")
-
-
 def _create(path: Path) -> None:
     """Put an empty database in place, whole or not at all."""
+    if log_of(path).exists():
+        raise FileError(path, "is missing, and its log is there; restore it from a copy")
     for leftover in path.parent.glob(f".writing-*{path.suffix}*"):
         leftover.unlink()
 

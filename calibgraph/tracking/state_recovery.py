@@ -11,6 +11,10 @@ from pathlib import Path
 
 from calibgraph.errors import FileError
 
+LAYOUT = 2
+APPLICATION = 0x43474254
+"""``CGBT``, in the header of the database."""
+
 
 @dataclass(frozen=True)
 class Recovered:
@@ -42,6 +46,7 @@ def read(path: Path) -> tuple[Recovered, int]:
     had_log = log.exists() and log.stat().st_size > 0
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
+            _require_layout(database, path)
             (state,) = database.execute("PRAGMA integrity_check(1)").fetchone()
             if state != "ok":
                 raise _damaged(path, state)
@@ -55,6 +60,16 @@ def read(path: Path) -> tuple[Recovered, int]:
         line = f"{log}: is missing, updates may be lost; went on after update {number}"
         recovered = replace(recovered, damages=(*recovered.damages, line))
     return recovered, number
+
+
+def _require_layout(database: sqlite3.Connection, path: Path) -> None:
+    (application,) = database.execute("PRAGMA application_id").fetchone()
+    (layout,) = database.execute("PRAGMA user_version").fetchone()
+    if application != APPLICATION:
+        raise FileError(path, "is a database of another program; choose another folder")
+    if layout != LAYOUT:
+        message = f"is state of layout {layout}, expected {LAYOUT}; choose another folder"
+        raise FileError(path, f"{message}, or continue with the calibgraph that wrote it")
 
 
 def _remove_index(path: Path, *, had_log: bool) -> None:

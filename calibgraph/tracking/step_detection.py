@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import accumulate
 
-import numpy as np
-
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
+from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
-from calibgraph.tracking.place_shift import shift_since
-from calibgraph.tracking.posterior import posteriors_before_epochs
 from calibgraph.tracking.state import CameraState, State
+from calibgraph.tracking.steps import shift_since
 from calibgraph.tracking.sums import Sums
 
 _PATIENCE = 5  # frames more, until the other cameras show whether they moved too
@@ -115,10 +113,11 @@ def detect_small_step(state: State) -> DetectedStep | None:
     if any(_is_pending(camera_state) for camera_state in state.cameras):
         return None
     afterwards = [*accumulate(epoch.sums for epoch in reversed(state.epochs))][::-1]
-    for place, before in posteriors_before_epochs(state):
-        if not state.epochs[place].frames:
+    for epoch, after in zip(state.epochs[1:], afterwards[1:], strict=True):
+        if not epoch.frames:
             continue
-        since, after = state.epochs[place].frames[0].number, afterwards[place]
+        since = epoch.frames[0].number
+        before = sum_epochs(state, since)
         for camera, camera_state in enumerate(state.cameras):
             if not camera_state.started or _shift_excess(state, camera, before, after) <= best:
                 continue  # by what places share it is less still
@@ -148,14 +147,10 @@ def _shift_excess(
     step = before.step(camera)
     if step is None:
         return 0.0
-    hessian = after.hessian[camera]
-    rows = pose_rows(camera)
-    inverse = np.linalg.inv(before.hessian[camera])
-    uncertain = hessian @ inverse
-    scatter = before.scatter[camera]
-    covariance = (
-        scatter * (after.frames[camera] / (frames - 1)) + uncertain @ scatter @ uncertain.T
-    ) * state.inflation(camera)
+    hessian, rows = after.hessian[camera], pose_rows(camera)
+    by_frames = before.scatter[camera] * (after.frames[camera] / (frames - 1))
+    by_frames = by_frames + hessian @ before.covariance(camera) @ hessian
+    covariance = by_frames * state.inflation(camera)
     if by_places is not None:
         covariance = covariance + hessian @ by_places[rows, rows] @ hessian
     score = after.gradient[camera] + hessian @ step

@@ -15,23 +15,15 @@ after it, as here for the error that all frames share::
 
 from __future__ import annotations
 
-import json
 import re
-import reprlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import from_json
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import describe
@@ -43,25 +35,10 @@ from calibgraph.tracking.stream_tables import Item, StreamFrame, refused
 
 MAX_CAMERAS = 1000
 MAX_LINE_BYTES = 64 * 2**20
-_MAX_METADATA_LEVELS = 32
-
-
-def _require_shallow(metadata: dict[str, Any]) -> dict[str, Any]:
-    if not _is_shallow(metadata, _MAX_METADATA_LEVELS):
-        raise ValueError(f"has more than {_MAX_METADATA_LEVELS} levels")
-    return metadata
-
-
-def _is_shallow(value: object, levels: int) -> bool:
-    if not isinstance(value, (dict, list)):
-        return True
-    children = value.values() if isinstance(value, dict) else value
-    return levels > 0 and all(_is_shallow(child, levels - 1) for child in children)
 
 
 Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63)]
 PlaceName = Annotated[str, Field(max_length=LONGEST_PLACE)] | Int64
-Metadata = Annotated[dict[str, Any], AfterValidator(_require_shallow)]
 
 
 class CameraColumns(BaseModel):
@@ -125,7 +102,7 @@ class HeaderLine(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    metadata: Metadata
+    metadata: dict[str, Any]
 
 
 class FrameLine(BaseModel):
@@ -137,7 +114,7 @@ class FrameLine(BaseModel):
     stamp_ns: Int64 = 0
     cameras: Annotated[dict[str, CameraColumns], Field(max_length=MAX_CAMERAS)]
     place: PlaceName | None = None
-    metadata: Metadata = {}
+    metadata: dict[str, Any] = {}
 
     def to_frame(self, header: Mapping[str, Any]) -> StreamFrame:
         """The frame with the correspondences of all its cameras.
@@ -155,7 +132,7 @@ class FrameLine(BaseModel):
         if not any("point_index" in columns.given for columns in self.cameras.values()):
             tables = [replace(table, point_index=None) for table in tables]
         table = concatenate([_empty_table({**header, **self.metadata}), *tables])
-        return StreamFrame(self.frame, stamp_ns, with_place(table, self.place))
+        return StreamFrame(self.frame, with_place(table, self.place))
 
 
 def frames_of_lines(chunks: Iterable[bytes], where: str) -> Iterator[Item]:
@@ -201,7 +178,7 @@ def _lines(chunks: Iterable[bytes]) -> Iterator[bytes | None]:
 def _parse(line: bytes, where: str, header: Mapping[str, Any]) -> Item | dict[str, Any]:
     """A frame, why it is none, or the metadata of a header."""
     try:
-        content = _json(line)
+        content = from_json(line, allow_inf_nan=False)
         if isinstance(content, dict) and content.keys() == {"metadata"}:
             metadata = HeaderLine.model_validate(content).metadata
             MatcherFindings.from_metadata(metadata)
@@ -212,35 +189,8 @@ def _parse(line: bytes, where: str, header: Mapping[str, Any]) -> Item | dict[st
         return refused(where, found.replace("valid dictionary", "JSON object"))
     except CorrespondenceError as error:
         return refused(where, str(error))
-
-
-def _json(line: bytes) -> Any:
-    try:
-        return json.loads(
-            line.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique
-        )
-    except UnicodeDecodeError as error:
-        found = f"is not UTF-8 ({error.reason} at byte {error.start})"
-    except json.JSONDecodeError as error:
-        found = f"is not JSON ({error.msg} at column {error.colno})"
-    except RecursionError:
-        found = "is nested too deeply"
-    except ValueError as error:  # Also Python's error about a number of thousands of digits.
-        found = f"cannot be read: {error}"
-    raise CorrespondenceError(f"{found}; send one frame a line, as JSON")
-
-
-def _refuse_constant(token: str) -> None:
-    raise ValueError(f"{token} is no number")
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    mapping: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in mapping:
-            raise ValueError(f"key {_short(key)} is given twice")
-        mapping[key] = value
-    return mapping
+    except ValueError as error:
+        return refused(where, f"is not JSON ({error}); send one frame a line, as JSON")
 
 
 def _empty_table(metadata: dict[str, Any]) -> Correspondences:
@@ -254,7 +204,3 @@ def _empty_table(metadata: dict[str, Any]) -> Correspondences:
         confidence=np.empty(0, np.float32),
         metadata=metadata,
     )
-
-
-def _short(value: object) -> str:
-    return reprlib.repr(value)

@@ -31,12 +31,10 @@ class StreamFrame:
 
     Attributes:
         frame: its number.
-        stamp_ns: its time; where the rows' times differ, the latest; None if none is given.
         table: rows of this frame alone; there may be none.
     """
 
     frame: int
-    stamp_ns: int | None
     table: Correspondences
 
 
@@ -154,11 +152,9 @@ def _frame_or_refused(rows: pa.Table, where: str) -> Item:
     """One frame from all its rows."""
     number = rows["frame"][0].as_py()
     try:
-        table = from_arrow(rows)
+        return StreamFrame(number, from_arrow(rows))
     except CorrespondenceError as error:
         return refused(where, f"frame {number} is left out; among its rows, {error}")
-    stamp_ns = None if table.stamp_ns is None else int(table.stamp_ns.max())
-    return StreamFrame(number, stamp_ns, table)
 
 
 def frames_of_batches(file: Any, where: str) -> Iterator[Item]:

@@ -27,10 +27,11 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import camera_key
-from calibgraph.solver.camera_block import BlockResiduals, CameraBlock
+from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
-from factors import ProjectionBlock, smallest_scaled_eigenvalue
+from factors import smallest_scaled_eigenvalue
 
 _SHAPES: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (6, 6), (6,), (6, 6), (), ())
 _STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away
@@ -147,32 +148,50 @@ def step_between(one: gtsam.Pose3, two: gtsam.Pose3) -> Array:
     return np.asarray(one.localCoordinates(two))
 
 
-def sums_of_frame(
-    residuals: BlockResiduals,
-    inliers: NDArray[np.bool_],
-    scale: ResidualScale,
-    reference: gtsam.Pose3,
-) -> Sums:
-    """The sums of one frame's matches of a camera, linearized where their residuals are.
+@dataclass(frozen=True, eq=False)
+class Gated:
+    """One frame's matches of a camera, gated at a T_lidar_camera.
 
-    Args:
-        residuals: of its matches, near the minimum.
+    Attributes:
+        residuals: of all of them, there.
         inliers: (m,) which of them are within the gate.
-        scale: of the residuals.
-        reference: T_lidar_camera at which the gradient is taken.
+        sums: of these.
     """
-    pose = residuals.T_lidar_camera
-    block = residuals.block.select(inliers).with_scale(scale)
-    hessian, sums = true_hessian(residuals, block, scale), block.sums(pose)
-    return Sums(
-        hessian,
-        sums.gradient + hessian @ step_between(pose, reference),
-        sums.hessian,
-        sums.gradient,
-        np.outer(sums.gradient, sums.gradient),
-        np.array(1.0),
-        np.array(float(len(block))),
-    )
+
+    residuals: BlockResiduals
+    inliers: NDArray[np.bool_]
+    sums: Sums
+
+    @property
+    def used(self) -> int:
+        """How many are within the gate."""
+        return int(self.sums.matches)
+
+    @staticmethod
+    def at(
+        T_lidar_camera: gtsam.Pose3, raw: CameraBlock, scale: ResidualScale, reference: gtsam.Pose3
+    ) -> Gated | None:
+        """The matches near the minimum; None if too few are within the gate.
+
+        Args:
+            T_lidar_camera: where they are linearized.
+            raw: all of them.
+            scale: of the residuals.
+            reference: T_lidar_camera at which the gradient is taken.
+        """
+        residuals = raw.at(to_T_camera_lidar(T_lidar_camera))
+        inliers = residuals.inliers(scale)
+        if np.count_nonzero(inliers) < MIN_MATCHES:
+            return None
+        pose = residuals.T_lidar_camera
+        block = raw.select(inliers).with_scale(scale)
+        here = block.sums(pose)
+        hessian = robust_hessian(block, pose) + residuals.gate_hessian(scale)
+        gradient = here.gradient + hessian @ step_between(pose, reference)
+        scatter = np.outer(here.gradient, here.gradient)
+        counts = np.array(1.0), np.array(float(len(block)))
+        sums = Sums(hessian, gradient, here.hessian, here.gradient, scatter, *counts)
+        return Gated(residuals, inliers, sums)
 
 
 def equation_5(
@@ -209,8 +228,3 @@ def sums_of_matches(
     here = block.with_scale(scale).sums(T_lidar_camera)
     sums = replace(Sums.zeros(), hessian=here.hessian, gradient=here.gradient)
     return sums.shift_reference(step_between(T_lidar_camera, reference))
-
-
-def true_hessian(residuals: BlockResiduals, block: ProjectionBlock, scale: ResidualScale) -> Array:
-    """(6, 6) of the robust cost of the matches in the gate, which moves with the extrinsic."""
-    return robust_hessian(block, residuals.T_lidar_camera) + residuals.gate_hessian(scale)

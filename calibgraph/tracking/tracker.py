@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.files import require_file, write_bytes
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
@@ -24,7 +25,7 @@ from calibgraph.tracking.absorption import (
     select_agreeing,
     with_open_frame,
 )
-from calibgraph.tracking.assessment import Assessment, assess, to_calibration
+from calibgraph.tracking.assessment import Assessment, assess, rig_at, to_calibration
 from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
 from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.events import Event
@@ -39,15 +40,9 @@ from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
-from calibgraph.tracking.state_bytes import (
-    StateError,
-    decode,
-    encode,
-    load_state_file,
-    save_state_file,
-)
+from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.step_detection import detect_small_step, detect_step
-from calibgraph.tracking.update import Update, make_update, rig_at
+from calibgraph.tracking.update import Update, make_update
 
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
 
@@ -68,7 +63,6 @@ class IncrementalCalibrator:
     _epoch_start: State
     _since_epoch_start: list[tuple[int, Correspondences]]
 
-    _rig_at: tuple[tuple[gtsam.Pose3, ...], Rig] | None = None
     _assessed: tuple[State, Assessment] | None = None
     _closed: ClosedPlaces
 
@@ -78,7 +72,7 @@ class IncrementalCalibrator:
     @property
     def rig(self) -> Rig:
         """The rig with the present estimates."""
-        return self._at(self._assess().T_lidar_camera)
+        return rig_at(self._state, self._assess().T_lidar_camera)
 
     @property
     def initial_rig(self) -> Rig:
@@ -144,7 +138,7 @@ class IncrementalCalibrator:
         table = with_metadata_per_frame(with_place(table, place))
         number, stamp = number_and_stamp(table, frame, self._state)
         new = without_repeats(self._state, table)
-        blocks = blocks_by_camera(self._state, self._at(self._state.T_lidar_camera), new)
+        blocks = blocks_by_camera(self._state, new)
         start, since = self._epoch_start, list(self._since_epoch_start)
         try:
             self._begin_frame(number, stamp, table)
@@ -186,12 +180,12 @@ class IncrementalCalibrator:
         self._refine()
         if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
             events += self._close_epoch()
-        return make_update(self._state, self.rig, self._assess(), tuple(events), used=used)
+        return make_update(self._state, self._assess(), tuple(events), used)
 
     def _refine(self) -> None:
         """Do a part of the work that the end of an epoch has left to the frames after it."""
         state, step = self._state, len(self._state.epochs[-1].frames)
-        if self._closed.findings != state.findings:
+        if self._closed.state.findings != state.findings:
             self._closed = ClosedPlaces.of(state)
         if step <= STEPS and len(state.epochs) > 1:
             self._state, self._closed = refine(state, self._closed, step)
@@ -204,16 +198,9 @@ class IncrementalCalibrator:
             self._assessed = state, assess(state, self._closed, before)
         return self._assessed[1]
 
-    def _at(self, estimates: tuple[gtsam.Pose3, ...]) -> Rig:
-        """The rig with these estimates; the last one is kept."""
-        if self._rig_at is None or self._rig_at[0] is not estimates:
-            self._rig_at = estimates, rig_at(self._state, estimates)
-        return self._rig_at[1]
-
     def to_bytes(self) -> bytes:
         """The tracker as bytes, from which :meth:`from_bytes` continues with the same numbers."""
-        content = self._epoch_start, tuple(self._since_epoch_start)
-        return encode(content, self._epoch_start.rig)
+        return encode((self._epoch_start, self._since_epoch_start))
 
     @staticmethod
     def from_bytes(data: bytes) -> IncrementalCalibrator:
@@ -231,7 +218,7 @@ class IncrementalCalibrator:
 
     def save(self, path: Path | str) -> None:
         """Write the tracker to a file, atomically; :meth:`load` continues from there."""
-        save_state_file(Path(path), self.to_bytes())
+        write_bytes(Path(path), self.to_bytes())
 
     @staticmethod
     def load(path: Path | str) -> IncrementalCalibrator:
@@ -241,7 +228,7 @@ class IncrementalCalibrator:
             FileError: if the file is missing, damaged, or not of this format.
         """
         try:
-            return IncrementalCalibrator.from_bytes(load_state_file(Path(path)))
+            return IncrementalCalibrator.from_bytes(require_file(Path(path)).read_bytes())
         except StateError as error:
             raise FileError(path, f"{error}; track anew from a rig") from error
 

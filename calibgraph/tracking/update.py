@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.model.rig import Rig
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import Verdict
 from calibgraph.report.as_json import finite
-from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.tracking.assessment import Assessment, covariance_by_camera
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.state import State
@@ -51,42 +48,34 @@ class Update:
 
 def make_update(
     state: State,
-    rig: Rig,
     assessment: Assessment,
     events: tuple[Event, ...],
-    *,
-    used: Mapping[int, CameraBlock],
+    used: Mapping[int, int],
 ) -> Update:
     """The update after the last frame of a state.
 
     Args:
         state: after the frame.
-        rig: with the estimates.
         assessment: of its estimates.
         events: detected with the frame.
-        used: per camera, by its place in the rig, the absorbed matches.
+        used: per camera, by its place in the rig, how many matches were absorbed.
     """
     names = state.names
+    poses = map(to_T_camera_lidar, assessment.T_lidar_camera)
     return Update(
         frame=state.frame or 0,
         stamp_ns=state.stamp_ns,
-        T_camera_lidar=rig.T_camera_lidar,
+        T_camera_lidar=dict(zip(names, poses, strict=True)),
         covariance=covariance_by_camera(assessment, names),
         verdicts=assessment.verdicts,
         events=events,
-        used={names[c]: len(block.frame) for c, block in used.items()},
+        used={names[camera]: count for camera, count in used.items()},
         left_out=tuple(
             name
             for name, camera_state in zip(names, state.cameras, strict=True)
             if camera_state.agreements[-1:] == ((state.frame, False),)
         ),
     )
-
-
-def rig_at(state: State, T_lidar_camera: Sequence[gtsam.Pose3]) -> Rig:
-    """The rig with these estimates."""
-    estimates = zip(state.names, T_lidar_camera, strict=True)
-    return state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
 
 
 def json_line(update: Update) -> str:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
+from calibgraph.trust.clock_checks import image_offset_checks, offset_checks
 from calibgraph.trust.competing_solution import competing_solution_checks
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.evidence import Checks, Evidence, concatenate
@@ -55,6 +56,7 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     repeated_frame_checks,      # how many are of one place, or copies?
     assumed_spread_checks,      # does the configured loss scale suit the residuals?
     intrinsics_checks,          # would another lens explain the residuals?
+    offset_checks,              # would images of another time?
     bootstrap_checks,           # does a bootstrap over frames give the reported covariance?
     prior_share_checks,         # how much of it comes from the priors?
 )  # fmt: skip
@@ -67,6 +69,7 @@ RUN_CHECKS: tuple[Callable[[RunEvidence], Checks], ...] = (
     rematch_checks,             # does matching from a displaced start end here?
     time_limit_checks,          # was anything left out for lack of time?
     image_checks,               # do the images agree with the result?
+    image_offset_checks,        # would they agree better at another time?
 )  # fmt: skip
 """Checks of a run, which also need the matcher, the images or the clouds."""
 

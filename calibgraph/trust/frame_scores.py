@@ -18,7 +18,6 @@ from calibgraph.matching.structure.shift_scores import (
     concatenate_scores,
     score_frame,
 )
-from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
 
 Images = Sequence[NDArray[np.uint8]]
@@ -36,7 +35,7 @@ class FrameScorer:
 
     def __init__(self, dataset: Dataset, frames: Sequence[Frame], pool: ThreadPoolExecutor) -> None:
         self.frames = frames
-        self._dataset = dataset
+        self.dataset = dataset
         self._pool = pool
         self._cache = cache_of(frames, FrameCache())
 
@@ -60,9 +59,11 @@ class FrameScorer:
     def _score_frame(
         self, gray: NDArray[np.uint8], frame: Frame, *, camera: Camera, level: Level, offset: int
     ) -> ShiftScores | None:
-        other = self._dataset.neighbour(frame, offset) if offset else frame
+        other = self.dataset.neighbour(frame, offset) if offset else frame
         if other is None:
             return None
         most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
-        cloud, camera = self._cache.cloud(other), when_taken(camera, other.twist_per_s)
-        return score_frame(gray, cloud, camera, level, frame=frame.index, max_windows=most)
+        cloud, twist = self._cache.cloud(other), other.twist_per_s
+        return score_frame(
+            gray, cloud, camera, level, frame=frame.index, max_windows=most, twist_per_s=twist
+        )

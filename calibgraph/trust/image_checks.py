@@ -1,4 +1,4 @@
-"""Checks of a result against the images: wrong optimum, lens, pairing, time offset."""
+"""Checks of a result against the images: wrong optimum, lens, pairing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidenc
 from calibgraph.trust.lens_parameter import IMAGES, check_parameter
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import limit, threshold
-from calibgraph.trust.time_offset import TimeOffset, time_offsets
 
 
 def image_checks(evidence: RunEvidence) -> Checks:
@@ -58,7 +57,7 @@ def check_images(
     """Score images and clouds at the extrinsics of a result, and displaced from them.
 
     Not observable: a principal point wrong along the shorter side of the image (it is equivalent to
-    a rotation), and a time offset under a constant motion (equivalent to a translation).
+    a rotation).
 
     Returns:
         Checks of every camera.
@@ -66,11 +65,7 @@ def check_images(
     evidence = measure_image_evidence(
         dataset, rig, places=table.places, seed=seed, progress=progress
     )
-    offsets = time_offsets(dataset, rig, table)
-    of_time = {
-        name: (*pairing_checks(found), *offset_checks(offsets.get(name)))
-        for name, found in evidence.items()
-    }
+    of_time = {name: pairing_checks(found) for name, found in evidence.items()}
     names = {frame.index: frame.name for frame in dataset.frames}
     row = threshold("displaced_z_score")
     placed = {n for n, found in evidence.items() if row.grade(found.displaced_z_score) != "FAIL"}
@@ -137,17 +132,3 @@ def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:
         "which cloud, and their time stamps"
     )
     return (threshold("own_clouds").check(found.pair_margin, advice=advice),)
-
-
-def offset_checks(offset: TimeOffset | None) -> tuple[Check, ...]:
-    """The time offset of one camera; nothing where it could not be measured."""
-    if offset is None or math.isnan(offset.sigma):
-        return ()
-    row, size = threshold("time_offset"), abs(offset.intervals)
-    significant = size > limit("offset_sigmas") * offset.sigma
-    status = row.grade(size) if significant else "PASS"
-    text = f"time offset {offset.intervals:+.2f} +- {offset.sigma:.2f} frame intervals"
-    if status != "PASS":
-        when = "later" if offset.intervals > 0 else "earlier"
-        text += f": the images were taken {when} than the clouds; {row.advice}"
-    return (row.describe(offset.intervals, status, text),)

@@ -15,6 +15,7 @@ from calibgraph.trust.lens_parameter import (
     check_parameter,
     lens_fields_px,
     lens_variable,
+    units_of,
 )
 from calibgraph.trust.thresholds import limit, threshold
 
@@ -58,7 +59,7 @@ def _check_camera(evidence: Evidence, name: str) -> list[Check]:
     if fit is None:
         return []
     found = (
-        LensParameter.of(each, camera, fit.free(*numbers), *numbers)
+        LensParameter.of(each, units_of(camera, *numbers), fit.free(*numbers))
         for each, numbers in _NUMBERS.items()
     )
     checks = [check_parameter(each, RESIDUALS) for each in found]

@@ -12,14 +12,17 @@ import cv2
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.matching.run import with_motion
 from calibgraph.matching.structure.consensus import maximize_score
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.shift_scores import ShiftScores
+from calibgraph.model.clock import at_pixels
 from calibgraph.model.error_components import error_components
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import apply_twist
 from calibgraph.solver.linear_fit import LinearFit, block_of, fit_camera
+from calibgraph.solver.scan_distortion import distortion_fields_px
 from calibgraph.trust.frame_scores import FINER, WIDE, FrameScorer, Images
 from calibgraph.trust.lens_parameter import (
     NAMES,
@@ -27,7 +30,9 @@ from calibgraph.trust.lens_parameter import (
     LensParameter,
     lens_fields_px,
     lens_variable,
+    units_of,
 )
+from calibgraph.trust.thresholds import limit
 
 SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)
 """Half-widths of a search; a focal length wrong by 5 % displaces a result by up to 0.5 m."""
@@ -65,7 +70,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     finer = Free.FOCAL, Free.RADIAL, along  # right shapes are nearer to zero without a finer fit
     searched = *finer, Free.ASPECT
     best = _search(camera, scores, searched, seed)
-    rough = _fit_at_peaks(camera, scores, best, places)
+    rough = _fit_at_peaks(scorer, camera, scores, best, places=places)
     if rough is None:
         return ()
     change, lens, moved = rough.free(*finer), lens_variable(camera), np.zeros(len(Free))
@@ -74,21 +79,15 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     moved[Free.RADIAL] = np.clip(moved[Free.RADIAL], -most, most)
     refined = lens.put_into(apply_twist(camera, change.twist), moved[:-1])
     again = scorer.score_together(images, refined, FINER)
-    rest = _fit_at_peaks(refined, again, np.zeros(len(best)), places)
+    rest = _fit_at_peaks(scorer, refined, again, np.zeros(len(best)), places=places)
     if rest is None:
         return ()
     fine, parameters = rest.counted_from(moved), []
     for name, number in zip(NAMES, (*searched, Free.SKEW), strict=True):
         fit, others = fine if number in finer else rough, [n for n in finer if n != number]
-        parameters.append(LensParameter.of(name, camera, fit.free(*others, number), number))
+        of = LensParameter.of(name, units_of(camera, number), fit.free(*others, number))
+        parameters.append(of)
     return tuple(parameters)
-
-
-def _extend(scores: ShiftScores, camera: Camera) -> ShiftScores:
-    """The scores, with the derivatives of the shifts in steps by the lens, too."""
-    fields = lens_fields_px(camera, scores.points_lidar_m).transpose(2, 1, 0)
-    jacobian = np.concatenate([scores.jacobian, fields * scores.steps_per_px[:, None]], axis=2)
-    return replace(scores, jacobian=jacobian)
 
 
 def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: int) -> Array:
@@ -100,7 +99,8 @@ def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: in
         lens: numbers of its parameters that are searched. A skew moves pixels too little for it.
         seed: of the search.
     """
-    columns, extended = [*range(6), *(6 + number for number in lens)], _extend(scores, camera)
+    columns = [*range(6), *(6 + number for number in lens)]
+    extended = scores.with_unknowns(lens_fields_px(camera, scores.points_lidar_m))
     units = np.array([1.0, 1.0, camera.intrinsics_px.fx, 1.0]) * SEARCH_LENS
     sigmas = np.array(lens_variable(camera).free.sigmas)[[*lens]]
     smooth = replace(
@@ -115,14 +115,23 @@ def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: in
 
 
 def _fit_at_peaks(
-    camera: Camera, scores: ShiftScores, start: Array, places: Places
+    scorer: FrameScorer, camera: Camera, scores: ShiftScores, start: Array, *, places: Places
 ) -> LinearFit | None:
-    """Fit pose and lens to the groups' peaks next to a start, (12,)."""
+    """Fit pose and lens to the groups' peaks next to a start, (12,); the scan may be distorted."""
     if not len(scores.weights):
         return None
-    table = extract_correspondences(_extend(scores, camera), start, "camera")
+    fields = lens_fields_px(camera, scores.points_lidar_m)
+    table = extract_correspondences(scores.with_unknowns(fields), start, "camera")
+    table = at_pixels(camera, with_motion(table, scorer.dataset))
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
-    variance = error_components().matchers["structure"].place_variance
-    shared = variance * places.frames_per_place(block.frame_numbers)
-    fields = lens_fields_px(camera, block.block.points_lidar_m)
-    return fit_camera(camera, block, fields, shared_variance=shared)
+    known, points = error_components().matchers["structure"], block.block.points_lidar_m
+    of_place = known.place_variance * places.frames_per_place(block.frame_numbers)
+    of_scan = np.array([known.elevation_rad, known.elevation_stretch, known.scan_motion_m])
+    bends = distortion_fields_px(camera, points) * of_scan[:, None, None]
+    return fit_camera(
+        camera,
+        block,
+        np.concatenate([lens_fields_px(camera, points), bends]),
+        shared_variance=max(of_place, limit("lens_match_share") * len(block)),
+        considered=len(bends),
+    )

@@ -8,12 +8,13 @@ half is a field of displacements of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from itertools import product
 
 import numpy as np
-from scipy.special import expit, logit, ndtr
+from scipy.special import expit, logit, ndtr, softmax
 
 from calibgraph.arrays import Array
 from calibgraph.graph.lens import LensSigmas, LensVariable
@@ -40,6 +41,8 @@ NAMES = {
     "skew": (None, "a skew of {} % of fx", "a skew of -{} % of fx"),
 }
 """Parameters that are judged: what ``--estimate`` calls them, and a lens with more or less."""
+TIME = "time offset"
+_WORDS = {**NAMES, TIME: ("offset", "images taken {} ms later", "images taken {} ms earlier")}
 
 SHAPES = "aspect ratio", "skew"
 """Those that no lens has wrong by much."""
@@ -48,7 +51,7 @@ RESIDUALS, IMAGES = "residuals over the image", "images"
 """What an estimate is by."""
 
 KINDS = {
-    by: {name: prefix + name.replace(" ", "_") for name in NAMES}
+    by: {name: prefix + name.replace(" ", "_") for name in _WORDS}
     for by, prefix in ((RESIDUALS, "lens_"), (IMAGES, ""))
 }
 """Kinds of the checks."""
@@ -69,6 +72,12 @@ def lens_variable(camera: Camera) -> LensVariable:
     return LensVariable(camera, free, np.zeros(len(free)))
 
 
+def units_of(camera: Camera, *numbers: int) -> list[float]:
+    """Standard deviations of a calibrated lens: relative, pixels, or of k1."""
+    units = *lens_variable(camera).free.sigmas, _SKEW_SIGMA
+    return [units[number] for number in numbers]
+
+
 def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
     """(6, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
     free, T, k = lens_variable(camera).free, camera.T_camera_lidar, camera.intrinsics_px
@@ -85,11 +94,11 @@ class LensParameter:
     """An estimate of one lens parameter together with the extrinsic.
 
     Attributes:
-        name: one of ``NAMES``.
+        name: one of ``NAMES``, or ``TIME``.
         values: (m,) change, in standard deviations of a calibrated lens.
         sigmas: (m,) their standard deviations, frames as clusters.
         twist: (6,) rotation [rad] and translation [m] by which the camera moves.
-        units: (m,) of the values: relative, pixels, or of k1.
+        units: (m,) of the values: relative, pixels, of k1, or seconds.
     """
 
     name: str
@@ -99,12 +108,12 @@ class LensParameter:
     units: Array
 
     @staticmethod
-    def of(name: str, camera: Camera, freed: Freed, *numbers: int) -> LensParameter:
-        """Of a fit whose last unknowns have these numbers; others may be free beside them."""
-        units = np.array([*lens_variable(camera).free.sigmas, _SKEW_SIGMA])[[*numbers]]
-        values, sigmas = (each[-len(numbers) :] for each in (freed.values, freed.sigmas))
-        twist = freed.compensating[:, -len(numbers) :] @ values
-        return LensParameter(name, values, sigmas, twist, units)
+    def of(name: str, units: Sequence[float], freed: Freed) -> LensParameter:
+        """Of a fit whose last unknowns have these units; others may be free before them."""
+        count = len(units)
+        values, covariance = _beside_others(name, freed, len(freed.values) - count)
+        twist = freed.compensating[:, -count:] @ values
+        return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, np.array(units))
 
     @property
     def moved(self) -> tuple[float, float]:
@@ -150,11 +159,44 @@ class LensParameter:
 
     def describe(self) -> str:
         """The lens that would be right, in words."""
-        _, more, less = NAMES[self.name]
-        units = 100 * self.units if "%" in more else self.units
+        _, more, less = _WORDS[self.name]
+        units = self.units * (100 if "%" in more else 1000 if "ms" in more else 1)
         values = units * (np.abs(self.values) if less else self.values)
         numbers = ", ".join(map(_with_sigma, values, units * self.sigmas))
         return (less if less and self.values[0] < 0 else more).format(numbers)
+
+
+def _beside_others(name: str, freed: Freed, others: int) -> tuple[Array, Array]:
+    """(m,) values and (m, m) covariance of unknowns beside others, each of them usual or wrong.
+
+    A focal length that is 1 % off is no less rare beside a distortion than alone. So the other
+    unknowns have the errors of lens parameters, too: the mean and the covariance over all of their
+    combinations of usual and wrong. Not beside a shape: a wrong fy alone is a wrong focal length,
+    too, which stays free.
+
+    Args:
+        name: of the unknowns.
+        freed: the fit, with all of them free.
+        others: how many of its first unknowns are the others.
+    """
+    first, last = slice(others), slice(others, None)
+    values, covariance = freed.values, freed.covariance
+    if not others or name in SHAPES or not np.isfinite(covariance).all():
+        return values[last], covariance[last, last]
+    wrong = np.array([*product((False, True), repeat=others)])
+    spreads = np.where(wrong, limit("lens_wrong"), 1.0)
+    total = covariance[first, first] + spreads[:, :, None] ** 2 * np.eye(others)
+    gain, misfit = (
+        np.linalg.solve(total, each) for each in (covariance[first, last], values[first, None])
+    )
+    odds = logit(limit("lens_wrong_share")) * wrong.sum(axis=1)
+    fits = values[first] @ misfit[..., 0].T + np.linalg.slogdet(total).logabsdet
+    weights = softmax(odds - fits / 2)
+    means = values[last] - values[first] @ gain
+    within = covariance[last, last] - covariance[last, first] @ gain
+    mean = weights @ means
+    apart = (means - mean)[:, :, None] * (means - mean)[:, None]
+    return mean, np.tensordot(weights, within + apart, axes=1)
 
 
 def _share_beyond(size: float, mean: Array | float, sigma: Array) -> Array:
@@ -178,10 +220,11 @@ def check_parameter(found: LensParameter, by: str) -> Check:
         by: RESIDUALS or IMAGES.
     """
     row, probability, (deg, cm) = threshold("lens"), found.probability, found.moved
-    status, (part, *_) = row.grade(probability), NAMES[found.name]
+    status, (part, *_) = row.grade(probability), _WORDS[found.name]
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
     if status != "PASS":
-        text += f": {row.advice}" + (f"; or run with --estimate {part}" if part else "")
+        advice = "correct the time stamps" if found.name == TIME else row.advice
+        text += f": {advice}" + (f"; or run with --estimate {part}" if part else "")
     check = row.describe(probability, status, text, name=f"{found.name} by the {by}: {row.name}")
     return replace(check, kind=KINDS[by][found.name])
 

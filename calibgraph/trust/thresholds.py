@@ -128,10 +128,10 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "Above half, it shows the priors more than the data."),
     # the lens, from the residuals and the images
     Threshold("lens", "probability of a wrong one", "at most", 0.005, 0.2, "share",
-              "Is focal length, principal point, distortion, fx / fy or skew wrong, so that the "
-              "camera is off by more than 0.5 deg or 10 cm?",
-              "The verdict's own cuts. By the posterior of a free lens, once from the residuals "
-              "and once from the images, and by `lens_wrong` etc.",
+              "Is focal length, principal point, distortion, fx / fy, skew or time of the images "
+              "wrong, so that the camera is off by more than 0.5 deg or 10 cm?",
+              "The verdict's own cuts. By the posterior of a free lens or clock, once from the "
+              "residuals and once from the images, and by `lens_wrong` etc.",
               "check the intrinsics, the image size, and that images are not undistorted twice, "
               "cropped, scaled or sheared"),
     Threshold("focal_sensitivity", "motion of the camera per 1 % of the focal length",
@@ -173,10 +173,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "at least", -0.05, -0.2, "share", "Do images and clouds belong together?",
               "KITTI 00: own clouds +0.4 and more, clouds one frame off -0.4 and less; about zero "
               "where the vehicle stands, which is no fault."),
-    Threshold("time_offset", "time offset", "at most", 0.1, 0.3, "intervals",
-              "Were images and clouds taken at the same time?",
-              "Of a frame interval: 10 and 30 cm at 10 Hz and 10 m/s.",
-              "correct the time stamps"),
     # while driving
     Threshold("disagreeing_frames", "share of the last frames that disagree with the estimate",
               "at most", 0.5, 1.0, "share", "Do recent frames agree with the tracked estimate?",
@@ -201,14 +197,14 @@ LIMITS: tuple[Limit, ...] = (
           "A pull within this of what a camera's own solution leaves open is zero."),
     Limit("lens_wrong", 20.0, "sigma", "The error of a wrong lens parameter, in standard "
           "deviations of a calibrated one: 0.2 % of the focal length, fx / fy and the skew, "
-          "0.002 focal lengths of the principal point, 0.002 of k1, or as the rig states."),
+          "0.002 focal lengths of the principal point, 0.002 of k1, 2 ms of the time of "
+          "an image, or as the rig states."),
     Limit("lens_wrong_share", 0.01, "share", "So many are taken for wrong."),
     Limit("lens_match_share", MATCH_SHARE, "share", "So much of a match's variance is taken to be "
           "shared by all: less cannot be told from a wrong lens."),
     Limit("lens_z_score", 3.0, "", "The lens is checked by the images only above this z-score "
           "against displaced extrinsics: at a wrong extrinsic it cannot be measured. KITTI 00 and "
           "the sample: wrong lenses left 3.2 and more."),
-    Limit("offset_sigmas", 3.0, "sigma", "A time offset counts beyond this."),
     Limit("competing_rotation", 0.3, "deg", "A competing solution this near, and as near as the "
           "next row, is the same solution."),
     Limit("competing_translation", 10.0, "cm", "See the row above."),

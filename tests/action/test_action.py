@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
-from calibgraph import Audit, CameraAudit, load_rig
+from calibgraph import Audit, CameraAudit, load_dataset, load_rig
 from calibgraph.audit import audit_summary
 from calibgraph.audit.result import AuditStatus
 from tests.audit.deployed import motion, with_camera_moved
@@ -112,7 +112,9 @@ def stand_in(folder: Path, status: AuditStatus, code: int) -> Path:
     """A folder with a ``python`` whose ``calibgraph check`` has found this at once."""
     xi, sigma = np.array([0, 0.02, 0, 0, 0, 0]), np.full(6, 0.002)
     left = CameraAudit(status, "turned about y\nby +1.15 deg | <b>", xi, sigma, 5 * sigma)
-    audit = Audit({"left_1": left, "blind": CameraAudit("OK", "nothing")}, None, 0.5, 10.0, 6)
+    cameras = {"left_1": left, "blind": CameraAudit("OK", "nothing")}
+    shown = load_dataset(SAMPLE).frames[0]
+    audit = Audit(cameras, None, load_rig(SAMPLE), shown, (str(SAMPLE),), 0.5, 10.0, 6)
     (folder / "audit.json").write_text(json.dumps(audit_summary(audit), indent=2))
     programs = folder / "programs"
     programs.mkdir()

@@ -31,8 +31,9 @@ def audit_with(*cameras: CameraAudit, lidar: LidarAudit | None = None) -> Audit:
     names = [*TRUTH.cameras][: len(cameras)]
     rig = TRUTH.model_copy(update={"cameras": {name: TRUTH.cameras[name] for name in names}})
     found = dict(zip(names, cameras, strict=True))
-    audit = Audit(found, lidar, 0.5, 10.0, 6, {"match": 1.5}, {"numpy": "2.0"})
-    return audit.of_recording(rig, calibgraph.load_dataset(SAMPLE, rig))
+    frame = calibgraph.load_dataset(SAMPLE, rig).frames[0]
+    numbers = 0.5, 10.0, 6, {"match": 1.5}, {"numpy": "2.0"}
+    return Audit(found, lidar, rig, frame, (str(SAMPLE),), *numbers)
 
 
 def page_of(audit: Audit, folder: Path) -> str:
@@ -93,17 +94,8 @@ def test_names_and_reasons_are_escaped(tmp_path: Path) -> None:
     assert "&lt;b&gt;x&amp;&#34;y&#39;" in text
 
 
-def test_numbers_alone_make_a_page_without_pictures(tmp_path: Path) -> None:
-    numbers = replace(audit_with(WRONG, NOTHING), deployed=None, shown=None, recording=())
-    text = page_of(numbers, tmp_path)
-    assert "<b>Pictures are left out:</b> the audit names no recording." in text
-    assert "data:image" not in text
-    assert text.count("<svg") == 2
-
-
 def test_images_that_are_gone_are_named(tmp_path: Path) -> None:
     audit = audit_with(WRONG)
-    assert audit.shown is not None
     gone = replace(audit, shown=replace(audit.shown, cloud_path=tmp_path / "gone.npy"))
     assert "gone.npy: no such file; check the path." in page_of(gone, tmp_path)
 

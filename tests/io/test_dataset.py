@@ -63,7 +63,6 @@ def test_a_rig_from_outside_replaces_the_datasets(pair: Rig) -> None:
 
 def test_neighbouring_clouds_show_the_motion(tmp_path: Path) -> None:
     """Scans of a room 0.1 s apart, 30 cm and 2 degrees on: exact but for their noise of 1 cm."""
-    pytest.importorskip("small_gicp")
     rng = np.random.default_rng(0)
     sides = rng.integers(0, 3, 20_000)
     room = rng.uniform([-20.0, -12.0, -2.0], [25.0, 15.0, 6.0], (20_000, 3))

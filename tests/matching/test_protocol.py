@@ -77,6 +77,18 @@ def guess(truth: Rig) -> Rig:
     return calibgraph.perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=0)
 
 
+def test_a_matcher_may_know_what_is_estimated_beside_the_pose() -> None:
+    class Knowing(Minimal):
+        def with_estimate(self, parts):  # noqa: ANN001, ANN202
+            other = Knowing()
+            other.rounds = 1 + len(parts)
+            return other
+
+    plain, knowing = (to_full_matcher(each) for each in (Minimal(), Knowing()))
+    assert plain.with_estimate(("focal",)) is plain
+    assert knowing.with_estimate(("focal", "offset")).rounds == 3
+
+
 def test_members_that_a_matcher_lacks_have_defaults(truth: Rig) -> None:
     full = to_full_matcher(Minimal())  # type: ignore[arg-type]
     assert (full.rounds, full.stage1) == (1, "pnp")

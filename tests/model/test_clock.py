@@ -19,7 +19,7 @@ from calibgraph import (
 )
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.matching.run import with_motion
-from calibgraph.model.clock import at_pixels, when_taken
+from calibgraph.model.clock import at_pixels, seen_at_rows, when_taken
 from calibgraph.simulation.rigs import rig_of
 
 TWISTS = np.array([[0.01, 0.02, 0.3, 8.0, 0.1, 0.0], [0.0, 0.0, -0.2, 12.0, 0.0, 0.1]])
@@ -59,6 +59,26 @@ def test_rows_below_the_middle_are_taken_later() -> None:
     camera, table = rig_with(readout_s=0.04).cameras["image_2"], rows(TWISTS[[1, 1]])
     moved = at_pixels(camera, table).points_lidar_m - table.points_lidar_m
     assert moved[0, 0] > 0 > moved[1, 0]  # ahead: a later point is nearer
+
+
+def test_points_of_a_rolling_shutter_are_seen_at_their_rows() -> None:
+    """To a tenth of a pixel where a table with the pixels has them."""
+    camera = rig_with(readout_s=0.04).cameras["image_2"]
+    points = np.array([[6.0, 2.0, -1.2], [12.0, -3.0, 1.5], [8.0, 0.5, 0.0]])
+    twist, T = TWISTS[0], camera.T_camera_lidar
+    seen = seen_at_rows(camera, np.repeat(points[:, None], 2, axis=1), twist)
+    np.testing.assert_array_equal(seen[:, 0], seen[:, 1])
+    pixels, _ = camera.lens.project(seen[:, 0] @ T[:3, :3].T + T[:3, 3])
+    table = Correspondences.from_arrays(
+        camera="image_2", frame=[0, 0, 0], pixels_px=pixels, points_lidar_m=points,
+        twist_per_s=np.tile(twist, (3, 1)),
+    )  # fmt: skip
+    there = at_pixels(camera, table).points_lidar_m
+    expected, _ = camera.lens.project(there @ T[:3, :3].T + T[:3, 3])
+    still, _ = camera.lens.project(points @ T[:3, :3].T + T[:3, 3])
+    assert np.abs(expected - still).max() > 4.0
+    np.testing.assert_allclose(pixels, expected, atol=0.1)
+    assert seen_at_rows(camera, points[:, None], None).shape == (3, 1, 3)
 
 
 def test_without_motion_or_times_nothing_moves() -> None:

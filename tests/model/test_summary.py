@@ -150,7 +150,7 @@ def test_a_failed_camera_has_no_error_bar_and_no_advice_about_it() -> None:
 
 
 def test_a_doubt_without_a_check_beyond_its_limit_names_the_nearest_one() -> None:
-    checks = (threshold("competing_solution").check(0.24), threshold("time_offset").check(0.01))
+    checks = (threshold("competing_solution").check(0.24), threshold("sigma_rotation").check(0.01))
     summary = summarize({"left": Verdict(checks, ErrorProbability(0.02))})
     (reason,) = summary.reasons
     assert (reason.status, reason.cause) == ("WARN", "matches")

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph import Calibration, Check, Rig, Verdict, simulate_correspondences
+from calibgraph.model.lens_estimate import LensEstimate
 from tests.conftest import ROOT, stereo_relative_pose
 from tests.report.conftest import solve_simulated, write_page
 
@@ -97,6 +98,18 @@ def test_warnings_about_the_data_are_in_the_verdict(
 ) -> None:
     text = write_page(replace(solved_pair, warnings=("left: blurred <&>",)), tmp_path)
     assert "left: blurred &lt;&amp;&gt;" in text.split("</section>")[0]
+
+
+def test_a_new_lens_and_the_old_one_are_in_the_verdict(
+    solved_pair: Calibration, tmp_path: Path
+) -> None:
+    focal = LensEstimate("focal", "px", 717.66, 2.13, 718.86, 14.4, "z", 0.4)
+    late = LensEstimate("offset", "s", 0.0203, 0.0028, 0.0, 0.05, "z", 0.4)
+    text = write_page(replace(solved_pair, lens={"left": (focal, late)}), tmp_path)
+    line = (
+        "left: focal 717.7 +- 2.1 px, before 718.9 px; offset 0.0203 +- 0.0028 s, before 0.0000 s."
+    )
+    assert line in text.split("</section>")[0]
 
 
 def test_the_title_names_the_recording_and_the_date(

@@ -71,27 +71,19 @@ def test_the_relative_pose_is_found_without_noise(
     a, b = list(truth.cameras)[:2]
     moved = perturb(truth, rotation_deg=1.0, translation_m=0.1, seed=1)
     guess = truth.moved_to({b: moved.T_camera_lidar[b]})
-    for kind in ("point", "surface"):
-        terms = pair_terms(guess, table, Config(), kind=kind)
-        assert {(term.a, term.b) for term in terms} == {(a, b), (b, a)}
-        # B's features have ranges by B's guess where points are fixed: one direction is exact.
-        exact = terms if kind == "surface" else terms[:1]
-        degrees, centimetres = pair_error(solve_pair(guess, exact, 1e-7), truth)
-        assert degrees < 1e-5 and centimetres < 1e-4
+    terms = pair_terms(guess, table, Config())
+    assert {(term.a, term.b) for term in terms} == {(a, b), (b, a)}
+    degrees, centimetres = pair_error(solve_pair(guess, terms, 1e-7), truth)
+    assert degrees < 1e-5 and centimetres < 1e-4
 
 
-def test_a_wrong_pose_of_a_spoils_points_but_not_surfaces(pair: Rig) -> None:
+def test_a_wrong_pose_of_a_does_not_spoil_the_relative_pose(pair: Rig) -> None:
     """A is 1.5 deg and 30 cm off, and only loosely held there."""
     table = simulated_pairs(pair)
     guess = perturb(pair, rotation_deg=1.5, translation_m=0.3, seed=3)
-    errors = {
-        kind: pair_error(
-            solve_pair(guess, pair_terms(guess, table, Config(), kind=kind), held), pair
-        )
-        for kind, held in (("point", 1e-7), ("surface", 0.03))
-    }
-    assert errors["surface"][0] < 0.02 and errors["surface"][1] < 0.5
-    assert errors["point"][1] > 4 * errors["surface"][1]
+    terms = pair_terms(guess, table, Config())
+    degrees, centimetres = pair_error(solve_pair(guess, terms, 0.03), pair)
+    assert degrees < 0.02 and centimetres < 0.5
 
 
 def test_features_without_a_surface_give_the_direction(pair: Rig) -> None:

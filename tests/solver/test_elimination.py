@@ -28,7 +28,7 @@ from calibgraph.graph.variables import (
     paired_key,
 )
 from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
-from calibgraph.solver.camera_pairs import Kind, pair_terms
+from calibgraph.solver.camera_pairs import pair_terms
 from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.joint import solve_joint
@@ -184,11 +184,10 @@ def with_correlations(model: LatentPoseModel) -> LatentPoseModel:
     return replace(model, components=components)
 
 
-@pytest.mark.parametrize("kind", ["surface", "point"])
-def test_a_pair_of_which_the_gate_has_left_nothing_takes_no_part(pair: Rig, kind: Kind) -> None:
+def test_a_pair_of_which_the_gate_has_left_nothing_takes_no_part(pair: Rig) -> None:
     table, matches = table_of(pair, 6, False, []), simulated_pairs(pair, count=40)
     solution = solve_joint(pair, table, Config(learnt_weights=False), camera_matches=matches)
-    term = pair_terms(pair, matches, Config(), kind=kind)[0].with_sigma(1.0)
+    term = pair_terms(pair, matches, Config())[0].with_sigma(1.0)
     empty = term.select(np.zeros(len(term.frame), np.bool_))
     more = replace(solution.inliers, pairs=(*solution.inliers.pairs, empty))
     found, expected = (
@@ -199,12 +198,9 @@ def test_a_pair_of_which_the_gate_has_left_nothing_takes_no_part(pair: Rig, kind
     np.testing.assert_array_equal(found.fit.covariance, expected.fit.covariance)
 
 
-@pytest.mark.parametrize("kind", ["surface", "point"])
-def test_the_factor_of_a_pair_and_its_cloud_is_that_of_the_moved_cameras(
-    pair: Rig, kind: Kind
-) -> None:
+def test_the_factor_of_a_pair_and_its_cloud_is_that_of_the_moved_cameras(pair: Rig) -> None:
     """Its error is that of the pair seen from the cloud, its Jacobian that by differences."""
-    term = pair_terms(pair, simulated_pairs(pair), Config(), kind=kind)[0]
+    term = pair_terms(pair, simulated_pairs(pair), Config())[0]
     cloud = gtsam.Pose3.Expmap(np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.1]))
     poses = [to_T_lidar_camera(pair.T_camera_lidar[name]) for name in (term.a, term.b)]
     values = gtsam.Values()

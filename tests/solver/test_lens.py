@@ -210,6 +210,17 @@ def test_the_rig_gets_the_lens_and_without_the_flag_keeps_its_own(
         assert "uncertain lenses" in found.error_sources[name].translation
 
 
+def test_a_result_is_a_rig_whose_lens_is_the_mean_of_the_next_prior(
+    drawn: tuple[Rig, Correspondences],
+) -> None:
+    truth, table = drawn
+    config = Config(estimate=("focal",))
+    first = solve(put_lens_error(truth, "focal", 0.02), table, config)
+    again = solve(first.rig, table, config)
+    for name, (one,) in again.lens.items():
+        assert one.prior == pytest.approx(first.lens[name][0].value, rel=1e-9)
+
+
 def test_refuses_what_has_no_lens_or_no_error_model(drawn: tuple[Rig, Correspondences]) -> None:
     truth, table = drawn
     with pytest.raises(ValueError, match="preset auto"):

@@ -105,3 +105,22 @@ def test_sigmas_are_the_scatter_of_the_values(outliers: int) -> None:
         values.append(fit.free(0).values[0])
         sigmas.append(fit.free(0).sigmas[0])
     assert 0.7 < np.mean(sigmas) / np.sqrt(np.mean(np.square(values))) < 1.5
+
+
+def test_what_is_considered_widens_an_unknown_by_its_scatter() -> None:
+    """Over 200 draws, within a fifth: four times the scatter of a standard deviation (5 %)."""
+    rng = np.random.default_rng(9)
+    camera, points = make_camera(), points_in_front(rng, 300)
+    exact, field = project_with_jacobian(camera, points)[0], rng.standard_normal((1, 2, 300))
+    fields = np.concatenate([field, 0.5 * field + 0.1 * rng.standard_normal((2, 2, 300))])
+    values, sigmas = [], []
+    for _ in range(200):
+        shifts = np.tensordot(rng.standard_normal(2), fields[1:], axes=1).T
+        table = table_of(exact + shifts + 0.1 * rng.standard_normal((300, 2)), points, 30)
+        rows = np.argsort(table.frame, kind="stable")
+        fit = fit_camera(camera, block_of(camera, table), fields[:, :, rows], considered=2)
+        assert fit is not None
+        values.append(fit.free(0).values[0])
+        sigmas.append(fit.free(0).sigmas[0])
+    assert np.mean(sigmas) == pytest.approx(np.std(values), rel=0.2)
+    assert np.mean(sigmas) > 0.6  # sqrt(2) / 2 of what is considered

@@ -133,7 +133,7 @@ def test_frames_of_a_dataset_have_their_places(
 ) -> None:
     """A restart looks again at the first frames of all places, and at those since the newest."""
     stated = [replace(t, metadata={"place_variance": 8.0}) for t in world.tables]
-    items = [StreamFrame(n, None, stated[n]) for n in range(start, FRAMES)]
+    items = [StreamFrame(n, stated[n]) for n in range(start, FRAMES)]
     finder = Odometer()
     found = list(with_places(items, recorded, finder, known))  # type: ignore[arg-type]
     names = [item.table.metadata["place"] for item in found if isinstance(item, StreamFrame)]
@@ -148,11 +148,11 @@ def test_a_restart_looks_again_at_few_frames(
     monkeypatch.setattr(dataset_frames, "MOST_AGAIN", 2)
     stated = replace(world.tables[8], metadata={"place_variance": 8.0})
     finder = Odometer()
-    list(with_places([StreamFrame(8, None, stated)], recorded, finder, ("0",)))  # type: ignore[arg-type]
+    list(with_places([StreamFrame(8, stated)], recorded, finder, ("0",)))  # type: ignore[arg-type]
     assert finder.shown == [6, 7, 8]
 
 
 def test_without_an_error_of_places_no_image_is_looked_at(world: World, recorded: Dataset) -> None:
-    finder, items = Odometer(), [StreamFrame(0, None, world.tables[0])]
+    finder, items = Odometer(), [StreamFrame(0, world.tables[0])]
     assert list(with_places(items, recorded, finder, ())) == items  # type: ignore[arg-type]
     assert not finder.shown

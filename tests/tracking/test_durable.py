@@ -52,7 +52,7 @@ def test_a_line_is_given_once_its_update_is_on_disk(world: World, tmp_path: Path
         written.append(line)
 
     written: list[str] = []
-    frames = [StreamFrame(int(table.frame[0]), None, table) for table in world.tables[:7]]
+    frames = [StreamFrame(int(table.frame[0]), table) for table in world.tables[:7]]
     with DurableCalibrator(tmp_path / "state", rig) as calibrator:
         counts = follow(
             frames, calibrator, History(), every=1, stop=lambda: False, write=write, notify=print
@@ -72,8 +72,7 @@ def test_a_refused_update_changes_neither_the_tracker_nor_the_disk(
         concatenate([good, world.tables[8]]),
         good.select(slice(0, 0)),
         replace(good, stamp_ns=stamps),
-        replace(good, metadata={"of": object()}),
-        replace(good, metadata={"of": np.float32(1)}),
+        replace(good, metadata={"place": 1.5}),
     )
     with DurableCalibrator(tmp_path, world.guess) as calibrator:
         for table in world.tables[:6]:
@@ -154,17 +153,6 @@ def test_a_damaged_database_is_refused_in_one_line(
     assert f"{path}: is damaged" in err and "choose another folder" in err
     assert err.count("\n") == 1
     assert files_in(tmp_path / "state") == before
-
-
-def test_a_state_of_the_earlier_layout_is_refused_in_one_line(
-    world: World, call: Call, tmp_path: Path
-) -> None:
-    (tmp_path / "state").mkdir()
-    (tmp_path / "state" / "snapshot-000001.state").write_bytes(b"calibgraph-tracker/1\nS")
-    code, out, err = call("track", world.rig, world.source, "--out", tmp_path)
-    assert (code, out) == (2, "")
-    assert "is state of the earlier layout" in err and "choose another folder" in err
-    assert err.count("\n") == 1
 
 
 def test_a_state_of_another_version_is_refused_in_one_line(

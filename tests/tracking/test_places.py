@@ -40,8 +40,8 @@ from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.contradictions import pose_priors
 from calibgraph.tracking.frame_order import PLACE, with_place
 from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model, quadratics_of
-from calibgraph.tracking.place_shift import shift_covariance
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
+from calibgraph.tracking.steps import shift_covariance
 from calibgraph.tracking.stream_lines import frames_of_lines
 from calibgraph.tracking.streams import Refused, StreamFrame
 from calibgraph.tracking.window import Window

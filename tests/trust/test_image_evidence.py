@@ -107,7 +107,6 @@ def test_clouds_of_another_time_are_shown_by_cameras_that_agree_with_clouds_at_a
     other = replace(good, displaced_z_score=displaced_z_score, pair_offset=-1, pair_margin=-0.6)
     evidence = {"good": good, "other": other}
     monkeypatch.setattr(image_checks, "measure_image_evidence", lambda *_, **__: evidence)
-    monkeypatch.setattr(image_checks, "time_offsets", lambda *_: {})
     checks = check_images(dataset, dataset.rig, EMPTY)
     found = {check.name: check.status for check in checks["good"]}
     assert found.get("clouds of another time", "PASS") == status

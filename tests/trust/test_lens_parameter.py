@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calibgraph.model.verdict import FAIL_ABOVE
+from calibgraph.solver.linear_fit import Freed
 from calibgraph.trust.lens_parameter import (
     IMAGES,
     RESIDUALS,
@@ -13,6 +14,8 @@ from calibgraph.trust.lens_parameter import (
     check_parameter,
     probability_of_lens,
 )
+from calibgraph.trust.thresholds import limit
+from tests.conftest import make_camera
 
 
 def estimate(name: str, size: float, sigma: float, moved_cm: float) -> LensParameter:
@@ -39,6 +42,35 @@ def test_the_probability_grows_with_the_significance() -> None:
         estimate("distortion", 0.03, 0.03 / sigmas, 30.0).probability for sigmas in (1, 3, 5, 9)
     ]
     assert found == sorted(found) and found[0] < 0.01 and found[-1] > 0.9  # noqa: PLR2004
+
+
+def freed(*values: float, covariance: list[list[float]]) -> Freed:
+    ones = np.ones(len(values))
+    return Freed(np.zeros(6), np.array(values), np.array(covariance), np.ones((6, len(ones))), ones)
+
+
+@pytest.mark.parametrize("other", [0.0, -2.0, -5.0, 8.0, 30.0])
+def test_the_other_parameter_is_usual_or_wrong(other: float) -> None:
+    """As by the sum of the joint density over a grid of both."""
+    covariance = np.array([[3.0, -4.0], [-4.0, 14.0]])
+    fit = freed(other, 10.0, covariance=covariance.tolist())
+    found = LensParameter.of("distortion", make_camera(), fit, 1)
+
+    share, wrong, grid = limit("lens_wrong_share"), limit("lens_wrong"), np.linspace(-90, 90, 1801)
+    steps = np.stack(np.meshgrid(grid - other, grid - 10.0, indexing="ij"), axis=-1)
+    fits = np.exp(-np.einsum("xyi,ij,xyj->xy", steps, np.linalg.inv(covariance), steps) / 2)
+    prior = (1 - share) * np.exp(-(grid**2) / 2)
+    prior += share / wrong * np.exp(-((grid / wrong) ** 2) / 2)
+    density = (prior[:, None] * fits).sum(axis=0)
+    mean = density @ grid / density.sum()
+    sigma = math.sqrt(density @ (grid - mean) ** 2 / density.sum())
+    np.testing.assert_allclose([found.values[0], found.sigmas[0]], [mean, sigma], rtol=1e-6)
+
+
+def test_an_unobservable_other_parameter_leaves_an_estimate_as_it_is() -> None:
+    fit = freed(0.3, 10.0, covariance=[[1e12, 0.0], [0.0, 14.0]])
+    found = LensParameter.of("distortion", make_camera(), fit, 1)
+    np.testing.assert_allclose([found.values[0], found.sigmas[0] ** 2], [10.0, 14.0])
 
 
 def test_a_shape_that_no_lens_has_counts_though_it_hardly_moves_the_camera() -> None:

@@ -14,6 +14,7 @@ from calibgraph.matching.camera_pairs.features import Features, features_of, mat
 from calibgraph.matching.camera_pairs.geometry import agree_on_epipolar_geometry
 from calibgraph.matching.camera_pairs.surfaces import planes_at
 from calibgraph.model.camera_matches import CameraMatches, concatenate_camera_matches
+from calibgraph.model.clock import when_taken
 from calibgraph.model.geometry import planes_in_lidar
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
@@ -101,6 +102,8 @@ def _match_frame(
 def with_surfaces(table: CameraMatches, dataset: Dataset, rig: Rig) -> CameraMatches:
     """The same matches with the LiDAR's surfaces next to them, under the rig's extrinsics.
 
+    The surfaces are in the LiDAR frame when the image is taken, at the offset of the rig.
+
     Args:
         table: of any pairs and frames.
         dataset: clouds.
@@ -129,9 +132,9 @@ def _planes_of_frame(
         if len(rows):
             camera = rig.cameras[name]
             rays = unproject(camera.lens, table.pixels_px[of_frame[rows], sides])[0]
-            T = camera.T_camera_lidar
+            T = when_taken(camera, frame.twist_per_s).T_camera_lidar
             in_camera = planes_at(rays, cloud @ T[:3, :3].T + T[:3, 3])
-            planes[rows, sides] = planes_in_lidar(in_camera, T)
+            planes[rows, sides] = planes_in_lidar(in_camera, camera.T_camera_lidar)
     return of_frame, planes
 
 

@@ -22,7 +22,7 @@ from calibgraph.matching.cmrnext.image_results import (
 from calibgraph.matching.cmrnext.inputs import View
 from calibgraph.matching.cmrnext.network import torch_device
 from calibgraph.matching.protocol import Start
-from calibgraph.model.config import Config, Stage1Source
+from calibgraph.model.config import Config, LensPart, Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Rig
@@ -89,6 +89,10 @@ class CmrNextMatcher:
         loaded = {path: self._load(path) for path in dict.fromkeys(map(str, weights))}
         self.networks = [loaded[str(path)] for path in weights]
         self.rounds = len(self.networks) if start_from == "joint" else 1
+
+    def with_estimate(self, parts: Sequence[LensPart]) -> "CmrNextMatcher":  # noqa: ARG002
+        """The same matcher: each of its frames has a pose of its own."""
+        return self
 
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress

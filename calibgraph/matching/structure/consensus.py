@@ -1,5 +1,7 @@
 """Pose consensus: the pose at which the shifts of all groups agree best."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from calibgraph.arrays import Array
@@ -9,9 +11,12 @@ from calibgraph.matching.structure.shift_scores import ShiftScores
 from factors.compiled import compiled
 
 SAMPLES, STEPS = 400, 14  # of a search
+MOST_SIGMAS = 3.0  # of its prior, by which a search displaces a further unknown
+MOST_GROUPS = 0.9  # share of the groups
 SAME_MAXIMUM = 1e-3  # relative difference of two searches' ends at the same maximum
 PRIOR = 6.0
 """Penalty, in standard deviations of chance agreement, of a twist sqrt(2 / 6) of the box from 0."""
+WEAK_PRIOR = 0.5  # the same of further unknowns, which have a prior of their own in the graph
 
 
 def z_score(scores: ShiftScores, unknowns: Array) -> float:
@@ -20,18 +25,43 @@ def z_score(scores: ShiftScores, unknowns: Array) -> float:
 
 
 def find_consensus(scores: ShiftScores, level: Level, *, seed: int) -> tuple[Array, float]:
-    """Maximise the summed score over twists, less a weak prior on their size.
+    """Maximise the summed score over twists and further unknowns, less a weak prior on their size.
 
     Returns:
-        (6,) twist (rotation [rad], translation [m]); its z-score.
+        (6 + k,) twist (rotation [rad], translation [m]) and further unknowns; their z-score.
     """
+    follows = _compensating(scores)
+    fields = scores.jacobian[:, :, 6:] + scores.jacobian[:, :, :6] @ follows
+    apart = replace(scores, jacobian=np.dstack([scores.jacobian[:, :, :6], fields]))
     half_widths = np.repeat([level.rotation_rad, level.translation_m], 3)
-    twist = maximize_score(scores, half_widths, seed=seed, searches=level.searches)
-    return twist, z_score(scores, twist)
+    half_widths = np.append(half_widths, _within_reach(apart))
+    priors = np.repeat([PRIOR, WEAK_PRIOR], [6, len(half_widths) - 6])
+    unknowns = maximize_score(apart, half_widths, seed=seed, searches=level.searches, prior=priors)
+    unknowns[:6] += follows @ unknowns[6:]
+    return unknowns, z_score(scores, unknowns)
+
+
+def _compensating(scores: ShiftScores) -> Array:
+    """(6, k) twists that make up for a unit of each further unknown, as far as a pose can."""
+    columns = scores.jacobian.reshape(-1, scores.jacobian.shape[2])
+    return np.asarray(-np.linalg.lstsq(columns[:, :6], columns[:, 6:], rcond=None)[0])
+
+
+def _within_reach(scores: ShiftScores) -> Array:
+    """(k,) half-widths of the further unknowns: what moves most groups within their grids."""
+    reach = (scores.grids.shape[1] - 1) // 2
+    steps = np.abs(scores.jacobian[:, :, 6:]).max(axis=1)
+    most = np.quantile(steps, MOST_GROUPS, axis=0) if len(steps) else np.zeros(steps.shape[1])
+    return np.asarray(np.minimum(MOST_SIGMAS, reach / np.maximum(most, 1e-9)))
 
 
 def maximize_score(
-    scores: ShiftScores, half_widths: Array, *, seed: int, searches: int = 3, prior: float = PRIOR
+    scores: ShiftScores,
+    half_widths: Array,
+    *,
+    seed: int,
+    searches: int = 3,
+    prior: float | Array = PRIOR,
 ) -> Array:
     """Maximise the summed score over as many unknowns as the Jacobian has columns.
 
@@ -61,13 +91,13 @@ def sum_scores(scores: ShiftScores, unknowns: Array) -> Array:
 
 
 def _maximize_once(
-    scores: ShiftScores, half_widths: Array, prior: float, rng: np.random.Generator
+    scores: ShiftScores, half_widths: Array, prior: float | Array, rng: np.random.Generator
 ) -> tuple[Array, float]:
     """One cross-entropy search: the unknowns and their penalised score."""
     weight = 0.5 * prior * scores.chance_sigma
 
     def penalised(unknowns: Array) -> Array:
-        penalty = weight * ((unknowns / half_widths) ** 2).sum(axis=1)
+        penalty = (weight * (unknowns / half_widths) ** 2).sum(axis=1)
         return np.asarray(sum_scores(scores, unknowns) - penalty)
 
     return maximize(

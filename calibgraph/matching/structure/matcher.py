@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from copy import copy
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
+from calibgraph.graph.lens import LensVariable
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
 from calibgraph.matching.protocol import Start
@@ -27,14 +30,16 @@ from calibgraph.matching.structure.shift_scores import (
     score_frame,
 )
 from calibgraph.matching.structure.window_weights import load_window_network, window_network
-from calibgraph.model.clock import when_taken
-from calibgraph.model.config import Stage1Source
+from calibgraph.model.clock import clock_of
+from calibgraph.model.config import LensPart, Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import STAGE1, MatcherFindings
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress
+from calibgraph.solver.camera_twist import free_fields_px
+from factors import displace
 
 _TRACKING_ROUNDS = (2, 4)
 _ROUND_AFTER_SEARCH = 3
@@ -95,9 +100,16 @@ class StructureMatcher:
         self.most_frames = most_frames
         own = None if window_weights is None else load_window_network(window_weights)
         self.levels = levels if own is None else [replace(level, network=own) for level in levels]
+        self.estimate: tuple[LensPart, ...] = ()
         self.rounds = len(levels)
         self._cache = FrameCache()
         self._backwards = False
+
+    def with_estimate(self, parts: Sequence[LensPart]) -> "StructureMatcher":
+        """The matcher that searches parts of lens and clock together with the pose."""
+        other = copy(self)
+        other.estimate, other._cache = tuple(parts), FrameCache()
+        return other
 
     @property
     def tracking_rounds(self) -> tuple[int, ...]:
@@ -182,6 +194,10 @@ class StructureMatcher:
         return cache
 
     def _first_round(self, candidates: Mapping[str, Located]) -> int:
+        if (
+            self.estimate
+        ):  # a search at the lens and clock of the rig ends where these are made up for
+            return 0
         confident = all(c.accepted and c.z_score >= CONFIDENT for c in candidates.values())
         return min(_ROUND_AFTER_SEARCH, self.rounds - 1) if confident else 0
 
@@ -197,10 +213,11 @@ class StructureMatcher:
 
         def score(frame: Frame, name: str, camera: Camera) -> ShiftScores:
             gray, cloud = cache.image(frame, name, camera), cache.cloud(frame)
-            camera = when_taken(camera, frame.twist_per_s)
-            return score_frame(
-                gray, cloud, camera, level, frame=frame.index, max_windows=max_windows
+            twist, number = frame.twist_per_s, frame.index
+            scores = score_frame(
+                gray, cloud, camera, level, frame=number, max_windows=max_windows, twist_per_s=twist
             )
+            return self._with_free(scores, camera, twist)
 
         waiting: dict[str, deque[Future[ShiftScores]]] = {name: deque() for name in rig.cameras}
         add = deque.appendleft if self._backwards else deque.append
@@ -209,6 +226,18 @@ class StructureMatcher:
                 add(waiting[name], cores.submit(score, frame, name, camera))
         self._backwards = not self._backwards
         return waiting
+
+    def _with_free(
+        self, scores: ShiftScores, camera: Camera, twist_per_s: Array | None
+    ) -> ShiftScores:
+        """Scores with what is free of lens and clock."""
+        if not self.estimate:
+            return scores
+        free, points_m = LensVariable.of(camera, self.estimate).free, scores.points_lidar_m
+        if twist_per_s is not None:
+            times_s = clock_of(camera).times_s(scores.pixels_px[:, 1])
+            points_m = displace(points_m, twist_per_s, -times_s)
+        return scores.with_unknowns(free_fields_px(camera, free, points_m, twist_per_s))
 
     def _match_camera(
         self, level: Level, name: str, waiting: deque[Future[ShiftScores]]
@@ -219,8 +248,8 @@ class StructureMatcher:
         finally:  # after an error in one frame, the others are not needed
             for future in waiting:
                 future.cancel()
-        twist, z_score = find_consensus(scores, level, seed=self.seed)
-        table = extract_correspondences(scores, twist, name, min_quality=level.min_quality)
+        unknowns, z_score = find_consensus(scores, level, seed=self.seed)
+        table = extract_correspondences(scores, unknowns, name, min_quality=level.min_quality)
         return table, z_score
 
     def _metadata(self, round_index: int, z_scores: Mapping[str, float]) -> dict[str, Any]:

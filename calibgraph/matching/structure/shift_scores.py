@@ -17,6 +17,7 @@ from calibgraph.matching.structure.visibility import find_in_view, find_places, 
 from calibgraph.matching.structure.window_weights import window_network
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.memory import mmap_zeros
+from calibgraph.model.clock import seen_at_rows, when_taken
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import project_with_jacobian
 
@@ -38,8 +39,8 @@ class ShiftScores:
 
     Attributes:
         grids: (g, s, s) score by shift [v, u], from -reach to reach steps; the mean is zero.
-        jacobian: (g, 2, 6) derivative of the shift in steps (u, v) by the twist xi = (rotation
-            [rad], translation [m]) of T_camera_lidar = exp(xi) estimate.
+        jacobian: (g, 2, 6 + k) derivative of the shift in steps (u, v) by the twist xi = (rotation
+            [rad], translation [m]) of T_camera_lidar = exp(xi) estimate, and by further unknowns.
         points_lidar_m: (g, 3) each group's mean point, in the LiDAR frame.
         pixels_px: (g, 2) where it projects at the estimate.
         frame: (g,) the number of its frame.
@@ -62,29 +63,48 @@ class ShiftScores:
         variances = [part.var(axis=(1, 2), dtype=np.float64) for part in parts]
         return float(np.sqrt(np.concatenate(variances).sum()))
 
+    def with_unknowns(self, fields_px: Array) -> "ShiftScores":
+        """The same scores, with (k, 2, g) derivatives of the pixels by further unknowns."""
+        columns = fields_px.transpose(2, 1, 0) * self.steps_per_px[:, None]
+        return replace(self, jacobian=np.concatenate([self.jacobian, columns], axis=2))
 
-def score_frame(
-    gray: Gray, cloud: PreparedCloud, camera: Camera, level: Level, *, frame: int, max_windows: int
+
+def score_frame(  # noqa: PLR0913 - what is scored, and how
+    gray: Gray,
+    cloud: PreparedCloud,
+    camera: Camera,
+    level: Level,
+    *,
+    frame: int,
+    max_windows: int,
+    twist_per_s: Array | None = None,
 ) -> ShiftScores:
-    """Score one image against one cloud, about the camera's estimated pose."""
+    """Score one image against one cloud, about the camera's estimated pose.
+
+    With the twist of the LiDAR, (6,), when the camera takes it.
+    """
+    camera = when_taken(camera, twist_per_s)
     image, scale = downscale_log_gray(gray, camera, level.step_rad, level.blur_steps)
     windows = select_windows(cloud, camera, level, max_windows=max_windows)
     T, viewpoint_m = camera.T_camera_lidar, cloud.viewpoint_lidar_m(camera)
     centres_lidar_m = windows.rays_m[:, 0] + viewpoint_m
     kept, group, groups = group_windows(centres_lidar_m @ T[:3, :3].T + T[:3, 3], level.group_rad)
     windows, centres_lidar_m = windows.select(kept), centres_lidar_m[kept]
-    places = find_places(windows.rays_m, viewpoint_m, camera, scale)
+    rays_m, seen_m = windows.rays_m, centres_lidar_m
+    if twist_per_s is not None and camera.readout_s:
+        moved_m = seen_at_rows(camera, rays_m + viewpoint_m, twist_per_s)
+        rays_m, seen_m = (moved_m - viewpoint_m).astype(np.float32), moved_m[:, 0]
+    places = find_places(rays_m, viewpoint_m, camera, scale)
     reach = int(np.ceil(level.reach_rad * camera.lens.pixels_per_rad * scale.max()))
     reach = max(reach, MIN_REACH_STEPS)
     grids: Grids = mmap_zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
     _add_scores(grids, image, places, windows, group, likelihood=level.fine)
     counts = np.bincount(group, minlength=groups)
-    centres = _mean_by_group(centres_lidar_m, group, counts)
-    pixels_px, jacobian_px = project_with_jacobian(camera, centres)
+    pixels_px, jacobian_px = project_with_jacobian(camera, _mean_by_group(seen_m, group, counts))
     return ShiftScores(
         grids=grids,
         jacobian=jacobian_px * scale[:, None],
-        points_lidar_m=centres,
+        points_lidar_m=_mean_by_group(centres_lidar_m, group, counts),
         pixels_px=pixels_px,
         frame=np.full(groups, frame, np.int64),
         weights=np.bincount(group, windows.weight, minlength=groups).astype(np.float64),

@@ -68,7 +68,6 @@ def test_poses_correct_them(bag: tuple[Path, list[np.ndarray]], motion: str) -> 
 
 
 def test_registration_of_neighbours_corrects_them(bag: tuple[Path, list[np.ndarray]]) -> None:
-    pytest.importorskip("small_gicp")
     assert max(errors_m(bag, "scans")) < 0.01  # surfaces without noise, in voxels of 0.25 m
 
 

@@ -17,9 +17,10 @@ def make_grids(peaks: np.ndarray, reach: int = 12, sigma: float = 2.0) -> np.nda
 
 
 def make_scores(twist: np.ndarray, *, outlier_share: float, seed: int = 0) -> ShiftScores:
-    """Groups whose peaks a twist explains, but for a share that peak anywhere."""
+    """Groups whose peaks a twist explains, and further unknowns, but for a share of outliers."""
     rng = np.random.default_rng(seed)
-    jacobian = rng.uniform(-1, 1, (300, 2, 6)) * [200, 200, 200, 40, 40, 40]
+    units = np.append([200, 200, 200, 40, 40, 40], np.full(len(twist) - 6, 4))
+    jacobian = rng.uniform(-1, 1, (300, 2, len(twist))) * units
     shifts = jacobian @ twist
     outlier = rng.random(300) < outlier_share
     shifts[outlier] = rng.uniform(-12, 12, (np.count_nonzero(outlier), 2))

@@ -19,6 +19,18 @@ def test_consensus_finds_the_twist_among_outliers() -> None:
     assert z_score > 15
 
 
+def test_further_unknowns_are_found_with_the_twist() -> None:
+    """Also one that a translation beyond the search makes up for: 3 m ahead at 40 steps per m."""
+    truth = np.array([0.01, -0.015, 0.008, 0.05, -0.08, 0.06, 1.0, 0.0])
+    scores = make_scores(truth, outlier_share=0.5)
+    jacobian = scores.jacobian.copy()
+    jacobian[:, :, 7] = 60.0 * scores.jacobian[:, :, 3] / 40.0 + 0.02 * scores.jacobian[:, :, 7]
+    found, z_score = find_consensus(replace(scores, jacobian=jacobian), LEVELS[0], seed=0)
+    assert np.abs(jacobian @ (found - truth)).max() < 1.0
+    assert abs(found[6] - 1.0) < 0.1
+    assert z_score > 15
+
+
 def test_consensus_of_outliers_alone_has_a_low_z_score() -> None:
     scores = make_scores(np.zeros(6), outlier_share=1.0)
     _, z_score = find_consensus(scores, LEVELS[0], seed=0)

@@ -1,8 +1,6 @@
-"""What all frames until now show of each camera, all matches taken for independent."""
+"""Sums over epochs, older ones discounted by the random walk of a camera that drifts."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
 
 import numpy as np
 
@@ -14,28 +12,17 @@ from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums
 
 
-def posterior(state: State, before: int | None = None) -> Sums:
-    """(n,) sums over all frames, or those before a frame's number."""
-    return closed_posterior(state, before) + _until(state.epochs[-1], before)
+def sum_epochs(state: State, before: int | None = None) -> Sums:
+    """(n,) over all frames, or those before a frame's number."""
+    return sum_closed_epochs(state, before) + _until(state.epochs[-1], before)
 
 
-def closed_posterior(state: State, before: int | None = None) -> Sums:
+def sum_closed_epochs(state: State, before: int | None = None) -> Sums:
     """The same without the frames of the open epoch."""
-    sums = _summaries(state)
+    sums = Sums.stack([one.summary.selected for one in state.cameras])
     for epoch in state.epochs[:-1]:
         sums = _after_epoch(state, sums + _until(epoch, before), epoch)
     return sums
-
-
-def posteriors_before_epochs(state: State) -> Iterator[tuple[int, Sums]]:
-    """Per live epoch but the first, its place and the sums over the frames before it."""
-    sums = _summaries(state)
-    for place, epoch in enumerate(state.epochs[:-1]):
-        sums = _after_epoch(state, sums + epoch.sums, epoch)
-        before = sums
-        for later in state.epochs[place + 1 : -1]:
-            before = _after_epoch(state, before, later)
-        yield place + 1, before
 
 
 def split_halves(state: State) -> Sums:
@@ -62,10 +49,6 @@ def estimates_of_halves(state: State, halves: Sums, camera: int) -> tuple[Array,
     return to_T_camera_lidar(reference.retract(first)), to_T_camera_lidar(reference.retract(second))
 
 
-def _summaries(state: State) -> Sums:
-    return Sums.stack([one.summary.selected for one in state.cameras])
-
-
 def _after_epoch(state: State, sums: Sums, epoch: Epoch) -> Sums:
     """The sums after the random walk of an epoch."""
     strengths = STRENGTHS[[one.summary.walk for one in state.cameras]]
@@ -77,7 +60,7 @@ def _after_epoch(state: State, sums: Sums, epoch: Epoch) -> Sums:
 
 
 def _until(epoch: Epoch, number: int | None) -> Sums:
-    if number is None:
+    earlier = [frame.sums for frame in epoch.frames if number is None or frame.number < number]
+    if len(earlier) == len(epoch.frames):
         return epoch.sums
-    earlier = [frame.sums for frame in epoch.frames if frame.number < number]
     return Sums.stack([Sums.zeros(len(epoch.T_lidar_camera)), *earlier]).total()

@@ -1,0 +1,157 @@
+"""Whether images are taken when their clouds are: the posterior of a free offset.
+
+Matches follow a wrong time as they follow a wrong pose, so the matcher matches again with the
+offset free, and pose and offset are fitted to these matches. Where the motion of the LiDAR is not
+known, neighbouring clouds are registered, and taken to be 0.1 s apart.
+
+A constant motion straight ahead is equivalent to a camera that is mounted further ahead.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from calibgraph.arrays import Array
+from calibgraph.errors import CalibrationError, DatasetError
+from calibgraph.io.dataset import Dataset, spread_out
+from calibgraph.io.frame import Frame, twist_by_scans
+from calibgraph.io.kept_frames import KeptFrame
+from calibgraph.matching.run import with_motion
+from calibgraph.model.clock import at_pixels, clock_of
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.verdict import Check
+from calibgraph.solver.camera_twist import free_fields_px
+from calibgraph.solver.linear_fit import block_of, fit_camera
+from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.trust.lens_parameter import (
+    IMAGES,
+    RESIDUALS,
+    TIME,
+    LensParameter,
+    check_parameter,
+)
+from calibgraph.trust.run_evidence import RunEvidence
+from calibgraph.trust.thresholds import limit
+from factors import FreeLens
+from factors.free_lens import CLOCK, OFFSET
+
+USUAL_SIGMA_S = 0.002  # of an offset, where the rig states none: of sensors that are synchronised
+INTERVAL_S = 0.1  # between clouds, where it is not known
+MAX_FRAMES = 10  # evenly spread: bounds the time
+MIN_FRAMES = 4  # with fewer, a single frame decides
+_TOLD_S, _TOLD_CM = 0.01, 0.1  # whose effect is told, if it has one
+_JERK, _JERK_M_S = 0.2, 1.0  # share and size by which the speeds to both neighbours may differ
+
+
+def offset_checks(evidence: Evidence) -> Checks:
+    """The offset of each camera by the matches of a table that comes with the LiDAR's motion."""
+    solution = evidence.solution
+    table, rig = solution.correspondences, solution.solved_rig
+    if table.twist_per_s is None or not {*CLOCK}.isdisjoint(solution.config.estimate):
+        return {}
+    return _check_cameras(rig, table, evidence.findings, by=RESIDUALS)
+
+
+def image_offset_checks(evidence: RunEvidence) -> Checks:
+    """The offset of each camera by matches that are made for it, unless it is estimated."""
+    run, config = evidence.run, evidence.run.solution.config
+    if run.out_of_time or not {*CLOCK}.isdisjoint(config.estimate):
+        return {}
+    rig, moved = run.solution.without_pairs().solved_rig, None
+    with suppress(CalibrationError, OSError):  # the checks on images report it
+        moved = _with_known_motion(run.dataset)
+    if moved is None or not run.matcher.tracking_rounds:
+        return {}
+    if moved.frames[0].twist_per_s is not run.dataset.frames[0].twist_per_s:
+        rig = _without_times(rig)
+    matcher = run.matcher.with_estimate(("offset",))
+    table = matcher.match(
+        moved, rig, round_index=matcher.tracking_rounds[-1], progress=evidence.progress
+    )
+    table = with_motion(table, moved).with_places(run.correspondences.places)
+    return _check_cameras(rig, table, run.correspondences.findings, by=IMAGES)
+
+
+def _check_cameras(
+    rig: Rig, table: Correspondences, findings: MatcherFindings, *, by: str
+) -> Checks:
+    fits = {
+        name: fit_offset(camera, table.of_camera(name), findings.place_variance)
+        for name, camera in rig.cameras.items()
+    }
+    return {name: [check_offset(fit, by)] for name, fit in fits.items() if fit is not None}
+
+
+def check_offset(found: LensParameter, by: str) -> Check:
+    """The check of an offset; of one that is not determined, it tells how much depends on it."""
+    check, size = check_parameter(found, by), float(found.units[0] * found.size)
+    if found.sigmas[0] < limit("lens_wrong"):
+        return check
+    text = "the time of the images is not determined by these data, and taken for right"
+    if size and (moved_cm := _TOLD_S * found.moved[1] / size) > _TOLD_CM:
+        text += f"; {1e3 * _TOLD_S:.0f} ms would move the camera by {moved_cm:.2g} cm"
+    return replace(check, text=text)
+
+
+def fit_offset(
+    camera: Camera, table: Correspondences, place_variance: float
+) -> LensParameter | None:
+    """Pose and offset by one camera's matches; None of too few matches or frames.
+
+    Args:
+        camera: lens, clock, and the extrinsic of the result.
+        table: its rows, with the motion of the LiDAR.
+        place_variance: of what the matches of a place share, over that of independent ones.
+    """
+    table = at_pixels(camera, table.select(np.argsort(table.frame, kind="stable")))
+    if len(np.unique(table.frame)) < MIN_FRAMES or table.twist_per_s is None:
+        return None
+    sigma_s = camera.time_offset_sigma_s or USUAL_SIGMA_S
+    free = FreeLens(camera.lens, (OFFSET,), (sigma_s,), clock_of(camera))
+    fields = free_fields_px(camera, free, table.points_lidar_m, table.twist_per_s)
+    places = table.places
+    block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
+    of_place = place_variance * places.frames_per_place(block.frame_numbers)
+    shared = max(of_place, limit("lens_match_share") * len(block))
+    fit = fit_camera(camera, block, fields, shared_variance=shared)
+    return None if fit is None else LensParameter.of(TIME, [sigma_s], fit.free(0))
+
+
+def _without_times(rig: Rig) -> Rig:
+    """The rig without times in seconds, which mean nothing where the interval is unknown."""
+    none = dict.fromkeys(("time_offset_s", "time_offset_sigma_s", "readout_s"))
+    cameras = {name: each.model_copy(update=none) for name, each in rig.cameras.items()}
+    return rig.model_copy(update={"cameras": cameras})
+
+
+def _with_known_motion(dataset: Dataset) -> Dataset | None:
+    """Some frames with their motion, by scans where it is not known; None of too few."""
+    frames = []
+    for frame in spread_out(dataset.frames, MAX_FRAMES):
+        twist = frame.twist_per_s
+        if twist is not None:
+            frames.append(frame)
+        elif isinstance(frame, KeptFrame) and (found := _register(dataset, frame)) is not None:
+            frames.append(replace(frame, twist=found))
+    return dataset.only(frames) if len(frames) >= MIN_FRAMES else None
+
+
+def _register(dataset: Dataset, frame: Frame) -> Array | None:
+    """(6,) the twist by both neighbours, if they are as far away as of one drive."""
+    near = [(dataset.neighbour(frame, sign), sign * INTERVAL_S) for sign in (-1, 1)]
+    known = [(other, later_s) for other, later_s in near if other is not None]
+    if len(known) < len(near):
+        return None
+    try:
+        before, after = (twist_by_scans(frame, [one]) for one in known)
+    except DatasetError:  # they do not fit
+        return None
+    jerk = np.linalg.norm(after[3:] - before[3:])
+    if jerk > _JERK * np.linalg.norm(after[3:]) + _JERK_M_S:
+        return None
+    return np.asarray((before + after) / 2)

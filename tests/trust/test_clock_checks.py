@@ -1,0 +1,75 @@
+"""Images of another time: seen by the motion of the LiDAR, and only where it tells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibgraph import Correspondences, solve
+from calibgraph.io.dataset import Dataset
+from calibgraph.io.kept_frames import keep_frames
+from calibgraph.model.verdict import Check
+from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
+from calibgraph.trust.clock_checks import _with_known_motion, check_offset, fit_offset
+from calibgraph.trust.lens_parameter import RESIDUALS, LensParameter
+from factors import Clock
+from tests.solver.test_lens import FIVE_SIGMAS, simulated
+
+STRAIGHT = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
+
+
+def fit(offset_s: float, twists: np.ndarray | None = None) -> LensParameter:
+    """The offset of a camera like KITTI's whose images are late: to first order in it."""
+    rig, table = simulated(0, frames=30, matches=100)
+    twists = draw_twists(30, np.random.default_rng(0)) if twists is None else twists
+    (name, camera), *_ = rig.cameras.items()
+    late = put_clock_error(table, rig, twists, Clock(offset_s)).of_camera(name)
+    found = fit_offset(camera, late, 0.0)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("offset_s", [0.02, -0.02, 0.0])
+def test_an_offset_is_recovered_within_its_sigma(offset_s: float) -> None:
+    found = fit(offset_s)
+    (seconds,), (sigma,) = found.units * found.values, found.units * found.sigmas
+    assert abs(seconds - offset_s) < FIVE_SIGMAS * sigma
+    assert sigma < 0.002
+    assert (found.probability > 0.5) == (offset_s != 0.0)
+    assert f"ms {'earlier' if seconds < 0 else 'later'}" in found.describe()
+
+
+@pytest.mark.parametrize("twists", [np.zeros((30, 6)), np.tile(STRAIGHT, (30, 1))])
+def test_at_rest_and_straight_ahead_nothing_is_known_of_it(twists: np.ndarray) -> None:
+    """Less than the 40 ms of an offset that is wrong, so it raises no doubt, and that is told."""
+    found = fit(0.05, twists)
+    assert 0.002 * found.sigmas[0] > 0.04
+    assert found.probability < 1e-3
+    check = check_offset(found, RESIDUALS)
+    assert check.status == "PASS"
+    assert "not determined by these data, and taken for right" in check.text
+    assert ("10 ms would move the camera by 10 cm" in check.text) == twists.any()
+
+
+def offset_check(table: Correspondences) -> list[Check]:
+    rig, _ = simulated(0, frames=30, matches=100)
+    verdicts = solve(rig, table).camera_verdicts.values()
+    return [c for verdict in verdicts for c in verdict.checks if c.kind == "lens_time_offset"]
+
+
+def test_a_table_with_motion_is_checked_and_names_the_cure() -> None:
+    rig, table = simulated(0, frames=30, matches=100)
+    assert offset_check(table) == []  # its motion is unknown
+    late = put_clock_error(table, rig, draw_twists(30, np.random.default_rng(0)), Clock(0.04))
+    checks = offset_check(late)
+    assert len(checks) == len(rig.cameras)
+    for check in checks:
+        assert check.status == "FAIL"
+        assert "correct the time stamps; or run with --estimate offset" in check.text
+
+
+def test_scans_that_are_not_of_one_drive_at_a_constant_rate_show_no_motion(
+    dataset: Dataset,
+) -> None:
+    """Frames of the sample are stops 2 to 6 m apart, and turned."""
+    assert _with_known_motion(keep_frames(dataset)) is None
