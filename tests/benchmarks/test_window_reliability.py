@@ -27,8 +27,8 @@ def windows_that_are_right_as_often_as_they_state() -> np.ndarray:
 
 def test_reliable_windows_deviate_by_chance_alone() -> None:
     scores = windows_that_are_right_as_often_as_they_state()
-    # Four standard deviations of a share of 600 windows, and 1 % for peaks that the seam of a rolled
-    # grid cuts.
+    # Four standard deviations of a share of 600 windows, and 1 % for peaks that are cut at the seam
+    # of a rolled grid.
     mean, largest, said, right = map(float, reliability(scores, 1.0))
     assert mean <= largest < 4 * np.sqrt(0.25 / 600) + 0.01
     assert said > 0.9 and right > 0.9
