@@ -21,7 +21,7 @@ from calibgraph.tracking.dataset_frames import DatasetDrive
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
 from calibgraph.tracking.preload import warm_up_tracker
-from calibgraph.tracking.run import Notify, RunCounts, follow
+from calibgraph.tracking.run import Notify, Run
 from calibgraph.tracking.streams import Item, frames_of
 
 STATE_FOLDER, PICTURE = "state", "track.png"
@@ -71,31 +71,15 @@ def track(
             warm_up_tracker()
         items, calibrator = _opened(settings, source, stop, notify)
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
+        run = Run(calibrator, history, print_line, notify)
         with calibrator:
-            counts = follow(
-                items,
-                calibrator,
-                history,
-                every=settings.every if settings.matcher is None else 1,
-                stop=stop,
-                write=print_line,
-                notify=notify,
-            )
+            run.follow(items, every=settings.every if settings.matcher is None else 1, stop=stop)
             if calibrator.tracker.frame is None and not stop():
-                held = f"held no frame that could be used ({counts.refused} left out); check it"
+                held = f"held no frame that could be used ({run.refused} left out); check it"
                 raise FileError("standard input" if str(source[0]) == "-" else source[0], held)
             result = calibrator.tracker.calibration()
-    _report_counts(counts, calibrator.tracker.frame, notify)
-    return result, _write_results(settings.out, result, history if counts.updates else None)
-
-
-def _report_counts(counts: RunCounts, last: int | None, notify: Notify) -> None:
-    notify(
-        f"{counts.updates} updates, {counts.refused} left out, {counts.skipped} known from before"
-    )
-    if counts.skipped and not counts.updates:
-        found = f"no frame comes after {last}"
-        notify(f"warning: {found}; if that number is wrong, choose another --out")
+    run.report_counts()
+    return result, _write_results(settings.out, result, history if run.updates else None)
 
 
 def _write_results(folder: Path, result: Calibration, history: History | None) -> list[Path]:

@@ -24,7 +24,7 @@ from calibgraph import (
 )
 from calibgraph.tracking import command, durable, tracker
 from calibgraph.tracking.history import History
-from calibgraph.tracking.run import follow
+from calibgraph.tracking.run import Run
 from calibgraph.tracking.state_database import DATABASE, StateDatabase
 from calibgraph.tracking.streams import StreamFrame
 from calibgraph.tracking.update import json_line
@@ -54,10 +54,9 @@ def test_a_line_is_given_once_its_update_is_on_disk(world: World, tmp_path: Path
     written: list[str] = []
     frames = [StreamFrame(int(table.frame[0]), table) for table in world.tables[:7]]
     with DurableCalibrator(tmp_path / "state", rig) as calibrator:
-        counts = follow(
-            frames, calibrator, History(), every=1, stop=lambda: False, write=write, notify=print
-        )
-    assert counts.updates == 7 and written == world.lines[:7]
+        run = Run(calibrator, History(), write, print)
+        run.follow(frames, every=1, stop=lambda: False)
+    assert run.updates == 7 and written == world.lines[:7]
 
 
 def test_a_refused_update_changes_neither_the_tracker_nor_the_disk(
