@@ -127,11 +127,15 @@ def _score_camera(
 ) -> ShiftScores:
     """The scores of a camera in all its frames, by twists of the body's lead."""
 
-    def score(gray: NDArray[np.uint8], cloud: PreparedCloud, number: int) -> ShiftScores:
-        return score_frame(gray, cloud, body[name], level, frame=number, max_windows=most)
+    def score(number: int) -> ShiftScores:
+        gray, cloud = frames.grays[number], frames.clouds[number]
+        twist = frames.frames[number].twist_per_s
+        return score_frame(
+            gray, cloud, body[name], level, frame=number, max_windows=most, twist_per_s=twist
+        )
 
     most, numbers = windows // len(frames.grays), range(len(frames.grays))
-    scores = concatenate_scores(list(frames.cores.map(score, frames.grays, frames.clouds, numbers)))
+    scores = concatenate_scores(list(frames.cores.map(score, numbers)))
     if body[name] is lead(body):
         return scores
     return replace(scores, jacobian=scores.jacobian @ adjoint(body, name))
