@@ -12,9 +12,10 @@ from itertools import combinations
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
+from calibgraph.model.pose_kernel import exponential_times, logarithms
 
 
 def transform(rotation: Rotation | ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
@@ -138,12 +139,8 @@ def twists_between(T_a_b: Array, references: Array) -> Array:
         T_a_b: (f, 4, 4).
         references: (4, 4) or (f, 4, 4).
     """
-    return _logarithms(relative_transform(T_a_b, references))
-
-
-def _logarithms(steps: Array) -> Array:
-    """(f, 6) twists of (f, 4, 4) transforms."""
-    return np.asarray(RigidTransform.from_matrix(steps).as_exp_coords())
+    twists: Array = logarithms(relative_transform(T_a_b, references))
+    return twists
 
 
 def pose_rows(camera: int) -> slice:
@@ -195,7 +192,9 @@ def retract_all(T_camera_lidar: Array, steps: Array) -> Array:
         T_camera_lidar: (f, 4, 4).
         steps: (f, 6) tangents of T_lidar_camera: rotation [rad], translation [m].
     """
-    return np.asarray(RigidTransform.from_exp_coords(-steps).as_matrix() @ T_camera_lidar)
+    moved = np.empty((len(steps), 4, 4))
+    exponential_times(-steps, np.ascontiguousarray(T_camera_lidar), moved)
+    return moved
 
 
 def local_coordinates(T_camera_lidar: Array, T_lidar_camera: Array) -> Array:
@@ -205,7 +204,8 @@ def local_coordinates(T_camera_lidar: Array, T_lidar_camera: Array) -> Array:
         T_camera_lidar: (4, 4) of the one, inverted.
         T_lidar_camera: (f, 4, 4) of the others.
     """
-    return _logarithms(T_camera_lidar @ T_lidar_camera)
+    tangents: Array = logarithms(T_camera_lidar @ T_lidar_camera)
+    return tangents
 
 
 def crosses(v: Array) -> Array:
