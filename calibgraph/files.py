@@ -232,7 +232,7 @@ def describe(error: ValidationError) -> str:
     if first["type"] == "missing":
         return f"key {where!r} is missing; add it"
     message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "model_type":  # its message names a class
+    if first["type"] in ("model_type", "dict_type"):  # its message names a class or a dictionary
         message = "expected keys with values, as in {key: value}"
     found = "" if first["type"] == "value_error" else f", found {describe_value(first['input'])}"
     return f"{where}: {message}{found}" if where else f"{message}{found}"

@@ -17,7 +17,7 @@ from calibgraph.matching.structure.consensus import maximize_score
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.clock import at_pixels
-from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import apply_twist
@@ -124,10 +124,10 @@ def _fit_at_peaks(
     table = extract_correspondences(scores.with_unknowns(fields), start, "camera")
     table = at_pixels(camera, with_motion(table, scorer.dataset))
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
-    known, points = error_components().matchers["structure"], block.block.points_lidar_m
-    of_place = known.place_variance * places.frames_per_place(block.frame_numbers)
-    of_scan = np.array([known.elevation_rad, known.elevation_stretch, known.scan_motion_m])
-    bends = distortion_fields_px(camera, points) * of_scan[:, None, None]
+    usual = MatcherFindings.from_metadata({"matcher": "structure"})
+    points = block.block.points_lidar_m
+    of_place = usual.place_variance * places.frames_per_place(block.frame_numbers)
+    bends = distortion_fields_px(camera, points) * np.reshape(usual.bend_sigmas, (3, 1, 1))
     return fit_camera(
         camera,
         block,

@@ -57,7 +57,7 @@ def wrong_lines(good: Correspondences) -> dict[str, bytes]:
         "confidence must lie": line(confidence=0),
         "frame: Input should be a valid integer": line(frame=1.5),
         "is missing": b'{"frame": 7}',
-        "Input should be a JSON object": b"[1, 2]",
+        "expected keys with values, as in {key: value}": b"[1, 2]",
         "is not JSON": b"\xff\xfe\xfa",
         "unknown key": line(time=3),
         "metadata 'systematic_rotation_rad'": line(metadata={"systematic_rotation_rad": "much"}),

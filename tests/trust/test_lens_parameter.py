@@ -15,7 +15,6 @@ from calibgraph.trust.lens_parameter import (
     probability_of_lens,
 )
 from calibgraph.trust.thresholds import limit
-from tests.conftest import make_camera
 
 
 def estimate(name: str, size: float, sigma: float, moved_cm: float) -> LensParameter:
@@ -54,7 +53,7 @@ def test_the_other_parameter_is_usual_or_wrong(other: float) -> None:
     """As by the sum of the joint density over a grid of both."""
     covariance = np.array([[3.0, -4.0], [-4.0, 14.0]])
     fit = freed(other, 10.0, covariance=covariance.tolist())
-    found = LensParameter.of("distortion", make_camera(), fit, 1)
+    found = LensParameter.of("distortion", [0.002], fit)
 
     share, wrong, grid = limit("lens_wrong_share"), limit("lens_wrong"), np.linspace(-90, 90, 1801)
     steps = np.stack(np.meshgrid(grid - other, grid - 10.0, indexing="ij"), axis=-1)
@@ -69,7 +68,7 @@ def test_the_other_parameter_is_usual_or_wrong(other: float) -> None:
 
 def test_an_unobservable_other_parameter_leaves_an_estimate_as_it_is() -> None:
     fit = freed(0.3, 10.0, covariance=[[1e12, 0.0], [0.0, 14.0]])
-    found = LensParameter.of("distortion", make_camera(), fit, 1)
+    found = LensParameter.of("distortion", [0.002], fit)
     np.testing.assert_allclose([found.values[0], found.sigmas[0] ** 2], [10.0, 14.0])
 
 
