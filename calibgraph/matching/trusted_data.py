@@ -56,8 +56,8 @@ def _of_result(folder: Path) -> Dataset:
     frames = tuple(frame_of_entry(entry) for entry in result.frames)
     for frame in frames:
         _require_same(frame, result.inputs)
-    source = Path(os.path.commonpath([frame.cloud_path for frame in frames]))
-    return Dataset(Rig(cameras=passed), frames, (source,))
+    files = [path for frame in frames for path in (frame.cloud_path, *frame.image_paths.values())]
+    return Dataset(Rig(cameras=passed), frames, (Path(os.path.commonpath(files)),))
 
 
 def _require_same(frame: Frame, hashes: dict[str, str]) -> None:

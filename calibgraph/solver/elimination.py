@@ -85,15 +85,20 @@ class Linearization:
     @cached_property
     def information(self) -> Array:
         """(6 N, 6 N) marginal information of all reported poses."""
-        model = self.model
-        return marginal_information(
-            self.graph, model.place_keys + model.shared_keys, model.reported_keys
-        )
+        return self._information_of(self.model.reported_keys)
 
     @cached_property
     def covariance(self) -> Array:
         """(6 N, 6 N) marginal covariance of all reported poses, in their tangents."""
         return np.asarray(np.linalg.inv(self.information))
+
+    def covariance_of(self, keys: Sequence[int]) -> Array:
+        """Marginal covariance of some variables, in their tangents."""
+        return np.asarray(np.linalg.inv(self._information_of(keys)))
+
+    def _information_of(self, keys: Sequence[int]) -> Array:
+        every = self.model.place_keys + self.model.shared_keys
+        return marginal_information(self.graph, every, keys)
 
     @cached_property
     def distances(self) -> Array:
@@ -189,10 +194,7 @@ class LatentPoseFit:
         if not self.linear.model.is_distorted:
             size = self.linear.model.components.distortion_jacobian.shape[2]
             return np.zeros(size), np.eye(size)
-        keys = self.linear.model.place_keys + self.linear.model.shared_keys
-        information = marginal_information(self.linear.graph, keys, [DISTORTION])
-        covariance = np.asarray(np.linalg.inv(information))
-        return self.linear.values.atVector(DISTORTION), covariance
+        return self.linear.values.atVector(DISTORTION), self.linear.covariance_of([DISTORTION])
 
     def place_weights(self, robust_scale: float) -> Array:
         """(P, 1 + N) weights of the cloud and of each camera at each place, in a robust loss."""
@@ -233,8 +235,7 @@ def fit_latent_poses(
         except RuntimeError:  # GTSAM finds an indeterminate linear system
             return None
         if found is None:  # this is the minimum, to rounding
-            converged = True
-            break
+            return LatentPoseFit(present, iterations, True)
         converged = present.cost - found.cost <= relative_tolerance * present.cost
         present, iterations = found, iterations + 1
     return LatentPoseFit(present, iterations, converged)

@@ -24,7 +24,7 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.elimination import LatentPoseFit, marginal_information
+from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import FreeLensBlock
@@ -177,7 +177,10 @@ def moved_lenses(lenses: Lenses, fit: LatentPoseFit | None) -> tuple[Lenses, flo
     moved, largest = {**lenses}, 0.0
     for number in fit.linear.model.lenses:
         name, key = fit.linear.model.cameras[number], lens_key(number)
-        values, sigmas = fit.linear.values.atVector(key), np.sqrt(np.diag(_marginal(fit, [key])))
+        values, sigmas = (
+            fit.linear.values.atVector(key),
+            np.sqrt(np.diag(fit.linear.covariance_of([key]))),
+        )
         moved[name] = lenses[name].moved_to(values)
         largest = max(largest, float((abs(values - lenses[name].values) / sigmas).max()))
     return moved, largest
@@ -188,7 +191,7 @@ def lens_estimates(fit: LatentPoseFit) -> dict[str, tuple[LensEstimate, ...]]:
     model, found = fit.linear.model, {}
     for number, term in model.lenses.items():
         own = [lens_key(number), model.reported_keys[number]]
-        covariance = _marginal(fit, own)
+        covariance = fit.linear.covariance_of(own)
         sigmas = np.sqrt(np.diag(covariance))
         values = fit.linear.values.atVector(own[0])
         with_pose = np.abs(covariance / np.outer(sigmas, sigmas))[:, len(values) :]
@@ -232,10 +235,3 @@ def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
         "centre_y": k.cy,
     }
     return known[name] if name in known else lens.free.coefficient(name, values)
-
-
-def _marginal(fit: LatentPoseFit, kept: list[int]) -> Array:
-    """The covariance of some variables."""
-    model = fit.linear.model
-    keys = model.place_keys + model.shared_keys
-    return np.asarray(np.linalg.inv(marginal_information(fit.linear.graph, keys, kept)))

@@ -15,7 +15,6 @@ after it, as here for the error that all frames share::
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Self
@@ -185,8 +184,7 @@ def _parse(line: bytes, where: str, header: Mapping[str, Any]) -> Item | dict[st
             return metadata
         return FrameLine.model_validate(content).to_frame(header)
     except ValidationError as error:
-        found = re.sub(" or instance of [A-Za-z]+", "", describe(error))
-        return refused(where, found.replace("valid dictionary", "JSON object"))
+        return refused(where, describe(error))
     except CorrespondenceError as error:
         return refused(where, str(error))
     except ValueError as error:

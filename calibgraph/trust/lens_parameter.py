@@ -60,7 +60,6 @@ LENS_KINDS = frozenset(kind for kinds in KINDS.values() for kind in kinds.values
 _NAMES = FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT
 _PARTS: tuple[LensPart, ...] = "focal", "aspect", "centre", "distortion"
 _SKEW_SIGMA = 0.002  # in parts of fx
-_ANYTHING = 1e6  # standard deviation of a parameter that is not determined
 _MOST_SIGMAS = 1e6  # enough for any probability
 
 
@@ -141,7 +140,7 @@ class LensParameter:
         aspect ratio or skew as no lens has it counts also if set free it moves the camera little:
         matches from rounds have followed it.
         """
-        if not self.sigma < _ANYTHING:
+        if not math.isfinite(self.sigma):  # not determined
             return 0.0
         moves = max(moved / most for moved, most in zip(self.moved, TOLERANCE, strict=True))
         tolerated = self.size / moves if moves else math.inf

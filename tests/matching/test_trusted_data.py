@@ -40,7 +40,7 @@ def test_a_result_is_trusted_where_it_is_pass(
     passed = {n for n, verdict in result.camera_verdicts.items() if verdict.status == "PASS"}
     assert passed
     data = load_trusted_dataset(folder)
-    assert data.rig.cameras.keys() == passed
+    assert data.rig.cameras.keys() == passed and data.folders == (SAMPLE,)
     assert [frame.entry() for frame in data.frames] == list(result.frames)
     for name in passed:
         np.testing.assert_array_equal(

@@ -19,17 +19,15 @@ from torch import Tensor
 from calibgraph.graph.objective import pose_key
 from calibgraph.matching.structure.peaks import MIN_CURVATURE_RATIO, PEAK_STEPS
 from calibgraph.matching.structure.training.samples import LEVEL, NEAR, SIDE, CameraWindows
+from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import MIN_MATCHES
 from calibgraph.solver.pose_loss import pose_loss
-from calibgraph.solver.whitening import upper_root
+from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
+from calibgraph.solver.whitening import MEDIAN_NORM, upper_root
 from factors import ProjectionBlock, pose_sigmas
 
 _CAMERA = "camera"
-_BEND, _MEDIAN = 2.385, 1.17741  # of Cauchy's loss, and the median of a norm, in sigmas
-_INFLATION = 6.0
-"""Variance of what the matches of a place share over that of independent ones, see the findings of
-``structure``: it widens the information, not the loss."""
 
 
 def damped(scores: Tensor, weights: Tensor) -> Tensor:
@@ -119,9 +117,10 @@ class _OptimumLoss(torch.autograd.Function):
             camera.lens, sample.points_lidar_m[rows], pixels.detach().numpy(),
             roots * np.exp(log_weights.detach().numpy())[:, None],
         )  # fmt: skip
-        widened = math.sqrt(_INFLATION)
+        # What matches of a place share widens the information, not the loss.
+        widened = math.sqrt(error_components().matchers["structure"].place_variance)
         sigma = widened * _spread(block, camera.T_camera_lidar)
-        block = block.rescale(scale=_BEND / widened, sigma=sigma)
+        block = block.rescale(scale=CAUCHY_SCALE_SIGMAS / widened, sigma=sigma)
         found = pose_loss({_CAMERA: block}, _prior(camera.T_camera_lidar),
                           {_CAMERA: camera.T_camera_lidar})  # fmt: skip
         gradients = found.by_pixels[_CAMERA], found.by_log_weights[_CAMERA]
@@ -136,7 +135,7 @@ class _OptimumLoss(torch.autograd.Function):
 
 def _spread(block: ProjectionBlock, T_camera_lidar: np.ndarray) -> float:
     """Robust standard deviation of the whitened residuals at a pose."""
-    return max(float(np.median(block.run_norms(T_camera_lidar[None])[-1])) / _MEDIAN, 1e-9)
+    return max(float(np.median(block.run_norms(T_camera_lidar[None])[-1]) / MEDIAN_NORM[1]), 1e-9)
 
 
 def _prior(T_camera_lidar: np.ndarray) -> gtsam.NonlinearFactorGraph:
