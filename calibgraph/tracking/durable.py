@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from operator import index
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from calibgraph.errors import FileError
+from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
@@ -63,12 +64,14 @@ class DurableCalibrator:
                 self.tracker = IncrementalCalibrator(begin() if begin else rig, config)
                 self._snapshot()
             else:
-                self.tracker = _restore(Path(folder), recovered.snapshot)
+                with _of_this_version(Path(folder)):
+                    self.tracker = IncrementalCalibrator.from_bytes(recovered.snapshot)
                 _require_same(Path(folder), self.tracker, rig, config or Config())
             self.repeated: Update | None = None
             for record in recovered.inputs:
-                frame, table = decode(record)
-                self.repeated = self.tracker.update(table, frame=frame)
+                with _of_this_version(Path(folder)):
+                    frame, table = decode(record, "input")
+                    self.repeated = self.tracker.update(table, frame=frame)
         except BaseException:
             self._database.close()
             raise
@@ -84,7 +87,7 @@ class DurableCalibrator:
             OSError: if it cannot be written; then close this, and make a new one.
         """
         table = with_metadata_per_frame(with_place(table, place))
-        record = encode((None if frame is None else index(frame), table))
+        record = encode((None if frame is None else index(frame), table), "input")
         self._continue_snapshot()  # before this update: the journal always holds the last one
         update = self.tracker.update(table, frame=frame)
         self._database.append(record)
@@ -135,10 +138,11 @@ class DurableCalibrator:
             self.abandon()
 
 
-def _restore(folder: Path, snapshot: bytes) -> IncrementalCalibrator:
+@contextmanager
+def _of_this_version(folder: Path) -> Iterator[None]:
     try:
-        return IncrementalCalibrator.from_bytes(snapshot)
-    except StateError as error:  # its checksum is right, so another version wrote it
+        yield
+    except (StateError, CorrespondenceError) as error:  # its checksum is right
         raise FileError(
             folder, f"holds a state of another version; choose another folder ({error})"
         ) from error
