@@ -13,7 +13,11 @@ from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.tracking.frame_order import with_metadata_per_frame, with_place
+from calibgraph.tracking.frame_order import (
+    require_number,
+    with_metadata_per_frame,
+    with_place,
+)
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.state_database import StateDatabase
 from calibgraph.tracking.tracker import IncrementalCalibrator
@@ -87,7 +91,7 @@ class DurableCalibrator:
             OSError: if it cannot be written; then close this, and make a new one.
         """
         table = with_metadata_per_frame(with_place(table, place))
-        record = encode((None if frame is None else index(frame), table), "input")
+        record = _record(table, frame)
         self._continue_snapshot()  # before this update: the journal always holds the last one
         update = self.tracker.update(table, frame=frame)
         self._database.append(record)
@@ -136,6 +140,15 @@ class DurableCalibrator:
             self.close()
         else:
             self.abandon()
+
+
+def _record(table: Correspondences, frame: int | None) -> bytes:
+    """An input as the journal keeps it."""
+    require_number(frame)
+    try:
+        return encode((None if frame is None else index(frame), table), "input")
+    except UnicodeEncodeError as error:  # of a camera, which no rig has
+        raise CorrespondenceError(f"a camera's name cannot be written ({error})") from error
 
 
 @contextmanager
