@@ -44,7 +44,8 @@ def read(path: Path) -> tuple[Recovered, int]:
     """What the database holds, and the number of its last input; no file is changed.
 
     Raises:
-        FileError: if it is damaged, of another layout, or of another program: then it is not opened.
+        FileError: if it is damaged, of another layout, or of another program, then without opening
+            it.
     """
     _require_layout(path)
     log = log_of(path)
