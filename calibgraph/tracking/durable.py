@@ -153,9 +153,10 @@ def _record(table: Correspondences, frame: int | None) -> bytes:
 
 @contextmanager
 def _of_this_version(folder: Path) -> Iterator[None]:
+    """Refuse what is not damaged, by its checksum in the database, but cannot be continued."""
     try:
         yield
-    except (StateError, CorrespondenceError) as error:  # its checksum is right
+    except (StateError, CorrespondenceError) as error:
         raise FileError(
             folder, f"holds a state of another version; choose another folder ({error})"
         ) from error

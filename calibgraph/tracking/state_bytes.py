@@ -84,7 +84,8 @@ def decode(data: bytes, kind: Kind) -> Any:
         found = data[: len(mark)].split(b"\n")[0].decode("ascii", "replace")
         expected = f"expected {mark[:-1].decode()!r}"
         raise StateError(f"is no tracker's {kind}: it begins with {found!r}, {expected}")
-    digest, body = data[len(mark) :][:_DIGEST], data[len(mark) + _DIGEST :]
+    start = len(mark) + _DIGEST
+    digest, body = data[len(mark) : start], data[start:]
     if hashlib.sha256(body).digest() != digest:
         raise StateError("is damaged: its checksum is wrong")
     try:
