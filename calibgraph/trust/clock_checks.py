@@ -62,12 +62,12 @@ def image_offset_checks(evidence: RunEvidence) -> Checks:
     run, config = evidence.run, evidence.run.solution.config
     if run.out_of_time or not {*CLOCK}.isdisjoint(config.estimate):
         return {}
-    rig, moved = run.solution.without_pairs().solved_rig, None
+    rig, moved, registered = run.solution.without_pairs().solved_rig, None, False
     with suppress(CalibrationError, OSError):  # the checks on images report it
-        moved = _with_known_motion(run.dataset)
+        moved, registered = _with_known_motion(run.dataset)
     if moved is None or not run.matcher.tracking_rounds:
         return {}
-    if moved.frames[0].twist_per_s is not run.dataset.frames[0].twist_per_s:
+    if registered:
         rig = _without_times(rig)
     matcher = run.matcher.with_estimate(("offset",))
     table = matcher.match(
@@ -123,22 +123,23 @@ def fit_offset(
 
 
 def _without_times(rig: Rig) -> Rig:
-    """The rig without times in seconds, which mean nothing where the interval is unknown."""
+    """The rig without times, which the result leaves out where the motion is not known."""
     none = dict.fromkeys(("time_offset_s", "time_offset_sigma_s", "readout_s"))
     cameras = {name: each.model_copy(update=none) for name, each in rig.cameras.items()}
     return rig.model_copy(update={"cameras": cameras})
 
 
-def _with_known_motion(dataset: Dataset) -> Dataset | None:
-    """Some frames with their motion, by scans where it is not known; None of too few."""
-    frames = []
+def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
+    """Some frames with their motion, None of too few; whether scans show that of any of them."""
+    frames, registered = [], False
     for frame in spread_out(dataset.frames, MAX_FRAMES):
         twist = frame.twist_per_s
         if twist is not None:
             frames.append(frame)
         elif isinstance(frame, KeptFrame) and (found := _register(dataset, frame)) is not None:
             frames.append(replace(frame, twist=found))
-    return dataset.only(frames) if len(frames) >= MIN_FRAMES else None
+            registered = True
+    return dataset.only(frames) if len(frames) >= MIN_FRAMES else None, registered
 
 
 def _register(dataset: Dataset, frame: Frame) -> Array | None:

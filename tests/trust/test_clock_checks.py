@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from calibgraph import Correspondences, solve
+from calibgraph import Config, Correspondences, Rig, solve
 from calibgraph.io.dataset import Dataset
+from calibgraph.io.frame import Frame, MovingFrame
 from calibgraph.io.kept_frames import keep_frames
+from calibgraph.io.motion import ScanMotion
+from calibgraph.matching.protocol import Matcher, to_full_matcher
+from calibgraph.matching.run import MatchingRun
 from calibgraph.model.verdict import Check
+from calibgraph.progress import Stopwatch
 from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
-from calibgraph.trust.clock_checks import _with_known_motion, check_offset, fit_offset
+from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.clock_checks import (
+    _with_known_motion,
+    check_offset,
+    fit_offset,
+    image_offset_checks,
+)
 from calibgraph.trust.lens_parameter import RESIDUALS, LensParameter
+from calibgraph.trust.run_evidence import RunEvidence
 from factors import Clock
 from tests.solver.test_lens import FIVE_SIGMAS, simulated
 
@@ -72,4 +89,62 @@ def test_scans_that_are_not_of_one_drive_at_a_constant_rate_show_no_motion(
     dataset: Dataset,
 ) -> None:
     """Frames of the sample are stops 2 to 6 m apart, and turned."""
-    assert _with_known_motion(keep_frames(dataset)) is None
+    assert _with_known_motion(keep_frames(dataset))[0] is None
+
+
+class Recorder:
+    """A matcher that searches the offset, too, and records the offsets of the rigs it is given."""
+
+    rounds, stage1, tracking_rounds, image_checks_can_fail = 1, "rig", (0,), True
+
+    def __init__(self, table: Correspondences) -> None:
+        self.table, self.offsets_s = table, list[float | None]()
+
+    def with_estimate(self, parts: Sequence[str]) -> Recorder:  # noqa: ARG002
+        other = copy(self)
+        other.offsets_s = self.offsets_s
+        return other
+
+    def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN201, ARG002
+        self.offsets_s += [camera.time_offset_s for camera in rig.cameras.values()]
+        numbers = [frame.index for frame in dataset.frames]
+        return self.table.select(np.isin(self.table.frame, numbers))
+
+    def release(self) -> None:
+        pass
+
+
+def run_of(
+    matcher: Matcher, rig: Rig, frames: Sequence[Frame], found: Correspondences
+) -> RunEvidence:
+    data = Dataset(rig=rig, frames=tuple(frames), folders=())
+    solution = solve_joint(rig, found, Config())
+    run = MatchingRun(
+        data, to_full_matcher(matcher), rig, found, solution, rounds=(), watch=Stopwatch()
+    )
+    return RunEvidence(run, {})
+
+
+def moving_frames(twists: np.ndarray) -> list[Frame]:
+    motions = [ScanMotion(tuple(twist.tolist()), 0.0) for twist in twists]
+    return [
+        MovingFrame(n, str(n), Path(f"{n}.pcd"), {}, find_motion=lambda found=found: found)
+        for n, found in enumerate(motions)
+    ]
+
+
+def late_by(offset_s: float) -> tuple[Rig, Correspondences, np.ndarray]:
+    rig, table = simulated(0, frames=30, matches=100)
+    twists = draw_twists(30, np.random.default_rng(0))
+    return rig, put_clock_error(table, rig, twists, Clock(offset_s)), twists
+
+
+def test_the_times_of_a_rig_stand_where_the_motion_of_a_bag_is_known() -> None:
+    rig, table, twists = late_by(0.04)
+    cameras = {n: c.model_copy(update={"time_offset_s": 0.04}) for n, c in rig.cameras.items()}
+    stated = rig.model_copy(update={"cameras": cameras})
+    matcher = Recorder(replace(table, twist_per_s=None))
+    evidence = run_of(matcher, stated, moving_frames(twists), table)
+    checks = image_offset_checks(evidence)
+    assert matcher.offsets_s == [0.04] * len(rig.cameras)
+    assert {check.status for of in checks.values() for check in of} == {"PASS"}
