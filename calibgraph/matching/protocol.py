@@ -4,12 +4,13 @@
 members; `to_full_matcher` adds defaults for missing ones. In calibration they are used in this
 order:
 
-1. `most_frames`: the largest number of frames that is used.
-2. `locate`: from where the rounds begin, and with which round.
-3. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
-4. `tracking_rounds`: run again from a start displaced from the result.
-5. `release`: no more rounds follow.
-6. `image_checks_can_fail`: whether the checks on images may FAIL the result.
+1. `with_estimate`: the matcher for the parts of lens and clock that are estimated.
+2. `most_frames`: the largest number of frames that is used.
+3. `locate`: from where the rounds begin, and with which round.
+4. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
+5. `tracking_rounds`: run again from a start displaced from the result.
+6. `release`: no more rounds of this matcher follow, but one of another `with_estimate`, if any.
+7. `image_checks_can_fail`: whether the checks on images may FAIL the result.
 """
 
 from collections.abc import Callable, Sequence
@@ -100,7 +101,11 @@ class FullMatcher(Matcher, Protocol):
         ...
 
     def with_estimate(self, parts: Sequence[LensPart]) -> "FullMatcher":
-        """The matcher for solves that estimate these parts of lens and clock; itself by default."""
+        """The matcher for solves that estimate these parts of lens and clock; itself by default.
+
+        One that is not itself matches also after ``release`` of the other: it checks the time of
+        the images, if it has ``tracking_rounds``.
+        """
         ...
 
     def locate(
@@ -130,7 +135,8 @@ class MatcherWithDefaults:
     def with_estimate(self, parts: Sequence[LensPart]) -> FullMatcher:
         """The matcher's own way, or the same matcher."""
         make = getattr(self._matcher, "with_estimate", None)
-        return self if make is None else MatcherWithDefaults(make(parts))
+        made = self._matcher if make is None else make(parts)
+        return self if made is self._matcher else MatcherWithDefaults(made)
 
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress

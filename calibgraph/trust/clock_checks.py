@@ -58,23 +58,28 @@ def offset_checks(evidence: Evidence) -> Checks:
 
 
 def image_offset_checks(evidence: RunEvidence) -> Checks:
-    """The offset of each camera by matches that are made for it, unless it is estimated."""
+    """The offset of each camera by matches that are made for it, unless it is estimated.
+
+    By a matcher made for them, since that of the run has been released.
+    """
     run, config = evidence.run, evidence.run.solution.config
     if run.out_of_time or not {*CLOCK}.isdisjoint(config.estimate):
         return {}
     rig, moved, registered = run.solution.without_pairs().solved_rig, None, False
     with suppress(CalibrationError, OSError):  # the checks on images report it
         moved, registered = _with_known_motion(run.dataset)
-    if moved is None or not run.matcher.tracking_rounds:
+    matcher = run.matcher.with_estimate(("offset",))
+    if moved is None or not matcher.tracking_rounds or matcher is run.matcher:
         return {}
     if registered:
         rig = _without_times(rig)
-    matcher = run.matcher.with_estimate(("offset",))
     table = matcher.match(
         moved, rig, round_index=matcher.tracking_rounds[-1], progress=evidence.progress
     )
+    matcher.release()
     table = with_motion(table, moved).with_places(run.correspondences.places)
-    return _check_cameras(rig, table, run.correspondences.findings, by=IMAGES)
+    checks = _check_cameras(rig, table, run.correspondences.findings, by=IMAGES)
+    return evidence.grade_by_images(checks)
 
 
 def _check_cameras(

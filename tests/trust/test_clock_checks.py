@@ -148,3 +148,28 @@ def test_the_times_of_a_rig_stand_where_the_motion_of_a_bag_is_known() -> None:
     checks = image_offset_checks(evidence)
     assert matcher.offsets_s == [0.04] * len(rig.cameras)
     assert {check.status for of in checks.values() for check in of} == {"PASS"}
+
+
+def test_without_the_image_checks_right_to_fail_a_late_image_is_a_warning() -> None:
+    rig, table, twists = late_by(0.04)
+    matcher = Recorder(replace(table, twist_per_s=None))
+    evidence = run_of(matcher, rig, moving_frames(twists), table)
+    (first, *_) = image_offset_checks(evidence).values()
+    matcher.image_checks_can_fail = False
+    evidence = run_of(matcher, rig, moving_frames(twists), table)
+    (second, *_) = image_offset_checks(evidence).values()
+    assert [first[0].status, second[0].status] == ["FAIL", "WARN"]
+    assert first[0].text == second[0].text
+
+
+def test_a_released_matcher_is_not_used_again() -> None:
+    class Released(Recorder):
+        def with_estimate(self, parts: Sequence[str]) -> Released:  # noqa: ARG002
+            return self  # does not search the offset
+
+        def match(self, *_: object, **__: object) -> Correspondences:
+            raise AssertionError("its network has been dropped")
+
+    rig, table, twists = late_by(0.04)
+    plain = Released(table)
+    assert image_offset_checks(run_of(plain, rig, moving_frames(twists), table)) == {}
