@@ -20,6 +20,7 @@ from calibgraph.io.motion import ScanMotion, register, twist_between
 from calibgraph.io.videos import PICTURE_SUFFIX, hash_picture
 from calibgraph.model.rig import Camera
 
+_MOST_M_S = 100.0  # of a vehicle
 _MOTION = "motion"
 """The key of an entry's :class:`ScanMotion`, if its cloud is corrected."""
 
@@ -162,7 +163,7 @@ def twist_by_scans(frame: Frame, beside: Sequence[tuple[Frame, float]]) -> Array
             they are [s].
 
     Raises:
-        DatasetError: if there is none, or scans do not fit.
+        DatasetError: if there is none, scans do not fit, or the speed is that of no vehicle.
     """
     if not beside:
         raise DatasetError(
@@ -176,7 +177,13 @@ def twist_by_scans(frame: Frame, beside: Sequence[tuple[Frame, float]]) -> Array
         twist_between(np.eye(4), register(own, cloud, frame.cloud_path), later_s)
         for cloud, (_, later_s) in zip(others, beside, strict=True)
     ]
-    return np.asarray(np.mean(twists, axis=0))
+    twist = np.asarray(np.mean(twists, axis=0))
+    if (speed_m_s := np.linalg.norm(twist[3:])) > _MOST_M_S:
+        raise DatasetError(
+            f"{frame.cloud_path}: by its neighbours, the LiDAR moves at {speed_m_s:.0f} m/s, more "
+            f"than {_MOST_M_S:g}; give the seconds between clouds as --interval-s"
+        )
+    return twist
 
 
 def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
