@@ -26,6 +26,7 @@ from calibgraph.matching.run import (
     MatchingRun,
     Rematch,
     RoundSummary,
+    require_known_motion,
     round_in_words,
     summarize_round,
     with_motion,
@@ -80,6 +81,7 @@ def match_in_rounds(
     data, guess = _open(dataset, rig, full.most_frames)
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
     with watch("inputs"):
+        require_known_motion(data, full, config.estimate)
         warnings = check_inputs(data, guess, at_guess=full.stage1 == "rig")
     with watch("places"):
         places = find_stationary(data, guess)

@@ -1,4 +1,4 @@
-"""The matcher protocol: three members that every matcher has, and six more that it may have.
+"""The matcher protocol: three members that every matcher has, and seven more that it may have.
 
 `Matcher` is the interface of a custom matcher. The program works with `FullMatcher`, which has all
 members; `to_full_matcher` adds defaults for missing ones. In calibration they are used in this
@@ -6,11 +6,12 @@ order:
 
 1. `with_estimate`: the matcher for the parts of lens and clock that are estimated.
 2. `most_frames`: the largest number of frames that is used.
-3. `locate`: from where the rounds begin, and with which round.
-4. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
-5. `tracking_rounds`: run again from a start displaced from the result.
-6. `release`: no more rounds of this matcher follow, but one of another `with_estimate`, if any.
-7. `image_checks_can_fail`: whether the checks on images may FAIL the result.
+3. `knows_motion`: whether frames may lack the motion that a clock is estimated by.
+4. `locate`: from where the rounds begin, and with which round.
+5. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
+6. `tracking_rounds`: run again from a start displaced from the result.
+7. `release`: no more rounds of this matcher follow, but one of another `with_estimate`, if any.
+8. `image_checks_can_fail`: whether the checks on images may FAIL the result.
 """
 
 from collections.abc import Callable, Sequence
@@ -82,6 +83,11 @@ class FullMatcher(Matcher, Protocol):
         ...
 
     @property
+    def knows_motion(self) -> bool:
+        """Whether its tables have the motion of the LiDAR, ``twist_per_s``; by default not."""
+        ...
+
+    @property
     def tracking_rounds(self) -> tuple[int, ...]:
         """Indices of the rounds to run from an estimate that is nearly right.
 
@@ -127,6 +133,7 @@ class MatcherWithDefaults:
         self.rounds = matcher.rounds
         self.stage1: Stage1Source = matcher.stage1
         self.most_frames: int | None = getattr(matcher, "most_frames", None)
+        self.knows_motion = bool(getattr(matcher, "knows_motion", False))
         self.tracking_rounds = tuple(getattr(matcher, "tracking_rounds", ()))
         self.image_checks_can_fail = bool(getattr(matcher, "image_checks_can_fail", False))
         self._locate = getattr(matcher, "locate", None)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Correspondences, Dataset, Rig
+from calibgraph import Config, Correspondences, Dataset, Rig
 from calibgraph.errors import CorrespondenceError
 from calibgraph.matching.protocol import Start, to_full_matcher
 from calibgraph.model.findings import MatcherFindings
@@ -102,6 +102,25 @@ def test_members_that_a_matcher_lacks_have_defaults(truth: Rig) -> None:
     table = full.match(data, truth, round_index=0, progress=no_progress)
     assert len(np.unique(table.frame)) == 6
     full.release()  # of nothing
+
+
+def test_a_clock_without_a_motion_is_refused_before_any_work(truth: Rig) -> None:
+    """Not of a matcher that knows the motion, which frames do not."""
+
+    class Knowing(Minimal):
+        knows_motion = True
+
+        def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN202
+            found = super().match(dataset, rig, round_index=round_index, progress=progress)
+            return replace(found, twist_per_s=np.zeros((len(found), 6)))
+
+    matcher, config = Complete(truth), Config(estimate=("offset",))
+    data = calibgraph.load_dataset(SAMPLE, truth)
+    with pytest.raises(CorrespondenceError, match="offset, the motion of the LiDAR must be known"):
+        match_in_rounds(data, matcher=matcher, config=config, progress=no_progress)
+    assert matcher.calls == []
+    run = match_in_rounds(data, matcher=Knowing(), config=config, progress=no_progress)
+    assert {one.name for lens in run.solution.lens.values() for one in lens} == {"offset"}
 
 
 def test_a_minimal_matcher_calibrates(truth: Rig) -> None:
