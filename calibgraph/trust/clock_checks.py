@@ -2,7 +2,7 @@
 
 Matches follow a wrong time as they follow a wrong pose, so the matcher matches again with the
 offset free, and pose and offset are fitted to these matches. Where the motion of the LiDAR is not
-known, neighbouring clouds are registered, and taken to be 0.1 s apart.
+known, neighbouring clouds are registered; without stamps they are taken to be 0.1 s apart.
 
 A constant motion straight ahead is equivalent to a camera that is mounted further ahead.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.io.frame import Frame, twist_by_scans
+from calibgraph.io.frame import Frame, seconds_between, twist_by_scans
 from calibgraph.io.kept_frames import KeptFrame
 from calibgraph.matching.run import with_motion
 from calibgraph.model.clock import at_pixels, clock_of
@@ -41,7 +41,8 @@ from factors import FreeLens
 from factors.free_lens import CLOCK, OFFSET
 
 USUAL_SIGMA_S = 0.002  # of an offset, where the rig states none: of sensors that are synchronised
-INTERVAL_S = 0.1  # between clouds, where it is not known
+INTERVAL_S = 0.1  # between clouds, where they have no stamps
+MAX_STEPS = 10  # between the numbers of neighbouring clouds, if it is clouds that they count
 MAX_FRAMES = 10  # evenly spread: bounds the time
 MIN_FRAMES = 4  # with fewer, a single frame decides
 _TOLD_S, _TOLD_CM = 0.01, 0.1  # whose effect is told, if it has one
@@ -79,6 +80,9 @@ def image_offset_checks(evidence: RunEvidence) -> Checks:
     matcher.release()
     table = with_motion(table, moved).with_places(run.correspondences.places)
     checks = _check_cameras(rig, table, run.correspondences.findings, by=IMAGES)
+    if registered and seconds_between(*moved.frames[:2]) is None:
+        taken = f"; successive clouds are taken to be {INTERVAL_S:g} s apart"
+        checks = {n: [replace(c, text=c.text + taken) for c in of] for n, of in checks.items()}
     return evidence.grade_by_images(checks)
 
 
@@ -149,9 +153,9 @@ def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
 
 def _register(dataset: Dataset, frame: Frame) -> Array | None:
     """(6,) the twist by both neighbours, if they are as far away as of one drive."""
-    near = [(dataset.neighbour(frame, sign), sign * INTERVAL_S) for sign in (-1, 1)]
-    known = [(other, later_s) for other, later_s in near if other is not None]
-    if len(known) < len(near):
+    near = [dataset.neighbour(frame, sign) for sign in (-1, 1)]
+    known = [(other, _later_s(frame, other)) for other in near if other is not None]
+    if len(known) < len(near) or not all(later_s for _, later_s in known):
         return None
     try:
         before, after = (twist_by_scans(frame, [one]) for one in known)
@@ -161,3 +165,15 @@ def _register(dataset: Dataset, frame: Frame) -> Array | None:
     if jerk > _JERK * np.linalg.norm(after[3:]) + _JERK_M_S:
         return None
     return np.asarray((before + after) / 2)
+
+
+def _later_s(frame: Frame, other: Frame) -> float:
+    """How much later a neighbour was recorded: by stamps, or by the numbers of both clouds."""
+    by_stamps = seconds_between(frame, other)
+    if by_stamps is not None:
+        return by_stamps
+    stems = frame.cloud_path.stem, other.cloud_path.stem
+    steps = int(stems[1]) - int(stems[0]) if all(map(str.isdecimal, stems)) else 0
+    if not 0 < abs(steps) <= MAX_STEPS:  # other numbers, such as times
+        steps = 1 if other.index > frame.index else -1
+    return INTERVAL_S * steps

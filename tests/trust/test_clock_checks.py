@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from calibgraph import Config, Correspondences, Rig, solve
+from calibgraph.io.bags import MESSAGE_SUFFIX
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame, MovingFrame
 from calibgraph.io.kept_frames import keep_frames
@@ -148,6 +149,54 @@ def test_the_times_of_a_rig_stand_where_the_motion_of_a_bag_is_known() -> None:
     checks = image_offset_checks(evidence)
     assert matcher.offsets_s == [0.04] * len(rig.cameras)
     assert {check.status for of in checks.values() for check in of} == {"PASS"}
+
+
+def registered(
+    stems: Sequence[str], folder: str, suffix: str, step_m: float, monkeypatch: pytest.MonkeyPatch
+) -> list[Frame]:
+    """Frames that have moved ahead by ``step_m`` from one to the next; their clouds fit exactly."""
+    T = np.eye(4)
+    T[0, 3] = step_m
+
+    def fit(target: np.ndarray, source: np.ndarray, _: Path) -> np.ndarray:
+        steps = round(float(source[0, 0] - target[0, 0]))
+        return np.asarray(np.linalg.matrix_power(T if steps > 0 else np.linalg.inv(T), abs(steps)))
+
+    monkeypatch.setattr("calibgraph.io.frame.register", fit)
+    monkeypatch.setattr(
+        Frame, "load_cloud", lambda self: np.full((1, 4), self.index, dtype=np.float32)
+    )
+    paths = [Path(folder) / f"{stem}{suffix}" for stem in stems]
+    return [Frame(n, stem, paths[n], {}) for n, stem in enumerate(stems)]
+
+
+@pytest.mark.parametrize(
+    ("stems", "suffix", "apart_s", "is_told"),
+    [
+        ([f"{3 * n:06d}" for n in range(30)], ".bin", 0.3, True),  # KITTI, every third
+        ([f"{n:06d}" for n in range(30)], ".bin", 0.1, True),
+        ([f"scan_{n:02d}" for n in range(30)], ".pcd", 0.1, True),
+        ([str(100 * n) for n in range(30)], ".pcd", 0.1, True),  # which count something else
+        ([str(1_533_151_603_547_590 + 50_000 * n) for n in range(30)], ".bin", 0.05, False),
+        ([str(7_000_000_000 + 200_000_000 * n) for n in range(30)], ".message", 0.2, False),
+    ],
+)
+def test_clouds_are_as_far_apart_as_their_stamps_or_numbers_say(
+    stems: list[str], suffix: str, *, apart_s: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig, table, _ = late_by(0.0)
+    suffix = MESSAGE_SUFFIX if suffix == ".message" else suffix
+    frames = registered(stems, "drive", suffix, 2.0, monkeypatch)
+    kept = keep_frames(Dataset(rig=rig, frames=tuple(frames), folders=()))
+    moved, by_scans = _with_known_motion(kept)
+    assert moved is not None and by_scans
+    for frame in moved.frames:
+        assert frame.twist_per_s is not None
+        np.testing.assert_allclose(frame.twist_per_s, [0, 0, 0, 2.0 / apart_s, 0, 0], atol=1e-9)
+    matcher = Recorder(replace(table, twist_per_s=None))
+    checks = image_offset_checks(run_of(matcher, rig, kept.frames, table))
+    told = ["successive clouds are taken to be 0.1 s apart" in c[0].text for c in checks.values()]
+    assert told == [is_told] * len(rig.cameras)
 
 
 def test_without_the_image_checks_right_to_fail_a_late_image_is_a_warning() -> None:
