@@ -64,6 +64,10 @@ def _lens_parts(value: Any) -> Any:
     if not isinstance(names, list | tuple):
         return names
     whole = {"lens": ("focal", "centre", "distortion"), "clock": ("offset", "readout")}
+    known = (*get_args(LensPart), *whole)
+    for name in names:
+        if name not in known:
+            raise ValueError(f"{name!r} is no part; give one or more of {', '.join(known)}")
     return tuple(dict.fromkeys(part for name in names for part in whole.get(name, (name,))))
 
 

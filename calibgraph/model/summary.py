@@ -19,6 +19,7 @@ MOST = 3
 _CANNOT_TELL = "cannot tell: "
 _OF_DATA = ("error bar", "data")  # causes
 _WORST_FIRST: tuple[Status, ...] = ("FAIL", "WARN", "PASS")
+_PARTS = re.compile(r"--estimate [a-z,]+")
 _NUMBER = re.compile(r"(-?\d+(?:\.\d+)?)")
 
 
@@ -210,8 +211,10 @@ def _reason(checks: Mapping[str, Check]) -> Reason:
     ordered = dict(sorted(checks.items(), key=lambda item: -item[1].severity))
     worst = next(iter(ordered.values()))
     kind = worst.kind or worst.name
-    cameras, text = tuple(ordered), _sentence(ordered)
-    return Reason(worst.status, cameras, text, cause_of(kind), action_of(kind))
+    cameras, text, action = tuple(ordered), _sentence(ordered), action_of(kind)
+    if parts := _PARTS.search(worst.text):  # several that look wrong are estimated together
+        action = _PARTS.sub(parts[0], action)
+    return Reason(worst.status, cameras, text, cause_of(kind), action)
 
 
 def _group_sentences(weaknesses: Mapping[str, Sequence[str]]) -> list[Reason]:

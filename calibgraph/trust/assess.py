@@ -24,6 +24,7 @@ from calibgraph.trust.guess import (
 )
 from calibgraph.trust.image_checks import image_checks
 from calibgraph.trust.intrinsics import intrinsics_checks
+from calibgraph.trust.lens_parameter import advise_together
 from calibgraph.trust.matcher_checks import matcher_checks
 from calibgraph.trust.pair_agreement import pair_agreement_checks
 from calibgraph.trust.place_checks import place_checks
@@ -76,7 +77,8 @@ RUN_CHECKS: tuple[Callable[[RunEvidence], Checks], ...] = (
 
 def assess(evidence: Evidence) -> dict[str, list[Check]]:
     """Per camera, the checks of a solution."""
-    return concatenate([check(evidence) for check in SOLUTION_CHECKS], evidence.cameras)
+    checks = concatenate([check(evidence) for check in SOLUTION_CHECKS], evidence.cameras)
+    return {name: advise_together(each) for name, each in checks.items()}
 
 
 def assess_run(evidence: RunEvidence) -> dict[str, list[Check]]:
@@ -86,7 +88,8 @@ def assess_run(evidence: RunEvidence) -> dict[str, list[Check]]:
     checks = concatenate([assess(evidence.solution), *of_run], cameras)
     convention = _intended_guess_checks(evidence, checks)
     implausible = implausible_checks(evidence.run.guess, checks)
-    return concatenate([convention, implausible, checks], cameras)
+    checks = concatenate([convention, implausible, checks], cameras)
+    return {name: advise_together(each) for name, each in checks.items()}
 
 
 def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:

@@ -8,6 +8,7 @@ half is a field of displacements of its own.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -56,6 +57,13 @@ KINDS = {
 }
 """Kinds of the checks."""
 LENS_KINDS = frozenset(kind for kinds in KINDS.values() for kind in kinds.values())
+_PART_OF = {
+    kind: part
+    for kinds in KINDS.values()
+    for name, kind in kinds.items()
+    if (part := _WORDS[name][0]) is not None
+}
+_ESTIMATE = re.compile(r"(run with --estimate )\S+$")
 
 _NAMES = FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT
 _PARTS: tuple[LensPart, ...] = "focal", "aspect", "centre", "distortion"
@@ -226,6 +234,25 @@ def check_parameter(found: LensParameter, by: str) -> Check:
         text += f": {advice}" + (f"; or run with --estimate {part}" if part else "")
     check = row.describe(probability, status, text, name=f"{found.name} by the {by}: {row.name}")
     return replace(check, kind=KINDS[by][found.name])
+
+
+def advise_together(checks: Sequence[Check]) -> list[Check]:
+    """The checks of a camera; of several parameters that look wrong, the advice is one.
+
+    A wrong parameter makes others look wrong, since matches follow it. To estimate one of those
+    alone would leave the camera where it is, with an error bar that does not hold.
+    """
+    look_wrong = {check.kind for check in checks if check.status != "PASS"}
+    parts = {_PART_OF[kind] for kind in look_wrong & _PART_OF.keys()}
+    if len(parts) < 2:  # noqa: PLR2004
+        return list(checks)
+    all_parts = ",".join(["lens", *sorted(parts & {"aspect", "offset"})])
+    return [
+        replace(check, text=_ESTIMATE.sub(rf"\1{all_parts}", check.text))
+        if check.kind in _PART_OF
+        else check
+        for check in checks
+    ]
 
 
 def probability_of_lens(values: Iterable[tuple[str, Status, float | None]]) -> float:

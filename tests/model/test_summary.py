@@ -80,6 +80,13 @@ def test_an_action_is_stated_once() -> None:
     assert len(summary.actions) == 1
 
 
+def test_the_lens_parts_to_estimate_are_those_that_the_check_names() -> None:
+    text = "a focal length 2 % longer: check the intrinsics; or run with --estimate lens,aspect"
+    check = Check("focal length", "FAIL", text, kind="focal_length")
+    (action,) = summarize({"left": Verdict((check,))}).actions
+    assert action.endswith("estimate the lens: --estimate lens,aspect.")
+
+
 def test_cannot_tell_is_a_reason_and_no_status() -> None:
     summary = summarize({"left": Verdict((), ErrorProbability(0.001, 0.3))})
     assert (summary.status, summary.cannot_tell) == ("WARN", True)

@@ -11,6 +11,7 @@ from calibgraph.trust.lens_parameter import (
     IMAGES,
     RESIDUALS,
     LensParameter,
+    advise_together,
     check_parameter,
     probability_of_lens,
 )
@@ -102,3 +103,18 @@ def test_the_worst_lens_parameter_counts_and_a_warning_as_one() -> None:
     assert found == 0.7  # noqa: PLR2004
     assert probability_of_lens([("skew", "WARN", 0.7), ("frames", "FAIL", 0.9)]) == FAIL_ABOVE
     assert probability_of_lens([("skew", "PASS", None)]) == 0.0
+
+
+def test_of_several_parameters_that_look_wrong_all_are_estimated_together() -> None:
+    focal = check_parameter(estimate("focal length", 0.02, 0.002, 30.0), IMAGES)
+    centre = check_parameter(estimate("principal point", 0.02, 0.002, 30.0), RESIDUALS)
+    aspect = check_parameter(estimate("aspect ratio", 0.02, 0.002, 30.0), IMAGES)
+    right = check_parameter(estimate("distortion", 0.0, 0.002, 0.0), IMAGES)
+    assert focal.text.endswith("run with --estimate focal")
+    assert advise_together([focal, right]) == [focal, right]
+    texts = [check.text for check in advise_together([focal, right, centre])]
+    assert [text.rpartition(" ")[2] for text in (texts[0], texts[2])] == ["lens", "lens"]
+    assert texts[1] == right.text
+    of_shape = advise_together([focal, aspect])
+    assert all(check.text.endswith("run with --estimate lens,aspect") for check in of_shape)
+    assert [check.value for check in of_shape] == [focal.value, aspect.value]
