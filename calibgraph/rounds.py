@@ -91,9 +91,8 @@ def match_in_rounds(
     indices, lens = [*range(start.first_round, full.rounds)], dict[str, tuple[LensEstimate, ...]]()
     for index in indices:
         repeat = len(rounds) + 1 - (full.rounds - start.first_round)
-        told = with_note(
-            progress, f"lens: repeat {repeat}, at most {_REPEATS}" if repeat > 0 else ""
-        )
+        note = f"{', '.join(config.estimate)}: repeat {repeat}, at most {_REPEATS}"
+        told = with_note(progress, note if repeat > 0 else "")
         with watch("match"):
             table = full.match(data, estimate, round_index=index, progress=told)
             table = with_motion(table, data).with_findings(start.findings).with_places(places)
