@@ -1,6 +1,6 @@
 """The rounds: match, solve, match again from the estimate; then once from a displaced start.
 
-The paper matches once and solves once. A weight-free matcher sees only what is near, so it starts
+The paper matches once and solves once. A local matcher sees only what is near, so it starts
 coarse and is run again from every better estimate.
 """
 

@@ -1,4 +1,4 @@
 """From images and clouds to correspondences; ``protocol`` defines a matcher.
 
-Two matchers: ``structure`` needs no weights, ``cmrnext`` is the learned one.
+Two matchers: ``structure`` needs no download, ``cmrnext`` is the learned one.
 """

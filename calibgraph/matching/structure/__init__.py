@@ -1,4 +1,4 @@
-"""The weight-free matcher `structure`: local correlation of clouds and images, pose consensus.
+"""The matcher `structure`, local correlation of clouds and images, pose consensus; no download.
 
 First a global search locates every camera, from a guess that may be far off (`global_search`):
 
