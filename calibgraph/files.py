@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 import tempfile
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_origin
@@ -209,6 +210,16 @@ def _unusual_number(value: object) -> str:
     if isinstance(value, (list, tuple)):
         return next(filter(None, map(_unusual_number, value)), "")
     return value.text if isinstance(value, UnusualInt) else ""
+
+
+def commented_defaults(model: type[BaseModel]) -> str:
+    """A YAML file with all defaults of a model, each with its description."""
+    lines = []
+    for name, field in model.model_fields.items():
+        description = " ".join((field.description or "").split())
+        lines += textwrap.wrap(description, 98, initial_indent="# ", subsequent_indent="# ")
+        lines += [yaml_text({name: field.default}).strip(), ""]
+    return "\n".join(lines)
 
 
 def checked_model(model: type[Model], content: Any, path: Path | str) -> Model:

@@ -15,12 +15,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy.ndimage import uniform_filter
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.scenes import Folders
 from benchmarks.accuracy.window_weights import REACH, RECORDINGS, Sample, sample_of
 from benchmarks.tables import Table, add_record_option, publish
+from calibgraph.matching.structure.training.loss import damped
 from calibgraph.matching.structure.window_weights import window_network
 
 FITTED = ("surround6", "acfr_vlp16_fisheye")
@@ -50,8 +52,8 @@ def main() -> None:
 def weighed(sample: Sample) -> np.ndarray:
     """(w, s, s) scores of some windows, by their weights."""
     rows = np.random.default_rng(0).permutation(len(sample.features))[:MOST]
-    weights = window_network().weights(sample.features.numpy()[rows])[:, None, None]
-    return np.asarray(-np.log(1 - weights * (1 - np.exp(-sample.scores.numpy()[rows]))))
+    weights = torch.as_tensor(window_network().weights(sample.features[rows]))
+    return np.asarray(damped(sample.scores[rows], weights))
 
 
 def stated(scores: np.ndarray, sharpness: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -14,9 +14,9 @@ all windows of one weight and with the network's.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +30,18 @@ from benchmarks.accuracy.scenes import Folders
 from benchmarks.tables import ROOT, Table, add_record_option, publish
 from calibgraph import Dataset, Rig, load_dataset, simulate_street
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
-from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
-from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.shift_scores import downscale_log_gray, select_windows
+from calibgraph.matching.structure.training.loss import damped
+from calibgraph.matching.structure.training.samples import score_each
+from calibgraph.matching.structure.training.trainee import Trainee
 from calibgraph.matching.structure.visibility import find_places
-from calibgraph.matching.structure.window_features_kernel import FEATURES, fill_features
-from calibgraph.matching.structure.window_weights import window_network
-from calibgraph.matching.structure.windows import Windows
+from calibgraph.matching.structure.window_features_kernel import FEATURES
+from calibgraph.matching.structure.window_weights import (
+    PACKAGE_FILE,
+    WindowNetwork,
+    window_network,
+)
 from calibgraph.simulation.scan_errors import draw_scan_errors
 from calibgraph.simulation.surroundings import SURROUNDINGS
 
@@ -45,7 +49,6 @@ LEVEL = replace(LEVELS[3], weighed=False)
 REACH = 12  # steps to each side that are kept
 FIRST_SEED, STREETS, OTHERS, FRAMES = 9000, 48, 6, 3
 MOST = {"rendered": 800, "recorded": 1000}  # windows of an image
-FILE = ROOT / "calibgraph" / "matching" / "structure" / "window_weights.json"
 HIDDEN, EPOCHS, BATCH, RATE, DECAY, NOISE = 16, 8, 512, 8e-3, 1e-2, 0.5
 SHARPNESS = 2.5  # logarithm to begin with: from 0 all weights would grow to 1 before it does
 RECORDINGS = (
@@ -63,7 +66,7 @@ class Sample:
         scores: (w, s, s) by shift [v, u] from the truth, in the middle; NaN beyond the reach.
     """
 
-    features: torch.Tensor
+    features: np.ndarray
     scores: torch.Tensor
 
 
@@ -81,7 +84,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.write:
         samples = [sample_of(*scene, "rendered") for scene in rendered(options.scenes)]
-        FILE.write_text(json.dumps(train(samples, options.seed)) + "\n", encoding="utf-8")
+        train(samples, options.seed).save(PACKAGE_FILE)
         window_network.cache_clear()
     if options.judge:
         publish("accuracy.window_weights", [judge(options.realdata)], record=options.record)
@@ -118,50 +121,23 @@ def sample_of(dataset: Dataset, rig: Rig, of: str, frames: int = 4) -> Sample:
             windows = select_windows(cloud, camera, LEVEL, max_windows=MOST[of])
             viewpoint_m = cloud.viewpoint_lidar_m(camera)
             reach = min(REACH, round(LEVEL.reach_rad * camera.lens.pixels_per_rad * scale.max()))
+            reach = max(reach, 3)
             places = find_places(windows.rays_m, viewpoint_m, camera, scale)
-            scores.append(score_each(image, places, windows, max(reach, 3)))
-            features.append(features_of(cloud.points_lidar_m - viewpoint_m, cloud, windows))
-    return Sample(torch.tensor(np.concatenate(features)), torch.tensor(np.concatenate(scores)))
+            margins = ((0, 0), (REACH - reach,) * 2, (REACH - reach,) * 2)
+            grids = score_each(image, places, windows, reach)
+            scores.append(np.pad(grids, margins, constant_values=np.nan))
+            features.append(windows.features)
+    return Sample(np.concatenate(features), torch.tensor(np.concatenate(scores)))
 
 
-def features_of(rays_m: np.ndarray, cloud: PreparedCloud, windows: Windows) -> np.ndarray:
-    """(w, f) features in single precision."""
-    found = np.zeros((len(windows.counts), len(FEATURES)))
-    fill_features(
-        (rays_m, cloud.intensity_rank),
-        windows.members,
-        windows.counts,
-        windows.front,
-        windows.basis,
-        found,
-    )
-    return found.astype(np.float32)
-
-
-def score_each(image: np.ndarray, places: np.ndarray, windows: Windows, reach: int) -> np.ndarray:
-    """(w, s, s) of every window by itself, on a grid of the largest reach."""
-    count, size = len(windows.counts), 2 * reach + 1
-    grids = np.zeros((count, size, size), np.float32)
-    group, first = np.arange(count, dtype=np.int32), np.array([-reach, -reach])
-    score_windows(image, places, windows.counts, windows.basis, group, first, True, grids)
-    margin = REACH - reach
-    return np.pad(grids, ((0, 0), (margin, margin), (margin, margin)), constant_values=np.nan)
-
-
-def train(samples: Sequence[Sample], seed: int) -> dict[str, object]:
-    """The trained network, as the package keeps it."""
+def train(samples: Sequence[Sample], seed: int) -> WindowNetwork:
+    """The trained network."""
     torch.manual_seed(seed)
     torch.set_num_threads(1)
-    features = torch.cat([sample.features for sample in samples])
-    mean, spread = features.mean(0), features.std(0) + 1e-6
-    network = torch.nn.Sequential(
-        torch.nn.Linear(len(FEATURES), HIDDEN), torch.nn.GELU(approximate="tanh"),
-        torch.nn.Linear(HIDDEN, HIDDEN), torch.nn.GELU(approximate="tanh"),
-        torch.nn.Linear(HIDDEN, 1),
-    )  # fmt: skip
+    trainee = Trainee(untrained(np.concatenate([sample.features for sample in samples])))
     sharpness = torch.nn.Parameter(torch.tensor(SHARPNESS))
     groups: list[dict[str, Any]] = [
-        {"params": network.parameters()},
+        {"params": trainee.layers.parameters()},
         {"params": [sharpness], "weight_decay": 0.0},
     ]
     optimizer = torch.optim.AdamW(groups, RATE / 2, weight_decay=DECAY)
@@ -169,25 +145,27 @@ def train(samples: Sequence[Sample], seed: int) -> dict[str, object]:
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=steps)
     for _ in range(EPOCHS):
         for sample, rows in batches(samples):
-            values = (sample.features[rows] - mean) / spread
-            values = values + NOISE * torch.randn_like(values)
-            weights = torch.sigmoid(network(values).clamp(-12, 12))[:, 0]
+            weights = trainee.weights(sample.features[rows.numpy()], NOISE)
             loss = negative_log_likelihood(weights, sample.scores[rows], sharpness.exp())
             optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()
             schedule.step()
         print(f"sharpness {float(sharpness.detach().exp()):.1f}", flush=True)
-    linear = [layer for layer in network if isinstance(layer, torch.nn.Linear)]
-    return {
-        "format": "calibgraph-window-weights/1",
-        "how": "python -m benchmarks.accuracy.window_weights --write: "
-        f"{len(features)} windows of {len(samples)} rendered scenes, seeds from {FIRST_SEED} on",
-        "features": list(FEATURES), "mean": _rounded(mean), "spread": _rounded(spread),
-        "layers": [
-            {"matrix": _rounded(layer.weight.T), "bias": _rounded(layer.bias)} for layer in linear
-        ],
-    }  # fmt: skip
+    count = sum(len(sample.features) for sample in samples)
+    return trainee.to_network(
+        f"python -m benchmarks.accuracy.window_weights --write: {count} windows of "
+        f"{len(samples)} rendered scenes, seeds from {FIRST_SEED} on"
+    )
+
+
+def untrained(features: np.ndarray) -> WindowNetwork:
+    """A network of random layers, for features (w, f) like these."""
+    sizes = pairwise((len(FEATURES), HIDDEN, HIDDEN, 1))
+    linear = [torch.nn.Linear(*size) for size in sizes]
+    layers = [(layer.weight.detach().T.numpy(), layer.bias.detach().numpy()) for layer in linear]
+    values = features.astype(np.float64)
+    return WindowNetwork(values.mean(axis=0), values.std(axis=0) + 1e-6, tuple(layers))
 
 
 def batches(samples: Sequence[Sample]) -> Iterator[tuple[Sample, torch.Tensor]]:
@@ -206,19 +184,13 @@ def negative_log_likelihood(
 ) -> torch.Tensor:
     """Its mean: of the nine middle shifts, against all being alike."""
     beyond = torch.isnan(scores)
-    damped = -torch.log(1 - weights[:, None, None] * (1 - torch.exp(-torch.nan_to_num(scores))))
-    logits = (sharpness * damped).masked_fill(beyond, -1e9).flatten(1)
+    logits = (
+        (sharpness * damped(torch.nan_to_num(scores), weights)).masked_fill(beyond, -1e9).flatten(1)
+    )
     middle = logits.reshape(scores.shape)[:, REACH - 1 : REACH + 2, REACH - 1 : REACH + 2]
     shifts = (~beyond).sum((1, 2)).float()
     found = torch.logsumexp(middle.flatten(1), 1) - torch.logsumexp(logits, 1)
     return -(found + torch.log(shifts / 9)).mean()
-
-
-def _rounded(values: torch.Tensor) -> list[Any]:
-    """To four digits."""
-    if values.ndim > 1:
-        return [_rounded(row) for row in values]
-    return [float(f"{value:.4g}") for value in values.tolist()]
 
 
 def judge(realdata: Path) -> Table:
@@ -226,10 +198,9 @@ def judge(realdata: Path) -> Table:
     rows = []
     for name in RECORDINGS:
         sample = sample_of(*Folders(realdata, None).load(name), "recorded")
-        weights = window_network().weights(sample.features.numpy().astype(np.float64))
-        scores = sample.scores.numpy()
-        damped = -np.log(1 - weights[:, None, None] * (1 - np.exp(-scores)))
-        before, after = summed_z(scores), summed_z(damped)
+        weights = window_network().weights(sample.features)
+        weighed = damped(sample.scores, torch.as_tensor(weights))
+        before, after = summed_z(sample.scores.numpy()), summed_z(weighed.numpy())
         rows.append((name, f"{before:.1f}", f"{after:.1f}", f"{after / before:.2f}",
                      f"{weights.mean():.2f}"))  # fmt: skip
     columns = ("recording", "one weight", "weights", "ratio", "mean weight")

@@ -1,7 +1,8 @@
 """The commands of the learned matcher: what is in a file of weights, and training."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -31,13 +32,31 @@ def weights(
         print_weights(terminal(), checkpoint.summary(), out)
 
 
-def _print_settings(requested: bool) -> None:
-    """Print a settings file with all defaults."""
+def _print_train_settings(requested: bool) -> None:
     if requested:
-        from calibgraph.matching.cmrnext.training.settings import commented_defaults
+        from calibgraph.files import commented_defaults
+        from calibgraph.matching.cmrnext import TrainSettings
 
-        print(commented_defaults())
+        print(commented_defaults(TrainSettings))
         raise typer.Exit
+
+
+def _print_window_settings(requested: bool) -> None:
+    if requested:
+        from calibgraph.files import commented_defaults
+        from calibgraph.matching.structure.training import WindowSettings
+
+        print(commented_defaults(WindowSettings))
+        raise typer.Exit
+
+
+def _print_settings_option(callback: Callable[[bool], None]) -> Any:
+    return typer.Option(
+        "--print-settings",
+        callback=callback,
+        is_eager=True,
+        help="Print a settings file with all defaults and what they mean, and exit.",
+    )
 
 
 def train(
@@ -61,15 +80,7 @@ def train(
             help="Settings of the training, YAML. (default: the published training's)",
         ),
     ] = None,
-    print_settings: Annotated[
-        bool,
-        typer.Option(
-            "--print-settings",
-            callback=_print_settings,
-            is_eager=True,
-            help="Print a settings file with all defaults and what they mean, and exit.",
-        ),
-    ] = False,
+    print_settings: Annotated[bool, _print_settings_option(_print_train_settings)] = False,
     held_out: Annotated[
         list[Path] | None,
         typer.Option(
@@ -147,16 +158,22 @@ def train_windows(
             "sequences or datasets with a reference.yaml.",
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE.json", help="Weights to write.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE.json", help="Weights to write, if recordings held out get better."
+        ),
+    ],
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Settings of the training, YAML.")
     ] = None,
+    print_settings: Annotated[bool, _print_settings_option(_print_window_settings)] = False,
     held_out: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="RESULT",
-            help="Recording that only measures; may be repeated. (default: the last fifth of each "
-            "RESULT)",
+            help="Recording that only measures whether the weights are better; may be repeated. "
+            "(default: the last fifth of each RESULT)",
         ),
     ] = None,
     start: Annotated[
@@ -165,7 +182,11 @@ def train_windows(
     ] = None,
     seed: ConfigSeedOption = None,
 ) -> None:
-    """Train the weights of the matcher structure's windows on the poses of your own recordings."""
+    """Train the weights of the matcher structure's windows on the poses of your own recordings.
+
+    If recordings held out get no better, nothing is written, and the exit code is 2.
+    """
+    from calibgraph.errors import CalibrationError
     from calibgraph.matching.structure.training import (
         WindowSettings,
         load_window_settings,
@@ -183,14 +204,20 @@ def train_windows(
         data, others = split(data)
     with progress_bar() as progress:
         found = train_windows(data, others, chosen, start=begun, progress=progress)
+    before, after = found.held_out
+    if not after < before:
+        raise CalibrationError(
+            f"{out}: is not written: recordings held out get no better ({_change(found.held_out)}, "
+            "negative log-likelihood of a camera's pose); learn from more recordings, or keep the "
+            "weights that you have"
+        )
     found.network.save(out)
-    better = "better" if found.held_out[1] < found.held_out[0] else "no better: do not use them"
     terminal().print(
         f"{out}: negative log-likelihood of a camera's pose {_change(found.loss)}, held out "
-        f"{_change(found.held_out)}, {better}",
+        f"{_change(found.held_out)}",
         soft_wrap=True, markup=False,
     )  # fmt: skip
 
 
 def _change(values: tuple[float, float]) -> str:
-    return f"{values[0]:.2f} -> {values[1]:.2f}"
+    return f"{values[0]:.3f} -> {values[1]:.3f}"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from calibgraph.errors import DatasetError
+from calibgraph.errors import DatasetError, FileError, in_words
 from calibgraph.io import kitti
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.io.dataset import Dataset, load_dataset
@@ -30,7 +30,7 @@ def load_trusted_dataset(folder: Path, rig: Rig | None = None) -> Dataset:
 
     Raises:
         DatasetError: if there is none of these: the folder's rig.yaml is only a guess; or if no
-            camera of the result is PASS, or its files have changed.
+            camera of the result is PASS, or its files are missing, have changed, or have no hash.
     """
     result = folder / CALIBRATION_FILE if folder.is_dir() else folder
     if rig is None and is_calibration_file(result):
@@ -55,18 +55,33 @@ def _of_result(folder: Path) -> Dataset:
         raise DatasetError(f"{folder}: {what}; learn from results of calibrate that are")
     frames = tuple(frame_of_entry(entry) for entry in result.frames)
     for frame in frames:
-        _require_same(frame, result.inputs)
+        _require_same(frame, result.inputs, folder)
     files = [path for frame in frames for path in (frame.cloud_path, *frame.image_paths.values())]
     return Dataset(Rig(cameras=passed), frames, (Path(os.path.commonpath(files)),))
 
 
-def _require_same(frame: Frame, hashes: dict[str, str]) -> None:
+def _require_same(frame: Frame, hashes: dict[str, str], folder: Path) -> None:
     for path in (frame.cloud_path, *frame.image_paths.values()):
         known = hashes.get(str(path))
-        if known is not None and known != hash_source(path):
-            raise DatasetError(
-                f"{path}: has changed since it was calibrated; calibrate again", frame=frame.index
-            )
+        if known is None:
+            what = f"{folder}: lists no hash of {path}, which may have changed"
+        elif known != _hash(path, folder):
+            what = f"{path}: has changed since it was calibrated"
+        else:
+            continue
+        raise DatasetError(f"{what}; calibrate again", frame=frame.index)
+
+
+def _hash(path: Path, folder: Path) -> str:
+    try:
+        return hash_source(path)
+    except (OSError, FileError) as error:
+        relative = "its paths are relative: start this in the folder where calibrate ran"
+        advice = "put the recording back" if path.is_absolute() else relative
+        raise DatasetError(
+            f"{folder}: its file {path} cannot be read ({in_words(error)}); {advice}, or calibrate "
+            "again"
+        ) from error
 
 
 def split(datasets: Sequence[Dataset]) -> tuple[list[Dataset], list[Dataset]]:

@@ -5,15 +5,23 @@ from __future__ import annotations
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
+from pydantic import BaseModel
 
 import calibgraph
 from calibgraph import Rig, load_rig
 from calibgraph.matching.cmrnext import TrainSettings, load_checkpoint
-from calibgraph.matching.structure.window_weights import PACKAGE_FILE, load_window_network
+from calibgraph.matching.structure.training import WindowSettings
+from calibgraph.matching.structure.window_weights import (
+    PACKAGE_FILE,
+    load_window_network,
+    window_network,
+)
 from tests.conftest import SAMPLE, Call
 from tests.matching.cmrnext.builders import good_content, saved
 
@@ -140,23 +148,42 @@ def test_training_refuses_misuse_in_one_line(tmp_path: Path, call: Call) -> None
     assert not out.exists()
 
 
-def test_default_settings_are_printed(call: Call) -> None:
-    code, printed, _ = call("train", "--print-settings")
+@pytest.mark.parametrize(
+    ("command", "settings"), [("train", TrainSettings), ("train-windows", WindowSettings)]
+)
+def test_default_settings_are_printed(call: Call, command: str, settings: type[BaseModel]) -> None:
+    code, printed, _ = call(command, "--print-settings")
     assert code == 0
-    assert TrainSettings.model_validate(yaml.safe_load(printed)) == TrainSettings()
+    assert settings.model_validate(yaml.safe_load(printed)) == settings()
 
 
 def test_windows_are_trained_on_the_command_line(tmp_path: Path, call: Call) -> None:
-    out, settings = tmp_path / "own.json", tmp_path / "small.yaml"
-    settings.write_text("epochs: 1\nframes: 2\n")
-    code, _, text = call("train-windows", SAMPLE, "--out", out, "--config", settings, "--seed", 2)
+    out, settings, start = (tmp_path / name for name in ("own.json", "small.yaml", "start.json"))
+    settings.write_text("epochs: 4\nframes: 2\nbatch: 1\nnoise: 0\nlearning_rate: 1e-2\n")
+    *hidden, (matrix, bias) = window_network().layers
+    # The worst windows count most, and what is learned is held out: training helps for certain.
+    replace(window_network(), layers=(*hidden, (-matrix, -bias))).save(start)
+    shipped, given = PACKAGE_FILE.read_bytes(), ("--config", settings, "--held-out", SAMPLE)
+    code, _, text = call(
+        "train-windows", SAMPLE, "--out", out, "--from", start, *given, "--seed", 2
+    )
     assert code == 0
-    assert re.search(r"pose -?\d+\.\d\d -> .*, held out .*, (no )?better", text)
+    number = r"(-?\d+\.\d{3})"
+    found = re.search(rf"pose {number} -> {number}, held out {number} -> {number}\n", text)
+    assert found is not None
+    before, after, held_before, held_after = map(float, found.groups())
+    assert after < before - 0.05 and (held_before, held_after) == (before, after)
     network = load_window_network(out)
     assert "seed 2" in network.how and "3 cameras" in network.how
+    assert not np.allclose(network.layers[0][0], load_window_network(start).layers[0][0], atol=1e-3)
     # Its own file may be replaced, and begun with; another one may not.
-    given = ("--out", tmp_path / "next.json", "--config", settings)
-    assert call("train-windows", SAMPLE, *given, "--from", out)[0] == 0
+    code, _, text = call(
+        "train-windows", SAMPLE, "--out", tmp_path / "next.json", "--from", out, *given
+    )
+    begun = re.search(rf"held out {number} -> {number}\n", text)
+    # Of the file's five digits three decimals are those of the training, but for the last.
+    assert code == 0 and begun is not None
+    assert float(begun[1]) == pytest.approx(held_after, abs=2e-3)
     other = tmp_path / "mine.json"
     other.write_text("{}")
     for arguments, message in (
@@ -170,4 +197,19 @@ def test_windows_are_trained_on_the_command_line(tmp_path: Path, call: Call) -> 
         code, _, line = call("train-windows", *arguments)
         assert code == 2 and line.count("\n") == 1
         assert re.search(message, line), line
-    assert PACKAGE_FILE.read_bytes() != out.read_bytes()
+    assert PACKAGE_FILE.read_bytes() == shipped
+
+
+def test_windows_that_get_no_better_leave_the_old_weights(tmp_path: Path, call: Call) -> None:
+    out, settings = tmp_path / "own.json", tmp_path / "too_fast.yaml"
+    settings.write_text("epochs: 2\nframes: 2\nlearning_rate: 1\n")
+    window_network().save(out)
+    good = out.read_bytes()
+    given = ("train-windows", SAMPLE, "--config", settings)
+    code, _, line = call(*given, "--out", out)
+    assert code == 2 and line.count("\n") == 1
+    found = re.search(r"own.json: is not written: .* no better \((\S+) -> (\S+), ", line)
+    assert found is not None and float(found[2]) > float(found[1])
+    assert out.read_bytes() == good
+    assert call(*given, "--out", tmp_path / "new.json")[0] == 2
+    assert not (tmp_path / "new.json").exists()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,14 +48,61 @@ def test_a_result_is_trusted_where_it_is_pass(
         np.testing.assert_array_equal(
             data.rig.T_camera_lidar[name], result.rig.T_camera_lidar[name]
         )
-    copy = tmp_path / "changed"
-    shutil.copytree(folder, copy)
-    content = yaml.safe_load((copy / "calibration.yaml").read_text())
-    first = next(iter(content["inputs"]))
-    content["inputs"] = {**content["inputs"], first: "0" * 64}
-    (copy / "calibration.yaml").write_text(yaml.safe_dump(content))
-    with pytest.raises(DatasetError, match="has changed since it was calibrated"):
-        load_trusted_dataset(copy)
+
+
+def rewritten(folder: Path, to: Path, change: Callable[[dict[str, Any], str], object]) -> Path:
+    """A copy of a result whose content is changed, by the path of its first cloud."""
+    shutil.copytree(folder, to)
+    content = yaml.safe_load((to / "calibration.yaml").read_text())
+    change(content, content["frames_used"][0]["cloud"])
+    (to / "calibration.yaml").write_text(yaml.safe_dump(content))
+    return to
+
+
+def with_relative_paths(content: dict[str, Any], _: str) -> None:
+    def relative(path: str) -> str:
+        return str(Path(path).relative_to(SAMPLE.parent))
+
+    content["inputs"] = {relative(path): known for path, known in content["inputs"].items()}
+    for frame in content["frames_used"]:
+        frame["cloud"] = relative(frame["cloud"])
+        frame["images"] = {name: relative(path) for name, path in frame["images"].items()}
+
+
+def moved_away(content: dict[str, Any], cloud: str) -> None:
+    content["frames_used"][0]["cloud"] = f"{cloud}.gone"
+    content["inputs"][f"{cloud}.gone"] = content["inputs"].pop(cloud)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c, p: c["inputs"].update({p: "0" * 64}), "has changed since it was calibrated"),
+        (
+            lambda c, p: c["inputs"].pop(p),
+            "lists no hash of .*000000.npy, which may have changed; calibrate again",
+        ),
+        (moved_away, r"result: its file .*\.gone cannot be read \(No such file.*put the recording"),
+        (
+            with_relative_paths,
+            r"result: its file sample/.*\(No such.*start this in the folder where",
+        ),
+    ],
+)
+def test_files_that_are_not_those_of_the_result_are_refused(
+    calibrated_sample: CommandRun, tmp_path: Path, change: Callable[..., object], message: str
+) -> None:
+    folder = rewritten(calibrated_sample.folder, tmp_path / "result", change)
+    with pytest.raises(DatasetError, match=message):
+        load_trusted_dataset(folder)
+
+
+def test_a_result_with_relative_paths_is_read_where_it_was_made(
+    calibrated_sample: CommandRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = rewritten(calibrated_sample.folder, tmp_path / "result", with_relative_paths)
+    monkeypatch.chdir(SAMPLE.parent)
+    assert len(load_trusted_dataset(folder).frames) == 6
 
 
 def test_frames_are_split_at_the_end(trusted: Dataset) -> None:

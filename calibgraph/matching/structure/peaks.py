@@ -11,6 +11,12 @@ MIN_QUALITY = 0.05  # as of a level; the confidence's unit
 MIN_CURVATURE_RATIO = 0.1  # to the larger curvature; below, a direction is unconstrained (an edge)
 
 
+_U, _V = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0])
+_TERMS = np.stack([_U**0, _U, _V, _U**2 / 2, _U * _V, _V**2 / 2]).reshape(6, 9).T
+QUADRATIC_FIT = np.linalg.pinv(_TERMS)
+"""(6, 9) least-squares fit of 1, u, v, u^2/2, u v, v^2/2 to nine values [v, u]."""
+
+
 def extract_correspondences(
     scores: ShiftScores, unknowns: Array, camera: str, *, min_quality: float = MIN_QUALITY
 ) -> Correspondences:
@@ -83,9 +89,7 @@ def _fit_quadratics(patches: Array) -> tuple[Array, Array]:
     Returns:
         (g, 2) offset (u, v) of the maximum; (g, 2, 2) Hessian of the negative score.
     """
-    u, v = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0])
-    terms = np.stack([u**0, u, v, u**2 / 2, u * v, v**2 / 2]).reshape(6, 9).T
-    fit = patches.reshape(len(patches), 9) @ np.linalg.pinv(terms).T
+    fit = patches.reshape(len(patches), 9) @ QUADRATIC_FIT.T
     values, vectors = np.linalg.eigh(-fit[:, [3, 4, 4, 5]].reshape(-1, 2, 2))
     kept = values > np.maximum(MIN_CURVATURE_RATIO * values[:, 1:], 1e-9)
     inverse = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)

@@ -1,5 +1,7 @@
 """Shift scores: agreement of the image with each group of LiDAR windows, over a grid of shifts."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -34,6 +36,31 @@ LOG_GRAY = np.log1p(np.arange(256, dtype=np.float32))
 
 
 @dataclass(frozen=True, eq=False)
+class ViewedWindows:
+    """The windows of a cloud that one image shows, by groups of one direction and depth.
+
+    Attributes:
+        camera: where it is when it takes the middle row, see :func:`when_taken`.
+        windows: w of them, by group.
+        group: (w,) the group of each.
+        image: logarithm of gray, a pixel per step.
+        steps_per_px: (2,) of u and v.
+        places: (w, l, 2) where the image shows their members [steps].
+        points_lidar_m: (g, 3) each group's mean point, in the LiDAR frame of the cloud.
+        seen_lidar_m: (g, 3) the same, where a rolling shutter sees it.
+    """
+
+    camera: Camera
+    windows: Windows
+    group: NDArray[np.int32]
+    image: NDArray[np.float32]
+    steps_per_px: Array
+    places: NDArray[np.int32]
+    points_lidar_m: Array
+    seen_lidar_m: Array
+
+
+@dataclass(frozen=True, eq=False)
 class ShiftScores:
     """Score grids of the groups of one camera.
 
@@ -63,7 +90,7 @@ class ShiftScores:
         variances = [part.var(axis=(1, 2), dtype=np.float64) for part in parts]
         return float(np.sqrt(np.concatenate(variances).sum()))
 
-    def with_unknowns(self, fields_px: Array) -> "ShiftScores":
+    def with_unknowns(self, fields_px: Array) -> ShiftScores:
         """The same scores, with (k, 2, g) derivatives of the pixels by further unknowns."""
         columns = fields_px.transpose(2, 1, 0) * self.steps_per_px[:, None]
         return replace(self, jacobian=np.concatenate([self.jacobian, columns], axis=2))
@@ -83,6 +110,39 @@ def score_frame(  # noqa: PLR0913 - what is scored, and how
 
     With the twist of the LiDAR, (6,), when the camera takes it.
     """
+    seen = view_windows(
+        gray, cloud, camera, level, max_windows=max_windows, twist_per_s=twist_per_s
+    )
+    scale, weight = seen.steps_per_px, seen.windows.weight
+    reach = int(np.ceil(level.reach_rad * camera.lens.pixels_per_rad * scale.max()))
+    reach, groups = max(reach, MIN_REACH_STEPS), len(seen.points_lidar_m)
+    grids: Grids = mmap_zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
+    _add_scores(grids, seen, likelihood=level.fine)
+    pixels_px, jacobian_px = project_with_jacobian(seen.camera, seen.seen_lidar_m)
+    return ShiftScores(
+        grids=grids,
+        jacobian=jacobian_px * scale[:, None],
+        points_lidar_m=seen.points_lidar_m,
+        pixels_px=pixels_px,
+        frame=np.full(groups, frame, np.int64),
+        weights=np.bincount(seen.group, weight, minlength=groups).astype(np.float64),
+        steps_per_px=scale,
+    )
+
+
+def view_windows(  # noqa: PLR0913 - what is seen, and how
+    gray: Gray,
+    cloud: PreparedCloud,
+    camera: Camera,
+    level: Level,
+    *,
+    max_windows: int,
+    twist_per_s: Array | None = None,
+) -> ViewedWindows:
+    """Select and group the windows that an image shows, and find where it shows them.
+
+    With the twist of the LiDAR, (6,), when the camera takes it.
+    """
     camera = when_taken(camera, twist_per_s)
     image, scale = downscale_log_gray(gray, camera, level.step_rad, level.blur_steps)
     windows = select_windows(cloud, camera, level, max_windows=max_windows)
@@ -94,21 +154,16 @@ def score_frame(  # noqa: PLR0913 - what is scored, and how
     if twist_per_s is not None and camera.readout_s:
         moved_m = seen_at_rows(camera, rays_m + viewpoint_m, twist_per_s)
         rays_m, seen_m = (moved_m - viewpoint_m).astype(np.float32), moved_m[:, 0]
-    places = find_places(rays_m, viewpoint_m, camera, scale)
-    reach = int(np.ceil(level.reach_rad * camera.lens.pixels_per_rad * scale.max()))
-    reach = max(reach, MIN_REACH_STEPS)
-    grids: Grids = mmap_zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
-    _add_scores(grids, image, places, windows, group, likelihood=level.fine)
     counts = np.bincount(group, minlength=groups)
-    pixels_px, jacobian_px = project_with_jacobian(camera, _mean_by_group(seen_m, group, counts))
-    return ShiftScores(
-        grids=grids,
-        jacobian=jacobian_px * scale[:, None],
-        points_lidar_m=_mean_by_group(centres_lidar_m, group, counts),
-        pixels_px=pixels_px,
-        frame=np.full(groups, frame, np.int64),
-        weights=np.bincount(group, windows.weight, minlength=groups).astype(np.float64),
+    return ViewedWindows(
+        camera=camera,
+        windows=windows,
+        group=group,
+        image=image,
         steps_per_px=scale,
+        places=find_places(rays_m, viewpoint_m, camera, scale),
+        points_lidar_m=_mean_by_group(centres_lidar_m, group, counts),
+        seen_lidar_m=_mean_by_group(seen_m, group, counts),
     )
 
 
@@ -201,17 +256,11 @@ def _mean_by_group(points: Array, group: NDArray[np.int32], counts: NDArray[np.i
     return np.stack(sums, axis=1) / counts[:, None]
 
 
-def _add_scores(
-    grids: Grids,
-    image: NDArray[np.float32],
-    places: NDArray[np.int32],
-    windows: Windows,
-    group: NDArray[np.int32],
-    *,
-    likelihood: bool,
-) -> None:
+def _add_scores(grids: Grids, seen: ViewedWindows, *, likelihood: bool) -> None:
     """Add the windows' scores to their groups' grids, and subtract each grid's mean."""
-    reach = (grids.shape[1] - 1) // 2
-    first = np.array([-reach, -reach])
-    score_windows(image, places, windows.counts, windows.basis, group, first, likelihood, grids)
+    windows, reach = seen.windows, (grids.shape[1] - 1) // 2
+    score_windows(
+        seen.image, seen.places, windows.counts, windows.basis, seen.group,
+        np.array([-reach, -reach]), likelihood, grids,
+    )  # fmt: skip
     grids -= grids.mean(axis=(1, 2), keepdims=True)

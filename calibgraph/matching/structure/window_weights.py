@@ -33,7 +33,8 @@ PACKAGE_FILE = Path(__file__).with_name("window_weights.json")
 LARGEST = 12.0  # of a logit: beyond, the weight is 0 or 1 to single precision
 MAX_HOW = 500  # characters
 _MOST = 256  # units of a layer of a file
-_Number = Annotated[float, Field(ge=-1e6, le=1e6)]
+_Number = Annotated[float, Field(strict=True, ge=-1e6, le=1e6)]
+_Spread = Annotated[float, Field(strict=True, ge=1e-6, le=1e6)]
 _Row = Annotated[list[_Number], Field(min_length=1, max_length=_MOST)]
 
 
@@ -88,7 +89,7 @@ class _File(BaseModel):
     how: Annotated[str, Field(max_length=MAX_HOW)]
     features: list[str]
     mean: _Row
-    spread: list[Annotated[float, Field(gt=0, le=1e6)]]
+    spread: Annotated[list[_Spread], Field(max_length=_MOST)]
     layers: Annotated[list[_Layer], Field(min_length=1, max_length=8)]
 
 
@@ -109,10 +110,10 @@ def load_window_network(path: Path | str) -> WindowNetwork:
     if content.features != list(FEATURES):
         raise FileError(path, "its features are not those of this version; train it again")
     sizes = [len(FEATURES), *(len(layer.bias) for layer in content.layers)]
-    shapes = [{len(layer.matrix), *map(len, layer.matrix)} for layer in content.layers]
-    expected = [{inputs, outputs} for inputs, outputs in pairwise(sizes)]
+    rows = [list(map(len, layer.matrix)) for layer in content.layers]
+    expected = [[outputs] * inputs for inputs, outputs in pairwise(sizes)]
     vectors = {len(content.mean), len(content.spread)}
-    if vectors != {len(FEATURES)} or shapes != expected or sizes[-1] != 1:
+    if vectors != {len(FEATURES)} or rows != expected or sizes[-1] != 1:
         raise FileError(path, "its layers do not fit each other, the features and one weight")
     if not content.how.isprintable():
         raise FileError(path, "its description holds control characters")

@@ -161,11 +161,20 @@ def test_a_network_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert [matrix.shape for matrix, _ in read.layers] == [(14, 5), (5, 1)]
 
 
+def transpose(layer: dict[str, Any]) -> None:
+    layer["matrix"] = [list(column) for column in zip(*layer["matrix"], strict=True)]
+
+
 HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "other features": (lambda c: c["features"].reverse(), "features are not those"),
     "a number that is none": (lambda c: c["mean"].__setitem__(3, float("nan")), "mean.3"),
     "a number beyond": (lambda c: c["layers"][1]["bias"].__setitem__(0, 1e300), "layers.1.bias.0"),
     "a spread of 0": (lambda c: c["spread"].__setitem__(0, 0), "spread.0"),
+    "a spread that overflows": (lambda c: c["spread"].__setitem__(0, 1e-300), "spread.0"),
+    "true for a number": (lambda c: c["mean"].__setitem__(0, True), "mean.0"),
+    "true for a spread": (lambda c: c["spread"].__setitem__(0, True), "spread.0"),
+    "a transposed matrix": (lambda c: transpose(c["layers"][0]), "do not fit"),
+    "a ragged row": (lambda c: c["layers"][0]["matrix"].__setitem__(0, [0.0] * 14), "do not fit"),
     "a layer cut off": (lambda c: c["layers"].pop(), "do not fit"),
     "a ragged matrix": (lambda c: c["layers"][0]["matrix"][2].pop(), "do not fit"),
     "a short mean": (lambda c: c["mean"].pop(), "do not fit"),

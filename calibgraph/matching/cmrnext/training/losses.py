@@ -2,23 +2,20 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import gtsam
 import numpy as np
 import torch
 from torch import Tensor
 
-from calibgraph.graph.objective import pose_key
 from calibgraph.matching.cmrnext.correlation import WINDOW, Correlation, cross_entropy
 from calibgraph.matching.cmrnext.layers import CELL
 from calibgraph.matching.cmrnext.network import upscale
 from calibgraph.matching.cmrnext.training.samples import Sample, SampleSettings
-from calibgraph.solver.pose_loss import pose_loss
+from calibgraph.matching.optimum_loss import optimum_loss as pose_optimum_loss
 from factors import ProjectionBlock, pose_sigmas
 
 _DISCOUNT = 0.8  # of each iteration's loss against the next one's
-_CAMERA = "camera"
 _USUAL, _LEAST_PX = 1.5, 1.0  # scale of the robust loss: in median errors, and at least
 _OFFSET_CELLS = 3.5  # largest distance of the correlation loss's windows from the truth, per axis
 
@@ -99,7 +96,7 @@ def optimum_loss(flow: Tensor, samples: Sequence[Sample], settings: SampleSettin
         settings: of the samples.
     """
     losses = [
-        _OptimumLoss.apply(  # type: ignore[no-untyped-call]
+        _optimum_loss_of(
             flow_at_points(flow[i : i + 1], [sample], halved=settings.half_resolution),
             sample,
             settings,
@@ -109,32 +106,16 @@ def optimum_loss(flow: Tensor, samples: Sequence[Sample], settings: SampleSettin
     return torch.stack(losses).mean()
 
 
-class _OptimumLoss(torch.autograd.Function):
-    """Of (n, 2) flow at the points of one sample."""
-
-    @staticmethod
-    def forward(ctx: Any, flow_px: Tensor, sample: Sample, settings: SampleSettings) -> Tensor:
-        pixels = sample.pixels_px + flow_px.detach().cpu().numpy()
-        errors_px = np.linalg.norm(pixels - sample.view.project(sample.points_camera_m), axis=1)
-        block = ProjectionBlock(
-            sample.view.lens, sample.points_camera_m, pixels,
-            scale=max(_USUAL * float(np.median(errors_px)), _LEAST_PX),
-        )  # fmt: skip
-        prior = gtsam.NonlinearFactorGraph()
-        prior.add(_perturbation_prior(sample, settings))
-        found = pose_loss({_CAMERA: block}, prior, {_CAMERA: np.eye(4)})
-        ctx.save_for_backward(flow_px.new_tensor(found.by_pixels[_CAMERA]))
-        return flow_px.new_tensor(found.value)
-
-    @staticmethod
-    def backward(ctx: Any, *above: Tensor) -> tuple[Tensor, None, None]:
-        return above[0] * ctx.saved_tensors[0], None, None
-
-
-def _perturbation_prior(sample: Sample, settings: SampleSettings) -> gtsam.PriorFactorPose3:
-    """About the perturbed start, as wide as perturbations are drawn."""
+def _optimum_loss_of(flow_px: Tensor, sample: Sample, settings: SampleSettings) -> Tensor:
+    """Of (n, 2) flow at the points of one sample; the prior is about the perturbed start."""
+    pixels = sample.pixels_px + flow_px.detach().cpu().numpy()
+    errors_px = np.linalg.norm(pixels - sample.view.project(sample.points_camera_m), axis=1)
+    block = ProjectionBlock(
+        sample.view.lens, sample.points_camera_m, pixels,
+        scale=max(_USUAL * float(np.median(errors_px)), _LEAST_PX),
+    )  # fmt: skip
     sigmas = pose_sigmas(
         rotation_rad=math.radians(settings.rotation_deg), translation_m=settings.translation_m
     )
-    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas / math.sqrt(3))  # of a uniform distribution
-    return gtsam.PriorFactorPose3(pose_key([_CAMERA], _CAMERA), gtsam.Pose3(sample.E), noise)
+    prior = gtsam.Pose3(sample.E), sigmas / math.sqrt(3)  # of a uniform distribution
+    return pose_optimum_loss(block, np.eye(4), prior, pixels_px=flow_px)

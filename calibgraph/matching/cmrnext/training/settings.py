@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from calibgraph.errors import FileError
@@ -118,17 +116,6 @@ def load_settings(path: Path | str) -> TrainSettings:
         FileError: if the file is missing, has an unknown key or a wrong value.
     """
     return checked_model(TrainSettings, read_yaml(Path(path)), path)
-
-
-def commented_defaults() -> str:
-    """A settings file with all defaults, each with its description."""
-    lines = []
-    for name, field in TrainSettings.model_fields.items():
-        description = " ".join((field.description or "").split())
-        lines += textwrap.wrap(description, 98, initial_indent="# ", subsequent_indent="# ")
-        default = yaml.safe_dump(field.default, default_flow_style=True).splitlines()[0]
-        lines += [f"{name}: {default}", ""]
-    return "\n".join(lines)
 
 
 def to_config(settings: TrainSettings, validation: Validation) -> dict[str, Any]:

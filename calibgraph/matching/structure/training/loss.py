@@ -9,25 +9,23 @@ that matches constrain and the spread of their residuals are taken as they are.
 from __future__ import annotations
 
 import math
-from typing import Any
 
-import gtsam
 import numpy as np
 import torch
 from torch import Tensor
 
-from calibgraph.graph.objective import pose_key
-from calibgraph.matching.structure.peaks import MIN_CURVATURE_RATIO, PEAK_STEPS
+from calibgraph.matching.optimum_loss import optimum_loss
+from calibgraph.matching.structure.peaks import MIN_CURVATURE_RATIO, PEAK_STEPS, QUADRATIC_FIT
 from calibgraph.matching.structure.training.samples import LEVEL, NEAR, SIDE, CameraWindows
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import MIN_MATCHES
-from calibgraph.solver.pose_loss import pose_loss
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from calibgraph.solver.whitening import MEDIAN_NORM, upper_root
 from factors import ProjectionBlock, pose_sigmas
 
-_CAMERA = "camera"
+_PRIOR_SIGMAS = pose_sigmas(rotation_rad=LEVEL.rotation_rad, translation_m=LEVEL.translation_m)
+"""As wide as the level searches: few matches determine no pose without a prior."""
 
 
 def damped(scores: Tensor, weights: Tensor) -> Tensor:
@@ -58,10 +56,31 @@ def pose_negative_log_likelihood(weights: Tensor, sample: CameraWindows) -> Tens
     pixels = torch.as_tensor(sample.pixels_px)[good] + shift[good].double() / scale
     log_weights = 0.5 * torch.log(quality[good] * trace[good]).double()
     roots = _directions(hessian[good] / trace[good, None, None], sample.steps_per_px)
-    found: Tensor = _OptimumLoss.apply(  # type: ignore[no-untyped-call]
-        pixels, log_weights - log_weights.mean(), (sample, good.numpy(), roots)
-    )
-    return found
+    log_weights = log_weights - log_weights.mean()
+    block = _block(pixels, log_weights, sample, rows=good.numpy(), roots=roots)
+    T = sample.camera.T_camera_lidar
+    prior = to_T_lidar_camera(T), _PRIOR_SIGMAS
+    return optimum_loss(block, T, prior, pixels_px=pixels, log_weights=log_weights)
+
+
+def _block(
+    pixels: Tensor,
+    log_weights: Tensor,
+    sample: CameraWindows,
+    *,
+    rows: np.ndarray,
+    roots: np.ndarray,
+) -> ProjectionBlock:
+    """The matches of the groups in these rows, by the roots of their information."""
+    camera = sample.camera
+    block = ProjectionBlock(
+        camera.lens, sample.points_lidar_m[rows], pixels.detach().numpy(),
+        roots * np.exp(log_weights.detach().numpy())[:, None],
+    )  # fmt: skip
+    # What matches of a place share widens the information, not the loss.
+    widened = math.sqrt(error_components().matchers["structure"].place_variance)
+    sigma = widened * _spread(block, camera.T_camera_lidar)
+    return block.rescale(scale=CAUCHY_SCALE_SIGMAS / widened, sigma=sigma)
 
 
 def _directions(shapes: Tensor, steps_per_px: np.ndarray) -> np.ndarray:
@@ -78,7 +97,7 @@ def _peaks(grids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     row, column = NEAR - PEAK_STEPS + top // span, NEAR - PEAK_STEPS + top % span
     around, index = torch.arange(-1, 2), torch.arange(count)[:, None, None]
     patches = grids[index, (row[:, None] + around)[:, :, None], (column[:, None] + around)[:, None]]
-    fit = patches.reshape(count, 9) @ _quadratic().T
+    fit = patches.reshape(count, 9) @ torch.as_tensor(QUADRATIC_FIT.T, dtype=torch.float32)
     hessian = -fit[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
     vectors = torch.linalg.eigh(hessian.detach())[1]  # to first order values follow the matrix
     values = torch.einsum("gji,gjk,gki->gi", vectors, hessian, vectors)
@@ -91,58 +110,6 @@ def _peaks(grids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return shift, torch.einsum("gij,gj,gkj->gik", vectors, curvatures, vectors), patches[:, 1, 1]
 
 
-def _quadratic() -> Tensor:
-    """(6, 9) least-squares fit of 1, u, v, u^2/2, u v, v^2/2 to nine values [v, u]."""
-    v, u = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij")
-    terms = np.stack([u**0, u, v, u**2 / 2, u * v, v**2 / 2]).reshape(6, 9).T
-    return torch.as_tensor(np.linalg.pinv(terms), dtype=torch.float32)
-
-
-class _OptimumLoss(torch.autograd.Function):
-    """Of (n, 2) pixels and the (n,) logarithms of their weights.
-
-    ``matched``: the sample, the rows of the groups that match, and the roots of their information.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        pixels: Tensor,
-        log_weights: Tensor,
-        matched: tuple[CameraWindows, np.ndarray, np.ndarray],
-    ) -> Tensor:
-        sample, rows, roots = matched
-        camera = sample.camera
-        block = ProjectionBlock(
-            camera.lens, sample.points_lidar_m[rows], pixels.detach().numpy(),
-            roots * np.exp(log_weights.detach().numpy())[:, None],
-        )  # fmt: skip
-        # What matches of a place share widens the information, not the loss.
-        widened = math.sqrt(error_components().matchers["structure"].place_variance)
-        sigma = widened * _spread(block, camera.T_camera_lidar)
-        block = block.rescale(scale=CAUCHY_SCALE_SIGMAS / widened, sigma=sigma)
-        found = pose_loss({_CAMERA: block}, _prior(camera.T_camera_lidar),
-                          {_CAMERA: camera.T_camera_lidar})  # fmt: skip
-        gradients = found.by_pixels[_CAMERA], found.by_log_weights[_CAMERA]
-        ctx.save_for_backward(*(pixels.new_tensor(one) for one in gradients))
-        return pixels.new_tensor(found.value)
-
-    @staticmethod
-    def backward(ctx: Any, *above: Tensor) -> tuple[Tensor, Tensor, None]:
-        by_pixels, by_log_weights = ctx.saved_tensors
-        return above[0] * by_pixels, above[0] * by_log_weights, None
-
-
 def _spread(block: ProjectionBlock, T_camera_lidar: np.ndarray) -> float:
     """Robust standard deviation of the whitened residuals at a pose."""
     return max(float(np.median(block.run_norms(T_camera_lidar[None])[-1]) / MEDIAN_NORM[1]), 1e-9)
-
-
-def _prior(T_camera_lidar: np.ndarray) -> gtsam.NonlinearFactorGraph:
-    """As wide as the level searches: few matches determine no pose without it."""
-    sigmas = pose_sigmas(rotation_rad=LEVEL.rotation_rad, translation_m=LEVEL.translation_m)
-    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-    graph = gtsam.NonlinearFactorGraph()
-    pose = to_T_lidar_camera(T_camera_lidar)
-    graph.add(gtsam.PriorFactorPose3(pose_key([_CAMERA], _CAMERA), pose, noise))
-    return graph

@@ -15,16 +15,12 @@ from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.matching.structure.peaks import PEAK_STEPS
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
-from calibgraph.matching.structure.shift_scores import (
-    downscale_log_gray,
-    group_windows,
-    select_windows,
-)
-from calibgraph.matching.structure.visibility import find_places
+from calibgraph.matching.structure.shift_scores import ViewedWindows, view_windows
 from calibgraph.matching.structure.windows import Windows
-from calibgraph.model.clock import when_taken
+from calibgraph.model.clock import clock_of
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import project_with_jacobian
+from factors import displace
 
 Floats = NDArray[np.float32]
 
@@ -45,7 +41,7 @@ class CameraWindows:
         near: (w, SIDE, SIDE) scores by shift [v, u] from the truth, which is in the middle.
         chance: (w, CHANCE_SHIFTS) scores at unrelated shifts.
         group: (w,) its group.
-        points_lidar_m: (g, 3) mean point of each group.
+        points_lidar_m: (g, 3) mean point of each group, where it is when its pixel is taken.
         pixels_px: (g, 2) where it projects.
         steps_per_px: (2,) of u and v.
     """
@@ -91,33 +87,32 @@ def camera_windows(
 def _of_frame(
     frame: Frame, name: str, camera: Camera, *, cache: FrameCache, most: int
 ) -> CameraWindows:
-    gray, cloud = cache.image(frame, name, camera), cache.cloud(frame)
-    camera = when_taken(camera, frame.twist_per_s)
-    image, scale = downscale_log_gray(gray, camera, LEVEL.step_rad, LEVEL.blur_steps)
-    windows = select_windows(cloud, camera, LEVEL, max_windows=most)
-    T, viewpoint_m = camera.T_camera_lidar, cloud.viewpoint_lidar_m(camera)
-    centres = windows.rays_m[:, 0] + viewpoint_m
-    kept, group, groups = group_windows(centres @ T[:3, :3].T + T[:3, 3], LEVEL.group_rad)
-    windows, centres = windows.select(kept), centres[kept]
-    places = find_places(windows.rays_m, viewpoint_m, camera, scale)
-    near, chance = _score(image, places, windows)
-    counts = np.bincount(group, minlength=groups)[:, None]
-    sums = [np.bincount(group, column, minlength=groups) for column in centres.T]
-    points = np.stack(sums, axis=1).reshape(groups, 3) / counts
+    gray, cloud, twist = cache.image(frame, name, camera), cache.cloud(frame), frame.twist_per_s
+    seen = view_windows(gray, cloud, camera, LEVEL, max_windows=most, twist_per_s=twist)
+    near, chance = _score(seen)
+    points = seen.seen_lidar_m
+    if twist is not None:
+        points = displace(points, twist, -clock_of(camera).offset_s)
     return CameraWindows(
-        camera, windows.features, near, chance, group.astype(np.int64), points,
-        project_with_jacobian(camera, points)[0], scale,
+        camera, seen.windows.features, near, chance, seen.group.astype(np.int64), points,
+        project_with_jacobian(camera, points)[0], seen.steps_per_px,
     )  # fmt: skip
 
 
-def _score(image: Floats, places: NDArray[np.int32], windows: Windows) -> tuple[Floats, Floats]:
+def _score(seen: ViewedWindows) -> tuple[Floats, Floats]:
     """Scores of every window by itself, near the truth and at unrelated shifts."""
-    count, side = len(windows.counts), 2 * REACH + 1
+    grids = score_each(seen.image, seen.places, seen.windows, REACH)
+    middle, flat = slice(REACH - NEAR, REACH + NEAR + 1), (len(grids), (2 * REACH + 1) ** 2)
+    return grids[:, middle, middle], grids.reshape(flat)[:, _unrelated()]
+
+
+def score_each(image: Floats, places: NDArray[np.int32], windows: Windows, reach: int) -> Floats:
+    """(w, s, s) scores of every window by itself, by shift [v, u] up to a reach in steps."""
+    count, side = len(windows.counts), 2 * reach + 1
     grids = np.zeros((count, side, side), np.float32)
-    group, first = np.arange(count, dtype=np.int32), np.array([-REACH, -REACH])
+    group, first = np.arange(count, dtype=np.int32), np.array([-reach, -reach])
     score_windows(image, places, windows.counts, windows.basis, group, first, True, grids)
-    middle = slice(REACH - NEAR, REACH + NEAR + 1)
-    return grids[:, middle, middle], grids.reshape(count, side**2)[:, _unrelated()]
+    return grids
 
 
 def _unrelated() -> NDArray[np.int64]:

@@ -105,7 +105,7 @@ def _learn(
         progress("training", step, total)
         optimizer.zero_grad()
         for sample in batch:
-            weights = trainee.weights(sample, settings.noise)
+            weights = trainee.weights(sample.features, settings.noise)
             loss = pose_negative_log_likelihood(weights, sample)
             if loss is not None:
                 (loss / len(batch)).backward()  # type: ignore[no-untyped-call]
@@ -127,6 +127,8 @@ def _batches(
 @torch.no_grad()
 def _mean_loss(trainee: Trainee, samples: Sequence[CameraWindows]) -> float:
     """Over the cameras with enough matches; infinite without any."""
-    losses = [pose_negative_log_likelihood(trainee.weights(sample), sample) for sample in samples]
+    losses = [
+        pose_negative_log_likelihood(trainee.weights(sample.features), sample) for sample in samples
+    ]
     found = [float(loss) for loss in losses if loss is not None]
     return sum(found) / len(found) if found else math.inf

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from calibgraph.matching.structure.training.samples import CameraWindows
 from calibgraph.matching.structure.window_weights import LARGEST, WindowNetwork
 
 
@@ -28,9 +29,9 @@ class Trainee:
         gelus = [(layer, torch.nn.GELU(approximate="tanh")) for layer in hidden]
         self.layers = torch.nn.Sequential(*(module for pair in gelus for module in pair), last)
 
-    def weights(self, sample: CameraWindows, noise: float = 0.0) -> Tensor:
-        """(w,) of a sample's windows, differentiable, with noise on the features."""
-        values = (torch.as_tensor(sample.features).double() - self._mean) / self._spread
+    def weights(self, features: NDArray[np.float32], noise: float = 0.0) -> Tensor:
+        """(w,) of windows with features (w, f), differentiable, with noise on the features."""
+        values = (torch.as_tensor(features).double() - self._mean) / self._spread
         values = (values + noise * torch.randn_like(values)).float()
         logits: Tensor = self.layers(values).clamp(-LARGEST, LARGEST)[:, 0]
         return torch.sigmoid(logits)

@@ -8,8 +8,9 @@ import pytest
 import yaml
 
 from calibgraph import FileError
+from calibgraph.files import commented_defaults
 from calibgraph.matching.cmrnext import TrainSettings
-from calibgraph.matching.cmrnext.training.settings import commented_defaults, load_settings
+from calibgraph.matching.cmrnext.training.settings import load_settings
 from tests.matching.cmrnext.training.tiny import TINY
 
 
@@ -66,7 +67,7 @@ def test_wrong_files_are_refused_in_one_line(tmp_path: Path, text: str, message:
 
 
 def test_the_printed_defaults_are_the_defaults() -> None:
-    text = commented_defaults()
+    text = commented_defaults(TrainSettings)
     assert TrainSettings.model_validate(yaml.safe_load(text)) == TrainSettings()
     lines = text.splitlines()
     for name in TrainSettings.model_fields:

@@ -9,15 +9,18 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from calibgraph import Dataset, DatasetError  # noqa: E402
+from calibgraph import Correspondences, Dataset, DatasetError  # noqa: E402
+from calibgraph.io.frame import DrivenFrame  # noqa: E402
 from calibgraph.matching.structure.frame_cache import FrameCache  # noqa: E402
 from calibgraph.matching.structure.peaks import find_local_peaks  # noqa: E402
+from calibgraph.matching.structure.shift_scores import score_frame  # noqa: E402
 from calibgraph.matching.structure.training import (  # noqa: E402
     WindowSettings,
     loss,
     train_windows,
 )
 from calibgraph.matching.structure.training.samples import (  # noqa: E402
+    LEVEL,
     NEAR,
     SIDE,
     CameraWindows,
@@ -25,6 +28,8 @@ from calibgraph.matching.structure.training.samples import (  # noqa: E402
 )
 from calibgraph.matching.structure.window_weights import window_network  # noqa: E402
 from calibgraph.matching.trusted_data import load_trusted_dataset  # noqa: E402
+from calibgraph.model.clock import at_pixels  # noqa: E402
+from calibgraph.solver.camera_twist import project_with_jacobian  # noqa: E402
 from tests.conftest import SAMPLE  # noqa: E402
 
 SMALL = WindowSettings(frames=3, windows=1500, epochs=15, batch=3, noise=0.0)
@@ -82,6 +87,34 @@ def test_the_gradient_is_that_of_solving_again(
             difference = float(value(step) - value(-step)) / 0.04
         # Scores are in single precision: 1e-6 of a value of some 30, over the step.
         assert difference == pytest.approx(float(by.grad[axis]), rel=0.02, abs=2e-3)
+
+
+@pytest.mark.parametrize("clock", [(0.0, 0.0), (0.08, 0.0), (0.08, 0.03)])
+def test_points_are_where_they_are_when_their_pixels_are_taken(
+    trusted: Dataset, clock: tuple[float, float]
+) -> None:
+    """As those of the matcher's rows in a solve, with a late camera on a LiDAR that moves."""
+    given, twist = trusted.frames[0], np.array([0.0, 0.02, 0.3, 8.0, 0.3, 0.0])
+    name, camera = next(iter(trusted.rig.cameras.items()))
+    camera = camera.model_copy(update={"time_offset_s": clock[0], "readout_s": clock[1]})
+    files = given.index, given.name, given.cloud_path, given.image_paths
+    frame, cache = DrivenFrame(*files, find_twist=lambda: twist), FrameCache()
+    found = camera_windows([frame], name, camera, per_frame=800, cache=cache)
+    scores = score_frame(
+        cache.image(frame, name, camera), cache.cloud(frame), camera, LEVEL,
+        frame=0, max_windows=800, twist_per_s=twist,
+    )  # fmt: skip
+    rows = Correspondences.from_arrays(
+        camera=name, frame=scores.frame, pixels_px=scores.pixels_px,
+        points_lidar_m=scores.points_lidar_m, twist_per_s=np.tile(twist, (len(scores.frame), 1)),
+    )  # fmt: skip
+    assert found is not None and len(rows) > 15
+    np.testing.assert_allclose(found.pixels_px, scores.pixels_px, atol=1e-9)
+    # A group is 3 degrees wide: its rows are taken within 4 ms, in which a mean is off by less.
+    points = at_pixels(camera, rows).points_lidar_m
+    np.testing.assert_allclose(found.points_lidar_m, points, atol=1e-9 if not clock[1] else 5e-3)
+    pixels, _ = project_with_jacobian(camera, found.points_lidar_m)
+    np.testing.assert_allclose(pixels, found.pixels_px, atol=1e-6)
 
 
 def test_training_makes_the_poses_likelier_and_repeats(trusted: Dataset) -> None:
