@@ -26,6 +26,7 @@ from calibgraph.matching.run import (
     MatchingRun,
     Rematch,
     RoundSummary,
+    require_known_motion,
     round_in_words,
     summarize_round,
     with_motion,
@@ -80,6 +81,7 @@ def match_in_rounds(
     data, guess = _open(dataset, rig, full.most_frames)
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
     with watch("inputs"):
+        require_known_motion(data, full, config.estimate)
         warnings = check_inputs(data, guess, at_guess=full.stage1 == "rig")
     with watch("places"):
         places = find_stationary(data, guess)
@@ -89,9 +91,8 @@ def match_in_rounds(
     indices, lens = [*range(start.first_round, full.rounds)], dict[str, tuple[LensEstimate, ...]]()
     for index in indices:
         repeat = len(rounds) + 1 - (full.rounds - start.first_round)
-        told = with_note(
-            progress, f"lens: repeat {repeat}, at most {_REPEATS}" if repeat > 0 else ""
-        )
+        note = f"{', '.join(config.estimate)}: repeat {repeat}, at most {_REPEATS}"
+        told = with_note(progress, note if repeat > 0 else "")
         with watch("match"):
             table = full.match(data, estimate, round_index=index, progress=told)
             table = with_motion(table, data).with_findings(start.findings).with_places(places)

@@ -149,6 +149,8 @@ def config_from(
 
     if config is not None and preset_name is not None:
         raise ValueError("--config and --preset exclude each other; put `preset:` into the file")
+    if (start := given.get("estimate")) in ("frame", "joint"):  # its former meaning
+        raise ValueError(f"--estimate {start}: is of lens and clock; give --start-from {start}")
     settings = (
         load_config(config)
         if config is not None

@@ -29,6 +29,8 @@ from calibgraph.model.rig import Rig
 
 Item = TypeVar("Item")
 
+LEAST_INTERVAL_S, MOST_INTERVAL_S = 0.005, 10.0
+
 
 @dataclass(frozen=True)
 class Dataset:
@@ -108,10 +110,13 @@ def load_dataset(
         FileError, DatasetError: if a folder is missing, frames do not pair up, or the folders'
             rigs differ.
         ValueError: if ``frames`` selects nothing, or is no selection; or if ``bag`` is given
-            without a bag, or ``interval_s`` is not positive.
+            without a bag, or ``interval_s`` is not within 0.005 to 10.
     """
-    if interval_s is not None and not interval_s > 0:
-        raise ValueError(f"interval_s must be positive, found {interval_s}; give seconds")
+    if interval_s is not None and not LEAST_INTERVAL_S <= interval_s <= MOST_INTERVAL_S:
+        raise ValueError(
+            f"--interval-s {interval_s:g}: neighbouring clouds are {LEAST_INTERVAL_S:g} to "
+            f"{MOST_INTERVAL_S:g} s apart, 0.1 of a LiDAR with 10 Hz; give seconds"
+        )
     if isinstance(folders, (str, Path)):
         folders = [folders]
     paths = tuple(Path(folder) for folder in folders)

@@ -20,6 +20,8 @@ from calibgraph.io.motion import ScanMotion, register, twist_between
 from calibgraph.io.videos import PICTURE_SUFFIX, hash_picture
 from calibgraph.model.rig import Camera
 
+_MICROSECONDS_DIGITS, _NANOSECONDS_DIGITS = 16, 18  # of a stamp
+_MOST_M_S = 100.0  # of a vehicle
 _MOTION = "motion"
 """The key of an entry's :class:`ScanMotion`, if its cloud is corrected."""
 
@@ -162,7 +164,7 @@ def twist_by_scans(frame: Frame, beside: Sequence[tuple[Frame, float]]) -> Array
             they are [s].
 
     Raises:
-        DatasetError: if there is none, or scans do not fit.
+        DatasetError: if there is none, scans do not fit, or the speed is that of no vehicle.
     """
     if not beside:
         raise DatasetError(
@@ -176,7 +178,34 @@ def twist_by_scans(frame: Frame, beside: Sequence[tuple[Frame, float]]) -> Array
         twist_between(np.eye(4), register(own, cloud, frame.cloud_path), later_s)
         for cloud, (_, later_s) in zip(others, beside, strict=True)
     ]
-    return np.asarray(np.mean(twists, axis=0))
+    twist = np.asarray(np.mean(twists, axis=0))
+    if (speed_m_s := np.linalg.norm(twist[3:])) > _MOST_M_S:
+        raise DatasetError(
+            f"{frame.cloud_path}: by its neighbours, the LiDAR moves at {speed_m_s:.0f} m/s, more "
+            f"than {_MOST_M_S:g}; give the seconds between clouds as --interval-s"
+        )
+    return twist
+
+
+def seconds_between(one: Frame, other: Frame) -> float | None:
+    """How much later another frame was recorded, by the stamps that name both; None without.
+
+    Nanoseconds in bags and Argoverse's logs, microseconds in nuScenes.
+    """
+    stems = [frame.name.rpartition("/")[2] for frame in (one, other)]
+    ticks = [_ticks_per_s(frame, stem) for frame, stem in zip((one, other), stems, strict=True)]
+    if ticks[0] is None or ticks[0] != ticks[1]:
+        return None
+    return (int(stems[1]) - int(stems[0])) / ticks[0]
+
+
+def _ticks_per_s(frame: Frame, stem: str) -> int | None:
+    """Of the stamp that names a frame; by the digits since 2001, as other names are shorter."""
+    if not stem.isdecimal():
+        return None
+    if frame.cloud_path.suffix == MESSAGE_SUFFIX or len(stem) >= _NANOSECONDS_DIGITS:
+        return 1_000_000_000
+    return 1_000_000 if len(stem) == _MICROSECONDS_DIGITS else None
 
 
 def frame_of_entry(entry: Mapping[str, Any]) -> Frame:

@@ -24,6 +24,7 @@ class TableMatcher:
 
     def __init__(self, table: Correspondences) -> None:
         self.table = table
+        self.knows_motion = table.twist_per_s is not None
 
     def match(
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress

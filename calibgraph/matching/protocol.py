@@ -1,15 +1,17 @@
-"""The matcher protocol: three members that every matcher has, and six more that it may have.
+"""The matcher protocol: three members that every matcher has, and seven more that it may have.
 
 `Matcher` is the interface of a custom matcher. The program works with `FullMatcher`, which has all
 members; `to_full_matcher` adds defaults for missing ones. In calibration they are used in this
 order:
 
-1. `most_frames`: the largest number of frames that is used.
-2. `locate`: from where the rounds begin, and with which round.
-3. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
-4. `tracking_rounds`: run again from a start displaced from the result.
-5. `release`: no more rounds follow.
-6. `image_checks_can_fail`: whether the checks on images may FAIL the result.
+1. `with_estimate`: the matcher for the parts of lens and clock that are estimated.
+2. `most_frames`: the largest number of frames that is used.
+3. `knows_motion`: whether frames may lack the motion that a clock is estimated by.
+4. `locate`: from where the rounds begin, and with which round.
+5. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
+6. `tracking_rounds`: run again from a start displaced from the result.
+7. `release`: no more rounds of this matcher follow, but one of another `with_estimate`, if any.
+8. `image_checks_can_fail`: whether the checks on images may FAIL the result.
 """
 
 from collections.abc import Callable, Sequence
@@ -81,6 +83,11 @@ class FullMatcher(Matcher, Protocol):
         ...
 
     @property
+    def knows_motion(self) -> bool:
+        """Whether its tables have the motion of the LiDAR, ``twist_per_s``; by default not."""
+        ...
+
+    @property
     def tracking_rounds(self) -> tuple[int, ...]:
         """Indices of the rounds to run from an estimate that is nearly right.
 
@@ -100,7 +107,11 @@ class FullMatcher(Matcher, Protocol):
         ...
 
     def with_estimate(self, parts: Sequence[LensPart]) -> "FullMatcher":
-        """The matcher for solves that estimate these parts of lens and clock; itself by default."""
+        """The matcher for solves that estimate these parts of lens and clock; itself by default.
+
+        One that is not itself matches also after ``release`` of the other: it checks the time of
+        the images, if it has ``tracking_rounds``.
+        """
         ...
 
     def locate(
@@ -122,6 +133,7 @@ class MatcherWithDefaults:
         self.rounds = matcher.rounds
         self.stage1: Stage1Source = matcher.stage1
         self.most_frames: int | None = getattr(matcher, "most_frames", None)
+        self.knows_motion = bool(getattr(matcher, "knows_motion", False))
         self.tracking_rounds = tuple(getattr(matcher, "tracking_rounds", ()))
         self.image_checks_can_fail = bool(getattr(matcher, "image_checks_can_fail", False))
         self._locate = getattr(matcher, "locate", None)
@@ -130,7 +142,8 @@ class MatcherWithDefaults:
     def with_estimate(self, parts: Sequence[LensPart]) -> FullMatcher:
         """The matcher's own way, or the same matcher."""
         make = getattr(self._matcher, "with_estimate", None)
-        return self if make is None else MatcherWithDefaults(make(parts))
+        made = self._matcher if make is None else make(parts)
+        return self if made is self._matcher else MatcherWithDefaults(made)
 
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress

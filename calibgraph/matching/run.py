@@ -1,17 +1,21 @@
 """The result of matching and solving in rounds: the input of the checks on images."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.protocol import FullMatcher
+from calibgraph.model.clock import require_motion
+from calibgraph.model.config import LensPart
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Rig
+from calibgraph.parallel import core_pool
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.solution import Solution
+from factors.free_lens import CLOCK
 
 RoundSummary = Mapping[str, Mapping[str, float]]
 """Per camera: number of ``matches``, and the motion of the estimate in the round, ``moved_deg`` and
@@ -63,6 +67,20 @@ class MatchingRun:
     out_of_time: bool = False
     warnings: tuple[str, ...] = ()
     rematch: Rematch | None = None
+
+
+def require_known_motion(data: Dataset, matcher: FullMatcher, parts: Sequence[LensPart]) -> None:
+    """Find the motion of all frames, if parts of the clock are to be estimated by it.
+
+    Raises:
+        CorrespondenceError: if it is not known of all, nor to the matcher.
+        DatasetError: if neighbouring clouds do not fit.
+    """
+    if matcher.knows_motion or {*CLOCK}.isdisjoint(parts):
+        return
+    with core_pool() as cores:  # registrations, which frames keep
+        twists = [*cores.map(lambda frame: frame.twist_per_s, data.frames)]
+    require_motion(parts, is_known=all(twist is not None for twist in twists))
 
 
 def with_motion(table: Correspondences, data: Dataset) -> Correspondences:

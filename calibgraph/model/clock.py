@@ -6,15 +6,19 @@ taken. Points of clouds and tables stay as they are recorded; they are moved whe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.errors import CorrespondenceError
+from calibgraph.model.config import LensPart
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
 from factors import Clock, displace
+from factors.free_lens import CLOCK
 
 _ROW_STEPS = 2  # a point 20 rows further is seen 2 ms later, and moves by 2 rows in these at most
 
@@ -22,6 +26,17 @@ _ROW_STEPS = 2  # a point 20 rows further is seen 2 ms later, and moves by 2 row
 def clock_of(camera: Camera) -> Clock:
     """The clock of a camera; what its rig does not state is zero."""
     return Clock(camera.time_offset_s or 0.0, camera.readout_s or 0.0, camera.height_px)
+
+
+def require_motion(parts: Sequence[LensPart], *, is_known: bool) -> None:
+    """Raise a CorrespondenceError if parts of a clock are to be estimated without a motion."""
+    clock = [part for part in CLOCK if part in parts]
+    if clock and not is_known:
+        raise CorrespondenceError(
+            f"to estimate {', '.join(clock)}, the motion of the LiDAR must be known: give "
+            "--interval-s with folders, --motion with bags, twists_per_s with arrays, or the "
+            "columns wx_rad_s to vz_m_s of a table"
+        )
 
 
 def motion_of(camera: Camera, rows: Correspondences) -> Array | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from calibgraph.errors import CorrespondenceError
 from calibgraph.graph.lens import lens_variables
 from calibgraph.model.camera_matches import CameraMatches
+from calibgraph.model.clock import require_motion
 from calibgraph.model.config import TERMS, Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import Places
@@ -24,7 +25,6 @@ from calibgraph.solver.preprocess import Preprocessed, preprocess
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
 from calibgraph.solver.start import best_start, require_determined, require_known
-from factors.free_lens import CLOCK
 
 _MOST_ROUNDS = 8  # of solves, each from the lenses of the last
 _SETTLED = 0.1  # standard deviations: a smaller change of a lens ends the rounds
@@ -136,13 +136,8 @@ def _solve_with_lenses(
             camera_matches=camera_matches,
             lenses=lenses,
         )
-        clock = [part for part in CLOCK if part in config.estimate]
-        if clock and solution.correspondences.twist_per_s is None:
-            raise CorrespondenceError(
-                f"to estimate {', '.join(clock)}, the motion of the LiDAR must be known: give "
-                "--interval-s with folders, --motion with bags, twists_per_s with arrays, or the "
-                "columns wx_rad_s to vz_m_s of a table"
-            )
+        is_known = solution.correspondences.twist_per_s is not None
+        require_motion(config.estimate, is_known=is_known)
         fit = None if solution.errors is None else solution.errors.fit
         lenses, change = moved_lenses(lenses, fit)
         if change < _SETTLED:

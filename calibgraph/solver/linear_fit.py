@@ -39,15 +39,12 @@ class Freed:
         covariance: (m, m) of these, by the scatter of the frames and what they share; NaN with one
             frame.
         compensating: (6, m) twists by which the pose makes up for a unit of each.
-        independent_shares: (m,) share (0 to 1, root mean square) of an unknown's Jacobian that is
-            independent of the pose and of the others. Near zero, the unknown is not observable.
     """
 
     twist: Array
     values: Array
     covariance: Array
     compensating: Array
-    independent_shares: Array
 
     @property
     def sigmas(self) -> Array:
@@ -91,9 +88,8 @@ class LinearFit:
         scatter += _weak(len(rows)) if frames > 1 else np.nan
         follow = inverse @ self.hessian[rows, len(self.hessian) - self.considered :]
         whole = inverse @ scatter @ inverse + self.shared * inverse + follow @ follow.T
-        shares = 1 / np.sqrt(np.diag(inverse) * np.diag(own))
         compensating = np.asarray(-np.linalg.solve(own[:6, :6], own[:6, 6:]))
-        return Freed(values[:6], values[6:], whole[6:, 6:], compensating, shares[6:])
+        return Freed(values[:6], values[6:], whole[6:, 6:], compensating)
 
 
 def fit_camera(

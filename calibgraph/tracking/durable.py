@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from operator import index
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from calibgraph.errors import FileError
+from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.tracking.frame_order import with_metadata_per_frame, with_place
+from calibgraph.tracking.frame_order import (
+    require_number,
+    with_metadata_per_frame,
+    with_place,
+)
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.state_database import StateDatabase
 from calibgraph.tracking.tracker import IncrementalCalibrator
@@ -63,12 +68,14 @@ class DurableCalibrator:
                 self.tracker = IncrementalCalibrator(begin() if begin else rig, config)
                 self._snapshot()
             else:
-                self.tracker = _restore(Path(folder), recovered.snapshot)
+                with _of_this_version(Path(folder)):
+                    self.tracker = IncrementalCalibrator.from_bytes(recovered.snapshot)
                 _require_same(Path(folder), self.tracker, rig, config or Config())
             self.repeated: Update | None = None
             for record in recovered.inputs:
-                frame, table = decode(record)
-                self.repeated = self.tracker.update(table, frame=frame)
+                with _of_this_version(Path(folder)):
+                    frame, table = decode(record, "input")
+                    self.repeated = self.tracker.update(table, frame=frame)
         except BaseException:
             self._database.close()
             raise
@@ -84,7 +91,7 @@ class DurableCalibrator:
             OSError: if it cannot be written; then close this, and make a new one.
         """
         table = with_metadata_per_frame(with_place(table, place))
-        record = encode((None if frame is None else index(frame), table))
+        record = _record(table, frame)
         self._continue_snapshot()  # before this update: the journal always holds the last one
         update = self.tracker.update(table, frame=frame)
         self._database.append(record)
@@ -135,10 +142,21 @@ class DurableCalibrator:
             self.abandon()
 
 
-def _restore(folder: Path, snapshot: bytes) -> IncrementalCalibrator:
+def _record(table: Correspondences, frame: int | None) -> bytes:
+    """An input as the journal keeps it."""
+    require_number(frame)
     try:
-        return IncrementalCalibrator.from_bytes(snapshot)
-    except StateError as error:  # its checksum is right, so another version wrote it
+        return encode((None if frame is None else index(frame), table), "input")
+    except UnicodeEncodeError as error:  # of a camera, which no rig has
+        raise CorrespondenceError(f"a camera's name cannot be written ({error})") from error
+
+
+@contextmanager
+def _of_this_version(folder: Path) -> Iterator[None]:
+    """Refuse what is not damaged, by its checksum in the database, but cannot be continued."""
+    try:
+        yield
+    except (StateError, CorrespondenceError) as error:
         raise FileError(
             folder, f"holds a state of another version; choose another folder ({error})"
         ) from error

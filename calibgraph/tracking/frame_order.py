@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import reprlib
 from dataclasses import replace
+from operator import index
 
 import numpy as np
 
@@ -40,8 +41,10 @@ def number_and_stamp(
         state: of the frames before.
 
     Raises:
-        CorrespondenceError: if the table holds several frames, or one that is not after the last.
+        CorrespondenceError: if the table holds several frames, or one that is not after the last,
+            or the number is beyond 63 bits.
     """
+    require_number(frame)
     same = len(table) > 0 and (table.frame == table.frame[0]).all()
     numbers = table.frame[:1] if same else np.unique(table.frame)
     if len(numbers) > 1:
@@ -57,6 +60,19 @@ def number_and_stamp(
     stamp = int(table.stamp_ns.max()) if table.stamp_ns is not None and len(table) else None
     _require_after(state, number, stamp)
     return number, stamp
+
+
+def require_number(frame: int | None) -> None:
+    """Refuse a number that no table can hold.
+
+    Raises:
+        CorrespondenceError: if it is beyond 63 bits.
+    """
+    if frame is not None and not -_LAST - 1 <= frame <= _LAST:
+        raise CorrespondenceError(
+            f"a frame's number must have at most 63 bits, found {index(frame).bit_length()}; "
+            "correct it: it is left out"
+        )
 
 
 def _require_after(state: State, number: int, stamp: int | None) -> None:
@@ -140,10 +156,10 @@ def _place_name(place: object) -> str:
         found = f"found {reprlib.repr(place)}"
         raise CorrespondenceError(f"the place of a frame must be a name or a number, {found}")
     name = str(place)
-    if len(name) > LONGEST_PLACE or "\0" in name:
+    if len(name) > LONGEST_PLACE or any(c == "\0" or "\ud800" <= c <= "\udfff" for c in name):
         raise CorrespondenceError(
-            f"the place of a frame must have at most {LONGEST_PLACE} characters, found "
-            f"{reprlib.repr(name)}"
+            f"the place of a frame must have at most {LONGEST_PLACE} characters, no NUL and no "
+            f"surrogate, found {reprlib.repr(name)}"
         )
     return name
 

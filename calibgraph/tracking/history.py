@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import gtsam
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from calibgraph.arrays import Array
 from calibgraph.files import write_bytes
@@ -23,6 +24,33 @@ if TYPE_CHECKING:
 
 _MOST_EVENTS = 1000
 _POSE = 6
+
+
+class _Saved(BaseModel):
+    """What a file holds of a :class:`History`."""
+
+    model_config = ConfigDict(
+        strict=True, arbitrary_types_allowed=True, revalidate_instances="always"
+    )
+
+    most: int = Field(ge=2)
+    stride: int = Field(ge=1)
+    updates: int = Field(ge=0)
+    origins: dict[str, np.ndarray]
+    begun: tuple[str, ...]
+    frames: np.ndarray
+    entries: np.ndarray
+    events: tuple[Event, ...]
+
+    @model_validator(mode="after")
+    def _check_arrays(self) -> Self:
+        entries, n = self.entries, self.frames.size
+        alike = {(T.shape, T.dtype.str) for T in self.origins.values()} <= {((4, 4), "<f8")}
+        whole = (self.frames.shape, self.frames.dtype.str) == ((n,), "<i8") and n <= self.most
+        shape = n, len(self.origins), 2 * _POSE
+        if not (alike and whole and (entries.shape, entries.dtype.str) == (shape, "<f8")):
+            raise ValueError("its arrays contradict each other")
+        return self
 
 
 class History:
@@ -130,8 +158,9 @@ class History:
 
     def save(self, path: Path) -> None:
         """Write the history to a file, atomically; see :meth:`load`."""
-        held = {"_frames": self._frames[: self._held], "_entries": self._entries[: self._held]}
-        write_bytes(path, encode({**vars(self), **held, "_begun": [*self._begun]}))
+        content = {name: getattr(self, f"_{name}") for name in _Saved.model_fields}
+        held = {name: content[name][: self._held] for name in ("frames", "entries")}
+        write_bytes(path, encode({**content, **held, "begun": [*self._begun]}, "history"))
 
     @staticmethod
     def load(path: Path) -> History:
@@ -139,18 +168,16 @@ class History:
 
         A file that cannot be read gives an empty history too: it is for the eye alone.
         """
-        history = History()
         try:
-            content = decode(path.read_bytes())
-        except (OSError, StateError):
-            return history
-        vars(history).update(content)
-        history._begun = set(history._begun)
-        for name in ("_frames", "_entries"):
-            held = content[name]
-            room = np.empty((history._most, *held.shape[1:]), held.dtype)
-            room[: len(held)] = held
-            setattr(history, name, room)
+            saved = _Saved.model_validate(decode(path.read_bytes(), "history"))
+            rooms = {
+                name: _room(getattr(saved, name), saved.most) for name in ("frames", "entries")
+            }
+        except (OSError, StateError, ValueError, MemoryError):
+            return History()
+        history = History()
+        content = {**dict(saved), **rooms, "begun": {*saved.begun}, "held": len(saved.frames)}
+        vars(history).update({f"_{name}": value for name, value in content.items()})
         return history
 
     def figure(self) -> Figure:
@@ -159,3 +186,10 @@ class History:
             return text_figure(f"Nothing to draw: {len(self)} frames so far.")
         first, newest = int(self._frames[0]), int(self._frames[self._held - 1])
         return history_figure(self.curves(), self.events, first, newest)
+
+
+def _room(held: Array, most: int) -> Array:
+    """An array with room for more rows, the first of which are those that are held."""
+    room = np.empty((most, *held.shape[1:]), held.dtype)
+    room[: len(held)] = held
+    return room

@@ -1,4 +1,4 @@
-"""The tracker's state as bytes and back, bit by bit: MessagePack behind a format and a checksum.
+"""What a tracker keeps as bytes and back, bit by bit: MessagePack behind a format and a checksum.
 
 A dataclass is written as its fields and read from a fixed list: no content of a file can name code
 to run.
@@ -10,14 +10,16 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any
+from typing import Any, Literal
 
 import gtsam
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import InstanceOf, TypeAdapter, ValidationError
 
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import CalibrationError, in_words
+from calibgraph.files import describe
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
@@ -36,11 +38,19 @@ from calibgraph.tracking.state import CameraState, DriftWatch, State
 from calibgraph.tracking.sums import Sums
 from factors import Lens, ProjectionBlock
 
-FORMAT = "calibgraph-tracker-state/8"
+Kind = Literal["state", "input", "history"]
+
+_VERSION = 8
 """Earlier ones held other sums, or were of another encoding."""
 
-_MARK = f"{FORMAT}\n".encode()
-_BODY = len(_MARK) + hashlib.sha256().digest_size
+_DIGEST = hashlib.sha256().digest_size
+_TREES: dict[Kind, TypeAdapter[Any]] = {
+    "state": TypeAdapter(
+        tuple[InstanceOf[State], tuple[tuple[int, InstanceOf[Correspondences]], ...]]
+    ),
+    "input": TypeAdapter(tuple[int | None, InstanceOf[Correspondences]]),
+    "history": TypeAdapter(dict[str, Any]),
+}
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
 
 
@@ -48,32 +58,46 @@ class StateError(CalibrationError):
     """Bytes that :func:`encode` has not written, or that are damaged."""
 
 
-def encode(content: Any) -> bytes:
+def encode(content: Any, kind: Kind) -> bytes:
     """Bytes of a tree of tuples, dicts, plain values, arrays and the tracker's dataclasses.
+
+    Args:
+        content: the tree.
+        kind: of which it is; :func:`decode` takes no other.
 
     Raises:
         TypeError: if the tree holds any other value, or a number of more than 64 bits.
         ValueError: if it is too deep.
     """
     body = _pack(content)
-    return _MARK + hashlib.sha256(body).digest() + body
+    return _mark(kind) + hashlib.sha256(body).digest() + body
 
 
-def decode(data: bytes) -> Any:
-    """The tree that :func:`encode` has written.
+def decode(data: bytes, kind: Kind) -> Any:
+    """The tree that :func:`encode` has written: of a state, an input or a history.
 
     Raises:
-        StateError: if the bytes are damaged or of another format.
+        StateError: if the bytes are damaged, of another format or of another kind.
     """
-    if not data.startswith(_MARK):
-        found = data[: len(_MARK)].split(b"\n")[0].decode("ascii", "replace")
-        raise StateError(f"is no tracker's state: it begins with {found!r}, expected {FORMAT!r}")
-    if hashlib.sha256(data[_BODY:]).digest() != data[len(_MARK) : _BODY]:
+    mark = _mark(kind)
+    if not data.startswith(mark):
+        found = data[: len(mark)].split(b"\n")[0].decode("ascii", "replace")
+        expected = f"expected {mark[:-1].decode()!r}"
+        raise StateError(f"is no tracker's {kind}: it begins with {found!r}, {expected}")
+    start = len(mark) + _DIGEST
+    digest, body = data[len(mark) : start], data[start:]
+    if hashlib.sha256(body).digest() != digest:
         raise StateError("is damaged: its checksum is wrong")
     try:
-        return _unpack(data[_BODY:])
-    except (ValueError, LookupError, TypeError, RecursionError) as error:
-        raise StateError(f"is no tracker's state ({error})") from error
+        return _TREES[kind].validate_python(_unpack(body), strict=True)
+    except ValidationError as error:
+        raise StateError(f"is no tracker's {kind} ({describe(error)})") from error
+    except Exception as error:  # of any kind: the bytes choose what is built, and of what
+        raise StateError(f"is no tracker's {kind} ({in_words(error)})") from error
+
+
+def _mark(kind: Kind) -> bytes:
+    return f"calibgraph-tracker-{kind}/{_VERSION}\n".encode()
 
 
 def _pack(value: Any) -> bytes:

@@ -33,6 +33,7 @@ from calibgraph.tracking.state_recovery import APPLICATION, LAYOUT, checksum, lo
 DATABASE = "state.sqlite"
 _PAGE_BYTES = 32768  # a snapshot takes half the time of SQLite's 4096
 _LOG_PAGES = 128  # in the log, before they are copied to the database: 4 MB, as by default
+_EARLIEST = ("snapshot-*.state", "journal-*.log")
 _TABLES = f"""
     PRAGMA page_size={_PAGE_BYTES};
     PRAGMA journal_mode=WAL;
@@ -58,7 +59,7 @@ class StateDatabase:
 
     Raises:
         FileError: if another process uses the folder, or its state is damaged, foreign, of the
-            earlier layout or of a newer one. The folder is left as it was.
+            earliest layout or of a newer one. The folder is left as it was.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -163,7 +164,11 @@ def _lock(folder: Path) -> int:
 
 
 def _create(path: Path) -> None:
-    """Put an empty database in place, whole or not at all."""
+    """Put an empty database in place, whole or not at all; not beside another one's parts."""
+    for pattern in _EARLIEST:
+        for found in path.parent.glob(pattern):
+            message = "is state of the earliest layout; choose another folder"
+            raise FileError(found, f"{message}, or continue with the calibgraph that wrote it")
     if log_of(path).exists():
         raise FileError(path, "is missing, and its log is there; restore it from a copy")
     for leftover in path.parent.glob(f".writing-*{path.suffix}*"):

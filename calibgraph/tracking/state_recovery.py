@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import sqlite3
+import struct
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 
 from calibgraph.errors import FileError
+from calibgraph.files import require_file
 
 LAYOUT = 2
 APPLICATION = 0x43474254
 """``CGBT``, in the header of the database."""
+
+_HEADER = struct.Struct(">16s44xI4xI28x")  # text, user_version, application_id
 
 
 @dataclass(frozen=True)
@@ -40,13 +44,14 @@ def read(path: Path) -> tuple[Recovered, int]:
     """What the database holds, and the number of its last input; no file is changed.
 
     Raises:
-        FileError: if it is damaged.
+        FileError: if it is damaged, of another layout, or of another program, then without opening
+            it.
     """
+    _require_layout(path)
     log = log_of(path)
     had_log = log.exists() and log.stat().st_size > 0
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
-            _require_layout(database, path)
             (state,) = database.execute("PRAGMA integrity_check(1)").fetchone()
             if state != "ok":
                 raise _damaged(path, state)
@@ -62,9 +67,13 @@ def read(path: Path) -> tuple[Recovered, int]:
     return recovered, number
 
 
-def _require_layout(database: sqlite3.Connection, path: Path) -> None:
-    (application,) = database.execute("PRAGMA application_id").fetchone()
-    (layout,) = database.execute("PRAGMA user_version").fetchone()
+def _require_layout(path: Path) -> None:
+    """By the header alone: to open a database may change the files beside it."""
+    with require_file(path).open("rb") as file:
+        header = file.read(_HEADER.size)
+    if len(header) < _HEADER.size or not header.startswith(b"SQLite format 3\0"):
+        raise _damaged(path, "it has no header of SQLite")
+    _, layout, application = _HEADER.unpack(header)
     if application != APPLICATION:
         raise FileError(path, "is a database of another program; choose another folder")
     if layout != LAYOUT:

@@ -8,7 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.errors import CorrespondenceError, FileError, in_words
 from calibgraph.files import require_file, write_bytes
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
@@ -200,7 +200,7 @@ class IncrementalCalibrator:
 
     def to_bytes(self) -> bytes:
         """The tracker as bytes, from which :meth:`from_bytes` continues with the same numbers."""
-        return encode((self._epoch_start, self._since_epoch_start))
+        return encode((self._epoch_start, self._since_epoch_start), "state")
 
     @staticmethod
     def from_bytes(data: bytes) -> IncrementalCalibrator:
@@ -209,11 +209,14 @@ class IncrementalCalibrator:
         Raises:
             CalibrationError: if the bytes are damaged or of another format.
         """
-        state, since = decode(data)
-        tracker = IncrementalCalibrator(state.rig, state.config)
-        tracker._resume(state)
-        for number, table in since:
-            tracker.update(table, frame=number)
+        state, since = decode(data, "state")
+        try:
+            tracker = IncrementalCalibrator(state.rig, state.config)
+            tracker._resume(state)
+            for number, table in since:
+                tracker.update(table, frame=number)
+        except Exception as error:  # of any kind: parts of the state may contradict each other
+            raise StateError(f"is no tracker's state ({in_words(error)})") from error
         return tracker
 
     def save(self, path: Path | str) -> None:

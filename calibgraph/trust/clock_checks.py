@@ -2,7 +2,7 @@
 
 Matches follow a wrong time as they follow a wrong pose, so the matcher matches again with the
 offset free, and pose and offset are fitted to these matches. Where the motion of the LiDAR is not
-known, neighbouring clouds are registered, and taken to be 0.1 s apart.
+known, neighbouring clouds are registered; without stamps they are taken to be 0.1 s apart.
 
 A constant motion straight ahead is equivalent to a camera that is mounted further ahead.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.io.frame import Frame, twist_by_scans
+from calibgraph.io.frame import Frame, seconds_between, twist_by_scans
 from calibgraph.io.kept_frames import KeptFrame
 from calibgraph.matching.run import with_motion
 from calibgraph.model.clock import at_pixels, clock_of
@@ -41,7 +41,8 @@ from factors import FreeLens
 from factors.free_lens import CLOCK, OFFSET
 
 USUAL_SIGMA_S = 0.002  # of an offset, where the rig states none: of sensors that are synchronised
-INTERVAL_S = 0.1  # between clouds, where it is not known
+INTERVAL_S = 0.1  # between clouds, where they have no stamps
+MAX_STEPS = 10  # between the numbers of neighbouring clouds, if it is clouds that they count
 MAX_FRAMES = 10  # evenly spread: bounds the time
 MIN_FRAMES = 4  # with fewer, a single frame decides
 _TOLD_S, _TOLD_CM = 0.01, 0.1  # whose effect is told, if it has one
@@ -58,23 +59,31 @@ def offset_checks(evidence: Evidence) -> Checks:
 
 
 def image_offset_checks(evidence: RunEvidence) -> Checks:
-    """The offset of each camera by matches that are made for it, unless it is estimated."""
+    """The offset of each camera by matches that are made for it, unless it is estimated.
+
+    By a matcher made for them, since that of the run has been released.
+    """
     run, config = evidence.run, evidence.run.solution.config
     if run.out_of_time or not {*CLOCK}.isdisjoint(config.estimate):
         return {}
-    rig, moved = run.solution.without_pairs().solved_rig, None
+    rig, moved, registered = run.solution.without_pairs().solved_rig, None, False
     with suppress(CalibrationError, OSError):  # the checks on images report it
-        moved = _with_known_motion(run.dataset)
-    if moved is None or not run.matcher.tracking_rounds:
-        return {}
-    if moved.frames[0].twist_per_s is not run.dataset.frames[0].twist_per_s:
-        rig = _without_times(rig)
+        moved, registered = _with_known_motion(run.dataset)
     matcher = run.matcher.with_estimate(("offset",))
+    if moved is None or not matcher.tracking_rounds or matcher is run.matcher:
+        return {}
+    if registered:
+        rig = _without_times(rig)
     table = matcher.match(
         moved, rig, round_index=matcher.tracking_rounds[-1], progress=evidence.progress
     )
+    matcher.release()
     table = with_motion(table, moved).with_places(run.correspondences.places)
-    return _check_cameras(rig, table, run.correspondences.findings, by=IMAGES)
+    checks = _check_cameras(rig, table, run.correspondences.findings, by=IMAGES)
+    if registered and seconds_between(*moved.frames[:2]) is None:
+        taken = f"; successive clouds are taken to be {INTERVAL_S:g} s apart"
+        checks = {n: [replace(c, text=c.text + taken) for c in of] for n, of in checks.items()}
+    return evidence.grade_by_images(checks)
 
 
 def _check_cameras(
@@ -123,29 +132,30 @@ def fit_offset(
 
 
 def _without_times(rig: Rig) -> Rig:
-    """The rig without times in seconds, which mean nothing where the interval is unknown."""
+    """The rig without times, which the result leaves out where the motion is not known."""
     none = dict.fromkeys(("time_offset_s", "time_offset_sigma_s", "readout_s"))
     cameras = {name: each.model_copy(update=none) for name, each in rig.cameras.items()}
     return rig.model_copy(update={"cameras": cameras})
 
 
-def _with_known_motion(dataset: Dataset) -> Dataset | None:
-    """Some frames with their motion, by scans where it is not known; None of too few."""
-    frames = []
+def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
+    """Some frames with their motion, None of too few; whether scans show that of any of them."""
+    frames, registered = [], False
     for frame in spread_out(dataset.frames, MAX_FRAMES):
         twist = frame.twist_per_s
         if twist is not None:
             frames.append(frame)
         elif isinstance(frame, KeptFrame) and (found := _register(dataset, frame)) is not None:
             frames.append(replace(frame, twist=found))
-    return dataset.only(frames) if len(frames) >= MIN_FRAMES else None
+            registered = True
+    return dataset.only(frames) if len(frames) >= MIN_FRAMES else None, registered
 
 
 def _register(dataset: Dataset, frame: Frame) -> Array | None:
     """(6,) the twist by both neighbours, if they are as far away as of one drive."""
-    near = [(dataset.neighbour(frame, sign), sign * INTERVAL_S) for sign in (-1, 1)]
-    known = [(other, later_s) for other, later_s in near if other is not None]
-    if len(known) < len(near):
+    near = [dataset.neighbour(frame, sign) for sign in (-1, 1)]
+    known = [(other, _later_s(frame, other)) for other in near if other is not None]
+    if len(known) < len(near) or not all(later_s for _, later_s in known):
         return None
     try:
         before, after = (twist_by_scans(frame, [one]) for one in known)
@@ -155,3 +165,15 @@ def _register(dataset: Dataset, frame: Frame) -> Array | None:
     if jerk > _JERK * np.linalg.norm(after[3:]) + _JERK_M_S:
         return None
     return np.asarray((before + after) / 2)
+
+
+def _later_s(frame: Frame, other: Frame) -> float:
+    """How much later a neighbour was recorded: by stamps, or by the numbers of both clouds."""
+    by_stamps = seconds_between(frame, other)
+    if by_stamps is not None:
+        return by_stamps
+    stems = frame.cloud_path.stem, other.cloud_path.stem
+    steps = int(stems[1]) - int(stems[0]) if all(map(str.isdecimal, stems)) else 0
+    if not 0 < abs(steps) <= MAX_STEPS:  # other numbers, such as times
+        steps = 1 if other.index > frame.index else -1
+    return INTERVAL_S * steps

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
@@ -38,12 +37,7 @@ def image_checks(evidence: RunEvidence) -> Checks:
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
         text = f"the images could not be checked: {error}"
         return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
-    if run.matcher.image_checks_can_fail:
-        return checks
-    return {
-        name: [replace(c, status="WARN") if c.status == "FAIL" else c for c in of_camera]
-        for name, of_camera in checks.items()
-    }
+    return evidence.grade_by_images(checks)
 
 
 def check_images(

@@ -16,7 +16,7 @@ from calibgraph.matching.run import with_motion
 from calibgraph.matching.structure.consensus import maximize_score
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.shift_scores import ShiftScores
-from calibgraph.model.clock import at_pixels
+from calibgraph.model.clock import at_pixels, clock_of
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera
@@ -33,6 +33,7 @@ from calibgraph.trust.lens_parameter import (
     units_of,
 )
 from calibgraph.trust.thresholds import limit
+from factors import displace
 
 SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)
 """Half-widths of a search; a focal length wrong by 5 % displaces a result by up to 0.5 m."""
@@ -69,6 +70,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     along = Free.CENTRE_X if camera.width_px >= camera.height_px else Free.CENTRE_Y
     finer = Free.FOCAL, Free.RADIAL, along  # right shapes are nearer to zero without a finer fit
     searched = *finer, Free.ASPECT
+    scores = _with_lens(scorer, camera, scores)
     best = _search(camera, scores, searched, seed)
     rough = _fit_at_peaks(scorer, camera, scores, best, places=places)
     if rough is None:
@@ -78,7 +80,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     most = MAX_RADIAL / lens.free.sigmas[Free.RADIAL]
     moved[Free.RADIAL] = np.clip(moved[Free.RADIAL], -most, most)
     refined = lens.put_into(apply_twist(camera, change.twist), moved[:-1])
-    again = scorer.score_together(images, refined, FINER)
+    again = _with_lens(scorer, refined, scorer.score_together(images, refined, FINER))
     rest = _fit_at_peaks(scorer, refined, again, np.zeros(len(best)), places=places)
     if rest is None:
         return ()
@@ -90,23 +92,32 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     return tuple(parameters)
 
 
+def _with_lens(scorer: FrameScorer, camera: Camera, scores: ShiftScores) -> ShiftScores:
+    """Scores with the lens as further unknowns, by points where they are when they are seen."""
+    twists = {frame.index: frame.twist_per_s for frame in scorer.frames}
+    known = {number: np.zeros(6) if one is None else one for number, one in twists.items()}
+    of_groups = np.array([known[number] for number in scores.frame.tolist()]).reshape(-1, 6)
+    times_s = clock_of(camera).times_s(scores.pixels_px[:, 1])
+    points_m = displace(scores.points_lidar_m, of_groups, -times_s)
+    return scores.with_unknowns(lens_fields_px(camera, points_m))
+
+
 def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: int) -> Array:
     """The best twist and lens, (12,).
 
     Args:
         camera: at the result.
-        scores: there.
+        scores: there, with the lens.
         lens: numbers of its parameters that are searched. A skew moves pixels too little for it.
         seed: of the search.
     """
     columns = [*range(6), *(6 + number for number in lens)]
-    extended = scores.with_unknowns(lens_fields_px(camera, scores.points_lidar_m))
     units = np.array([1.0, 1.0, camera.intrinsics_px.fx, 1.0]) * SEARCH_LENS
     sigmas = np.array(lens_variable(camera).free.sigmas)[[*lens]]
     smooth = replace(
-        extended,
+        scores,
         grids=np.stack([cv2.GaussianBlur(g, (0, 0), SEARCH_BLUR_STEPS) for g in scores.grids]),
-        jacobian=np.ascontiguousarray(extended.jacobian[:, :, columns]),
+        jacobian=np.ascontiguousarray(scores.jacobian[:, :, columns]),
     )
     widths = np.append(SEARCH_POSE, units / sigmas)
     best = np.zeros(6 + len(Free))
@@ -120,8 +131,7 @@ def _fit_at_peaks(
     """Fit pose and lens to the groups' peaks next to a start, (12,); the scan may be distorted."""
     if not len(scores.weights):
         return None
-    fields = lens_fields_px(camera, scores.points_lidar_m)
-    table = extract_correspondences(scores.with_unknowns(fields), start, "camera")
+    table = extract_correspondences(scores, start, "camera")
     table = at_pixels(camera, with_motion(table, scorer.dataset))
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
     usual = MatcherFindings.from_metadata({"matcher": "structure"})

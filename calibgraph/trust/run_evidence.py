@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from calibgraph.arrays import Array
 from calibgraph.matching.run import MatchingRun
 from calibgraph.progress import Progress, no_progress
-from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.pose_posterior import PosePosterior, measure_posteriors
 
 
@@ -25,6 +25,15 @@ class RunEvidence:
     def solution(self) -> Evidence:
         """The evidence of the last round's solution."""
         return Evidence(self.run.solution, self.run.guess, self._measure_posteriors)
+
+    def grade_by_images(self, checks: Checks) -> Checks:
+        """Checks on images, without a FAIL where those of the run's matcher WARN at most."""
+        if self.run.matcher.image_checks_can_fail:
+            return checks
+        return {
+            name: [replace(c, status="WARN") if c.status == "FAIL" else c for c in of_camera]
+            for name, of_camera in checks.items()
+        }
 
     def _measure_posteriors(
         self, covariances: Mapping[str, Array], groups: Sequence[Sequence[str]]

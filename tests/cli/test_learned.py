@@ -83,6 +83,7 @@ def test_untrained_weights_fail_on_the_command_line(
         ),
         (("--start-from", "joint"), "--start-from is for --matcher cmrnext only"),
         (("--matcher", "cmrnext", "--weights", "{w}", "--start-from", "both"), "known are frame"),
+        (("--matcher", "cmrnext", "--estimate", "joint"), "give --start-from joint"),
         (("--matcher", "cmrnext", "--weights", "{w}", "--device", "tpu"), "known are auto, cpu"),
     ],
 )

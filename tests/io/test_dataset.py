@@ -88,7 +88,12 @@ def test_neighbouring_clouds_show_the_motion(tmp_path: Path) -> None:
         np.testing.assert_allclose(frame.twist_per_s[3:], twist[3:], atol=0.05)
         assert twist_of_entry(frame.entry()) == pytest.approx(frame.twist_per_s)
     assert load_dataset(folder, rig).frames[0].twist_per_s is None
-    with pytest.raises(ValueError, match="interval_s must be positive"):
-        load_dataset(folder, rig, interval_s=0.0)
+    for wrong_s in (0.0, -0.1, 1e-300, 0.001, 100.0, np.inf, np.nan):
+        with pytest.raises(ValueError, match="--interval-s .* 0.005 to 10 s apart"):
+            load_dataset(folder, rig, interval_s=wrong_s)
+    first = twist_by_scans(data.frames[0], [(data.frames[1], 0.005)])
+    assert np.linalg.norm(first[3:]) == pytest.approx(60.0, abs=1.0)  # 0.3 m in 5 ms
+    with pytest.raises(DatasetError, match=r"at 150 m/s, more than 100; .* --interval-s"):
+        twist_by_scans(data.frames[0], [(data.frames[1], 0.002)])
     with pytest.raises(DatasetError, match="no neighbouring scan"):
         twist_by_scans(data.frames[0], [])

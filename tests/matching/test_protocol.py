@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Correspondences, Dataset, Rig
+from calibgraph import Config, Correspondences, Dataset, Rig
 from calibgraph.errors import CorrespondenceError
 from calibgraph.matching.protocol import Start, to_full_matcher
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.progress import Progress, no_progress
 from calibgraph.rounds import match_in_rounds
+from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
+from factors import Clock
 from tests.conftest import SAMPLE
 
 
@@ -102,6 +104,45 @@ def test_members_that_a_matcher_lacks_have_defaults(truth: Rig) -> None:
     table = full.match(data, truth, round_index=0, progress=no_progress)
     assert len(np.unique(table.frame)) == 6
     full.release()  # of nothing
+
+
+def test_a_clock_without_a_motion_is_refused_before_any_work(truth: Rig) -> None:
+    """Not of a matcher that knows the motion, which frames do not."""
+
+    class Knowing(Minimal):
+        knows_motion = True
+
+        def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN202
+            found = super().match(dataset, rig, round_index=round_index, progress=progress)
+            return replace(found, twist_per_s=np.zeros((len(found), 6)))
+
+    matcher, config = Complete(truth), Config(estimate=("offset",))
+    data = calibgraph.load_dataset(SAMPLE, truth)
+    with pytest.raises(CorrespondenceError, match="offset, the motion of the LiDAR must be known"):
+        match_in_rounds(data, matcher=matcher, config=config, progress=no_progress)
+    assert matcher.calls == []
+    run = match_in_rounds(data, matcher=Knowing(), config=config, progress=no_progress)
+    assert {one.name for lens in run.solution.lens.values() for one in lens} == {"offset"}
+
+
+def test_a_repeated_round_names_what_is_estimated(truth: Rig) -> None:
+    class Late(Minimal):
+        knows_motion = True
+
+        def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN202
+            progress("matching", 0, 1)
+            found = simulate(dataset, truth)
+            twists = draw_twists(len(dataset.frames), np.random.default_rng(0))
+            return put_clock_error(found, truth, twists, Clock(0.1))
+
+    told: list[str] = []
+    match_in_rounds(
+        calibgraph.load_dataset(SAMPLE, truth),
+        matcher=Late(),
+        config=Config(estimate=("offset",)),
+        progress=lambda what, *_: told.append(what),
+    )
+    assert told[:2] == ["matching", "matching (offset: repeat 1, at most 4)"]
 
 
 def test_a_minimal_matcher_calibrates(truth: Rig) -> None:

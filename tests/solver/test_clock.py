@@ -85,6 +85,22 @@ def test_a_stated_error_of_the_clock_is_one_of_a_mount_and_no_other() -> None:
         np.testing.assert_allclose(np.sqrt(np.abs(added[:, 1])), added_m, rtol=0.02, atol=1e-6)
 
 
+def test_the_sentence_names_the_time_only_where_it_is_not_included() -> None:
+    truth, table = late(0.0, 0.0)
+    still, doubted = replace(table, twist_per_s=None), with_times(truth, time_offset_sigma_s=0.01)
+    mount, usual = Config(of="mount"), "errors of the intrinsics"
+    beyond = f"{usual}, beyond what the rig states or a calibration with a target leaves"
+    with_time = f"{beyond}, of the time of the images, and of the clouds' scale are not included"
+    without = f"{beyond}, and of the clouds' scale are not included"
+    assert solve(doubted, table, mount).not_included == without
+    assert solve(truth, table, mount).not_included == with_time
+    assert solve(doubted, still, mount).not_included == with_time
+    alignment = f"{usual}, of the time of the images, and of the clouds' scale are not included"
+    assert solve(doubted, table).not_included == alignment
+    estimated = solve(truth, table, Config(estimate=("offset",)))
+    assert estimated.not_included == f"{usual} and of the clouds' scale are not included"
+
+
 def test_a_saved_result_is_solved_again(tmp_path: Path) -> None:
     truth, table = late(0.03, 0.0)
     result = solve(truth, table, Config(estimate=("offset",)))

@@ -45,7 +45,6 @@ def test_an_unknown_that_the_pose_compensates_is_not_observable() -> None:
     field = jacobian[:, :, :1].transpose(2, 1, 0)
     fit = fit_table(make_camera(), table_of(pixels, points, 4), field)
     assert fit is not None
-    assert fit.free(0).independent_shares[0] < 1e-3
     assert fit.free(0).sigmas[0] > 0.99  # as the prior of the pose: a radian
 
 

@@ -72,6 +72,8 @@ def test_a_refused_update_changes_neither_the_tracker_nor_the_disk(
         good.select(slice(0, 0)),
         replace(good, stamp_ns=stamps),
         replace(good, metadata={"place": 1.5}),
+        replace(good, metadata={"place": "\ud800"}),
+        replace(good, cameras=("left", "right", "\ud800")),
     )
     with DurableCalibrator(tmp_path, world.guess) as calibrator:
         for table in world.tables[:6]:
@@ -84,6 +86,13 @@ def test_a_refused_update_changes_neither_the_tracker_nor_the_disk(
             assert (calibrator.tracker.to_bytes(), files_in(tmp_path)) == before
         with pytest.raises(CorrespondenceError, match="is of frame 7, not 9"):
             calibrator.update(good, frame=9)
+        for number in (2**63, -(2**63) - 1, 2**70, 10**5000, np.uint64(2**64 - 1)):
+            with pytest.raises(CorrespondenceError, match="must have at most 63 bits, found"):
+                calibrator.update(good.select(slice(0, 0)), frame=number)
+        for place in ("\ud800", "half \udfff", "\0"):
+            with pytest.raises(CorrespondenceError, match="place of a frame must have .*found '"):
+                calibrator.update(good, place=place)
+        assert (calibrator.tracker.to_bytes(), files_in(tmp_path)) == before
         assert calibrator.update(good, frame=np.int64(7)).frame == 7
 
 

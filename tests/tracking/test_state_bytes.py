@@ -1,7 +1,9 @@
-"""A saved tracker: the same numbers after loading, and files that are refused."""
+"""What a tracker keeps: the same numbers after loading, and files that are refused."""
 
 from __future__ import annotations
 
+from contextlib import closing
+from dataclasses import fields, replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -10,12 +12,19 @@ import numpy as np
 import pytest
 
 from calibgraph import (
+    DurableCalibrator,
+    Event,
     FileError,
     IncrementalCalibrator,
     Rig,
 )
-from calibgraph.tracking.state_bytes import FORMAT, StateError, decode, encode
-from tests.tracking.steps import drive, moved, step_of
+from calibgraph.tracking.history import History
+from calibgraph.tracking.state import State
+from calibgraph.tracking.state_bytes import Kind, StateError, decode, encode
+from calibgraph.tracking.state_database import StateDatabase
+from tests.tracking.steps import drive, moved, step_of, tracked
+
+KINDS: tuple[Kind, ...] = ("state", "input", "history")
 
 
 def test_a_saved_tracker_continues_with_the_same_numbers(pair: Rig, tmp_path: Path) -> None:
@@ -45,7 +54,7 @@ def test_a_file_that_is_no_saved_tracker_is_refused_in_one_line(pair: Rig, tmp_p
     IncrementalCalibrator(pair).save(path)
     data = path.read_bytes()
     head = data.index(b"\n") + 1
-    assert data[:head].decode() == f"{FORMAT}\n"
+    assert data[:head] == b"calibgraph-tracker-state/8\n"
     for wrong, match in (
         (data[:-1], "is damaged: its checksum is wrong"),
         (data[:-9] + bytes(9), "is damaged: its checksum is wrong"),
@@ -62,9 +71,102 @@ def test_a_file_that_is_no_saved_tracker_is_refused_in_one_line(pair: Rig, tmp_p
         assert path.read_bytes() == wrong
 
 
-def sealed(body: bytes) -> bytes:
-    """With the checksum of a whole file."""
-    return f"{FORMAT}\n".encode() + sha256(body).digest() + body
+def sealed(body: bytes, kind: Kind = "state") -> bytes:
+    """With the mark and the checksum of a whole file."""
+    return f"calibgraph-tracker-{kind}/8\n".encode() + sha256(body).digest() + body
+
+
+def array(dtype: str, shape: list[int], data: bytes) -> msgpack.ExtType:
+    return msgpack.ExtType(0, msgpack.packb([dtype, shape, data]))
+
+
+WRONG = [
+    None, True, 5, -1, 2**64 - 1, 1.5, "text", b"bytes", [], {}, {"a": 1}, {5: None}, [1, []],
+    [None, None], [[], []], [5, None], ["5", []], [{}, {}], [1, 2, 3], msgpack.Timestamp(5),
+    [None, msgpack.Timestamp(5)], {"_frames": []}, {"most": "5"},
+    array("<f8", [2**62, 4], b""), array("<f8", [2**40, 2**40], b""), array("<f8", [], bytes(8)),
+    array("<f8", [-4, 1], bytes(8)), [array("<f8", [1], bytes(8)), []],
+    msgpack.ExtType(1, b""), msgpack.ExtType(1, msgpack.packb("no pose")),
+    msgpack.ExtType(2, msgpack.packb({})), msgpack.ExtType(4, msgpack.packb([])),
+    msgpack.ExtType(20, msgpack.packb({"cameras": 5})),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=repr)
+def test_content_of_a_wrong_kind_is_refused_though_its_checksum_is_right(
+    pair: Rig, tmp_path: Path, wrong: object
+) -> None:
+    body = msgpack.packb(wrong)
+    path = tmp_path / "saved"
+    path.write_bytes(sealed(body))
+    with pytest.raises(FileError, match="is no tracker's state") as error:
+        IncrementalCalibrator.load(path)
+    assert "\n" not in str(error.value)
+    path.write_bytes(sealed(body, "history"))
+    assert vars(History.load(path)).keys() == vars(History()).keys()
+    assert len(History.load(path)) == 0 and History.load(path).events == ()
+    DurableCalibrator(tmp_path / "state", pair).close()
+    with closing(StateDatabase(tmp_path / "state")) as database:
+        database.append(sealed(body, "input"))
+    with pytest.raises(FileError, match=r"of another version.*is no tracker's input") as error:
+        DurableCalibrator(tmp_path / "state", pair)
+    assert "\n" not in str(error.value)
+
+
+def test_state_input_and_history_are_not_taken_for_each_other(pair: Rig) -> None:
+    tracker, _ = tracked(pair, tables := drive(lambda frame: pair, 2))
+    for kind in KINDS:
+        data = sealed(b"", kind)
+        for other in {*KINDS} - {kind}:
+            with pytest.raises(StateError, match=f"no tracker's {other}: it begins .*-{kind}/"):
+                decode(data, other)
+    for content, kind in (
+        (decode(tracker.to_bytes(), "state"), "input"),
+        ((1, tables[0]), "state"),
+    ):
+        with pytest.raises(StateError, match=f"is no tracker's {kind} "):
+            decode(encode(content, kind), kind)
+
+
+def test_a_state_with_a_part_of_a_wrong_kind_raises_nothing_else(pair: Rig, tmp_path: Path) -> None:
+    tracker, _ = tracked(pair, drive(lambda frame: pair, 3))
+    state, since = decode(tracker.to_bytes(), "state")
+    path, refused = tmp_path / "saved", 0
+    for one in fields(State):
+        for wrong in (None, "text", (), np.zeros((0, 3))):
+            changed = replace(state, **{one.name: wrong})
+            path.write_bytes(encode((changed, since), "state"))
+            try:
+                IncrementalCalibrator.load(path)
+            except FileError as error:
+                refused += 1
+                assert "\n" not in str(error)
+    assert refused > 2 * len(fields(State))
+
+
+def test_a_history_with_a_part_of_a_wrong_kind_is_empty(pair: Rig, tmp_path: Path) -> None:
+    _, updates = tracked(pair, drive(lambda frame: pair, 5))
+    history, path = History(), tmp_path / "history.state"
+    for update in updates:
+        history.add(update)
+    history.save(path)
+    loaded = History.load(path)
+    assert len(loaded) == 5 and loaded.events == history.events != ()
+    content = decode(path.read_bytes(), "history")
+    wrong = {
+        "most": (1, 4, 2**62, "5", None), "stride": (0, 1.5), "updates": (-1, "5"),
+        "origins": ({}, [], {"left": np.eye(4)}, {"left": np.eye(3), "right": np.eye(3)}),
+        "begun": (5, (5,)), "frames": (None, np.zeros(5), np.zeros((), np.int64)),
+        "entries": ((), np.zeros((5, 2, 6)), np.zeros((5, 2, 12), np.float32)),
+        "events": (5, (5,), (Event("fell", None, 1, 1),), (Event("moved", 5, 1, 1),)),
+    }  # fmt: skip
+    assert wrong.keys() == content.keys()
+    for name, values in wrong.items():
+        for value in values:
+            path.write_bytes(encode({**content, name: value}, "history"))
+            assert len(History.load(path)) == 0, (name, value)
+        path.write_bytes(encode({k: v for k, v in content.items() if k != name}, "history"))
+        assert len(History.load(path)) == 0, name
 
 
 @pytest.mark.parametrize(
@@ -82,7 +184,7 @@ def sealed(body: bytes) -> bytes:
 )
 def test_bytes_that_are_no_state_are_refused(body: bytes) -> None:
     with pytest.raises(StateError, match="is no tracker's state") as error:
-        decode(sealed(body))
+        decode(sealed(body), "state")
     assert "\n" not in str(error.value)
 
 
@@ -92,9 +194,9 @@ def test_a_class_that_is_not_listed_is_not_written() -> None:
 
     for value in (State(), {"a": [object()]}, np.array([object()]), np.float32(1), 2**64):
         with pytest.raises(TypeError, match="cannot write a"):
-            encode(value)
+            encode(value, "state")
     deep: list[object] = []
     for _ in range(2000):
         deep = [deep]
     with pytest.raises(ValueError, match="recursion"):
-        encode(deep)
+        encode(deep, "state")

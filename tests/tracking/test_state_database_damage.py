@@ -169,7 +169,23 @@ def test_a_database_of_another_layout_or_program_is_refused(
 @pytest.mark.parametrize("data", [b"", b"half", b"no database at all" * 1000])
 def test_a_file_that_is_no_database_is_refused(tmp_path: Path, data: bytes) -> None:
     restored(tmp_path, {DATABASE: data})
-    require_refused(tmp_path, "is (damaged|a database of another program).*; .*another folder")
+    require_refused(tmp_path, "is damaged .*; .*another folder")
+
+
+@pytest.mark.parametrize("name", ["snapshot-000001.state", "journal-000002.log"])
+def test_a_folder_of_the_earliest_layout_is_refused(tmp_path: Path, name: str) -> None:
+    restored(tmp_path, {name: b"calibgraph-tracker/1\nwhatever"})
+    require_refused(tmp_path, f"{name}: is state of the earliest layout; choose another folder, or")
+
+
+@pytest.mark.parametrize("log", [b"", b"theirs"])
+def test_files_beside_a_database_of_another_program_are_left_alone(
+    tmp_path: Path, log: bytes
+) -> None:
+    with closing(sqlite3.connect(tmp_path / DATABASE)) as database:
+        database.executescript("PRAGMA journal_mode=WAL; CREATE TABLE theirs (number INTEGER)")
+    files = content(tmp_path) | {f"{DATABASE}-shm": b"theirs", LOG: log}
+    require_refused(restored(tmp_path, files), "is a database of another program")
 
 
 # The lock.

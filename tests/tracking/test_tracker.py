@@ -227,6 +227,12 @@ def test_wrong_input_is_refused_and_changes_nothing(pair: Rig) -> None:
         with pytest.raises(CorrespondenceError, match=reason):
             tracker.update(wrong)
         assert tracker.to_bytes() == before
+    for number in (2**63, 2**70, -(2**63) - 1):
+        with pytest.raises(CorrespondenceError, match="must have at most 63 bits, found"):
+            tracker.update(tables[11].select(slice(0, 0)), frame=number)
+    with pytest.raises(CorrespondenceError, match="place of a frame must have"):
+        tracker.update(tables[11], place="\ud800")
+    assert tracker.to_bytes() == before
     tracker.update(stamped)
     late = replace(stamped, frame=stamped.frame + 1)
     with pytest.raises(CorrespondenceError, match="stamp_ns 0 is not after 0"):

@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from calibgraph import Correspondences, solve
+from calibgraph import Config, Correspondences, Rig, solve
+from calibgraph.io.bags import MESSAGE_SUFFIX
 from calibgraph.io.dataset import Dataset
+from calibgraph.io.frame import Frame, MovingFrame
 from calibgraph.io.kept_frames import keep_frames
+from calibgraph.io.motion import ScanMotion
+from calibgraph.matching.protocol import Matcher, to_full_matcher
+from calibgraph.matching.run import MatchingRun
 from calibgraph.model.verdict import Check
+from calibgraph.progress import Stopwatch
 from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
-from calibgraph.trust.clock_checks import _with_known_motion, check_offset, fit_offset
+from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.clock_checks import (
+    _with_known_motion,
+    check_offset,
+    fit_offset,
+    image_offset_checks,
+)
 from calibgraph.trust.lens_parameter import RESIDUALS, LensParameter
+from calibgraph.trust.run_evidence import RunEvidence
 from factors import Clock
 from tests.solver.test_lens import FIVE_SIGMAS, simulated
 
@@ -72,4 +90,135 @@ def test_scans_that_are_not_of_one_drive_at_a_constant_rate_show_no_motion(
     dataset: Dataset,
 ) -> None:
     """Frames of the sample are stops 2 to 6 m apart, and turned."""
-    assert _with_known_motion(keep_frames(dataset)) is None
+    assert _with_known_motion(keep_frames(dataset))[0] is None
+
+
+class Recorder:
+    """A matcher that searches the offset, too, and records the offsets of the rigs it is given."""
+
+    rounds, stage1, tracking_rounds, image_checks_can_fail = 1, "rig", (0,), True
+
+    def __init__(self, table: Correspondences) -> None:
+        self.table, self.offsets_s = table, list[float | None]()
+
+    def with_estimate(self, parts: Sequence[str]) -> Recorder:  # noqa: ARG002
+        other = copy(self)
+        other.offsets_s = self.offsets_s
+        return other
+
+    def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN201, ARG002
+        self.offsets_s += [camera.time_offset_s for camera in rig.cameras.values()]
+        numbers = [frame.index for frame in dataset.frames]
+        return self.table.select(np.isin(self.table.frame, numbers))
+
+    def release(self) -> None:
+        pass
+
+
+def run_of(
+    matcher: Matcher, rig: Rig, frames: Sequence[Frame], found: Correspondences
+) -> RunEvidence:
+    data = Dataset(rig=rig, frames=tuple(frames), folders=())
+    solution = solve_joint(rig, found, Config())
+    run = MatchingRun(
+        data, to_full_matcher(matcher), rig, found, solution, rounds=(), watch=Stopwatch()
+    )
+    return RunEvidence(run, {})
+
+
+def moving_frames(twists: np.ndarray) -> list[Frame]:
+    motions = [ScanMotion(tuple(twist.tolist()), 0.0) for twist in twists]
+    return [
+        MovingFrame(n, str(n), Path(f"{n}.pcd"), {}, find_motion=lambda found=found: found)
+        for n, found in enumerate(motions)
+    ]
+
+
+def late_by(offset_s: float) -> tuple[Rig, Correspondences, np.ndarray]:
+    rig, table = simulated(0, frames=30, matches=100)
+    twists = draw_twists(30, np.random.default_rng(0))
+    return rig, put_clock_error(table, rig, twists, Clock(offset_s)), twists
+
+
+def test_the_times_of_a_rig_stand_where_the_motion_of_a_bag_is_known() -> None:
+    rig, table, twists = late_by(0.04)
+    cameras = {n: c.model_copy(update={"time_offset_s": 0.04}) for n, c in rig.cameras.items()}
+    stated = rig.model_copy(update={"cameras": cameras})
+    matcher = Recorder(replace(table, twist_per_s=None))
+    evidence = run_of(matcher, stated, moving_frames(twists), table)
+    checks = image_offset_checks(evidence)
+    assert matcher.offsets_s == [0.04] * len(rig.cameras)
+    assert {check.status for of in checks.values() for check in of} == {"PASS"}
+
+
+def registered(
+    stems: Sequence[str], folder: str, suffix: str, step_m: float, monkeypatch: pytest.MonkeyPatch
+) -> list[Frame]:
+    """Frames that have moved ahead by ``step_m`` from one to the next; their clouds fit exactly."""
+    T = np.eye(4)
+    T[0, 3] = step_m
+
+    def fit(target: np.ndarray, source: np.ndarray, _: Path) -> np.ndarray:
+        steps = round(float(source[0, 0] - target[0, 0]))
+        return np.asarray(np.linalg.matrix_power(T if steps > 0 else np.linalg.inv(T), abs(steps)))
+
+    monkeypatch.setattr("calibgraph.io.frame.register", fit)
+    monkeypatch.setattr(
+        Frame, "load_cloud", lambda self: np.full((1, 4), self.index, dtype=np.float32)
+    )
+    paths = [Path(folder) / f"{stem}{suffix}" for stem in stems]
+    return [Frame(n, stem, paths[n], {}) for n, stem in enumerate(stems)]
+
+
+@pytest.mark.parametrize(
+    ("stems", "suffix", "apart_s", "is_told"),
+    [
+        ([f"{3 * n:06d}" for n in range(30)], ".bin", 0.3, True),  # KITTI, every third
+        ([f"{n:06d}" for n in range(30)], ".bin", 0.1, True),
+        ([f"scan_{n:02d}" for n in range(30)], ".pcd", 0.1, True),
+        ([str(100 * n) for n in range(30)], ".pcd", 0.1, True),  # which count something else
+        ([str(1_533_151_603_547_590 + 50_000 * n) for n in range(30)], ".bin", 0.05, False),
+        ([str(7_000_000_000 + 200_000_000 * n) for n in range(30)], ".message", 0.2, False),
+    ],
+)
+def test_clouds_are_as_far_apart_as_their_stamps_or_numbers_say(
+    stems: list[str], suffix: str, *, apart_s: float, is_told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig, table, _ = late_by(0.0)
+    suffix = MESSAGE_SUFFIX if suffix == ".message" else suffix
+    frames = registered(stems, "drive", suffix, 2.0, monkeypatch)
+    kept = keep_frames(Dataset(rig=rig, frames=tuple(frames), folders=()))
+    moved, by_scans = _with_known_motion(kept)
+    assert moved is not None and by_scans
+    for frame in moved.frames:
+        assert frame.twist_per_s is not None
+        np.testing.assert_allclose(frame.twist_per_s, [0, 0, 0, 2.0 / apart_s, 0, 0], atol=1e-9)
+    matcher = Recorder(replace(table, twist_per_s=None))
+    checks = image_offset_checks(run_of(matcher, rig, kept.frames, table))
+    told = ["successive clouds are taken to be 0.1 s apart" in c[0].text for c in checks.values()]
+    assert told == [is_told] * len(rig.cameras)
+
+
+def test_without_the_image_checks_right_to_fail_a_late_image_is_a_warning() -> None:
+    rig, table, twists = late_by(0.04)
+    matcher = Recorder(replace(table, twist_per_s=None))
+    evidence = run_of(matcher, rig, moving_frames(twists), table)
+    (first, *_) = image_offset_checks(evidence).values()
+    matcher.image_checks_can_fail = False
+    evidence = run_of(matcher, rig, moving_frames(twists), table)
+    (second, *_) = image_offset_checks(evidence).values()
+    assert [first[0].status, second[0].status] == ["FAIL", "WARN"]
+    assert first[0].text == second[0].text
+
+
+def test_a_released_matcher_is_not_used_again() -> None:
+    class Released(Recorder):
+        def with_estimate(self, parts: Sequence[str]) -> Released:  # noqa: ARG002
+            return self  # does not search the offset
+
+        def match(self, *_: object, **__: object) -> Correspondences:
+            raise AssertionError("its network has been dropped")
+
+    rig, table, twists = late_by(0.04)
+    plain = Released(table)
+    assert image_offset_checks(run_of(plain, rig, moving_frames(twists), table)) == {}

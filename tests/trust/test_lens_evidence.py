@@ -8,13 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import gtsam
 import numpy as np
 import pytest
 
 import calibgraph
 from calibgraph import Camera, Dataset, Rig
+from calibgraph.io.frame import DrivenFrame
 from calibgraph.model.places import Places
 from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
+from calibgraph.trust import lens_evidence
 from calibgraph.trust.frame_scores import WIDE, FrameScorer
 from calibgraph.trust.image_checks import evidence_checks
 from calibgraph.trust.image_evidence import ImageEvidence
@@ -95,6 +98,32 @@ def test_a_wrong_lens_is_named_and_measured(
     if name == "aspect ratio":  # half of it is a focal length
         return
     assert all(status[other] == "PASS" for other in NAMES if other != name)
+
+
+class _Seen(Exception):
+    """Ends a measurement with the points that the lens is applied to."""
+
+
+def test_the_lens_is_applied_to_points_where_they_are_when_they_are_seen(
+    truth: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def see(_: Camera, points_m: np.ndarray) -> np.ndarray:
+        raise _Seen(points_m)
+
+    monkeypatch.setattr(lens_evidence, "lens_fields_px", see)
+    late = truth.model_copy(update={"time_offset_s": 0.05})
+    data, twist = calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: late})), np.arange(6.0)
+    files = [(f.index, f.name, f.cloud_path, f.image_paths) for f in data.frames[:2]]
+    moving = tuple(DrivenFrame(*each, find_twist=lambda: twist) for each in files)
+    with ThreadPoolExecutor(2) as pool:
+        scorer = FrameScorer(replace(data, frames=moving), moving, pool)
+        images = scorer.load_images(NAME, late)
+        scores = scorer.score_together(images, late, WIDE)
+        with pytest.raises(_Seen) as seen:
+            measure_lens(scorer, images, late, scores, seed=0)
+    step = gtsam.Pose3.Expmap(-0.05 * twist).matrix()
+    expected = scores.points_lidar_m @ step[:3, :3].T + step[:3, 3]
+    np.testing.assert_allclose(seen.value.args[0], expected, atol=1e-9)
 
 
 def test_frames_of_one_content_are_one_frame_which_shows_no_significance(truth: Camera) -> None:

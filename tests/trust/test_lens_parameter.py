@@ -46,8 +46,8 @@ def test_the_probability_grows_with_the_significance() -> None:
 
 
 def freed(*values: float, covariance: list[list[float]]) -> Freed:
-    ones = np.ones(len(values))
-    return Freed(np.zeros(6), np.array(values), np.array(covariance), np.ones((6, len(ones))), ones)
+    compensating = np.ones((6, len(values)))
+    return Freed(np.zeros(6), np.array(values), np.array(covariance), compensating)
 
 
 @pytest.mark.parametrize("other", [0.0, -2.0, -5.0, 8.0, 30.0])

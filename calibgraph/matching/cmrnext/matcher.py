@@ -60,6 +60,7 @@ class CmrNextMatcher:
     most_frames: int | None = None
     tracking_rounds: tuple[int, ...] = ()
     image_checks_can_fail = False
+    knows_motion = False
 
     def __init__(
         self,

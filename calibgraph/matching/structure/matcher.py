@@ -82,6 +82,7 @@ class StructureMatcher:
 
     stage1: Stage1Source = "rig"
     image_checks_can_fail: bool = True
+    knows_motion: bool = False
 
     def __init__(
         self,
