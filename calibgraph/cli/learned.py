@@ -115,7 +115,7 @@ def train(
     from calibgraph.io.rigs import load_rig
     from calibgraph.matching.cmrnext import TrainSettings, train
     from calibgraph.matching.cmrnext.training.settings import load_settings
-    from calibgraph.matching.trusted_data import load_trusted_dataset, split
+    from calibgraph.matching.trusted_data import load_held_out, load_trusted_dataset, split
 
     given = {"config": config, "seed": seed, "from": start}
     with checked_arguments():
@@ -129,7 +129,7 @@ def train(
     trusted = load_rig(rig) if rig else None
     data = [load_trusted_dataset(folder, trusted) for folder in dataset]
     if held_out:
-        others = [load_trusted_dataset(folder, trusted) for folder in held_out]
+        others = load_held_out(held_out, data, trusted)
     else:
         data, others = split(data)
     console = terminal()
@@ -193,13 +193,13 @@ def train_windows(
         train_windows,
     )
     from calibgraph.matching.structure.window_weights import load_window_network
-    from calibgraph.matching.trusted_data import load_trusted_dataset, split
+    from calibgraph.matching.trusted_data import load_held_out, load_trusted_dataset, split
 
     chosen = WindowSettings() if config is None else load_window_settings(config)
     chosen = chosen if seed is None else chosen.model_copy(update={"seed": seed})
     begun = None if start is None else load_window_network(start)
     data = [load_trusted_dataset(folder) for folder in recording]
-    others = [load_trusted_dataset(folder) for folder in held_out or ()]
+    others = load_held_out(held_out or (), data)
     if not others:
         data, others = split(data)
     with progress_bar() as progress:

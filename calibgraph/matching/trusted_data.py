@@ -84,6 +84,24 @@ def _hash(path: Path, folder: Path) -> str:
         ) from error
 
 
+def load_held_out(
+    folders: Sequence[Path], learned: Sequence[Dataset], rig: Rig | None = None
+) -> list[Dataset]:
+    """Load recordings that only measure, as :func:`load_trusted_dataset`.
+
+    Raises:
+        DatasetError: if a frame of one is learned from.
+    """
+    clouds = {frame.cloud_path.resolve() for data in learned for frame in data.frames}
+    found = [load_trusted_dataset(folder, rig) for folder in folders]
+    for folder, data in zip(folders, found, strict=True):
+        if not clouds.isdisjoint(frame.cloud_path.resolve() for frame in data.frames):
+            raise DatasetError(
+                f"{folder}: is learned from and held out; hold out another recording"
+            )
+    return found
+
+
 def split(datasets: Sequence[Dataset]) -> tuple[list[Dataset], list[Dataset]]:
     """Split each dataset's frames into the first four fifths and the last; neighbours look alike.
 

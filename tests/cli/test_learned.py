@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -163,7 +164,8 @@ def test_windows_are_trained_on_the_command_line(tmp_path: Path, call: Call) -> 
     *hidden, (matrix, bias) = window_network().layers
     # The worst windows count most, and what is learned is held out: training helps for certain.
     replace(window_network(), layers=(*hidden, (-matrix, -bias))).save(start)
-    shipped, given = PACKAGE_FILE.read_bytes(), ("--config", settings, "--held-out", SAMPLE)
+    alike = shutil.copytree(SAMPLE, tmp_path / "alike")
+    shipped, given = PACKAGE_FILE.read_bytes(), ("--config", settings, "--held-out", alike)
     code, _, text = call(
         "train-windows", SAMPLE, "--out", out, "--from", start, *given, "--seed", 2
     )
@@ -188,6 +190,7 @@ def test_windows_are_trained_on_the_command_line(tmp_path: Path, call: Call) -> 
     other.write_text("{}")
     for arguments, message in (
         ((SAMPLE, "--out", other), "was not written by calibgraph train-windows"),
+        ((SAMPLE, "--out", out, "--held-out", SAMPLE), "is learned from and held out"),
         ((SAMPLE, "--out", out, "--from", out), "is read by this command"),
         ((SAMPLE, "--out", tmp_path / "a.json", "--from", other), "key '\\w+' is missing"),
         ((SAMPLE, "--out", tmp_path / "a.pt"), ".json"),
