@@ -44,8 +44,9 @@ def _match_cameras(run: MatchingRun, progress: Progress) -> CameraMatches | None
         pairs = [pair for pair in near if missed.isdisjoint(pair)]
         if not pairs:
             return None
+        rig = run.guess.with_lenses_of(run.solution.solved_rig)  # as far as they are estimated
         return match_some_frames(
-            run.dataset, run.guess, pairs, seed=run.solution.config.seed, progress=progress
+            run.dataset, rig, pairs, seed=run.solution.config.seed, progress=progress
         )
 
 
