@@ -39,8 +39,8 @@ def load_trusted_dataset(folder: Path, rig: Rig | None = None) -> Dataset:
         reference = folder / REFERENCE_NAME
         if folder.is_dir() and not reference.is_file():
             raise DatasetError(
-                f"{folder}: has no {REFERENCE_NAME}, and its rig.yaml is a guess; give the trusted "
-                "extrinsic with --rig"
+                f"{folder}: is no result of calibrate, and has no {REFERENCE_NAME} (a rig.yaml is "
+                "a guess); give a result, or add the trusted rig as that file"
             )
         rig = load_rig(reference) if folder.is_dir() else None
     return load_dataset(folder, rig)
@@ -51,12 +51,13 @@ def _of_result(folder: Path) -> Dataset:
     passed = {n: c for n, c in result.rig.cameras.items()
               if result.camera_verdicts[n].status == "PASS"}  # fmt: skip
     if not passed or not result.frames:
-        what = "names no images" if passed else "has no camera that is PASS"
-        raise DatasetError(f"{folder}: {what}; learn from results of calibrate that are")
+        what = "is of a table, without images" if passed else "has no camera that is PASS"
+        raise DatasetError(f"{folder}: {what}; give a result of calibrate with a PASS")
     frames = tuple(frame_of_entry(entry) for entry in result.frames)
     for frame in frames:
         _require_same(frame, result.inputs, folder)
-    files = [path for frame in frames for path in (frame.cloud_path, *frame.image_paths.values())]
+    sources = (path for each in frames for path in (each.cloud_path, *each.image_paths.values()))
+    files = [path.absolute() for path in sources]
     return Dataset(Rig(cameras=passed), frames, (Path(os.path.commonpath(files)),))
 
 

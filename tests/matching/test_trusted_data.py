@@ -29,7 +29,7 @@ def test_the_reference_is_trusted_and_not_the_guess(trusted: Dataset, tmp_path: 
     folder = tmp_path / "data"
     shutil.copytree(SAMPLE, folder)
     (folder / "reference.yaml").unlink()
-    with pytest.raises(DatasetError, match="rig.yaml is a guess"):
+    with pytest.raises(DatasetError, match="a rig.yaml is a guess"):
         load_trusted_dataset(folder)
     assert load_trusted_dataset(folder, trusted.rig).rig == trusted.rig
 
