@@ -65,7 +65,7 @@ def train(
         typer.Argument(
             metavar="DATASET...",
             help="Folders with a trusted extrinsic: KITTI sequences, datasets with a "
-            "reference.yaml, or results, of which PASS cameras count; they may be of different "
+            "reference.yaml, or results, whose PASS cameras count; they may be of different "
             "rigs.",
         ),
     ],

@@ -164,7 +164,7 @@ def twist_by_scans(frame: Frame, beside: Sequence[tuple[Frame, float]]) -> Array
             they are [s].
 
     Raises:
-        DatasetError: if there is none, scans do not fit, or the speed is that of no vehicle.
+        DatasetError: if there is none, scans do not fit, or the speed is beyond that of a vehicle.
     """
     if not beside:
         raise DatasetError(

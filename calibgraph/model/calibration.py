@@ -18,7 +18,7 @@ from calibgraph.model import geometry, result_files
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.error_sources import ErrorSources
+from calibgraph.model.error_sources import ErrorSources, left_out
 from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.model.summary import Summary, summarize
@@ -182,30 +182,9 @@ class Calibration:
     @property
     def not_included(self) -> str:
         """Sentence about errors that the bars leave out: relative poses show the clouds' scale."""
-        free = self.lens and {*self.config.estimate} - {"offset", "readout"}
-        fixed = "errors of the other intrinsics" if free else "errors of the intrinsics"
-        if self._is_mount:
-            fixed += ", beyond what the rig states or a calibration with a target leaves"
-        others = [] if self._includes_times else ["of the time of the images"]
-        others += [] if self.rig.relative_poses else ["of the clouds' scale"]
-        joint = ", and " if self._is_mount or len(others) > 1 else " and "
-        named = ", ".join([fixed, *others[:-1]])
-        return f"{joint.join([named, *others[-1:]])} are not included"
-
-    @property
-    def _is_mount(self) -> bool:
-        """Whether the covariance includes what is uncertain of lenses and clocks."""
-        return self.config.of == "mount" and self.config.preset == "auto"
-
-    @property
-    def _includes_times(self) -> bool:
-        """Whether the covariance includes errors of the images' times, of every camera."""
-        if "offset" in self.config.estimate:
-            return True
         table = self.correspondences
-        is_moving = table is not None and table.twist_per_s is not None
-        stated = all(camera.time_offset_sigma_s for camera in self.rig.cameras.values())
-        return self._is_mount and is_moving and stated
+        moves = table is not None and table.twist_per_s is not None
+        return left_out(self.config, self.rig, has_new_lens=bool(self.lens), motion_known=moves)
 
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.

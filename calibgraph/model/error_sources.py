@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from calibgraph.model.config import Config
+from calibgraph.model.rig import Rig
 from calibgraph.model.threshold import in_unit
 
 MATCHES = "scatter of the matches"
@@ -111,3 +113,25 @@ class _Bar(NamedTuple):
 
 def _is_enough(error_bar: tuple[float, float], tolerance: tuple[float, float]) -> bool:
     return all(one <= NEEDED * most for one, most in zip(error_bar, tolerance, strict=True))
+
+
+def left_out(config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool) -> str:
+    """Sentence about errors that the bars leave out: relative poses show the clouds' scale.
+
+    Args:
+        config: what was estimated, and of what the poses are.
+        rig: what it states of the cameras' times; its relative poses.
+        has_new_lens: whether parts of lenses or clocks were estimated.
+        motion_known: whether the correspondences come with the LiDAR's motion.
+    """
+    free = has_new_lens and {*config.estimate} - {"offset", "readout"}
+    lens = "errors of the other intrinsics" if free else "errors of the intrinsics"
+    is_mount = config.of == "mount" and config.preset == "auto"  # lenses and clocks are uncertain
+    if is_mount:
+        lens += ", beyond what the rig states or a calibration with a target leaves"
+    stated = motion_known and all(each.time_offset_sigma_s for each in rig.cameras.values())
+    times = "offset" in config.estimate or (is_mount and stated)
+    others = [] if times else ["of the time of the images"]
+    others += [] if rig.relative_poses else ["of the clouds' scale"]
+    joint = ", and " if is_mount or len(others) > 1 else " and "
+    return f"{joint.join([', '.join([lens, *others[:-1]]), *others[-1:]])} are not included"
