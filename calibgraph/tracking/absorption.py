@@ -48,7 +48,7 @@ def blocks_by_camera(state: State, table: Correspondences) -> dict[int, CameraBl
     if not len(table):
         return {}
     kept = preprocess(rig_at(state, state.T_lidar_camera), table, state.config)
-    blocks = camera_blocks(state.rig, kept.table, state.config)
+    blocks = camera_blocks(state.rig_in_time, kept.table, state.config)
     return {state.names.index(name): block for name, block in blocks.items()}
 
 
@@ -113,7 +113,7 @@ def agrees_at_its_place(state: State, closed: ClosedPlaces, camera: int, own: Ou
     gated = Gated.at(own.T_lidar_camera, own.raw, one.scale, state.references[camera])
     if gated is None:
         return False
-    state = with_open_frame(state, frame.add(camera, own.raw, gated))
+    state = with_open_frame(state, frame.add(camera, own.raw, gated, state.offsets))
     window, _ = closed.with_open_epoch(state, None)
     place = window.places.index(frame.place)
     displaced = Linearization.at(window.model, window.values).distances[place, [0, 1 + camera]]
@@ -164,7 +164,7 @@ def absorb(
         gated = Gated.at(state.T_lidar_camera[camera], block, scale, reference)
         if gated is None:
             continue
-        frame = frame.add(camera, block, gated)
+        frame = frame.add(camera, block, gated, state.offsets)
         state = _count_absorbed(state, camera, gated)
         used[camera] = gated.used
     state = add_to_totals(with_open_frame(state, frame), frame)

@@ -13,12 +13,18 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import BlockByPlace, QuadraticByPlace, SummarizedByPlace
+from calibgraph.graph.by_place import (
+    BlockByPlace,
+    LateQuadraticByPlace,
+    QuadraticByPlace,
+    SummarizedByPlace,
+)
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.linear_data import poses_of
-from calibgraph.graph.variables import cloud_at_key, matched_at_key
+from calibgraph.graph.variables import cloud_at_key, matched_at_key, seen_lens_key
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import invert_each, pose_rows, to_T_lidar_camera
 from calibgraph.solver.curvature import convex_hessian
@@ -33,16 +39,19 @@ from calibgraph.solver.within_place import (
     relative_covariance,
 )
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
+from calibgraph.tracking.offset_terms import late_quadratic, offset_term, seen_offset_s
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
 
 Numbers = NDArray[np.int64]
-Data = BlockByPlace | QuadraticByPlace | SummarizedByPlace
-Quadratics = dict[int, dict[str, tuple[gtsam.Pose3, Array]]]
-"""Per camera and name of a place: the minimum T_lidar_camera, and (6, 6) information."""
+Data = BlockByPlace | QuadraticByPlace | LateQuadraticByPlace | SummarizedByPlace
+Quadratics = dict[int, dict[str, tuple[gtsam.Pose3, float, Array]]]
+"""Per camera and name of a place: T_lidar_camera and time offset [s] at the minimum; (d, d)
+information."""
 
 _PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a moved camera has few
+_WEAK_OFFSET = 0.01  # 1/s^2: of an offset within sight
 _EXACT = 1e-4  # rad and m: what is stated of places to be smaller counts as nothing
 
 
@@ -66,6 +75,7 @@ class FrameSpread:
         frames, the scatter is shrunk towards that of all its frames so far. Where the matcher
         states nothing of places it is wider if epochs scatter more than their frames suggest.
         """
+        sums = sums.pose
         (scatter, left), every = sums.within_places, sums.rows.total()
         hessian, reweighted, frames = every.hessian, every.reweighted, every.frames
         found = FrameSpread(np.tile(np.eye(6), (len(frames), 1, 1)), np.ones(len(frames)))
@@ -87,7 +97,7 @@ class FrameSpread:
         return WithinPlace.of(
             self.covariance[camera],
             float(self.efficiency[camera]),
-            roots=np.linalg.cholesky(sums.rows.reweighted[rows, camera] + WEAK),
+            roots=np.linalg.cholesky(sums.rows.pose.reweighted[rows, camera] + WEAK),
             frames=sums.frames[rows, camera] / sums.places[rows, camera],
             alike=float(sums.alike[camera]),
         )
@@ -125,7 +135,10 @@ class PlaceData:
         ]
         kept, cameras = [frame for frame in frames if frame.place in places], dict[int, Data]()
         for camera, one in enumerate(state.cameras):
-            quadratic = _by_place(earlier.get(camera, {}), [*places])
+            quadratic = _by_place(state, camera, earlier.get(camera, {}), [*places])
+            if isinstance(quadratic, LateQuadraticByPlace):
+                cameras[camera] = quadratic
+                continue
             own = None if one.summary.walk else inliers_of(kept, camera)
             if own is not None:
                 block = block_by_place(own, one.scale, numbers)
@@ -137,16 +150,18 @@ class PlaceData:
 
 
 def _by_place(
-    known: Mapping[str, tuple[gtsam.Pose3, Array]], names: Sequence[str]
-) -> QuadraticByPlace:
+    state: State,
+    camera: int,
+    known: Mapping[str, tuple[gtsam.Pose3, float, Array]],
+    names: Sequence[str],
+) -> QuadraticByPlace | LateQuadraticByPlace:
     """The quadratics of a camera at those of some places where it has one."""
-    places = [place for place, name in enumerate(names) if name in known]
+    places = np.array([place for place, name in enumerate(names) if name in known], dtype=np.int64)
     chosen = [known[names[place]] for place in places]
-    return QuadraticByPlace(
-        np.array(places, dtype=np.int64),
-        [pose for pose, _ in chosen],
-        np.array([information for _, information in chosen]).reshape(-1, 6, 6),
-    )
+    if state.offsets is not None and chosen:
+        return late_quadratic(state, camera, places, chosen)
+    information = np.array([one for _, _, one in chosen]).reshape(-1, 6, 6)
+    return QuadraticByPlace(places, [pose for pose, _, _ in chosen], information)
 
 
 def place_model(
@@ -161,9 +176,14 @@ def place_model(
         data: the matches of the places.
     """
     chosen, names = data.rows, state.names
-    blocks, shown = {}, {}
+    blocks, shown, lenses = {}, {}, {}
     for camera, matches in data.cameras.items():
         within = seen.within(sums, camera, chosen)
+        if state.offsets is not None:
+            rows = np.flatnonzero(sums.frames[:, camera])
+            own = seen.within(sums, camera, rows)
+            by_place = sums.rows[rows, camera]
+            lenses[camera] = offset_term(state, state.offsets, camera, by_place, own)
         blocks[names[camera]] = matches.with_variance(within.least)
         shown[names[camera]] = within, _distortion(state, camera, len(chosen))
     components = variance_components(state.findings, names, shown, places=len(chosen))
@@ -178,7 +198,7 @@ def place_model(
     )
     components = state.sizes.scale(components)
     none = gtsam.NonlinearFactorGraph()
-    return LatentPoseModel(names, blocks, (), none, components, state.config.of)
+    return LatentPoseModel(names, blocks, (), none, components, state.config.of, lenses)
 
 
 def marginals_of_places(fit: LatentPoseFit) -> list[gtsam.GaussianFactorGraph]:
@@ -207,37 +227,51 @@ def summary_factor(
     if marginals:
         factor, at = gtsam.HessianFactor(join_linear(*marginals)), gtsam.Values()
         for key in list(factor.keys()):
-            at.insert(key, values.atPose3(key))
+            is_vector = gtsam.symbolChr(key) == gtsam.symbolChr(seen_lens_key(0))
+            at.insert(key, values.atVector(key) if is_vector else values.atPose3(key))
         graph.add(gtsam.LinearContainerFactor(factor, at))
     return graph
 
 
 def quadratics_of(
-    state: State, sums: PlaceSums, cameras: Iterable[int] | None = None
+    state: State,
+    sums: PlaceSums,
+    cameras: Iterable[int] | None = None,
+    *,
+    places: Iterable[int] | None = None,
 ) -> Quadratics:
-    """The quadratics of some cameras, or all, at all places.
+    """The quadratics of some cameras, or all, at some places, or all.
 
     As those of matches that are kept: with the gradient of the robust cost, near the optimum of the
     last epoch, and the Hessian by the weights of the matches there.
     """
     return {
         camera: {
-            name: _quadratic(state, sums.rows[row, camera], name, camera)
-            for row, name in enumerate(sums.names)
+            sums.names[row]: _quadratic(state, sums.rows[row, camera], sums.names[row], camera)
+            for row in (range(len(sums.names)) if places is None else places)
             if sums.frames[row, camera]
         }
         for camera in (range(len(state.cameras)) if cameras is None else cameras)
     }
 
 
-def _quadratic(state: State, own: Sums, place: str, camera: int) -> tuple[gtsam.Pose3, Array]:
-    pose, information = state.pose_at(place, camera), own.reweighted + WEAK
+def _quadratic(
+    state: State, own: Sums, place: str, camera: int
+) -> tuple[gtsam.Pose3, float, Array]:
+    pose, weak, offset = state.pose_at(place, camera), WEAK, 0.0
+    if state.offsets is not None:
+        weak = block_diag(WEAK, _WEAK_OFFSET)
+        offset = float(state.offsets.values_s[camera])
+    information = own.reweighted + weak
     if pose is None:
-        step = np.linalg.solve(convex_hessian(own.hessian, own.reweighted) + WEAK, -own.gradient)
+        step = np.linalg.solve(convex_hessian(own.hessian, own.reweighted) + weak, -own.gradient)
     else:
         step = step_between(state.references[camera], pose)
+        if state.offsets is not None and state.optimum is not None:
+            step = np.append(step, seen_offset_s(state, state.optimum, camera) - offset)
         step = step - np.linalg.solve(information, own.gradient + own.hessian @ step)
-    return state.references[camera].retract(step), information
+    found = state.references[camera].retract(step[:6])
+    return found, offset + float(step[6:].sum()), information
 
 
 def linearized(data: PlaceData, fit: LatentPoseFit) -> Quadratics:
@@ -245,6 +279,7 @@ def linearized(data: PlaceData, fit: LatentPoseFit) -> Quadratics:
     values, count, found = fit.linear.values, len(data.names), Quadratics()
     clouds = poses_of(values, map(cloud_at_key, range(count)))
     for camera, matches in data.cameras.items():
+        assert not isinstance(matches, LateQuadraticByPlace)  # it is no nearer there
         places, T_camera_cloud = matches.places, np.tile(np.eye(4), (count, 1, 1))
         keys = [matched_at_key(int(place), camera) for place in places]
         T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
@@ -254,6 +289,7 @@ def linearized(data: PlaceData, fit: LatentPoseFit) -> Quadratics:
         found[camera] = {
             data.names[place]: (
                 to_T_lidar_camera(T_camera_cloud[place]).retract(steps[place]),
+                0.0,
                 information[place],
             )
             for place in places

@@ -154,7 +154,7 @@ def _restart_camera(
     )
     camera_state = replace(
         camera_state,
-        summary=EpochSummary.empty(),
+        summary=EpochSummary.empty(state.width),
         outlier_frames=(),
         agreements=(),
         moved_at=state.updates,
@@ -181,7 +181,8 @@ def _with_anchor_at(drift: DriftWatch | None, camera: int, step: Array) -> Drift
     """The watch with one camera's anchor moved by the step of that camera."""
     if drift is None:
         return None
-    own = drift.anchors[camera].shift_reference(step)
+    own = drift.anchors[camera]
+    own = own.shift_reference(np.pad(step, (0, own.width - len(step))))
     return replace(drift, anchors=drift.anchors.replace_at(camera, own))
 
 

@@ -12,6 +12,10 @@ If the extrinsic may have walked by a covariance Q since, then
 
 so that ``H'^-1 B' H'^-1 = H^-1 B H^-1 + Q`` exactly, whatever the gain. k, the mean eigenvalue of
 ``H^-1 B`` per frame, is the overconfidence of H: matches of a frame share errors.
+
+Where the time offset of the camera is estimated, sums over several frames have a seventh row. A
+frame that is taken t later is that of a camera which has moved by t times the twist of the LiDAR:
+the seventh column is the product of the others with this twist, which differs from frame to frame.
 """
 
 from __future__ import annotations
@@ -33,7 +37,9 @@ from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
 from factors import smallest_scaled_eigenvalue
 
-_SHAPES: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (6, 6), (6,), (6, 6), (), ())
+_POSE = 6
+_MATRIX, _VECTOR, _NUMBER = 2, 1, 0
+_AXES = _MATRIX, _VECTOR, _MATRIX, _VECTOR, _MATRIX, _NUMBER, _NUMBER
 _STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away
 _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
@@ -42,13 +48,15 @@ _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near
 class Sums:
     """Sums over frames. The leading axes (...), of cameras, places or others, are alike in all.
 
+    Of the pose, d is 6; with the time offset [s] of the camera last, d is 7.
+
     Attributes:
-        hessian: (..., 6, 6) true Hessian of the robust cost, in the tangent of T_lidar_camera.
-        gradient: (..., 6) at the reference, which ``State`` holds.
-        reweighted: (..., 6, 6) Hessian by the matches' weights in the loss: it is positive
+        hessian: (..., d, d) true Hessian of the robust cost, in the tangent of T_lidar_camera.
+        gradient: (..., d) at the reference, which ``State`` holds.
+        reweighted: (..., d, d) Hessian by the matches' weights in the loss: it is positive
             semidefinite, of however few.
-        score: (..., 6) sum of the frames' gradients, each at the estimate of its time.
-        scatter: (..., 6, 6) sum of the outer products of the same.
+        score: (..., d) sum of the frames' gradients, each at the estimate of its time.
+        scatter: (..., d, d) sum of the outer products of the same.
         frames, matches: (...) how many.
     """
 
@@ -61,9 +69,64 @@ class Sums:
     matches: Array
 
     @staticmethod
-    def zeros(*shape: int) -> Sums:
-        """Over no frames, with these leading axes."""
-        return Sums(*(np.zeros((*shape, *own)) for own in _SHAPES))
+    def zeros(*shape: int, width: int = _POSE) -> Sums:
+        """Over no frames, with these leading axes, and d."""
+        return Sums(*(np.zeros((*shape, *[width] * own)) for own in _AXES))
+
+    @property
+    def width(self) -> int:
+        """The number d."""
+        return self.gradient.shape[-1]
+
+    @property
+    def pose(self) -> Sums:
+        """The sums of the pose, the offset at its reference."""
+        if self.width == _POSE:
+            return self
+        rows = slice(_POSE)
+        cut = {_NUMBER: (), _VECTOR: (..., rows), _MATRIX: (..., rows, rows)}
+        return Sums(*(v[cut[own]] for v, own in zip(vars(self).values(), _AXES, strict=True)))
+
+    def with_offset(self, twists_per_s: Array) -> Sums:
+        """The sums of frames, with the offset, by (..., 6) twists in the camera's axes."""
+        E = np.concatenate(
+            [np.broadcast_to(np.eye(_POSE), (*twists_per_s.shape, _POSE)), twists_per_s[..., None]],
+            axis=-1,
+        )
+        return self._mapped(E.swapaxes(-1, -2))
+
+    def without_offset(self, information: Array, overconfidence: Array) -> Sums:
+        """The sums of the pose, with the offset marginalized.
+
+        Args:
+            information: (...) of the offset at its reference [1/s^2], by other data.
+            overconfidence: (...) k of the module's description.
+        """
+        known, column = information * overconfidence, self.hessian[..., :_POSE, _POSE]
+        gain = column / (self.hessian[..., _POSE, _POSE] + known)[..., None]
+        M = np.concatenate(
+            [np.broadcast_to(np.eye(_POSE), (*gain.shape, _POSE)), -gain[..., None]], axis=-1
+        )
+        outer = gain[..., :, None] * gain[..., None, :]
+        found = self._mapped(M)
+        return replace(
+            found,
+            hessian=found.hessian + outer * known[..., None, None],
+            reweighted=found.reweighted + outer * known[..., None, None],
+            scatter=found.scatter + outer * (known * overconfidence)[..., None, None],
+        )
+
+    def _mapped(self, M: Array) -> Sums:
+        """The sums whose gradients are (..., e, d) M times these."""
+        back = M.swapaxes(-1, -2)
+        return replace(
+            self,
+            hessian=M @ self.hessian @ back,
+            gradient=(M @ self.gradient[..., None])[..., 0],
+            reweighted=M @ self.reweighted @ back,
+            score=(M @ self.score[..., None])[..., 0],
+            scatter=M @ self.scatter @ back,
+        )
 
     @staticmethod
     def stack(parts: Sequence[Sums]) -> Sums:
@@ -81,8 +144,8 @@ class Sums:
         """All of them times (...) weights."""
         return Sums(
             *(
-                values * np.reshape(weight, (*np.shape(weight), *[1] * len(own)))
-                for values, own in zip(vars(self).values(), _SHAPES, strict=True)
+                values * np.reshape(weight, (*np.shape(weight), *[1] * own))
+                for values, own in zip(vars(self).values(), _AXES, strict=True)
             )
         )
 
@@ -102,7 +165,7 @@ class Sums:
         return Sums(*(values.sum(axis=0) for values in vars(self).values()))
 
     def shift_reference(self, steps: Array) -> Sums:
-        """The sums about references that are moved by (..., 6) tangent steps."""
+        """The sums about references that are moved by (..., d) tangent steps."""
         moved = (self.hessian @ steps[..., None])[..., 0]
         return replace(self, gradient=self.gradient + moved)
 
@@ -110,14 +173,14 @@ class Sums:
         """The sums after a random walk, and (...) which share of them is left.
 
         Args:
-            variance: (..., 6) of the walk.
+            variance: (..., d) of the walk.
             overconfidence: (...) k of the module's description.
         """
         by = variance / np.asarray(overconfidence)[..., None]
-        gain = np.linalg.inv(np.eye(6) + self.hessian * by[..., None, :])
+        gain = np.linalg.inv(np.eye(self.width) + self.hessian * by[..., None, :])
         hessian, back = gain @ self.hessian, gain.swapaxes(-1, -2)
         hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
-        kept = np.trace(gain, axis1=-2, axis2=-1) / 6
+        kept = np.trace(gain[..., :_POSE, :_POSE], axis1=-2, axis2=-1) / _POSE
         walked = replace(
             self * kept,
             hessian=hessian,
@@ -125,6 +188,21 @@ class Sums:
             scatter=gain @ self.scatter @ back + hessian * variance[..., None, :] @ hessian,
         )
         return walked, kept
+
+    def after_offset_walk(self, variance: Array, overconfidence: Array) -> Sums:
+        """The sums at each place, whose scores are of use, after a walk of the offset alone."""
+        by = variance / overconfidence[..., None]
+        gains = [
+            np.linalg.inv(np.eye(self.width) + H * by[..., None, :])
+            for H in (self.hessian, self.reweighted)
+        ]
+        walked, _ = self.after_walk(variance, overconfidence)
+        reweighted = gains[1] @ self.reweighted
+        return replace(
+            walked,
+            score=(gains[0] @ self.score[..., None])[..., 0],
+            reweighted=(reweighted + reweighted.swapaxes(-1, -2)) / 2,
+        )
 
     def step(self, camera: int) -> Array | None:
         """(6,) from a camera's reference to the minimum of its sums; None if undetermined."""

@@ -12,6 +12,7 @@ from calibgraph.errors import CorrespondenceError, FileError, in_words
 from calibgraph.files import require_file, write_bytes
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.clock import require_motion
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
@@ -72,7 +73,7 @@ class IncrementalCalibrator:
     @property
     def rig(self) -> Rig:
         """The rig with the present estimates."""
-        return rig_at(self._state, self._assess().T_lidar_camera)
+        return self.calibration().rig
 
     @property
     def initial_rig(self) -> Rig:
@@ -135,6 +136,9 @@ class IncrementalCalibrator:
                 changed then.
         """
         table = with_common_error(table, self._state.config)
+        if len(table):
+            known = table.twist_per_s is not None
+            require_motion(self._state.config.estimate, is_known=known)
         table = with_metadata_per_frame(with_place(table, place))
         number, stamp = number_and_stamp(table, frame, self._state)
         new = without_repeats(self._state, table)
@@ -166,7 +170,9 @@ class IncrementalCalibrator:
             updates=state.updates + 1,
             findings=table.findings if len(table) else state.findings,
         )
-        self._state = with_open_frame(state, LiveFrame.empty(number, len(state.names), place))
+        in_time = state.offsets is not None
+        frame = LiveFrame.empty(number, len(state.names), place, in_time=in_time)
+        self._state = with_open_frame(state, frame)
 
     def _take(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
@@ -258,10 +264,13 @@ class IncrementalCalibrator:
 
     def _close_epoch(self) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, begin another."""
-        state = self._state
+        state, offsets = self._state, self._state.offsets
         if self._assessed is not None:
             state = replace(state, optimum=self._assessed[1].newest(state.optimum))
-        self._state, events = close_epoch(state)
+            offsets = self._assessed[1].offsets(state)
+        if offsets is not None:
+            state = self._closed.follow(state, offsets)
+        self._state, events = close_epoch(state, offsets)
         detected = detect_small_step(self._state)
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
