@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
@@ -60,7 +61,11 @@ def at_minimum(state: State, closed: ClosedPlaces, more: Mapping[int, Sums] | No
         closed: its closed epochs.
         more: sums of further matches, per camera.
     """
-    poses = minimum(closed.equation_5(state, more), state.T_lidar_camera)
+    return with_poses(state, minimum(closed.equation_5(state, more), state.T_lidar_camera))
+
+
+def with_poses(state: State, poses: tuple[gtsam.Pose3, ...]) -> State:
+    """The state with other estimates in its open epoch."""
     last = replace(state.epochs[-1], T_lidar_camera=poses)
     return replace(state, epochs=(*state.epochs[:-1], last))
 

@@ -21,7 +21,6 @@ from calibgraph.solver.elimination import (
     start_values,
 )
 from calibgraph.solver.variance_components import estimate_variance_ratios
-from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.contradictions import (
     Conflicts,
     Rows,
@@ -32,7 +31,6 @@ from calibgraph.tracking.contradictions import (
     poses_by_name,
 )
 from calibgraph.tracking.epoch_sums import split_halves, sum_closed_epochs
-from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
@@ -140,17 +138,6 @@ class ClosedPlaces:
     def all_sums(self, state: State) -> Sums:
         """(n,) over the summaries and all live frames."""
         return self._closed_sums + state.epochs[-1].sums
-
-    def follow(self, state: State, offsets: Offsets) -> State:
-        """The state with the poses that fit its matches best at other time offsets."""
-        assert state.offsets is not None
-        sums, later_s = self.all_sums(state), offsets.values_s - state.offsets.values_s
-        hessian = sums.hessian[:, :6, :6] + WEAK
-        steps = -np.linalg.solve(hessian, (sums.hessian[:, :6, 6] * later_s[:, None])[..., None])
-        moves = zip(state.T_lidar_camera, steps[..., 0], strict=True)
-        poses = tuple(pose.retract(step) for pose, step in moves)
-        last = replace(state.epochs[-1], T_lidar_camera=poses)
-        return replace(state, epochs=(*state.epochs[:-1], last))
 
     def equation_5(
         self, state: State, more: Mapping[int, Sums] | None = None

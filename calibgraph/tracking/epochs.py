@@ -94,6 +94,11 @@ def _with_references(
     )
 
 
+def at_offsets(state: State, offsets: Offsets) -> State:
+    """The state with its matches at other time offsets, within an epoch."""
+    return regate(_with_references(state, state.T_lidar_camera, offsets))
+
+
 def _with_points_at(state: State, later_s: Array) -> State:
     """The state with the points of all kept matches some seconds later, (n,)."""
     epochs = tuple(

@@ -60,15 +60,16 @@ class LiveFrame:
         self, camera: int, raw: CameraBlock, gated: Gated, offsets: Offsets | None
     ) -> LiveFrame:
         """The frame with a camera's matches."""
-        twists = self.twists_per_s
+        twists, sums = self.twists_per_s, gated.sums
         if twists is not None and offsets is not None and raw.block.motion is not None:
             twists = twists.copy()
             twists[camera] = offsets.adjoints[camera] @ raw.block.motion[0, :6]
+            sums = sums.with_even_hessian()
         return replace(
             self,
             raw={**self.raw, camera: raw},
             inliers={**self.inliers, camera: gated.inliers},
-            sums=self.sums.replace_at(camera, gated.sums),
+            sums=self.sums.replace_at(camera, sums),
             twists_per_s=twists,
         )
 

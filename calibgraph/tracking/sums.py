@@ -35,11 +35,13 @@ from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.within_place import WEAK
 from factors import smallest_scaled_eigenvalue
 
 _POSE = 6
 _MATRIX, _VECTOR, _NUMBER = 2, 1, 0
 _AXES = _MATRIX, _VECTOR, _MATRIX, _VECTOR, _MATRIX, _NUMBER, _NUMBER
+_SHARES = 0.5, 1.0  # of the true Hessian in that by weights
 _STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away
 _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
@@ -94,6 +96,14 @@ class Sums:
             axis=-1,
         )
         return self._mapped(E.swapaxes(-1, -2))
+
+    def with_even_hessian(self) -> Sums:
+        """The sums of a frame whose true Hessian is a multiple of that by weights.
+
+        An offset shows by differences of frames, in which the scatter of true Hessians would count.
+        """
+        share = np.trace(np.linalg.solve(self.reweighted + WEAK, self.hessian)) / _POSE
+        return replace(self, hessian=float(np.clip(share, *_SHARES)) * self.reweighted)
 
     def without_offset(self, information: Array, overconfidence: Array) -> Sums:
         """The sums of the pose, with the offset marginalized.

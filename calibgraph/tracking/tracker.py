@@ -24,11 +24,12 @@ from calibgraph.tracking.absorption import (
     blocks_by_camera,
     count_absent,
     select_agreeing,
+    with_poses,
     with_open_frame,
 )
 from calibgraph.tracking.assessment import Assessment, assess, rig_at, to_calibration
 from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
-from calibgraph.tracking.epochs import close_epoch
+from calibgraph.tracking.epochs import at_offsets, close_epoch
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import (
     PLACE,
@@ -38,6 +39,8 @@ from calibgraph.tracking.frame_order import (
     without_repeats,
 )
 from calibgraph.tracking.live_frames import LiveFrame
+from calibgraph.tracking.offset_search import explaining_offsets, follow
+from calibgraph.tracking.offsets import delayed
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
@@ -176,6 +179,7 @@ class IncrementalCalibrator:
 
     def _take(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
+        blocks = self._at_explaining_offsets(blocks)
         self._state, agreeing = select_agreeing(self._state, self._closed, blocks)
         self._state, used = absorb(self._state, self._closed, agreeing)
         self._state, events = start_cameras(self._state, table, blocks)
@@ -187,6 +191,18 @@ class IncrementalCalibrator:
         if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
             events += self._close_epoch()
         return make_update(self._state, self._assess(), tuple(events), used)
+
+    def _at_explaining_offsets(self, blocks: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
+        """The blocks, and the state, at the time offsets with which they agree."""
+        before, sums = self._state.offsets, self._closed.all_sums(self._state)
+        offsets = explaining_offsets(self._state, sums, blocks)
+        if offsets is None or before is None:
+            return blocks
+        state = with_poses(self._state, follow(self._state, sums, offsets))
+        self._state = replace(at_offsets(state, offsets), optimum=None)
+        self._rebuild()
+        later_s = offsets.values_s - before.values_s
+        return {camera: delayed(block, later_s[camera]) for camera, block in blocks.items()}
 
     def _refine(self) -> None:
         """Do a part of the work that the end of an epoch has left to the frames after it."""
@@ -269,7 +285,7 @@ class IncrementalCalibrator:
             state = replace(state, optimum=self._assessed[1].newest(state.optimum))
             offsets = self._assessed[1].offsets(state)
         if offsets is not None:
-            state = self._closed.follow(state, offsets)
+            state = with_poses(state, follow(state, self._closed.all_sums(state), offsets))
         self._state, events = close_epoch(state, offsets)
         detected = detect_small_step(self._state)
         if detected is not None:
