@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.camera_block import CameraBlock, merge
 from calibgraph.tracking.cause import Cause, Steps, find_cause
 from calibgraph.tracking.drift import follow_drift
@@ -220,7 +221,18 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         if own is not None:
             sums = replace(own.sums, frames=np.array(float(len(parts))))
             found = found.replace_at(camera, sums)
-    return found
+    return _with_uncertain_offsets(state, found, detected.since)
+
+
+def _with_uncertain_offsets(state: State, sums: Sums, since: int) -> Sums:
+    """The (n,) sums of frames since a step, which do not show the offset themselves."""
+    if state.offsets is None:
+        return sums
+    twists = [frame.twists_per_s for frame in state.live_frames if frame.number >= since]
+    share = sums.frames / np.maximum(state.total_frames, 1.0)
+    scatter = [s * state.total[pose_rows(c), pose_rows(c)] for c, s in enumerate(share)]
+    sums = replace(sums, scatter=np.array(scatter))
+    return state.of_poses(sums.with_offset(np.mean(twists, axis=0)))
 
 
 def _measure_steps(state: State, detected: DetectedStep) -> Measured:
@@ -229,5 +241,8 @@ def _measure_steps(state: State, detected: DetectedStep) -> Measured:
     new = [c for c in range(len(state.cameras)) if state.frame_noise(c) is None]
     guessed = {camera: after.hessian[camera] * _GUESSED_OVERCONFIDENCE for camera in new}
     own = {camera: before.scatter[camera] for camera in (*new, *state.drifting)}
+    if state.offsets is not None:
+        own = dict(enumerate(before.scatter))
+        guessed = {**dict(enumerate(after.scatter)), **guessed}
     by_places = shift_since(state, detected.since)
     return steps_between(state, (before, own), (after, guessed), by_places)

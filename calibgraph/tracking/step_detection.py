@@ -149,6 +149,8 @@ def _shift_excess(
         return 0.0
     hessian, rows = after.hessian[camera], pose_rows(camera)
     by_frames = before.scatter[camera] * (after.frames[camera] / (frames - 1))
+    if state.offsets is not None:  # both sides know the offset differently
+        by_frames = after.scatter[camera]
     by_frames = by_frames + hessian @ before.covariance(camera) @ hessian
     covariance = by_frames * state.inflation(camera)
     if by_places is not None:
