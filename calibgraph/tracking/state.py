@@ -238,6 +238,8 @@ class State:
         if self.offsets is None:
             return sums
         (variance,) = self.walk_variance(np.zeros(1), frames)
+        count = np.append(np.full(len(sums.names) - 1, max(len(sums.names) - 1.0, 1.0)), 1.0)
+        variance = count[:, None, None] * variance
         rows = sums.rows.after_offset_walk(variance, self.all_overconfidence)
         return replace(sums, rows=rows)
 
