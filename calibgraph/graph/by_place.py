@@ -151,12 +151,13 @@ class LateQuadraticByPlace:
         T_lidar_camera: Sequence[gtsam.Pose3],
         offsets: Array,
         information: Array,
+        *,
         key: int,
     ) -> LateQuadraticByPlace:
         """From the (p, 7, 7) information of poses and offset."""
         across = information[:, :6, 6]
         poses = QuadraticByPlace(places, T_lidar_camera, information[:, :6, :6])
-        follows = -np.linalg.solve(poses.information, across[..., None])[..., 0]
+        follows = np.asarray(-np.linalg.solve(poses.information, across[..., None])[..., 0])
         left = information[:, 6, 6] + np.einsum("pi,pi->p", across, follows)
         least = _ROUNDING * information[:, 6, 6] + _LEAST_INFORMATION
         return LateQuadraticByPlace(poses, offsets, follows, np.maximum(left, least), key)
@@ -178,7 +179,9 @@ class LateQuadraticByPlace:
             T_camera_cloud: (p, 4, 4) of these places.
             values: (1,) the offset.
         """
-        return [self._sums(row, to_T_lidar_camera(T), values) for row, T in enumerate(T_camera_cloud)]
+        return [
+            self._sums(row, to_T_lidar_camera(T), values) for row, T in enumerate(T_camera_cloud)
+        ]
 
     def _sums(self, row: int, pose: gtsam.Pose3, values: Array) -> BlockSums:
         away, by_offset = values[0] - self.offsets[row], self.follows[row]

@@ -59,10 +59,7 @@ from factors import (
     robust_noise,
 )
 
-
-Data = (
-    BlockByPlace | QuadraticByPlace | LateQuadraticByPlace | SummarizedByPlace | FreeLensByPlace
-)
+Data = BlockByPlace | QuadraticByPlace | LateQuadraticByPlace | SummarizedByPlace | FreeLensByPlace
 
 
 @dataclass(frozen=True, eq=False)

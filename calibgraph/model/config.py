@@ -37,8 +37,8 @@ class Tracking(StrictNumbers):
             makes from one frame to the next. The model of a camera is constant until the residuals
             favour a walk: this one, a fifth of it, or five times it.
         walk_translation_m: the same of its position.
-        walk_time_offset_s: standard deviation of the random walk of a time offset that is estimated,
-            from one frame to the next; at 10 Hz, 1e-4 is 19 ms in an hour. 0: it is constant.
+        walk_time_offset_s: standard deviation of the random walk of a time offset, if that is
+            estimated, from one frame to the next: 1e-4 is 19 ms in an hour at 10 Hz; 0 is none.
         step_frames: frames that must agree on a new extrinsic before a step is reported.
         blind_frames: frames without usable matches before a camera is reported as blind.
     """

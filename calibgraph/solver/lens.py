@@ -173,9 +173,7 @@ def _minimum(
     return np.tile(to_T_camera_lidar(pose), each), values
 
 
-def _frame_scatter(
-    free: FreeLensBlock, placed: BlockByPlace, at: tuple[Array, Array]
-) -> Array:
+def _frame_scatter(free: FreeLensBlock, placed: BlockByPlace, at: tuple[Array, Array]) -> Array:
     """(6 + k, 6 + k) sum of the outer products of the gradients of frames."""
     counts = placed.count_of_frame[np.argsort(placed.place_of_frame, kind="stable")]
     columns = free.columns(at[0][0], at[1])

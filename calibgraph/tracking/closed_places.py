@@ -35,14 +35,12 @@ from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
     PlaceData,
-    Quadratics,
-    linearized,
     marginals_of_places,
     place_model,
-    quadratics_of,
     summary_factor,
 )
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
+from calibgraph.tracking.quadratics import Quadratics, linearized, quadratics_of
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, equation_5
 from calibgraph.tracking.window import Window
@@ -115,7 +113,7 @@ class ClosedPlaces:
         """The matches of the graph near its optimum."""
         if self.state.offsets is not None:
             return quadratics_of(self.state, self.sums)
-        return linearized(self.data, self.fit)
+        return linearized(self.data.names, self.data.cameras, self.fit)
 
     @cached_property
     def marginals(self) -> list[gtsam.GaussianFactorGraph]:

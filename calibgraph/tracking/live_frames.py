@@ -15,6 +15,7 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
+from calibgraph.tracking.offset_sums import with_even_hessian, with_offset
 from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.sums import Gated, Sums
 
@@ -47,7 +48,7 @@ class LiveFrame:
     def whole(self) -> Sums:
         """(n,) its sums, with the time offset where that is estimated."""
         known = self.twists_per_s
-        return self.sums if known is None else self.sums.with_offset(known)
+        return self.sums if known is None else with_offset(self.sums, known)
 
     def without(self, camera: int) -> LiveFrame:
         """The frame without one camera's matches."""
@@ -64,7 +65,7 @@ class LiveFrame:
         if twists is not None and offsets is not None and raw.block.motion is not None:
             twists = twists.copy()
             twists[camera] = offsets.adjoints[camera] @ raw.block.motion[0, :6]
-            sums = sums.with_even_hessian()
+            sums = with_even_hessian(sums)
         return replace(
             self,
             raw={**self.raw, camera: raw},

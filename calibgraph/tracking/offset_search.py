@@ -66,7 +66,7 @@ def follow(state: State, sums: Sums, offsets: Offsets) -> tuple[gtsam.Pose3, ...
 def pose_by_offset(sums: Sums) -> Array:
     """(n, 6) step of each pose that makes up for a second of its offset."""
     hessian = sums.hessian[:, :6, :6] + WEAK
-    return -np.linalg.solve(hessian, sums.hessian[:, :6, 6:])[..., 0]
+    return np.asarray(-np.linalg.solve(hessian, sums.hessian[:, :6, 6:])[..., 0])
 
 
 def _moved(pose: gtsam.Pose3, follows: Array, seconds: float) -> gtsam.Pose3:

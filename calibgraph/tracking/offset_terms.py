@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import LateQuadraticByPlace
@@ -16,7 +15,6 @@ from calibgraph.graph.variables import seen_lens_key
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.solver.lens import lens_term_of
 from calibgraph.solver.within_place import WithinPlace
-from calibgraph.tracking.offsets import Offsets, prior_sigma_s
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums
@@ -24,19 +22,17 @@ from calibgraph.tracking.sums import Sums
 Numbers = NDArray[np.int64]
 
 
-def offset_term(
-    state: State, offsets: Offsets, camera: int, sums: Sums, within: WithinPlace
-) -> LensTerm:
+def offset_term(state: State, camera: int, sums: Sums, within: WithinPlace) -> LensTerm:
     """The offset of a camera in the error model; scan distortion does not displace it.
 
     Args:
         state: of the tracker.
-        offsets: its own.
         camera: by its place in the rig.
         sums: (p,) of the camera at each place where it has frames.
         within: what its matches of one of these places share.
     """
-    lens = offsets.variable(state.rig, camera)
+    assert state.offsets is not None
+    lens = state.offsets.variable(state.rig, camera)
     units, total = _units(lens.free.sigmas[0]), sums.total()
     findings: MatcherFindings = state.findings
     of_poses = within.at_place(findings.place_variance)
@@ -62,7 +58,7 @@ def late_quadratic(
     information = np.array([units @ one @ units for _, _, one in chosen]).reshape(-1, 7, 7)
     poses = [pose for pose, _, _ in chosen]
     key = seen_lens_key(camera)
-    return LateQuadraticByPlace.of(places, poses, away_s / sigma, information, key)
+    return LateQuadraticByPlace.of(places, poses, away_s / sigma, information, key=key)
 
 
 def seen_offset_s(state: State, optimum: Optimum, camera: int) -> float:

@@ -93,9 +93,12 @@ class Optimum:
             expected = self.shared.get(matched_key(camera), values.atPose3(matched_key(camera)))
             of_place = self.matched.get(names[place], {})
             known[matched_at_key(place, camera)] = of_place.get(camera, expected)
-        for key, value in (*known.items(), *self.lenses.items()):
+        for key, pose in known.items():
             if values.exists(key):
-                values.update(key, value)
+                values.update(key, pose)
+        for key, vector in self.lenses.items():
+            if values.exists(key):
+                values.update(key, vector)
         if model.is_distorted and self.distortion is not None:
             values.update(DISTORTION, self.distortion)
         return values

@@ -7,26 +7,22 @@ marginal on the cloud and the cameras as matches show them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
-    BlockByPlace,
     LateQuadraticByPlace,
-    QuadraticByPlace,
     SummarizedByPlace,
 )
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
-from calibgraph.graph.linear_data import poses_of
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, seen_lens_key
 from calibgraph.model.error_components import error_components
-from calibgraph.model.geometry import invert_each, pose_rows, to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.curvature import convex_hessian
 from calibgraph.solver.data_by_place import block_by_place
 from calibgraph.solver.elimination import LatentPoseFit, join_linear
@@ -39,19 +35,13 @@ from calibgraph.solver.within_place import (
     relative_covariance,
 )
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
-from calibgraph.tracking.offset_terms import late_quadratic, offset_term, seen_offset_s
+from calibgraph.tracking.offset_terms import offset_term
 from calibgraph.tracking.place_sums import PlaceSums
+from calibgraph.tracking.quadratics import Data, Quadratics, by_place
 from calibgraph.tracking.state import State
-from calibgraph.tracking.sums import Sums, step_between
 
 Numbers = NDArray[np.int64]
-Data = BlockByPlace | QuadraticByPlace | LateQuadraticByPlace | SummarizedByPlace
-Quadratics = dict[int, dict[str, tuple[gtsam.Pose3, float, Array]]]
-"""Per camera and name of a place: T_lidar_camera and time offset [s] at the minimum; (d, d)
-information."""
-
 _PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a moved camera has few
-_WEAK_OFFSET = 0.01  # 1/s^2: of an offset within sight
 _EXACT = 1e-4  # rad and m: what is stated of places to be smaller counts as nothing
 
 
@@ -135,7 +125,7 @@ class PlaceData:
         ]
         kept, cameras = [frame for frame in frames if frame.place in places], dict[int, Data]()
         for camera, one in enumerate(state.cameras):
-            quadratic = _by_place(state, camera, earlier.get(camera, {}), [*places])
+            quadratic = by_place(state, camera, earlier.get(camera, {}), [*places])
             if isinstance(quadratic, LateQuadraticByPlace):
                 cameras[camera] = quadratic
                 continue
@@ -147,21 +137,6 @@ class PlaceData:
             elif len(quadratic.places):
                 cameras[camera] = quadratic
         return PlaceData([*places], np.array([*places.values()], dtype=np.int64), cameras)
-
-
-def _by_place(
-    state: State,
-    camera: int,
-    known: Mapping[str, tuple[gtsam.Pose3, float, Array]],
-    names: Sequence[str],
-) -> QuadraticByPlace | LateQuadraticByPlace:
-    """The quadratics of a camera at those of some places where it has one."""
-    places = np.array([place for place, name in enumerate(names) if name in known], dtype=np.int64)
-    chosen = [known[names[place]] for place in places]
-    if state.offsets is not None and chosen:
-        return late_quadratic(state, camera, places, chosen)
-    information = np.array([one for _, _, one in chosen]).reshape(-1, 6, 6)
-    return QuadraticByPlace(places, [pose for pose, _, _ in chosen], information)
 
 
 def place_model(
@@ -182,8 +157,8 @@ def place_model(
         if state.offsets is not None:
             rows = np.flatnonzero(sums.frames[:, camera])
             own = seen.within(sums, camera, rows)
-            by_place = sums.rows[rows, camera]
-            lenses[camera] = offset_term(state, state.offsets, camera, by_place, own)
+            at_places = sums.rows[rows, camera]
+            lenses[camera] = offset_term(state, camera, at_places, own)
         blocks[names[camera]] = matches.with_variance(within.least)
         shown[names[camera]] = within, _distortion(state, camera, len(chosen))
     components = variance_components(state.findings, names, shown, places=len(chosen))
@@ -231,70 +206,6 @@ def summary_factor(
             at.insert(key, values.atVector(key) if is_vector else values.atPose3(key))
         graph.add(gtsam.LinearContainerFactor(factor, at))
     return graph
-
-
-def quadratics_of(
-    state: State,
-    sums: PlaceSums,
-    cameras: Iterable[int] | None = None,
-    *,
-    places: Iterable[int] | None = None,
-) -> Quadratics:
-    """The quadratics of some cameras, or all, at some places, or all.
-
-    As those of matches that are kept: with the gradient of the robust cost, near the optimum of the
-    last epoch, and the Hessian by the weights of the matches there.
-    """
-    return {
-        camera: {
-            sums.names[row]: _quadratic(state, sums.rows[row, camera], sums.names[row], camera)
-            for row in (range(len(sums.names)) if places is None else places)
-            if sums.frames[row, camera]
-        }
-        for camera in (range(len(state.cameras)) if cameras is None else cameras)
-    }
-
-
-def _quadratic(
-    state: State, own: Sums, place: str, camera: int
-) -> tuple[gtsam.Pose3, float, Array]:
-    pose, weak, offset = state.pose_at(place, camera), WEAK, 0.0
-    if state.offsets is not None:
-        weak = block_diag(WEAK, _WEAK_OFFSET)
-        offset = float(state.offsets.values_s[camera])
-    information = own.reweighted + weak
-    if pose is None:
-        step = np.linalg.solve(convex_hessian(own.hessian, own.reweighted) + weak, -own.gradient)
-    else:
-        step = step_between(state.references[camera], pose)
-        if state.offsets is not None and state.optimum is not None:
-            step = np.append(step, seen_offset_s(state, state.optimum, camera) - offset)
-        step = step - np.linalg.solve(information, own.gradient + own.hessian @ step)
-    found = state.references[camera].retract(step[:6])
-    return found, offset + float(step[6:].sum()), information
-
-
-def linearized(data: PlaceData, fit: LatentPoseFit) -> Quadratics:
-    """The quadratics of all matches at the poses that their places have in a fit."""
-    values, count, found = fit.linear.values, len(data.names), Quadratics()
-    clouds = poses_of(values, map(cloud_at_key, range(count)))
-    for camera, matches in data.cameras.items():
-        assert not isinstance(matches, LateQuadraticByPlace)  # it is no nearer there
-        places, T_camera_cloud = matches.places, np.tile(np.eye(4), (count, 1, 1))
-        keys = [matched_at_key(int(place), camera) for place in places]
-        T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
-        here = matches.sums(T_camera_cloud)
-        information = here.hessian + WEAK
-        steps = -np.linalg.solve(information, here.gradient[..., None])[..., 0]
-        found[camera] = {
-            data.names[place]: (
-                to_T_lidar_camera(T_camera_cloud[place]).retract(steps[place]),
-                0.0,
-                information[place],
-            )
-            for place in places
-        }
-    return found
 
 
 def _distortion(state: State, camera: int, places: int) -> DistortionEvidence | None:

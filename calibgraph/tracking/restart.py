@@ -17,6 +17,7 @@ from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
+from calibgraph.tracking.offset_sums import with_offset
 from calibgraph.tracking.outlier_frames import refine
 from calibgraph.tracking.start import absorb_frames
 from calibgraph.tracking.state import DriftWatch, State, replace_item
@@ -228,11 +229,12 @@ def _with_uncertain_offsets(state: State, sums: Sums, since: int) -> Sums:
     """The (n,) sums of frames since a step, which do not show the offset themselves."""
     if state.offsets is None:
         return sums
-    twists = [frame.twists_per_s for frame in state.live_frames if frame.number >= since]
+    later = [frame for frame in state.live_frames if frame.number >= since]
+    twists = [f.twists_per_s for f in later if f.twists_per_s is not None]
     share = sums.frames / np.maximum(state.total_frames, 1.0)
     scatter = [s * state.total[pose_rows(c), pose_rows(c)] for c, s in enumerate(share)]
     sums = replace(sums, scatter=np.array(scatter))
-    return state.of_poses(sums.with_offset(np.mean(twists, axis=0)))
+    return state.of_poses(with_offset(sums, np.mean(twists, axis=0)))
 
 
 def _measure_steps(state: State, detected: DetectedStep) -> Measured:

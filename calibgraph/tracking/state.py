@@ -29,6 +29,7 @@ from calibgraph.tracking.noise import (
     no_groups,
     widening,
 )
+from calibgraph.tracking.offset_sums import after_offset_walk, without_offset
 from calibgraph.tracking.offsets import Offsets, require_offset_alone
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
@@ -234,27 +235,31 @@ class State:
         return np.insert(variance, 6, tracking.walk_time_offset_s**2 * frames, axis=1)
 
     def after_offset_walk(self, sums: PlaceSums, frames: int) -> PlaceSums:
-        """The sums at all places after the walk of the time offsets over so many frames."""
+        """The sums at all places after the walk of the time offsets over so many frames.
+
+        Walks of places that are left are taken for independent, and wider by their number: together
+        they then say no more of the present offset than one of them.
+        """
         if self.offsets is None:
             return sums
-        (variance,) = self.walk_variance(np.zeros(1), frames)
-        count = np.append(np.full(len(sums.names) - 1, max(len(sums.names) - 1.0, 1.0)), 1.0)
-        variance = count[:, None, None] * variance
-        rows = sums.rows.after_offset_walk(variance, self.all_overconfidence)
+        left = len(sums.names) - 1
+        counts = np.append(np.full(left, max(left, 1.0)), 1.0)
+        variance = counts[:, None, None] * self.walk_variance(np.zeros(1), frames)
+        rows = after_offset_walk(sums.rows, variance, self.all_overconfidence)
         return replace(sums, rows=rows)
 
     def of_poses(self, sums: Sums) -> Sums:
         """(n,) sums of the poses alone: the offsets are as uncertain as their estimates."""
         if self.offsets is None:
             return sums
-        return sums.without_offset(self.offsets.sigmas_s**-2, self.all_overconfidence)
+        return without_offset(sums, self.offsets.sigmas_s**-2, self.all_overconfidence)
 
     def of_pose(self, camera: int, sums: Sums) -> Sums:
         """The same of (...) sums of one camera."""
         if self.offsets is None:
             return sums
         information = self.offsets.sigmas_s[camera] ** -2
-        return sums.without_offset(information, np.array(self.overconfidence(camera)))
+        return without_offset(sums, information, np.array(self.overconfidence(camera)))
 
     def frame_noise(self, index: int) -> Array | None:
         """(6, 6) scatter of one frame's gradient of a camera; None while it is unknown.

@@ -12,10 +12,6 @@ If the extrinsic may have walked by a covariance Q since, then
 
 so that ``H'^-1 B' H'^-1 = H^-1 B H^-1 + Q`` exactly, whatever the gain. k, the mean eigenvalue of
 ``H^-1 B`` per frame, is the overconfidence of H: matches of a frame share errors.
-
-Where the time offset of the camera is estimated, sums over several frames have a seventh row. A
-frame that is taken t later is that of a camera which has moved by t times the twist of the LiDAR:
-the seventh column is the product of the others with this twist, which differs from frame to frame.
 """
 
 from __future__ import annotations
@@ -35,13 +31,11 @@ from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.solver.within_place import WEAK
 from factors import smallest_scaled_eigenvalue
 
 _POSE = 6
 _MATRIX, _VECTOR, _NUMBER = 2, 1, 0
 _AXES = _MATRIX, _VECTOR, _MATRIX, _VECTOR, _MATRIX, _NUMBER, _NUMBER
-_SHARES = 0.5, 1.0  # of the true Hessian in that by weights
 _STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away
 _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
@@ -78,7 +72,7 @@ class Sums:
     @property
     def width(self) -> int:
         """The number d."""
-        return self.gradient.shape[-1]
+        return int(self.gradient.shape[-1])
 
     @property
     def pose(self) -> Sums:
@@ -88,55 +82,6 @@ class Sums:
         rows = slice(_POSE)
         cut = {_NUMBER: (), _VECTOR: (..., rows), _MATRIX: (..., rows, rows)}
         return Sums(*(v[cut[own]] for v, own in zip(vars(self).values(), _AXES, strict=True)))
-
-    def with_offset(self, twists_per_s: Array) -> Sums:
-        """The sums of frames, with the offset, by (..., 6) twists in the camera's axes."""
-        E = np.concatenate(
-            [np.broadcast_to(np.eye(_POSE), (*twists_per_s.shape, _POSE)), twists_per_s[..., None]],
-            axis=-1,
-        )
-        return self._mapped(E.swapaxes(-1, -2))
-
-    def with_even_hessian(self) -> Sums:
-        """The sums of a frame whose true Hessian is a multiple of that by weights.
-
-        An offset shows by differences of frames, in which the scatter of true Hessians would count.
-        """
-        share = np.trace(np.linalg.solve(self.reweighted + WEAK, self.hessian)) / _POSE
-        return replace(self, hessian=float(np.clip(share, *_SHARES)) * self.reweighted)
-
-    def without_offset(self, information: Array, overconfidence: Array) -> Sums:
-        """The sums of the pose, with the offset marginalized.
-
-        Args:
-            information: (...) of the offset at its reference [1/s^2], by other data.
-            overconfidence: (...) k of the module's description.
-        """
-        known, column = information * overconfidence, self.hessian[..., :_POSE, _POSE]
-        gain = column / (self.hessian[..., _POSE, _POSE] + known)[..., None]
-        M = np.concatenate(
-            [np.broadcast_to(np.eye(_POSE), (*gain.shape, _POSE)), -gain[..., None]], axis=-1
-        )
-        outer = gain[..., :, None] * gain[..., None, :]
-        found = self._mapped(M)
-        return replace(
-            found,
-            hessian=found.hessian + outer * known[..., None, None],
-            reweighted=found.reweighted + outer * known[..., None, None],
-            scatter=found.scatter + outer * (known * overconfidence)[..., None, None],
-        )
-
-    def _mapped(self, M: Array) -> Sums:
-        """The sums whose gradients are (..., e, d) M times these."""
-        back = M.swapaxes(-1, -2)
-        return replace(
-            self,
-            hessian=M @ self.hessian @ back,
-            gradient=(M @ self.gradient[..., None])[..., 0],
-            reweighted=M @ self.reweighted @ back,
-            score=(M @ self.score[..., None])[..., 0],
-            scatter=M @ self.scatter @ back,
-        )
 
     @staticmethod
     def stack(parts: Sequence[Sums]) -> Sums:
@@ -198,21 +143,6 @@ class Sums:
             scatter=gain @ self.scatter @ back + hessian * variance[..., None, :] @ hessian,
         )
         return walked, kept
-
-    def after_offset_walk(self, variance: Array, overconfidence: Array) -> Sums:
-        """The sums at each place, whose scores are of use, after a walk of the offset alone."""
-        by = variance / overconfidence[..., None]
-        gains = [
-            np.linalg.inv(np.eye(self.width) + H * by[..., None, :])
-            for H in (self.hessian, self.reweighted)
-        ]
-        walked, _ = self.after_walk(variance, overconfidence)
-        reweighted = gains[1] @ self.reweighted
-        return replace(
-            walked,
-            score=(gains[0] @ self.score[..., None])[..., 0],
-            reweighted=(reweighted + reweighted.swapaxes(-1, -2)) / 2,
-        )
 
     def step(self, camera: int) -> Array | None:
         """(6,) from a camera's reference to the minimum of its sums; None if undetermined."""

@@ -24,10 +24,10 @@ from calibgraph.tracking.absorption import (
     blocks_by_camera,
     count_absent,
     select_agreeing,
-    with_poses,
     with_open_frame,
+    with_poses,
 )
-from calibgraph.tracking.assessment import Assessment, assess, rig_at, to_calibration
+from calibgraph.tracking.assessment import Assessment, assess, to_calibration
 from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
 from calibgraph.tracking.epochs import at_offsets, close_epoch
 from calibgraph.tracking.events import Event
