@@ -99,29 +99,30 @@ def displaced_between_factor(
     shifts: Mapping[int, Array],
     noise: gtsam.noiseModel.Base,
     *,
-    measured: gtsam.Pose3 | None = None,
+    measured: tuple[gtsam.Pose3, Array] | None = None,
 ) -> gtsam.CustomFactor:
-    """The same with several vectors: error ``log(M^-1 X_1^-1 X_2) - sum shifts b``.
+    """The same with several vectors: error ``log(M^-1 X_1^-1 X_2) + m - sum shifts b``.
 
     Args:
         key_1: variable X_1.
         key_2: variable X_2.
         shifts: by the key of each vector b, (6, B) twist of X_2 in X_1's frame by its numbers.
         noise: of the six rows.
-        measured: M, X_2 in X_1 without shifts; None: the identity.
+        measured: M, a pose of X_2 in X_1, and the (6,) sum m of the shifts there; None: none.
     """
 
     def error(
         factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
     ) -> Array:
         seen = values.atPose3(key_1).between(values.atPose3(key_2))
-        step = seen if measured is None else measured.between(seen)
+        step = seen if measured is None else measured[0].between(seen)
         twist = gtsam.Pose3.Logmap(step)
         if jacobians is not None:
             by_step = gtsam.Pose3.LogmapDerivative(twist)
             by_first = -by_step @ seen.inverse().AdjointMap()
             for number, jacobian in enumerate([by_first, *(-s for s in shifts.values()), by_step]):
                 jacobians[number] = np.asfortranarray(jacobian)
-        return np.asarray(twist - sum(s @ values.atVector(key) for key, s in shifts.items()))
+        by_vectors = sum(s @ values.atVector(key) for key, s in shifts.items())
+        return np.asarray((twist if measured is None else twist + measured[1]) - by_vectors)
 
     return gtsam.CustomFactor(noise, [key_1, *shifts, key_2], error)

@@ -204,11 +204,11 @@ class LateQuadraticByPlace:
     def _factors(self, row: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
         noise = gtsam.noiseModel.Gaussian.Information(self.poses.information[row])
         middle, by_offset = self.poses.T_lidar_camera[row], self.follows[row]
-        start = middle.retract(-by_offset * self.offsets[row])
+        measured = middle, by_offset * self.offsets[row]
         sigma = gtsam.noiseModel.Isotropic.Sigma(1, self.information[row] ** -0.5)
         prior = gtsam.PriorFactorVector(self.key, self.offsets[[row]], sigma)
         shifts = {self.key: by_offset[:, None]}
-        return [displaced_between_factor(cloud, matched, shifts, noise, measured=start), prior]
+        return [displaced_between_factor(cloud, matched, shifts, noise, measured=measured), prior]
 
 
 @dataclass(frozen=True, eq=False)

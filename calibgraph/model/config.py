@@ -109,7 +109,8 @@ class Config(StrictNumbers):
         estimate: parts of each lens that are estimated with the extrinsics, by ``calibrate`` and
             ``solve``: ``focal``, ``aspect`` (fx over fy), ``centre``, ``distortion``; ``lens`` is
             focal, centre and distortion. Also ``offset``, how long after its cloud an image is
-            taken, and ``readout`` of a rolling shutter; ``clock`` is both.
+            taken, and ``readout`` of a rolling shutter; ``clock`` is both. ``track`` follows
+            ``offset``.
         seed: of everything random.
         tracking: of the recalibration while driving.
     """

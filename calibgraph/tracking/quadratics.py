@@ -84,7 +84,9 @@ def _quadratic(
     else:
         step = step_between(state.references[camera], pose)
         if state.offsets is not None and state.optimum is not None:
-            step = np.append(step, seen_offset_s(state, state.optimum, camera) - offset)
+            away_s = seen_offset_s(state, state.optimum, camera) - offset
+            follows = np.linalg.solve(information[:6, :6], information[:6, 6])
+            step = np.append(step + follows * away_s, 0.0)  # as it is at the present offset
         step = step - np.linalg.solve(information, own.gradient + own.hessian @ step)
     found = state.references[camera].retract(step[:6])
     return found, offset + float(step[6:].sum()), information
