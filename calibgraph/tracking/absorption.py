@@ -115,7 +115,8 @@ def agrees_at_its_place(state: State, closed: ClosedPlaces, camera: int, own: Ou
     one, frame = state.cameras[camera], state.live_frames[-1]
     if one.summary.walk or state.config.preset != "auto" or not states_places(state):
         return False
-    gated = Gated.at(own.T_lidar_camera, own.raw, one.scale, state.references[camera])
+    even = state.offsets is not None
+    gated = Gated.at(own.T_lidar_camera, own.raw, one.scale, state.references[camera], even=even)
     if gated is None:
         return False
     state = with_open_frame(state, frame.add(camera, own.raw, gated, state.offsets))
@@ -166,7 +167,8 @@ def absorb(
     frame, used = state.epochs[-1].frames[-1], dict[int, int]()
     for camera, block in blocks.items():
         scale, reference = state.cameras[camera].scale, state.references[camera]
-        gated = Gated.at(state.T_lidar_camera[camera], block, scale, reference)
+        pose, even = state.T_lidar_camera[camera], state.offsets is not None
+        gated = Gated.at(pose, block, scale, reference, even=even)
         if gated is None:
             continue
         frame = frame.add(camera, block, gated, state.offsets)

@@ -15,7 +15,7 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
-from calibgraph.tracking.offset_sums import with_even_hessian, with_offset
+from calibgraph.tracking.offset_sums import with_offset
 from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.sums import Gated, Sums
 
@@ -61,16 +61,15 @@ class LiveFrame:
         self, camera: int, raw: CameraBlock, gated: Gated, offsets: Offsets | None
     ) -> LiveFrame:
         """The frame with a camera's matches."""
-        twists, sums = self.twists_per_s, gated.sums
+        twists = self.twists_per_s
         if twists is not None and offsets is not None and raw.block.motion is not None:
             twists = twists.copy()
             twists[camera] = offsets.adjoints[camera] @ raw.block.motion[0, :6]
-            sums = with_even_hessian(sums)
         return replace(
             self,
             raw={**self.raw, camera: raw},
             inliers={**self.inliers, camera: gated.inliers},
-            sums=self.sums.replace_at(camera, sums),
+            sums=self.sums.replace_at(camera, gated.sums),
             twists_per_s=twists,
         )
 

@@ -11,10 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.sums import Sums
-
-_SHARES = 0.5, 1.0  # of the true Hessian in that by weights
 
 
 def with_offset(sums: Sums, twists_per_s: Array) -> Sums:
@@ -22,15 +19,6 @@ def with_offset(sums: Sums, twists_per_s: Array) -> Sums:
     return _mapped(
         sums, np.concatenate([_units(twists_per_s), twists_per_s[..., None, :]], axis=-2)
     )
-
-
-def with_even_hessian(sums: Sums) -> Sums:
-    """The sums of a frame whose true Hessian is a multiple of that by weights.
-
-    An offset shows by differences of frames, in which the scatter of true Hessians would count.
-    """
-    share = np.trace(np.linalg.solve(sums.reweighted + WEAK, sums.hessian)) / 6
-    return replace(sums, hessian=float(np.clip(share, *_SHARES)) * sums.reweighted)
 
 
 def without_offset(sums: Sums, information: Array, overconfidence: Array) -> Sums:

@@ -15,7 +15,6 @@ from calibgraph.graph.variables import seen_lens_key
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.solver.lens import lens_term_of
 from calibgraph.solver.within_place import WithinPlace
-from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums
 
@@ -59,13 +58,6 @@ def late_quadratic(
     poses = [pose for pose, _, _ in chosen]
     key = seen_lens_key(camera)
     return LateQuadraticByPlace.of(places, poses, away_s / sigma, information, key=key)
-
-
-def seen_offset_s(state: State, optimum: Optimum, camera: int) -> float:
-    """The offset of a camera as its matches show it at the optimum."""
-    assert state.offsets is not None
-    lens = state.offsets.variable(state.rig, camera)
-    return lens.free.clock_at(optimum.lenses[seen_lens_key(camera)]).offset_s
 
 
 def _units(sigma_s: float) -> Array:

@@ -21,7 +21,7 @@ from calibgraph.model.geometry import invert_each, to_T_lidar_camera
 from calibgraph.solver.curvature import convex_hessian
 from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.solver.within_place import WEAK
-from calibgraph.tracking.offset_terms import late_quadratic, seen_offset_s
+from calibgraph.tracking.offset_terms import late_quadratic
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
@@ -74,22 +74,19 @@ def quadratics_of(
 def _quadratic(
     state: State, own: Sums, place: str, camera: int
 ) -> tuple[gtsam.Pose3, float, Array]:
-    pose, weak, offset = state.pose_at(place, camera), WEAK, 0.0
-    if state.offsets is not None:
+    reference, true = state.references[camera], convex_hessian(own.hessian, own.reweighted)
+    if state.offsets is not None:  # poses at another offset may be far away
         weak = block_diag(WEAK, _WEAK_OFFSET)
-        offset = float(state.offsets.values_s[camera])
-    information = own.reweighted + weak
+        step = np.linalg.solve(true + weak, -own.gradient)
+        offset_s = float(state.offsets.values_s[camera] + step[6])
+        return reference.retract(step[:6]), offset_s, own.reweighted + weak
+    pose, information = state.pose_at(place, camera), own.reweighted + WEAK
     if pose is None:
-        step = np.linalg.solve(convex_hessian(own.hessian, own.reweighted) + weak, -own.gradient)
+        step = np.linalg.solve(true + WEAK, -own.gradient)
     else:
-        step = step_between(state.references[camera], pose)
-        if state.offsets is not None and state.optimum is not None:
-            away_s = seen_offset_s(state, state.optimum, camera) - offset
-            follows = np.linalg.solve(information[:6, :6], information[:6, 6])
-            step = np.append(step + follows * away_s, 0.0)  # as it is at the present offset
+        step = step_between(reference, pose)
         step = step - np.linalg.solve(information, own.gradient + own.hessian @ step)
-    found = state.references[camera].retract(step[:6])
-    return found, offset + float(step[6:].sum()), information
+    return reference.retract(step), 0.0, information
 
 
 def linearized(names: Sequence[str], cameras: Mapping[int, Data], fit: LatentPoseFit) -> Quadratics:

@@ -119,6 +119,7 @@ def absorb_frames(
     """
     if state.offsets is not None:
         state = replace(state, offsets=state.offsets.with_axes(camera, T_lidar_camera))
+    even = state.offsets is not None
     by_number = {int(part.frame[0]): part for part in blocks}
     scale, reference = state.cameras[camera].scale, state.references[camera]
     epochs: list[Epoch] = []
@@ -127,7 +128,9 @@ def absorb_frames(
         frames = []
         for before in epoch.frames:
             frame, raw = before, by_number.get(before.number)
-            found = None if raw is None else Gated.at(T_lidar_camera, raw, scale, reference)
+            found = (
+                None if raw is None else Gated.at(T_lidar_camera, raw, scale, reference, even=even)
+            )
             if raw is not None and found is not None:
                 frame = frame.add(camera, raw, found, state.offsets)
                 counts.update(absorbed=1, given=len(raw.frame), used=found.used)

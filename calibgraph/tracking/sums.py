@@ -31,11 +31,13 @@ from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.within_place import WEAK
 from factors import smallest_scaled_eigenvalue
 
 _POSE = 6
 _MATRIX, _VECTOR, _NUMBER = 2, 1, 0
 _AXES = _MATRIX, _VECTOR, _MATRIX, _VECTOR, _MATRIX, _NUMBER, _NUMBER
+_SHARES = 0.5, 1.0  # of the true Hessian in that by weights
 _STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away
 _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
@@ -187,7 +189,12 @@ class Gated:
 
     @staticmethod
     def at(
-        T_lidar_camera: gtsam.Pose3, raw: CameraBlock, scale: ResidualScale, reference: gtsam.Pose3
+        T_lidar_camera: gtsam.Pose3,
+        raw: CameraBlock,
+        scale: ResidualScale,
+        reference: gtsam.Pose3,
+        *,
+        even: bool = False,
     ) -> Gated | None:
         """The matches near the minimum; None if too few are within the gate.
 
@@ -196,6 +203,8 @@ class Gated:
             raw: all of them.
             scale: of the residuals.
             reference: T_lidar_camera at which the gradient is taken.
+            even: let the true Hessian be a multiple of that by weights. A time offset shows by
+                differences of frames, in which the scatter of true Hessians would count.
         """
         residuals = raw.at(to_T_camera_lidar(T_lidar_camera))
         inliers = residuals.inliers(scale)
@@ -205,6 +214,9 @@ class Gated:
         block = raw.select(inliers).with_scale(scale)
         here = block.sums(pose)
         hessian = robust_hessian(block, pose) + residuals.gate_hessian(scale)
+        if even:
+            share = np.trace(np.linalg.solve(here.hessian + WEAK, hessian)) / _POSE
+            hessian = float(np.clip(share, *_SHARES)) * here.hessian
         gradient = here.gradient + hessian @ step_between(pose, reference)
         scatter = np.outer(here.gradient, here.gradient)
         counts = np.array(1.0), np.array(float(len(block)))
