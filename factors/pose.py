@@ -94,35 +94,27 @@ def biased_between_factor(
 
 
 def displaced_between_factor(
-    key_1: int,
-    key_2: int,
-    shifts: Mapping[int, Array],
-    noise: gtsam.noiseModel.Base,
-    *,
-    measured: tuple[gtsam.Pose3, Array] | None = None,
+    key_1: int, key_2: int, shifts: Mapping[int, Array], noise: gtsam.noiseModel.Base
 ) -> gtsam.CustomFactor:
-    """The same with several vectors: error ``log(M^-1 X_1^-1 X_2) + m - sum shifts b``.
+    """The same with several vectors: error ``log(X_1^-1 X_2) - sum shifts b``.
 
     Args:
         key_1: variable X_1.
         key_2: variable X_2.
         shifts: by the key of each vector b, (6, B) twist of X_2 in X_1's frame by its numbers.
         noise: of the six rows.
-        measured: M, a pose of X_2 in X_1, and the (6,) sum m of the shifts there; None: none.
     """
 
     def error(
         factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
     ) -> Array:
-        seen = values.atPose3(key_1).between(values.atPose3(key_2))
-        step = seen if measured is None else measured[0].between(seen)
+        step = values.atPose3(key_1).between(values.atPose3(key_2))
         twist = gtsam.Pose3.Logmap(step)
         if jacobians is not None:
             by_step = gtsam.Pose3.LogmapDerivative(twist)
-            by_first = -by_step @ seen.inverse().AdjointMap()
+            by_first = -by_step @ step.inverse().AdjointMap()
             for number, jacobian in enumerate([by_first, *(-s for s in shifts.values()), by_step]):
                 jacobians[number] = np.asfortranarray(jacobian)
-        by_vectors = sum(s @ values.atVector(key) for key, s in shifts.items())
-        return np.asarray((twist if measured is None else twist + measured[1]) - by_vectors)
+        return np.asarray(twist - sum(s @ values.atVector(key) for key, s in shifts.items()))
 
     return gtsam.CustomFactor(noise, [key_1, *shifts, key_2], error)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -15,13 +16,11 @@ from factors import (
     BlockSums,
     PairBlock,
     ProjectionBlock,
-    displaced_between_factor,
+    free_lens_sums_factor,
     pair_block_factor,
 )
 
 Numbers = NDArray[np.int64]
-
-_ROUNDING, _LEAST_INFORMATION = 1e-12, 1e-9  # of an offset in standard deviations of its prior
 
 
 def place_of(frame: Numbers, places: Sequence[Numbers]) -> Numbers:
@@ -132,45 +131,22 @@ class LateQuadraticByPlace:
     """The same of a camera whose time offset is a variable.
 
     Attributes:
-        poses: the quadratics of the poses, with the offset where it is.
+        places: as there.
+        T_lidar_camera: as there.
         offsets: (p,) at the minima, in the units of the variable.
-        follows: (p, 6) step of each minimum by a unit of the offset.
-        information: (p,) of the offset, the pose of its place eliminated.
+        information: (p, 7, 7) of poses and offset there.
         key: of the variable.
     """
 
-    poses: QuadraticByPlace
+    places: Numbers
+    T_lidar_camera: Sequence[gtsam.Pose3]
     offsets: Array
-    follows: Array
     information: Array
     key: int
 
-    @staticmethod
-    def of(
-        places: Numbers,
-        T_lidar_camera: Sequence[gtsam.Pose3],
-        offsets: Array,
-        information: Array,
-        *,
-        key: int,
-    ) -> LateQuadraticByPlace:
-        """From the (p, 7, 7) information of poses and offset."""
-        across = information[:, :6, 6]
-        poses = QuadraticByPlace(places, T_lidar_camera, information[:, :6, :6])
-        follows = np.asarray(-np.linalg.solve(poses.information, across[..., None])[..., 0])
-        left = information[:, 6, 6] + np.einsum("pi,pi->p", across, follows)
-        least = _ROUNDING * information[:, 6, 6] + _LEAST_INFORMATION
-        return LateQuadraticByPlace(poses, offsets, follows, np.maximum(left, least), key)
-
-    @property
-    def places(self) -> Numbers:
-        """(p,) the places that have correspondences, in rising order."""
-        return self.poses.places
-
     def with_variance(self, factor: float) -> LateQuadraticByPlace:
         """Multiply the variance of the matches."""
-        poses = self.poses.with_variance(factor)
-        return replace(self, poses=poses, information=self.information / factor)
+        return replace(self, information=self.information / factor)
 
     def sums(self, T_camera_cloud: Array, values: Array) -> list[BlockSums]:
         """H, b and c of every place with correspondences, by pose and offset.
@@ -179,36 +155,19 @@ class LateQuadraticByPlace:
             T_camera_cloud: (p, 4, 4) of these places.
             values: (1,) the offset.
         """
-        return [
-            self._sums(row, to_T_lidar_camera(T), values) for row, T in enumerate(T_camera_cloud)
-        ]
+        return [self._sums(row, T, values) for row, T in enumerate(T_camera_cloud)]
 
-    def _sums(self, row: int, pose: gtsam.Pose3, values: Array) -> BlockSums:
-        away, by_offset = values[0] - self.offsets[row], self.follows[row]
-        step = self.poses.T_lidar_camera[row].localCoordinates(pose) - by_offset * away
-        of_pose, of_offset = self.poses.information[row], self.information[row]
-        jacobian = np.column_stack([np.eye(6), -by_offset])
-        hessian, pull = jacobian.T @ of_pose @ jacobian, jacobian.T @ of_pose @ step
-        hessian[6, 6] += of_offset
-        pull[6] += of_offset * away
-        return BlockSums(hessian, pull, step @ of_pose @ step + of_offset * away**2)
+    def _sums(self, row: int, T_camera_cloud: Array, values: Array) -> BlockSums:
+        step = self.T_lidar_camera[row].localCoordinates(to_T_lidar_camera(T_camera_cloud))
+        step = np.append(step, values - self.offsets[row])
+        gradient = self.information[row] @ step
+        return BlockSums(self.information[row], gradient, step @ gradient)
 
     def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
         """The quadratic of one place, on the variables of these keys and the offset."""
-        return [
-            factor
-            for row in map(int, np.flatnonzero(self.places == place))
-            for factor in self._factors(row, cloud, matched)
-        ]
-
-    def _factors(self, row: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
-        noise = gtsam.noiseModel.Gaussian.Information(self.poses.information[row])
-        middle, by_offset = self.poses.T_lidar_camera[row], self.follows[row]
-        measured = middle, by_offset * self.offsets[row]
-        sigma = gtsam.noiseModel.Isotropic.Sigma(1, self.information[row] ** -0.5)
-        prior = gtsam.PriorFactorVector(self.key, self.offsets[[row]], sigma)
-        shifts = {self.key: by_offset[:, None]}
-        return [displaced_between_factor(cloud, matched, shifts, noise, measured=measured), prior]
+        rows = map(int, np.flatnonzero(self.places == place))
+        keys = cloud, matched, self.key
+        return [free_lens_sums_factor(keys, partial(self._sums, row), 1) for row in rows]
 
 
 @dataclass(frozen=True, eq=False)

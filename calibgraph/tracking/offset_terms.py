@@ -57,7 +57,7 @@ def late_quadratic(
     information = np.array([units @ one @ units for _, _, one in chosen]).reshape(-1, 7, 7)
     poses = [pose for pose, _, _ in chosen]
     key = seen_lens_key(camera)
-    return LateQuadraticByPlace.of(places, poses, away_s / sigma, information, key=key)
+    return LateQuadraticByPlace(places, poses, away_s / sigma, information, key)
 
 
 def _units(sigma_s: float) -> Array:
