@@ -183,7 +183,7 @@ def test_windows_are_trained_on_the_command_line(tmp_path: Path, call: Call) -> 
     code, _, text = call(
         "train-windows", SAMPLE, "--out", tmp_path / "next.json", "--from", out, *given
     )
-    begun = re.search(rf"held out {number} -> {number} \(one camera: ", text)
+    begun = re.search(rf"held out {number} -> {number} {over}", text)
     # Of the file's five digits three decimals are those of the training, but for the last.
     assert code == 0 and begun is not None
     assert float(begun[1]) == pytest.approx(held_after, abs=2e-3)
