@@ -13,7 +13,11 @@ import pytest
 import calibgraph
 from calibgraph import RelativePose, Rig, StructureMatcher
 from calibgraph.matching.structure import acceptance, global_search, pose_search
-from calibgraph.matching.structure.acceptance import least_z_score
+from calibgraph.matching.structure.acceptance import (
+    WITH_SECOND_LOOK,
+    Chance,
+    least_z_score,
+)
 from calibgraph.matching.structure.bodies import Body, lead, place
 from calibgraph.matching.structure.global_search import TRIES, Located, Locator
 from calibgraph.matching.structure.pose_refinement import Candidate
@@ -286,15 +290,72 @@ def test_no_pose_is_tried_after_the_time_limit(one: Rig, monkeypatch: pytest.Mon
     assert "left" in start.findings.missed
 
 
+class FewFrames(MadeUp):
+    """The evidence of a pose is by its number of cameras."""
+
+    few, evidence = True, {1: 0.0, 2: 0.0}
+
+    def __init__(self, *given: Any, **others: Any) -> None:
+        super().__init__(*given, **others)
+        self._few = self.few
+
+    def _evidence(self, candidate: Candidate) -> float:
+        return self.evidence[len(candidate.body)]
+
+
+@pytest.mark.parametrize(
+    ("few", "above", "accepted"), [(True, 0.1, True), (True, -0.1, False), (False, 0.1, False)]
+)
+def test_in_few_frames_the_fine_levels_can_accept_a_pose(
+    one: Rig, few: bool, above: float, accepted: bool
+) -> None:
+    elsewhere = off(one.T_camera_lidar["left"])
+    search = FewFrames(one, [(elsewhere, MANY - 4)], {"left": [elsewhere]})
+    search._few = few
+    search.evidence = {1: least_z_score(TRIES[2], WITH_SECOND_LOOK) + above}
+    assert locate(search)["left"].accepted == accepted
+
+
+@pytest.mark.parametrize(
+    ("z_score", "alone", "both", "accepted"),
+    [
+        (MANY + 0.1, 20.0, 21.0, True),
+        (MANY + 0.1, 20.0, 19.0, False),  # the second camera speaks against it
+        (MANY - 0.1, 10.0, 11.0, False),
+    ],
+)
+def test_in_few_frames_two_cameras_are_accepted_together(
+    two: Rig, monkeypatch: pytest.MonkeyPatch, z_score: float, alone: float, both: float,
+    accepted: bool,
+) -> None:  # fmt: skip
+    first, second = (two.T_camera_lidar[name] for name in NAMES)
+    right = off(first), off(second)
+    monkeypatch.setattr(pose_search, "refine", lambda _, body: Candidate(body, z_score))
+    search = FewFrames(
+        two,
+        [(second, 7.0), (right[1], 14.0), (right[0], 9.0)],
+        {NAMES[1]: [right[1]]},
+        {(NAMES[1], NAMES[0]): (right[1], right[0])},
+    )
+    search.evidence = {1: alone, 2: both}
+    found = locate(search)
+    for name, T in zip(NAMES, right, strict=True):
+        assert found[name].accepted == accepted
+        if accepted:
+            assert found[name].z_score == z_score
+            np.testing.assert_allclose(found[name].camera.T_camera_lidar, T, atol=1e-9)
+
+
 def test_fewer_tries_need_less() -> None:
     assert ALONE < MANY < AGAIN < math.inf
 
 
-def test_the_stated_share_of_searches_with_nothing_to_find_is_accepted() -> None:
+@pytest.mark.parametrize("chance", [acceptance.SEARCH, WITH_SECOND_LOOK])
+def test_the_stated_share_of_searches_with_nothing_to_find_is_accepted(chance: Chance) -> None:
     """Scenes, and the best z-scores on them, drawn from the distributions that are assumed."""
     rng = np.random.default_rng(0)
     tries, scenes, rate = 3, 400_000, acceptance.FALSE_ACCEPTANCE
-    locations = rng.normal(acceptance.PRIOR_LOCATION, acceptance.PRIOR_SIGMA, scenes)
-    best = rng.gumbel(locations + acceptance.SCALE * math.log(tries), acceptance.SCALE)
-    share = np.mean(best >= least_z_score(tries))
+    locations = rng.normal(chance.location, chance.sigma, scenes)
+    best = rng.gumbel(locations + chance.scale * math.log(tries), chance.scale)
+    share = np.mean(best >= least_z_score(tries, chance))
     assert 0.5 * rate < share < 1.1 * rate
