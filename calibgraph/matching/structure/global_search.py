@@ -84,7 +84,6 @@ class Locator:
         self._proposers: list[Candidate] = []  # that have proposed
         self._moves: set[tuple[str, str]] = set()  # a body, and the one by which it was moved
         self._near: dict[str, Candidate] = {}
-        self._joined: list[Candidate] = []  # that were tried together with others
         self.best: dict[str, Candidate] = {}
         self.located: dict[str, Candidate] = {}
 
@@ -99,7 +98,6 @@ class Locator:
             self._consider(name, tried[best], TRIES[1])
         steps = (
             self._propose,
-            self._accept_together,
             self._search_next,
             self._accept_guess,
             self._search_again,
@@ -192,28 +190,6 @@ class Locator:
                 continue
             if self._consider(name, near, ALONE):
                 return True
-        return False
-
-    def _accept_together(self) -> bool:
-        """Accept a body where another one sees it, if both agree as one body.
-
-        By the images of few frames, each of them may agree too little with its own cloud.
-        """
-        missing = self._missing()
-        unlocated = sorted((self.best[n] for n in missing), key=lambda one: -one.z_score)
-        for one in [*self.located.values(), *unlocated]:
-            if one in self._joined or self._search.out_of_time():
-                continue
-            self._joined.append(one)
-            own, others = next(iter(one.body)), [n for n in missing if n not in one.body]
-            tries = TRIES[max(1, self._searches[own])]
-            for name in others:
-                joint = self._search.together(one, self._bodies[name])
-                if joint is not None and self._is_accepted(joint, tries):
-                    for each in (own, name):
-                        body = {member: joint.body[member] for member in self._bodies[each]}
-                        self.located[each] = Candidate(body, joint.z_score)
-                    return True
         return False
 
     def _search_again(self) -> bool:

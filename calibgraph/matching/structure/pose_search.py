@@ -2,21 +2,20 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibgraph.matching.structure.acceptance import WITH_SECOND_LOOK, least_z_score
-from calibgraph.matching.structure.bodies import Body, lead, place, place_member
+from calibgraph.matching.structure.acceptance import least_z_score, second_look_chance
+from calibgraph.matching.structure.bodies import Body, lead, place, place_member, rigid_bodies
 from calibgraph.matching.structure.box_search import BodyMaps, Box, search_box
 from calibgraph.matching.structure.common_features import CommonFeatures
 from calibgraph.matching.structure.correlation_maps import CorrelationMaps, correlate
 from calibgraph.matching.structure.pose_refinement import (
     CONFIDENT,
     GAIN,
-    HOPELESS,
     CameraFrames,
     Candidate,
     approach,
@@ -40,7 +39,9 @@ SURVIVORS = 2  # candidates of a roll that are refined, those that are best afte
 DRAWS_AROUND, AROUND_RAD, AROUND_M = 12, np.radians(4.0), 0.8  # per axis
 MAX_LOOKS = 3
 
-PROMISING = 10.6  # more is tried about a pose from this z-score on: local optima had 10.8 and more
+PROMISING, FEW_PROMISING = 10.6, 9.0
+"""More is tried about a pose from this z-score on: local optima had 10.8 and more; with few frames
+9.5 and more, where wrong poses mostly end at 6 to 8.5."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,11 +142,27 @@ class PoseSearch:
 
         In few frames right poses are too near to chance for the last level of the search alone.
         """
-        least = least_z_score(tries, WITH_SECOND_LOOK)
-        return self._few and candidate.z_score > HOPELESS and self._evidence(candidate) >= least
+        if not self._few or candidate.z_score < FEW_PROMISING:
+            return False
+        chance = second_look_chance(self._mirrored_evidence)
+        return self._evidence(candidate) >= least_z_score(tries, chance)
 
     def _evidence(self, candidate: Candidate) -> float:
         return candidate.z_score + look_again(self._frames, candidate.body).z_score
+
+    @cached_property
+    def _mirrored_evidence(self) -> float:
+        """Mean over the bodies of the most that a search finds in mirrored images: by chance.
+
+        These are as alike to the clouds as images of other places of the kind.
+        """
+        frames = {name: _mirror(one) for name, one in self._frames.items()}
+        search = PoseSearch(
+            self.rig, frames, self._range, seed=self._seed, out_of_time=self.out_of_time
+        )
+        found = [search.with_roll(body, 0.0, effort=1) for body in rigid_bodies(self.rig)]
+        evidence = [search._evidence(one) for one in found if math.isfinite(one.z_score)]
+        return float(np.mean(evidence)) if evidence else math.inf
 
     def seen_by(self, other: Body, body: Body) -> Body | None:
         """The body where a located one sees it; None if they see nothing in common."""
@@ -155,20 +172,6 @@ class PoseSearch:
                 if T is not None:
                     return place_member(body, name, T)
         return None
-
-    def together(self, candidate: Candidate, other: Body) -> Candidate | None:
-        """A candidate in few frames and another body where it sees that, as one body.
-
-        Returns:
-            None if it does not see it, or if both together agree no better than it does alone.
-        """
-        if not self._few or candidate.z_score < HOPELESS:
-            return None
-        placed = self.seen_by(candidate.body, other)
-        if placed is None:
-            return None
-        joint = refine(self._frames, {**candidate.body, **placed})
-        return joint if self._evidence(joint) > self._evidence(candidate) else None
 
     def as_in_guess(self, other: Body, body: Body) -> Body:
         """The body at its relative pose in the guess to a located one."""
@@ -184,7 +187,7 @@ class PoseSearch:
         decimetres off can agree far better than by chance.
         """
         for _ in range(MAX_LOOKS):
-            hopeless = candidate.z_score < PROMISING
+            hopeless = candidate.z_score < (FEW_PROMISING if self._few else PROMISING)
             if hopeless or candidate.is_beyond_doubt or self.out_of_time():
                 break
             refined = candidate
@@ -231,6 +234,11 @@ class PoseSearch:
             dense=self._few,
             seed=self._seed + 1000 * (effort - 1),
         )
+
+
+def _mirror(frames: CameraFrames) -> CameraFrames:
+    """The frames with the images' left and right swapped."""
+    return replace(frames, grays=[np.ascontiguousarray(gray[:, ::-1]) for gray in frames.grays])
 
 
 def _by_z_score(candidate: Candidate) -> float:
