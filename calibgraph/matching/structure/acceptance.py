@@ -45,7 +45,7 @@ SEARCH = Chance(5.7, 3.0, 0.92)
 to 47,000 points a scan 5 to 7, 16 beams in a laboratory 11; rendered streets, all alike, 12."""
 
 
-MIRRORED_RATIO, MIRRORED_SPREAD, SECOND_LOOK_SCALE = 1.2, 0.2, 1.1
+MIRRORED_RATIO, MIRRORED_SPREAD, SECOND_LOOK_SCALE = 1.1, 0.2, 1.1
 """Of the z-score of a search in one to three frames plus that of its best pose at the fine levels:
 mean and standard deviation over scenes of the location over the same sum in mirrored images, and
 scale. In clouds of other places the sum was 0.9 to 1.2 times that in mirrored images on KITTI and

@@ -160,7 +160,7 @@ class PoseSearch:
         search = PoseSearch(
             self.rig, frames, self._range, seed=self._seed, out_of_time=self.out_of_time
         )
-        found = [search.with_roll(body, 0.0, effort=1) for body in rigid_bodies(self.rig)]
+        found = [search.everywhere(body, effort=1) for body in rigid_bodies(self.rig)]
         evidence = [search._evidence(one) for one in found if math.isfinite(one.z_score)]
         return float(np.mean(evidence)) if evidence else math.inf
 

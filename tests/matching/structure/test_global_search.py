@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -310,6 +311,27 @@ def test_in_few_frames_the_fine_levels_can_accept_a_pose(
     search._few = few
     search.evidence = least_z_score(TRIES[1], second_look_chance(12.0)) + above
     assert locate(search)["left"].accepted == accepted
+
+
+@pytest.mark.parametrize(("frames", "approached", "refined"), [(1, 5, 10), (3, 5, 10), (4, 5, 2)])
+def test_in_few_frames_all_candidates_are_refined(
+    one: Rig, monkeypatch: pytest.MonkeyPatch, frames: int, approached: int, refined: int
+) -> None:
+    """An approach may lead away from the right pose, and its z-score ranks poses badly."""
+    tried: list[str] = []
+    for name in ("approach", "refine"):
+
+        def improve(_: Any, body: Body, name: str = name) -> Candidate:
+            tried.append(name)
+            return Candidate(body, 1.0)
+
+        monkeypatch.setattr(pose_search, name, improve)
+    monkeypatch.setattr(pose_search, "search_box", lambda *_, **__: [np.eye(4)] * 5)
+    monkeypatch.setattr(PoseSearch, "_correlate", lambda *_: SimpleNamespace(maps=["some"]))
+    seen: Any = {"left": SimpleNamespace(frames=[None] * frames, cores=None)}
+    search = PoseSearch(one, seen, SearchRange(0.3, 1.5), seed=0, out_of_time=never)
+    search.with_roll(dict(one.cameras), 0.0, effort=1)
+    assert (tried.count("approach"), tried.count("refine")) == (approached, refined)
 
 
 def test_fewer_tries_need_less() -> None:
