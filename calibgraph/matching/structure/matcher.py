@@ -62,7 +62,7 @@ are found. Whole scans of 16 beams have 1600."""
 
 
 class StructureMatcher:
-    """Weight-free matching: a search within a range of the guess, then rounds, coarse to fine.
+    """Matching with what is shipped: a search about the guess, then rounds, coarse to fine.
 
     The prepared clouds and images of a dataset's frames are kept from round to round.
 
