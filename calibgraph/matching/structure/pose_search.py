@@ -144,7 +144,7 @@ class PoseSearch:
         """
         if not self._few or candidate.z_score < FEW_PROMISING:
             return False
-        chance = second_look_chance(self._mirrored_evidence)
+        chance = second_look_chance(self._mirrored_evidence, len(ROLLS_RAD))
         return self._evidence(candidate) >= least_z_score(tries, chance)
 
     def _evidence(self, candidate: Candidate) -> float:

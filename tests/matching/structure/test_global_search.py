@@ -309,7 +309,7 @@ def test_in_few_frames_the_fine_levels_can_accept_a_pose(
     elsewhere = off(one.T_camera_lidar["left"])
     search = FewFrames(one, [(elsewhere, MANY - 4)], {"left": [elsewhere]})
     search._few = few
-    search.evidence = least_z_score(TRIES[1], second_look_chance(12.0)) + above
+    search.evidence = least_z_score(TRIES[1], second_look_chance(12.0, 3)) + above
     assert locate(search)["left"].accepted == accepted
 
 
@@ -338,7 +338,7 @@ def test_fewer_tries_need_less() -> None:
     assert ALONE < MANY < AGAIN < math.inf
 
 
-@pytest.mark.parametrize("chance", [acceptance.SEARCH, second_look_chance(12.0)])
+@pytest.mark.parametrize("chance", [acceptance.SEARCH, second_look_chance(12.0, 3)])
 def test_the_stated_share_of_searches_with_nothing_to_find_is_accepted(chance: Chance) -> None:
     """Scenes, and the best z-scores on them, drawn from the distributions that are assumed."""
     rng = np.random.default_rng(0)
