@@ -63,8 +63,7 @@ def root_of_sums(sums):  # type: ignore[no-untyped-def]
         total[k] = 0.0
         for r in range(len(sums)):
             total[k] += sums[r, k]
-    for k in range(42):
-        jacobian[k // 7, k % 7] = 0.0
+    jacobian[:] = 0.0
     place, rest_of_cost = 0, total[27]
     for i in range(6):
         for j in range(i, 6):

@@ -60,7 +60,7 @@ def accumulate(kind: int, *, shared: bool = False) -> Any:
             for start in range(runs[i, 0], runs[i, 1], TILE):
                 n = min(TILE, runs[i, 1] - start)
                 rays = False
-                if kind == PINHOLE:
+                if kind == PINHOLE:  # noqa: SIM102 - a constant, of other lenses nothing is compiled
                     if lens[LIMIT] == math.inf and whitening.shape[0] < MATRICES:
                         rays = project_rays(lens, T, columns, start, n, tile)
                 if not rays:
@@ -105,7 +105,7 @@ def evaluate(kind: int, *, shared: bool = False) -> Any:
             for start in range(runs[i, 0], runs[i, 1], TILE):
                 n = min(TILE, runs[i, 1] - start)
                 fast = False
-                if kind == PINHOLE:
+                if kind == PINHOLE:  # noqa: SIM102 - as above
                     if lens[LIMIT] == math.inf:
                         fast = project_rays(lens, T, columns, start, n, tile)
                 if not fast:

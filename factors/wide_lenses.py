@@ -76,7 +76,7 @@ def equirectangular_rays(angles_rad: Array) -> Array:
 
 @compiled(part=True)
 def project_equirectangular(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Longitude and latitude times fx and fy, with the Jacobian, see ``lens_kernels.projection_of``."""
+    """Longitude and latitude times fx and fy, see ``lens_kernels.projection_of``."""
     fx, fy = lens[0], lens[1]
     n2 = x * x + y * y + z * z
     # At the poles there is no longitude: the derivative is held, so that it is finite.
