@@ -19,7 +19,6 @@ from calibgraph.model.config import Config
 from calibgraph.model.geometry import adjoint_camera_lidar
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.camera_block import CameraBlock
-from factors import displace
 
 
 def require_offset_alone(config: Config) -> None:
@@ -90,10 +89,11 @@ def prior_sigma_s(camera: Camera) -> float:
 
 
 def delayed(raw: CameraBlock, seconds: float) -> CameraBlock:
-    """Matches with their points where they are some seconds later."""
+    """Matches of one frame with their points where they are some seconds later."""
     block = raw.block
     if block.motion is None or not seconds:
         return raw
-    points = displace(block.points_lidar_m, block.motion[:, :6], -seconds)
+    step = gtsam.Pose3.Expmap(-seconds * block.motion[0, :6]).matrix()
+    points = block.points_lidar_m @ step[:3, :3].T + step[:3, 3]
     motion = block.motion + np.append(np.zeros(6), seconds)
     return replace(raw, block=replace(block, points_lidar_m=points, motion=motion))
