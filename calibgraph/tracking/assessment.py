@@ -18,12 +18,13 @@ from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES, sigmas_of_hessian
 from calibgraph.solver.lens import estimates_of
+from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.epoch_sums import estimates_of_halves, in_its_half
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.optimum import Optimum
-from calibgraph.tracking.state import CameraState, State
+from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
 from calibgraph.tracking.window import Window
 from calibgraph.trust.estimate import Estimate

@@ -14,13 +14,14 @@ from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.within_place import WEAK
+from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, inliers_of
 from calibgraph.tracking.offsets import Offsets, delayed
 from calibgraph.tracking.place_sums import sums_by_place
-from calibgraph.tracking.state import CameraState, State
+from calibgraph.tracking.state import State
 from calibgraph.tracking.steps import shift_between
 from calibgraph.tracking.sums import Sums, step_between, sums_of_matches
 from factors import to_runs
@@ -41,10 +42,8 @@ def close_epoch(state: State, offsets: Offsets | None) -> tuple[State, list[Even
         state = _summarize_oldest(state)
     state = _with_references(state, state.T_lidar_camera, offsets)
     cameras = tuple(
-        replace(camera_state, scale=camera_state.residuals.scale(state.config))
-        if camera_state.started
-        else camera_state
-        for camera_state in state.cameras
+        replace(one, scale=one.residuals.scale(state.config)) if one.started else one
+        for one in state.cameras
     )
     state = replace(state, cameras=cameras)
     state = regate(state)

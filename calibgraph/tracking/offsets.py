@@ -13,9 +13,11 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.errors import CorrespondenceError
 from calibgraph.graph.lens import LensVariable
-from calibgraph.model.clock import clock_of
+from calibgraph.model.clock import clock_of, require_motion
 from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import adjoint_camera_lidar
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.camera_block import CameraBlock
@@ -86,6 +88,34 @@ class Offsets:
 def prior_sigma_s(camera: Camera) -> float:
     """The standard deviation of the prior of a camera's offset."""
     return LensVariable.of(camera, ("offset",)).free.sigmas[0]
+
+
+def with_motion_in_use(
+    rig: Rig, config: Config, table: Correspondences, before: CameraBlock | None
+) -> Correspondences:
+    """The matches of a frame, with the motion of the LiDAR where a clock uses it.
+
+    Args:
+        rig: with the clocks of its cameras.
+        config: settings.
+        table: the matches.
+        before: matches of an earlier frame; None if there are none.
+
+    Raises:
+        CorrespondenceError: if the motion is needed and not known, or not known of all frames.
+    """
+    known = table.twist_per_s is not None
+    require_motion(config.estimate, is_known=known)
+    used = config.estimate or any(c.time_offset_s or c.readout_s for c in rig.cameras.values())
+    if not used:
+        return replace(table, twist_per_s=None)
+    if before is not None and (before.block.motion is not None) != known:
+        found, earlier = ("no ", "one") if not known else ("a ", "none")
+        raise CorrespondenceError(
+            f"it has {found}motion of the LiDAR (twist_per_s), earlier frames have {earlier}; the "
+            "rig's time_offset_s and readout_s need it with every frame: give it or leave it out"
+        )
+    return table
 
 
 def delayed(raw: CameraBlock, seconds: float) -> CameraBlock:

@@ -15,8 +15,8 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.optimizer import optimize
 from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.live_frames import OutlierFrame
-from calibgraph.tracking.state import CameraState
 
 AGREEMENT = 0.7
 """A frame agrees with an estimate that explains this share of the usual share of its matches."""

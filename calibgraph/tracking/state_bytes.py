@@ -28,6 +28,7 @@ from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
+from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
@@ -35,7 +36,7 @@ from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
 from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
-from calibgraph.tracking.state import CameraState, DriftWatch, State
+from calibgraph.tracking.state import DriftWatch, State
 from calibgraph.tracking.sums import Sums
 from factors import Lens, ProjectionBlock
 

@@ -8,11 +8,12 @@ from itertools import accumulate
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows
+from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
 from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
-from calibgraph.tracking.state import CameraState, State
+from calibgraph.tracking.state import State
 from calibgraph.tracking.steps import shift_since
 from calibgraph.tracking.sums import Sums
 

@@ -12,7 +12,6 @@ from calibgraph.errors import CorrespondenceError, FileError, in_words
 from calibgraph.files import require_file, write_bytes
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.clock import require_motion
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
@@ -40,7 +39,7 @@ from calibgraph.tracking.frame_order import (
 )
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.offset_search import explaining_offsets, follow
-from calibgraph.tracking.offsets import delayed
+from calibgraph.tracking.offsets import delayed, with_motion_in_use
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
@@ -140,8 +139,9 @@ class IncrementalCalibrator:
         """
         table = with_common_error(table, self._state.config)
         if len(table):
-            known = table.twist_per_s is not None
-            require_motion(self._state.config.estimate, is_known=known)
+            kept = (raw for one in self._state.live_frames for raw in one.raw.values())
+            before = next(kept, None)
+            table = with_motion_in_use(self._state.rig, self._state.config, table, before)
         table = with_metadata_per_frame(with_place(table, place))
         number, stamp = number_and_stamp(table, frame, self._state)
         new = without_repeats(self._state, table)

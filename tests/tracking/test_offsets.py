@@ -22,6 +22,7 @@ from calibgraph import (
     Update,
     concatenate,
     load_calibration,
+    simulate_correspondences,
     solve,
 )
 from calibgraph.graph.by_place import LateQuadraticByPlace
@@ -36,6 +37,7 @@ from calibgraph.tracking.offset_sums import with_offset, without_offset
 from calibgraph.tracking.sums import Sums
 from calibgraph.tracking.update import json_line
 from factors import Clock
+from tests.conftest import make_pair
 from tests.tracking.drives import content_of, moved_later
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.1)
@@ -284,3 +286,31 @@ def test_the_quadratic_of_a_late_camera_is_its_factors() -> None:
     (sums,) = late_one.sums(pose.inverse().matrix()[None], value)
     assert sums.hessian == pytest.approx(A @ A.T, rel=1e-9)
     assert graph.error(values) == pytest.approx(float(sums.cost), abs=1e-12)
+
+
+def test_motion_that_no_clock_needs_may_come_and_go() -> None:
+    tracker = IncrementalCalibrator(make_pair())
+    for frame, table in enumerate(_motion_for_some(make_pair())):
+        assert tracker.update(table, frame=frame).frame == frame
+
+
+def test_frames_without_motion_among_others_are_refused_where_a_clock_needs_it() -> None:
+    rig = make_pair()
+    late = {n: c.model_copy(update={"time_offset_s": 0.02}) for n, c in rig.cameras.items()}
+    tracker = IncrementalCalibrator(rig.model_copy(update={"cameras": late}))
+    *known, unknown = _motion_for_some(rig)
+    for frame, table in enumerate(known):
+        tracker.update(table, frame=frame)
+    with pytest.raises(CorrespondenceError, match=r"no motion of the LiDAR .* earlier frames have"):
+        tracker.update(unknown, frame=len(known))
+    again = replace(known[-1], frame=known[-1].frame + 2)
+    assert tracker.update(again, frame=len(known) + 1).frame == len(known) + 1
+
+
+def _motion_for_some(rig: Rig) -> list[Correspondences]:
+    """A frame each; the last one's motion is not known."""
+    table = simulate_correspondences(rig, frames=13, matches=80)
+    frames = [table.select(table.frame == frame) for frame in range(13)]
+    twist = np.array([0.0, 0.0, 0.1, 5.0, 0.0, 0.0])
+    known = [replace(one, twist_per_s=np.tile(twist, (len(one), 1))) for one in frames[:-1]]
+    return [*known, frames[-1]]
