@@ -44,7 +44,7 @@ test: $(VENV)/test ## Run the tests
 	$(PYTEST)
 
 coverage: $(VENV)/test ## Measure the branches of graph, solver, trust and factors that their tests reach
-	$(PYTEST) --cov --cov-report term tests/factors tests/solver tests/trust
+	$(PYTEST) --cov --cov-report term tests/factors tests/graph tests/solver tests/trust
 
 test-ci: $(VENV)/test ## Run the tests and a short choice of the slow ones
 	$(PYTEST) -m "ci or not (slow or realdata or statistics)"

@@ -41,6 +41,23 @@ def test_kitti_is_calibrated_from_2_deg_and_20_cm(realdata: Path, names: str) ->
         assert error.translation_error_cm < 8
 
 
+@pytest.mark.parametrize(("name", "frame"), [("05", 2), ("07", 0)])
+def test_a_single_frame_is_found_from_10_deg_and_half_a_metre(
+    realdata: Path, name: str, frame: int
+) -> None:
+    """Where the z-score of the search alone is below its limit."""
+    (folder,) = sequences(realdata, name)
+    data, reference = calibgraph.load_dataset(folder), calibgraph.load_rig(folder)
+    start = calibgraph.perturb(reference, rotation_deg=10, translation_m=0.5, seed=frame)
+    found = calibgraph.StructureMatcher().locate(
+        data.select(str(frame)), start, out_of_time=lambda: False, progress=lambda *_: None
+    )
+    assert not found.findings.missed
+    for error in calibgraph.evaluate(found.rig, reference).cameras.values():
+        assert error.rotation_error_deg < 1.0
+        assert error.translation_error_cm < 30
+
+
 @pytest.mark.parametrize("names", ["01", "08"])
 def test_poor_scenes_are_not_passed(realdata: Path, names: str) -> None:
     """A motorway with 3 frames, and one place with 5: too little to be sure of, right or wrong."""

@@ -2,6 +2,7 @@
 
     python -m benchmarks.accuracy.search --data 00,00+01 --within 20/1.5,2/0.2
     python -m benchmarks.accuracy.search --kinds dark,half_beams --starts 3 --out out/spoilt.jsonl
+    python -m benchmarks.accuracy.search --kinds one_frame,two_frames --within 10/0.5 --starts 6
     python -m benchmarks.accuracy.search --summary out/search.jsonl
 
 Guesses are drawn uniformly per axis, independently per camera. A run is a success if every camera
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -92,6 +94,12 @@ def _good(scene: Scene) -> Dataset:
     return scene.data
 
 
+def _few(scene: Scene, frames: int) -> Dataset:
+    """So many frames, from one that the seed chooses."""
+    first = scene.seed % (len(scene.data.frames) - frames + 1)
+    return replace(scene.data, frames=scene.data.frames[first : first + frames])
+
+
 def _no_intensity(scene: Scene) -> Dataset:
     return with_clouds(scene, lambda cloud: cloud[:, :3])
 
@@ -134,6 +142,8 @@ def _over_exposed(image: Any) -> Any:
 
 KINDS: dict[str, Callable[[Scene], Dataset]] = {
     "good": _good,
+    "one_frame": partial(_few, frames=1),
+    "two_frames": partial(_few, frames=2),
     "no_intensity": _no_intensity,
     "half_beams": _half_beams,
     "dark": partial(_changed, change=_dark),

@@ -1,6 +1,7 @@
 """``check``: is the calibration that is deployed still right?"""
 
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -25,6 +26,7 @@ from calibgraph.matching.run import MatchingRun
 from calibgraph.model.config import Config
 from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 from calibgraph.model.rig import Rig
+from calibgraph.model.verdict import Status
 from calibgraph.model.versions import package_versions
 from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import Progress, Stopwatch, no_progress
@@ -182,14 +184,32 @@ def _doubt_by_z_score(z_score: float | None) -> str:
     )
 
 
-class _Inputs(BaseModel):
-    """The inputs of a result, as its file names them."""
+class _Verdict(BaseModel):
+    status: Status
+
+
+class _Result(BaseModel):
+    """What is used here of the file of a result."""
 
     inputs: dict[str, str] = {}
+    verdict: _Verdict | None = None
 
 
-def is_made_from(rig: Path, data: Dataset) -> bool:
-    """Whether a cloud of the recording is one that the calibration was made from.
+@dataclass(frozen=True)
+class Provenance:
+    """What the file of a deployed calibration states.
+
+    Attributes:
+        same_recording: whether a cloud of the recording is one that it was made from.
+        verdict: of the result when it was made; None for a rig that is no result.
+    """
+
+    same_recording: bool = False
+    verdict: Status | None = None
+
+
+def provenance(rig: Path, data: Dataset) -> Provenance:
+    """Where a deployed calibration is from.
 
     Only clouds with the name of one of its inputs are read.
 
@@ -198,8 +218,9 @@ def is_made_from(rig: Path, data: Dataset) -> bool:
     """
     path = rig / CALIBRATION_FILE if rig.is_dir() else rig
     if not is_calibration_file(path):
-        return False
-    inputs = checked_model(_Inputs, read_yaml(path), path).inputs
-    names = {Path(source).name for source in inputs}
+        return Provenance()
+    result = checked_model(_Result, read_yaml(path), path)
+    names = {Path(source).name for source in result.inputs}
     clouds = (frame.cloud_path for frame in data.frames if frame.cloud_path.name in names)
-    return any(hash_source(cloud) in inputs.values() for cloud in clouds)
+    same = any(hash_source(cloud) in result.inputs.values() for cloud in clouds)
+    return Provenance(same, None if result.verdict is None else result.verdict.status)

@@ -11,6 +11,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Rig
+from calibgraph.model.verdict import Status
 
 AuditStatus = Literal["OK", "CANNOT TELL", "WRONG"]
 
@@ -78,6 +79,7 @@ class Audit:
         versions: of this package and the libraries that matter.
         same_recording: whether the deployed calibration was made from these very frames, so that
             errors that they repeat cannot be seen.
+        deployed_verdict: of the result that is deployed, when it was made; None of other rigs.
     """
 
     cameras: Mapping[str, CameraAudit]
@@ -91,6 +93,7 @@ class Audit:
     timings_s: Mapping[str, float] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     same_recording: bool = False
+    deployed_verdict: Status | None = None
 
     @property
     def status(self) -> AuditStatus:
@@ -121,6 +124,7 @@ def audit_summary(audit: Audit) -> dict[str, Any]:
         "tolerance_cm": audit.tolerance_cm,
         "frames": audit.frames,
         "same_recording": audit.same_recording,
+        "deployed_verdict": audit.deployed_verdict,
         "cameras": {name: _camera_summary(camera) for name, camera in audit.cameras.items()},
         "lidar": None if audit.lidar is None else lidar_summary(audit.lidar),
         "timings_s": dict(audit.timings_s),

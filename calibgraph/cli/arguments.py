@@ -120,6 +120,8 @@ def _structure_matcher(given: dict[str, Any], *, seed: int, all_frames: bool) ->
     if len(search) == len(_SEARCH_OPTIONS) and len({n is None for n in search.values()}) > 1:
         raise ValueError("--search-deg and --search-m: give numbers, or none for no search")
     settings: dict[str, Any] = {**given, **search}
+    if given.get("window_weights") == "none":
+        settings["window_weights"] = None
     if None in search.values():
         settings.update(dict.fromkeys(_SEARCH_OPTIONS))
     if all_frames:

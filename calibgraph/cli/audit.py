@@ -39,7 +39,7 @@ def check(
     but the page, if one is wanted.
     """
     from calibgraph.audit import check
-    from calibgraph.audit.check import is_made_from
+    from calibgraph.audit.check import provenance
     from calibgraph.audit.significance import Tolerance
     from calibgraph.io.rigs import load_rig
 
@@ -57,7 +57,8 @@ def check(
             seed=seed,
             progress=progress,
         )
-    audit = replace(audit, same_recording=is_made_from(rig, data))
+    origin = provenance(rig, data)
+    audit = replace(audit, same_recording=origin.same_recording, deployed_verdict=origin.verdict)
     if page is not None:
         from calibgraph.audit.page import write_audit_report
 

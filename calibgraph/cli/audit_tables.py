@@ -12,6 +12,10 @@ from calibgraph.cli.tables import CAMERA_AXES_COLUMNS, add_number_columns, empty
 from calibgraph.cli.terminal import print_plain
 
 _SAME = "; this recording made it, and errors that it repeats are not seen: check another one"
+_DOUBTED = (
+    "This result was {} when it was made. A lens and an extrinsic that are wrong together look "
+    "right here, so read its report, too."
+)
 _COLOURS = {"OK": "green", "CANNOT TELL": "yellow", "WRONG": "red", "CHANGED": "red"}
 _LETTERS = 13  # of a result's name in a table; reasons have all of it
 
@@ -24,6 +28,8 @@ def print_audit(console: Console, audit: Audit, page: Path | None = None) -> Non
         print_plain(console, f"  WRONG LiDAR: {audit.lidar.reason}; all cameras agree on it")
     for name, camera in audit.cameras.items():
         print_plain(console, f"  {camera.status} {name}: {camera.reason}")
+    if audit.deployed_verdict not in (None, "PASS"):
+        print_plain(console, f"  {_DOUBTED.format(audit.deployed_verdict)}")
     console.print(audit_table(audit))
     console.print(
         "deviation: motion of the camera from where it is deployed, about and along its own axes; "

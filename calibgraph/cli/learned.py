@@ -214,10 +214,16 @@ def train_windows(
     found.network.save(out)
     terminal().print(
         f"{out}: negative log-likelihood of a camera's pose {_change(found.loss)}, held out "
-        f"{_change(found.held_out)}",
+        f"{_change(found.held_out)} ({_of_cameras(found.held_out_cameras, found.standard_error)})",
         soft_wrap=True, markup=False,
     )  # fmt: skip
 
 
 def _change(values: tuple[float, float]) -> str:
     return f"{values[0]:.3f} -> {values[1]:.3f}"
+
+
+def _of_cameras(count: int, standard_error: float) -> str:
+    if count == 1:
+        return "one camera: hold out more to know whether it holds"
+    return f"mean over {count} cameras, its change known to +- {standard_error:.3f}"

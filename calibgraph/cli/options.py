@@ -48,10 +48,11 @@ SearchMetresOption = Annotated[
     ),
 ]
 WindowWeightsOption = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
-        metavar="FILE",
-        help="Weights of windows of train-windows, in place of the package's.",
+        metavar="FILE|none",
+        help="Weights of windows of train-windows, in place of the package's; none: all windows "
+        "count alike.",
         rich_help_panel=_STRUCTURE,
     ),
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -134,16 +135,14 @@ def error_bar_table(result: Calibration) -> Table:
 
 
 def lens_table(result: Calibration) -> Table:
-    """One row per parameter of each lens that was estimated."""
-    table = empty_table("Lens", "camera", "parameter")
+    """One row per parameter of each lens and clock that was estimated."""
+    table = empty_table("Lens and clock", "camera", "parameter")
     add_number_columns(table, "estimate", "sigma", "prior", "prior\nsigma")
     table.add_column("with the pose")
     for name, parameters in result.lens.items():
         for one in parameters:
-            values = one.value, one.sigma, one.prior, one.prior_sigma
-            numbers = (f"{value:.{one.decimals}f}" for value in values)
-            label = f"{one.name} {one.unit}".strip()
-            table.add_row(escape(name), label, *numbers, one.describe())
+            label = f"{one.name} {one.printed_unit}".strip()
+            table.add_row(escape(name), label, *one.printed, one.describe())
     return table
 
 
@@ -179,6 +178,9 @@ def print_evaluation(console: Console, errors: Evaluation, estimate: Path, refer
     console.print(evaluation_table(errors))
     if errors.deviations:
         console.print(deviation_table(errors))
+    for name, pixels in errors.lens_px.items():
+        far = f"up to {pixels:.1f} px" if math.isfinite(pixels) else "whole rays"
+        print_plain(console, f"{name}: lens {far} from the reference in the corners of the image")
     for what, of in (("time offset", errors.time_offset_ms), ("read-out", errors.readout_ms)):
         for name, value in of.items():
             print_plain(console, f"{name}: {what} {value:+.1f} ms from the reference")

@@ -18,7 +18,7 @@ STRETCH = "LiDAR's elevation scale"
 MOTION = "LiDAR's motion during a scan"
 PAIRS = "images of camera pairs"
 PRIORS = "priors and relative poses"
-LENSES = "uncertain lenses"
+LENSES = "uncertain lenses and clocks"
 FLAT = "flat evidence of the images"
 
 NEEDED = 0.3

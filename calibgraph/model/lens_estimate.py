@@ -47,15 +47,26 @@ class LensEstimate:
         return left or self.sigma < share * self.prior_sigma
 
     @property
-    def decimals(self) -> int:
-        """So many show two digits of the standard deviation."""
-        return max(0, 1 - math.floor(math.log10(self.sigma)))
+    def printed(self) -> tuple[str, str, str, str]:
+        """Value, sigma, prior and its sigma in ``printed_unit``, to two digits of the sigma."""
+        scale = 1e3 if self.unit == "s" else 1.0
+        decimals = max(0, 1 - math.floor(math.log10(scale * self.sigma)))
+        value, sigma, prior, prior_sigma = (
+            f"{scale * number:.{decimals}f}"
+            for number in (self.value, self.sigma, self.prior, self.prior_sigma)
+        )
+        return value, sigma, prior, prior_sigma
+
+    @property
+    def printed_unit(self) -> str:
+        """``px``, ``ms`` or empty."""
+        return "ms" if self.unit == "s" else self.unit
 
     @property
     def change(self) -> str:
         """The estimate, its standard deviation and the value that the rig states, in words."""
-        new, sigma, old = (f"{v:.{self.decimals}f}" for v in (self.value, self.sigma, self.prior))
-        unit = f" {self.unit}" if self.unit else ""
+        new, sigma, old, _ = self.printed
+        unit = f" {self.printed_unit}" if self.unit else ""
         return f"{self.name} {new} +- {sigma}{unit}, before {old}{unit}"
 
     def describe(self) -> str:

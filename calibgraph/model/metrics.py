@@ -12,6 +12,7 @@ from scipy.special import chdtrc
 from calibgraph.arrays import Array
 from calibgraph.errors import RigError
 from calibgraph.model.geometry import angle_deg, relative_transform, twist_between
+from calibgraph.model.lens_difference import corners_of, has_other_lens, lens_difference
 from calibgraph.model.rig import Camera, Rig
 
 
@@ -61,13 +62,16 @@ class Evaluation:
 
     The pair ``"A->B"`` is T_B_A = T_B_lidar T_A_lidar^-1, which maps coordinates in A to
     coordinates in B; its errors are along the axes of B. ``deviations`` are of the cameras whose
-    reference has a covariance. ``time_offset_ms`` and ``readout_ms`` are differences of the cameras
-    of which both rigs state them.
+    reference has a covariance. ``lens_px`` is how far at most the lenses see the ray of a corner of
+    the image apart, of cameras whose lenses differ, infinite where one of them has no such ray.
+    ``time_offset_ms`` and ``readout_ms`` are differences of the cameras of which both rigs state
+    them.
     """
 
     cameras: dict[str, PoseError]
     pairs: dict[str, PoseError]
     deviations: dict[str, Deviation] = field(default_factory=dict)
+    lens_px: dict[str, float] = field(default_factory=dict)
     time_offset_ms: dict[str, float] = field(default_factory=dict)
     readout_ms: dict[str, float] = field(default_factory=dict)
 
@@ -77,6 +81,7 @@ class Evaluation:
             "cameras": {name: asdict(error) for name, error in self.cameras.items()},
             "pairs": {name: asdict(error) for name, error in self.pairs.items()},
             "deviations": {name: asdict(found) for name, found in self.deviations.items()},
+            "lens_px": {n: v if np.isfinite(v) else None for n, v in self.lens_px.items()},
             "time_offset_ms": self.time_offset_ms,
             "readout_ms": self.readout_ms,
         }
@@ -119,7 +124,18 @@ def evaluate(
         if reference.cameras[name].covariance is not None
     }
     clocks = (_later_ms(estimate, reference, key) for key in ("time_offset_s", "readout_s"))
-    return Evaluation(cameras, pairs, deviations, *clocks)
+    return Evaluation(cameras, pairs, deviations, _lens_px(estimate, reference), *clocks)
+
+
+def _lens_px(estimate: Rig, reference: Rig) -> dict[str, float]:
+    """Largest distance of the corners' rays, of cameras whose lenses differ."""
+    both = {n: (reference.cameras[n], camera) for n, camera in estimate.cameras.items()}
+    return {
+        name: float(np.nan_to_num(np.hypot(*apart.T), nan=np.inf).max())
+        for name, (before, after) in both.items()
+        if has_other_lens(before, after)
+        for apart in [lens_difference(before, after, corners_of(before))]
+    }
 
 
 def _later_ms(estimate: Rig, reference: Rig, key: str) -> dict[str, float]:

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import degrees_and_centimetres, invert, point_in_lidar
+from calibgraph.model.lens_difference import has_other_lens
 from calibgraph.model.metrics import PoseError, pose_error
 from calibgraph.model.rig import Camera
 from calibgraph.model.threshold import Direction, beside, in_unit, is_reachable
@@ -224,6 +225,9 @@ def camera_diagrams(result: Calibration, name: str, errors: BeforeAfter | None) 
         found["over_image"] = plots.residual_map(camera, after)
         found["coverage"] = plots.coverage(camera, after)
         found["distances"] = plots.distances(after)
+    before, camera = result.initial_rig.cameras[name], result.rig.cameras[name]
+    if name in result.lens and has_other_lens(before, camera):
+        found["lens"] = plots.lens_change(before, camera)
     sigmas, bootstrap = result.error_bar(name), result.bootstrap.get(name)
     if sigmas is not None:
         others = None if bootstrap is None else degrees_and_centimetres(bootstrap)

@@ -120,7 +120,7 @@ def agrees_at_its_place(state: State, closed: ClosedPlaces, camera: int, own: Ou
     if displaced @ displaced > chance_limit():
         return False
     cloud, pose = window.T_lidar_camera([cloud_at_key(place), matched_at_key(place, camera)])
-    return agrees(own.raw, cloud.inverse().compose(pose), one)
+    return agrees(own.raw, cloud.between(pose), one)
 
 
 def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> State:

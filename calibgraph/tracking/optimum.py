@@ -96,4 +96,4 @@ class Optimum:
         """T_lidar_camera as a camera's matches at a place show it; None if it was never there."""
         if camera not in self.matched.get(name, {}):
             return None
-        return self.clouds[name].inverse().compose(self.matched[name][camera])
+        return self.clouds[name].between(self.matched[name][camera])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from calibgraph import load_dataset, load_rig
-from calibgraph.audit.check import is_made_from
+from calibgraph.audit.check import provenance
 from tests.conftest import SAMPLE, CommandRun
 
 
@@ -13,19 +13,19 @@ def test_the_recording_of_a_result_is_known_by_its_content_wherever_it_lies(
     calibrated_sample: CommandRun, tmp_path: Path
 ) -> None:
     result, rig = calibrated_sample.folder, load_rig(SAMPLE / "rig.yaml")
-    assert is_made_from(result, load_dataset(SAMPLE, rig))
+    assert provenance(result, load_dataset(SAMPLE, rig)).same_recording
     other = tmp_path / "other"
     for source in SAMPLE.rglob("*"):
         if source.is_file():
             copy = other / source.relative_to(SAMPLE)
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(source.read_bytes())
-    assert is_made_from(result / "calibration.yaml", load_dataset(other, rig))
+    assert provenance(result / "calibration.yaml", load_dataset(other, rig)).same_recording
     for cloud in load_dataset(other, rig).frames:  # the same names, other clouds
         cloud.cloud_path.write_bytes(cloud.cloud_path.read_bytes()[:-32])
-    assert not is_made_from(result, load_dataset(other, rig))
+    assert not provenance(result, load_dataset(other, rig)).same_recording
 
 
 def test_a_rig_names_no_recording() -> None:
     rig = load_rig(SAMPLE / "rig.yaml")
-    assert not is_made_from(SAMPLE / "rig.yaml", load_dataset(SAMPLE, rig))
+    assert not provenance(SAMPLE / "rig.yaml", load_dataset(SAMPLE, rig)).same_recording

@@ -69,7 +69,7 @@ def test_solve_estimates_a_lens_and_its_files_have_it(solved: CommandRun, call: 
         assert focal.value == pytest.approx(np.sqrt(k.fx * k.fy), rel=1e-9)
         assert focal.value != focal.prior
     assert {*result.lens} == {"left", "right"}
-    assert "Lens of left" in (out / "report.html").read_text()
+    assert "Lens and clock of left" in (out / "report.html").read_text()
     assert load_calibration(solved.folder).lens == {}
 
 

@@ -38,8 +38,8 @@ def test_a_right_rig_exits_with_0_and_the_json_names_its_units(call: Call) -> No
     assert code == 0, err  # after 5 s, on a busy machine, err has a line of progress
     content = json.loads(out)
     assert set(content) == {
-        "status", "wrong", "tolerance_deg", "tolerance_cm", "frames", "same_recording", "cameras",
-        "lidar", "timings_s",
+        "status", "wrong", "tolerance_deg", "tolerance_cm", "frames", "same_recording",
+        "deployed_verdict", "cameras", "lidar", "timings_s",
     }  # fmt: skip
     assert content["status"] == "OK"
     assert content["wrong"] == []
@@ -87,6 +87,19 @@ def test_the_recording_that_made_the_result_is_named_in_the_first_line(
     )
     _, out, _ = call("check", calibrated_sample.folder, SAMPLE, "--frames", "0", "--json")
     assert json.loads(out)["same_recording"] is True
+    assert json.loads(out)["deployed_verdict"] == "PASS"
+
+
+@pytest.mark.usefixtures("measured_once")
+def test_a_result_that_was_doubtful_is_said_to_have_been(
+    call: Call, calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    said, deployed = "This result was WARN when it was made.", tmp_path / "calibration.yaml"
+    text = (calibrated_sample.folder / "calibration.yaml").read_text()
+    given = (deployed, SAMPLE, "--frames", "0")
+    for status in ("WARN", "PASS"):
+        deployed.write_text(text.replace("status: PASS", f"status: {status}"))
+        assert (said in call("check", *given)[2]) == (status == "WARN")
 
 
 @pytest.mark.usefixtures("measured_once")

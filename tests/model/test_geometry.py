@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import gtsam
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
     twist_between,
 )
-from tests.conftest import make_camera
+from tests.conftest import ROOT, make_camera
 
 # A quarter turn about z and a shift: p_a = (-y, x, z) + (1, 2, 3).
 QUARTER = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
@@ -165,3 +167,15 @@ def test_the_covariance_of_ros_is_that_of_the_moved_pose() -> None:
     expected = jacobian @ covariance @ jacobian.T
     # Central differences: rounding 1e-16 / 1e-6, of values up to about 10.
     np.testing.assert_allclose(ros_pose_covariance(covariance, T), expected, atol=1e-7)
+
+
+def test_poses_are_inverted_in_one_file_of_the_package() -> None:
+    """A second inversion is how signs and directions get lost; ``factors`` has its own."""
+    files = [*(ROOT / "calibgraph").rglob("*.py"), *(ROOT / "factors").rglob("*.py")]
+    inverting = {
+        path.relative_to(ROOT).as_posix()
+        for path in files
+        if re.search(r"\.inverse\(\)|linalg\.inv\(\w*T_", path.read_text("utf-8"))
+    }
+    allowed = {f"factors/{name}.py" for name in ("block", "free_lens", "pose")}
+    assert inverting == {"calibgraph/model/geometry.py"} | allowed

@@ -53,3 +53,22 @@ def test_names_of_cameras_are_escaped_and_drawn_as_they_are(tmp_path: Path) -> N
     assert "<b>x" not in text
     assert "&lt;b&gt;x&amp;&#34;y&#39;&lt;b&gt;" in text
     assert "$x_1$" in text
+
+
+def test_a_change_of_the_lens_is_drawn_where_it_was_estimated(solved_pair: Calibration) -> None:
+    """Of a lens that was not free there is no picture; a clock has none, either."""
+    assert "lens" not in camera_diagrams(solved_pair, "left", None)
+    camera = solved_pair.rig.cameras["left"]
+    k = camera.intrinsics_px
+    longer = k.model_copy(update={"fx": 1.01 * k.fx, "fy": 1.01 * k.fy})
+    cameras = {
+        **solved_pair.rig.cameras,
+        "left": camera.model_copy(update={"intrinsics_px": longer}),
+    }
+    moved = replace(
+        solved_pair,
+        rig=solved_pair.rig.model_copy(update={"cameras": cameras}),
+        lens={name: () for name in cameras},
+    )
+    assert "lens" in camera_diagrams(moved, "left", None)
+    assert "lens" not in camera_diagrams(moved, "right", None)

@@ -7,7 +7,7 @@ guess, and not on its position. The global search reads its z-scores from these 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -29,7 +29,7 @@ from calibgraph.model.rig import Camera
 Maps = NDArray[np.float32]
 
 STEP_RAD = np.radians(0.6)  # of the angular image and of the samples in a window
-STRIDE_SPACINGS = 3.0
+STRIDE_SPACINGS, DENSE_SPACINGS = 3.0, 1.5  # of the windows; the latter with few frames
 BLUR_STEPS = 1.0
 MAX_AZIMUTH_RAD, MAX_ELEVATION_RAD = np.radians(110.0), np.radians(80.0)
 GROUP_RAD = np.radians(2.5)
@@ -135,12 +135,19 @@ def correlate(
     *,
     range_rad: float,
     max_windows: int,
+    dense: bool = False,
     seed: int,
 ) -> CorrelationMaps:
-    """Correlate the images of a camera with their clouds, at all places."""
+    """Correlate the images of a camera with their clouds, at all places.
+
+    The windows of a frame are at most so many, drawn by the seed; if dense, four times as close.
+    """
     cells = _to_angular_image(grays[0], camera).log_gray.size
     max_windows = max(1, min(max_windows, MAX_CELLS // (cells * len(grays))))
-    one = partial(_correlate_frame, camera=camera, range_rad=range_rad, draw=(max_windows, seed))
+    stride = DENSE_SPACINGS if dense else STRIDE_SPACINGS
+    draw = max_windows, seed
+    cut = partial(_cut_windows_in_reach, range_rad=range_rad, stride=stride, draw=draw)
+    one = partial(_correlate_frame, camera=camera, cut=cut)
     frames = list(cores.map(one, grays, clouds))
     return CorrelationMaps(
         np.concatenate([frame.maps for frame in frames]),
@@ -155,12 +162,11 @@ def _correlate_frame(
     cloud: PreparedCloud,
     *,
     camera: Camera,
-    range_rad: float,
-    draw: tuple[int, int],
+    cut: Callable[[_AngularImage, PreparedCloud, Camera], Windows],
 ) -> CorrelationMaps:
-    """The maps of one frame; the windows are drawn by their largest number and a seed."""
+    """The maps of one frame, of windows that are cut so."""
     image = _to_angular_image(gray, camera)
-    windows = _cut_windows_in_reach(image, cloud, camera, range_rad, draw=draw)
+    windows = cut(image, cloud, camera)
     if not len(windows.counts):
         nothing = np.zeros((0, *image.inside.shape), np.float32)
         return CorrelationMaps(nothing, np.zeros((0, 3)), image.origin_rad, float(STEP_RAD))
@@ -180,11 +186,15 @@ def _cut_windows_in_reach(
     image: _AngularImage,
     cloud: PreparedCloud,
     camera: Camera,
-    range_rad: float,
     *,
+    range_rad: float,
+    stride: float,
     draw: tuple[int, int],
 ) -> Windows:
-    """Windows of the part of the cloud that the camera may see from anywhere in the range."""
+    """Windows of the part of the cloud that the camera may see from anywhere in the range.
+
+    They are drawn by their largest number and a seed.
+    """
     R, origin = camera.T_camera_lidar[:3, :3], image.origin_rad
     rays_m = (cloud.points_lidar_m - cloud.viewpoint_lidar_m(camera)) @ R.T
     angles = view_angles(rays_m)
@@ -194,7 +204,7 @@ def _cut_windows_in_reach(
     if not cloud.seen_from_origin:
         distance_m = np.linalg.norm(rays_m[near], axis=1)
         near[near] = find_visible(angles[near], distance_m, STEP_RAD / 2)
-    table = cloud.windows(camera, near, STEP_RAD, STRIDE_SPACINGS, fine=False)
+    table = cloud.windows(camera, near, STEP_RAD, stride, fine=False)
     return table.cut(near, near, max_covered=1.0, max_windows=draw[0], seed=draw[1])
 
 

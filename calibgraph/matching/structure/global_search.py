@@ -110,10 +110,14 @@ class Locator:
         """Keep a candidate if it is the best of its body, and locate the body if it is accepted."""
         if name not in self.best or candidate.z_score > self.best[name].z_score:
             self.best[name] = candidate
-        if candidate.z_score < least_z_score(tries):
+        if not self._is_accepted(candidate, tries):
             return False
         self.located[name] = candidate
         return True
+
+    def _is_accepted(self, candidate: Candidate, tries: float) -> bool:
+        enough = candidate.z_score >= least_z_score(tries)
+        return enough or self._search.stands_second_look(candidate, tries)
 
     def _propose(self) -> bool:
         """Let the best located body that has not proposed yet propose poses for all others."""

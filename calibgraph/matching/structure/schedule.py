@@ -1,5 +1,7 @@
 """The coarse-to-fine schedule: the reach and the resolution of each round, as angles."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +48,10 @@ class Level:
     max_windows: int = 20_000
     searches: int = 3
     min_quality: float = 0.05
+
+    def with_network(self, network: WindowNetwork | None) -> Level:
+        """The level with another network, or without weights."""
+        return replace(self, network=network, weighed=self.weighed and network is not None)
 
 
 def _level(

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,11 @@ class WindowNetwork:
         logits = np.clip((values @ matrix + bias)[:, 0], -LARGEST, LARGEST)
         return np.asarray(1.0 / (1.0 + np.exp(-logits)), dtype=np.float32)
 
+    @property
+    def origin(self) -> dict[str, str]:
+        """Its hash and what it was trained on, for the metadata of matches."""
+        return {"sha256": self.sha256, "how": self.how}
+
     def save(self, path: Path) -> None:
         """Write it as JSON, numbers to five digits."""
         content = {
@@ -85,7 +90,7 @@ class _Layer(BaseModel):
 class _File(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    format: Literal["calibgraph-window-weights/1"]
+    format: str
     how: Annotated[str, Field(max_length=MAX_HOW)]
     features: list[str]
     mean: _Row
@@ -103,10 +108,17 @@ def load_window_network(path: Path | str) -> WindowNetwork:
     """Read a network from its file.
 
     Raises:
-        FileError: if the file is missing or malformed, or is of other features.
+        FileError: if the file is missing or malformed, or is of another kind or other features.
     """
     path = Path(path)
-    content = checked_model(_File, read_json(path), path)
+    read = read_json(path)
+    if read.get("format") != WINDOW_WEIGHTS_MARK:
+        raise FileError(
+            path,
+            f"no window weights: its format is not {WINDOW_WEIGHTS_MARK}; "
+            "they are made by calibgraph train-windows",
+        )
+    content = checked_model(_File, read, path)
     if content.features != list(FEATURES):
         raise FileError(path, "its features are not those of this version; train it again")
     sizes = [len(FEATURES), *(len(layer.bias) for layer in content.layers)]

@@ -4,8 +4,12 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from calibgraph.matching.structure.correlation_maps import CorrelationMaps
+import calibgraph
+from calibgraph.matching.structure.correlation_maps import CorrelationMaps, correlate
 from calibgraph.matching.structure.directions import view_angles
+from calibgraph.matching.structure.frame_cache import FrameCache
+from calibgraph.parallel import core_pool
+from tests.conftest import SAMPLE
 
 
 def make_maps(rng: np.random.Generator) -> CorrelationMaps:
@@ -54,3 +58,19 @@ def test_the_best_shift_is_that_of_the_highest_sum() -> None:
     z_scores, shifts = shifted.find_best_shifts(identity, (0.2, 0.1))
     np.testing.assert_allclose(shifts, np.tile([4 * step, 2 * step], (40, 1)), atol=1e-9)
     assert np.ptp(z_scores) == 0 and z_scores[0] > 5
+
+
+def test_with_dense_windows_the_right_pose_stands_out_more() -> None:
+    data, rig = calibgraph.load_dataset(SAMPLE), calibgraph.load_rig(SAMPLE / "reference.yaml")
+    frame, (name, camera) = data.frames[0], next(iter(rig.cameras.items()))
+    cache = FrameCache()
+    gray, cloud = cache.image(frame, name, camera), cache.cloud(frame)
+    z_scores = {}
+    with core_pool() as cores:
+        for dense in (False, True):
+            maps = correlate(
+                [gray], [cloud], camera, cores,
+                range_rad=0.3, max_windows=9000, dense=dense, seed=0,
+            )  # fmt: skip
+            z_scores[dense] = maps.blur(1.0).z_scores(camera.T_camera_lidar[None])[0]
+    assert z_scores[True] > 1.2 * z_scores[False] > 0

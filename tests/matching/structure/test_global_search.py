@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,11 @@ import pytest
 import calibgraph
 from calibgraph import RelativePose, Rig, StructureMatcher
 from calibgraph.matching.structure import acceptance, global_search, pose_search
-from calibgraph.matching.structure.acceptance import least_z_score
+from calibgraph.matching.structure.acceptance import (
+    Chance,
+    least_z_score,
+    second_look_chance,
+)
 from calibgraph.matching.structure.bodies import Body, lead, place
 from calibgraph.matching.structure.global_search import TRIES, Located, Locator
 from calibgraph.matching.structure.pose_refinement import Candidate
@@ -286,15 +291,59 @@ def test_no_pose_is_tried_after_the_time_limit(one: Rig, monkeypatch: pytest.Mon
     assert "left" in start.findings.missed
 
 
+class FewFrames(MadeUp):
+    """All poses are of one evidence."""
+
+    evidence, _mirrored_evidence = 0.0, 12.0
+
+    def _evidence(self, _: Candidate) -> float:
+        return self.evidence
+
+
+@pytest.mark.parametrize(
+    ("few", "above", "accepted"), [(True, 0.1, True), (True, -0.1, False), (False, 0.1, False)]
+)
+def test_in_few_frames_the_fine_levels_can_accept_a_pose(
+    one: Rig, few: bool, above: float, accepted: bool
+) -> None:
+    elsewhere = off(one.T_camera_lidar["left"])
+    search = FewFrames(one, [(elsewhere, MANY - 4)], {"left": [elsewhere]})
+    search._few = few
+    search.evidence = least_z_score(TRIES[1], second_look_chance(12.0, 3)) + above
+    assert locate(search)["left"].accepted == accepted
+
+
+@pytest.mark.parametrize(("frames", "approached", "refined"), [(1, 5, 10), (3, 5, 10), (4, 5, 2)])
+def test_in_few_frames_all_candidates_are_refined(
+    one: Rig, monkeypatch: pytest.MonkeyPatch, frames: int, approached: int, refined: int
+) -> None:
+    """An approach may lead away from the right pose, and its z-score ranks poses badly."""
+    tried: list[str] = []
+    for name in ("approach", "refine"):
+
+        def improve(_: Any, body: Body, name: str = name) -> Candidate:
+            tried.append(name)
+            return Candidate(body, 1.0)
+
+        monkeypatch.setattr(pose_search, name, improve)
+    monkeypatch.setattr(pose_search, "search_box", lambda *_, **__: [np.eye(4)] * 5)
+    monkeypatch.setattr(PoseSearch, "_correlate", lambda *_: SimpleNamespace(maps=["some"]))
+    seen: Any = {"left": SimpleNamespace(frames=[None] * frames, cores=None)}
+    search = PoseSearch(one, seen, SearchRange(0.3, 1.5), seed=0, out_of_time=never)
+    search.with_roll(dict(one.cameras), 0.0, effort=1)
+    assert (tried.count("approach"), tried.count("refine")) == (approached, refined)
+
+
 def test_fewer_tries_need_less() -> None:
     assert ALONE < MANY < AGAIN < math.inf
 
 
-def test_the_stated_share_of_searches_with_nothing_to_find_is_accepted() -> None:
+@pytest.mark.parametrize("chance", [acceptance.SEARCH, second_look_chance(12.0, 3)])
+def test_the_stated_share_of_searches_with_nothing_to_find_is_accepted(chance: Chance) -> None:
     """Scenes, and the best z-scores on them, drawn from the distributions that are assumed."""
     rng = np.random.default_rng(0)
     tries, scenes, rate = 3, 400_000, acceptance.FALSE_ACCEPTANCE
-    locations = rng.normal(acceptance.PRIOR_LOCATION, acceptance.PRIOR_SIGMA, scenes)
-    best = rng.gumbel(locations + acceptance.SCALE * math.log(tries), acceptance.SCALE)
-    share = np.mean(best >= least_z_score(tries))
+    locations = rng.normal(chance.location, chance.sigma, scenes)
+    best = rng.gumbel(locations + chance.scale * math.log(tries), chance.scale)
+    share = np.mean(best >= least_z_score(tries, chance))
     assert 0.5 * rate < share < 1.1 * rate

@@ -17,6 +17,7 @@ import calibgraph
 from calibgraph import FileError, Rig, StructureMatcher
 from calibgraph.files import sha256
 from calibgraph.matching.structure.consensus import z_score
+from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
@@ -182,6 +183,7 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "no layers": (lambda c: c.update(layers=[]), "layers"),
     "an unknown key": (lambda c: c.update(exec="rm"), "unknown key 'exec'"),
     "another format": (lambda c: c.update(format="calibgraph-window-weights/9"), "format"),
+    "a file of another kind": (lambda c: c.pop("format"), "no window weights: "),
     "control characters": (lambda c: c.update(how="\x1b[2J"), "control characters"),
     "text for a number": (lambda c: c["layers"][0]["bias"].__setitem__(0, "x"), "layers.0.bias.0"),
 }
@@ -209,21 +211,35 @@ def test_a_file_that_is_no_network_is_refused(tmp_path: Path, data: bytes) -> No
     assert "\n" not in str(caught.value)
 
 
-def test_the_matcher_uses_and_names_the_network_of_a_file(tmp_path: Path) -> None:
+def test_the_matcher_uses_and_names_the_weights_of_a_file_or_none(tmp_path: Path) -> None:
     path, shipped = tmp_path / "own.json", window_network()
     matrix, bias = shipped.layers[-1]
     opposite = replace(shipped, layers=(*shipped.layers[:-1], (-matrix, -bias)), how="opposite")
     opposite.save(path)
     data = calibgraph.load_dataset(SAMPLE).select("0")
+    others = (StructureMatcher(window_weights=file) for file in (path, None))
+    matchers = (StructureMatcher(), *others)
     tables = [
-        StructureMatcher(window_weights=file).match(
+        matcher.match(
             data, calibgraph.load_rig(SAMPLE / "reference.yaml"), round_index=5,
             progress=lambda *_: None,
         )
-        for file in (None, PACKAGE_FILE, path)
+        for matcher in matchers
     ]  # fmt: skip
-    named = [table.metadata["window_weights"] for table in tables]
-    assert named[0] == named[1] == {"sha256": sha256(PACKAGE_FILE), "how": shipped.how}
-    assert named[2] == {"sha256": sha256(path), "how": "opposite"}
-    np.testing.assert_array_equal(tables[0].pixels_px, tables[1].pixels_px)
-    assert tables[2].findings.z_score != tables[0].findings.z_score
+    assert [table.metadata["window_weights"] for table in tables] == [
+        {"sha256": sha256(PACKAGE_FILE), "how": shipped.how},
+        {"sha256": sha256(path), "how": "opposite"},
+        {"how": "none: all windows count alike"},
+    ]
+    z_scores = [table.findings.z_score["front_left"] for table in tables]
+    assert len(set(z_scores)) == len(tables)
+
+
+def test_without_weights_all_windows_are_scored_alike() -> None:
+    data, rig = calibgraph.load_dataset(SAMPLE), calibgraph.load_rig(SAMPLE / "reference.yaml")
+    frame, (name, camera) = data.frames[0], next(iter(rig.cameras.items()))
+    cache = FrameCache()
+    gray, cloud = cache.image(frame, name, camera), cache.cloud(frame)
+    level = StructureMatcher(window_weights=None).levels[-1]
+    scores = score_frame(gray, cloud, camera, level, frame=0, max_windows=2000)
+    assert (scores.weights == np.rint(scores.weights)).all()  # numbers of windows

@@ -6,8 +6,10 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.frame_cache import FrameCache
@@ -29,11 +31,15 @@ class WindowTraining:
         network: the trained one.
         loss: mean negative log-likelihood of a camera's trusted pose, before and after.
         held_out: the same of recordings that took no part; infinite without any.
+        held_out_cameras: how many these have.
+        standard_error: of the mean change of their loss; NaN of fewer than two.
     """
 
     network: WindowNetwork
     loss: tuple[float, float]
     held_out: tuple[float, float]
+    held_out_cameras: int
+    standard_error: float
 
 
 def train_windows(
@@ -60,16 +66,24 @@ def train_windows(
     torch.manual_seed(settings.seed)
     samples = _samples(datasets, settings, progress)
     others = _samples(held_out, settings, progress)
-    before = _mean_loss(trainee, samples), _mean_loss(trainee, others)
-    if math.isinf(before[0]):
+    before = _losses(trainee, samples), _losses(trainee, others)
+    if not np.isfinite(before[0]).any():
         raise DatasetError("no camera has enough windows with structure to learn from")
     _learn(trainee, samples, settings, progress)
     names = ", ".join(data.folders[0].name for data in datasets)
     how = f"calibgraph train-windows, seed {settings.seed}: {len(samples)} cameras of {names}"
+    (first, last), (other_first, other_last) = (
+        _matched(one, _losses(trainee, of))
+        for one, of in zip(before, (samples, others), strict=True)
+    )
+    change, count = other_last - other_first, len(other_first)
+    known = count > 1 and bool(np.isfinite(change).all())
     return WindowTraining(
         trainee.to_network("".join(filter(str.isprintable, how))[:MAX_HOW]),
-        (before[0], _mean_loss(trainee, samples)),
-        (before[1], _mean_loss(trainee, others)),
+        (_mean(first), _mean(last)),
+        (_mean(other_first), _mean(other_last)),
+        count,
+        float(np.std(change, ddof=1) / math.sqrt(count)) if known else math.nan,
     )
 
 
@@ -125,10 +139,20 @@ def _batches(
 
 
 @torch.no_grad()
-def _mean_loss(trainee: Trainee, samples: Sequence[CameraWindows]) -> float:
-    """Over the cameras with enough matches; infinite without any."""
+def _losses(trainee: Trainee, samples: Sequence[CameraWindows]) -> Array:
+    """(n,) per camera; infinite with too few matches."""
     losses = [
         pose_negative_log_likelihood(trainee.weights(sample.features), sample) for sample in samples
     ]
-    found = [float(loss) for loss in losses if loss is not None]
-    return sum(found) / len(found) if found else math.inf
+    return np.array([math.inf if loss is None else float(loss) for loss in losses])
+
+
+def _matched(before: Array, after: Array) -> tuple[Array, Array]:
+    """Those of the cameras that had matches; one that has lost them is infinitely worse."""
+    had = np.isfinite(before)
+    return before[had], after[had]
+
+
+def _mean(losses: Array) -> float:
+    """Infinite without any."""
+    return float(losses.mean()) if len(losses) else math.inf
