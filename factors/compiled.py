@@ -7,7 +7,8 @@ on standard error (by ``logging``) reports it once.
 numba compares the source file of a kernel alone, and not what the file imports. So a kernel may use
 the kernels and constants of its own folder and of ``factors``, and the cache is one of all files of
 these two and of the versions of Python, numpy and numba: a change of any of them begins another.
-Environments with other versions thus do not overwrite each other's code while it is in use.
+Environments with other versions thus do not overwrite each other's code while it is in use. A
+kernel may enclose numbers, but no other kernel: numba would not find its code again.
 """
 
 import hashlib

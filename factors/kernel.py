@@ -16,7 +16,7 @@ from numba import prange
 from numba.core.errors import NumbaWarning
 
 from factors.compiled import compiled
-from factors.kernel_projection import project_rays, projection_of_tiles
+from factors.kernel_projection import project, project_pinhole, project_rays
 from factors.kernel_sums import (
     apply_weights,
     scale_residuals,
@@ -27,7 +27,7 @@ from factors.kernel_sums import (
     weigh,
     whiten,
 )
-from factors.lens_kernels import LIMIT, PINHOLE, domain_of
+from factors.lens_kernels import LIMIT, PINHOLE, is_projectable
 from factors.tile import FAST, MATRICES, ROWS, RU, RV, TILE, X, Y, Z
 
 # Open3D brings an older libtbb than numba uses; numba then takes another library, as good.
@@ -40,7 +40,6 @@ COST, GRADIENT, HESSIAN = range(3)
 @cache
 def accumulate(kind: int, *, shared: bool = False) -> Any:
     """The kernel of sums over runs of correspondences; ``shared``: by all cores."""
-    project = projection_of_tiles(kind)
 
     @compiled(fastmath=FAST, parallel=shared)
     def accumulate_runs(lens, poses, columns, whitening, loss, scales, runs, wanted):  # type: ignore[no-untyped-def]
@@ -60,11 +59,13 @@ def accumulate(kind: int, *, shared: bool = False) -> Any:
             for start in range(runs[i, 0], runs[i, 1], TILE):
                 n = min(TILE, runs[i, 1] - start)
                 rays = False
-                if kind == PINHOLE:  # noqa: SIM102 - a constant, of other lenses nothing is compiled
+                if kind == PINHOLE:
                     if lens[LIMIT] == math.inf and whitening.shape[0] < MATRICES:
                         rays = project_rays(lens, T, columns, start, n, tile)
-                if not rays:
-                    project(lens, T, columns, start, n, tile)
+                    if not rays:
+                        project_pinhole(lens, T, columns, start, n, tile)
+                else:
+                    project(kind, lens, T, columns, start, n, tile)
                 if rays:
                     scale_residuals(whitening, start, n, tile)
                 else:
@@ -89,7 +90,6 @@ def accumulate(kind: int, *, shared: bool = False) -> Any:
 @cache
 def evaluate(kind: int, *, shared: bool = False) -> Any:
     """The kernel of the residuals of runs of correspondences; ``shared``: by all cores."""
-    project, is_inside = projection_of_tiles(kind), domain_of(kind)
 
     @compiled(fastmath=FAST, parallel=shared)
     def evaluate_runs(lens, poses, columns, whitening, factor, runs, residuals, norms):  # type: ignore[no-untyped-def]
@@ -105,13 +105,17 @@ def evaluate(kind: int, *, shared: bool = False) -> Any:
             for start in range(runs[i, 0], runs[i, 1], TILE):
                 n = min(TILE, runs[i, 1] - start)
                 fast = False
-                if kind == PINHOLE:  # noqa: SIM102 - as above
+                if kind == PINHOLE:
                     if lens[LIMIT] == math.inf:
                         fast = project_rays(lens, T, columns, start, n, tile)
-                if not fast:
-                    fast = project(lens, T, columns, start, n, tile)
+                    if not fast:
+                        fast = project_pinhole(lens, T, columns, start, n, tile)
+                else:
+                    project(kind, lens, T, columns, start, n, tile)
                 for k in range(n):
-                    valid[start + k] = fast or is_inside(lens, tile[X, k], tile[Y, k], tile[Z, k])
+                    valid[start + k] = fast or is_projectable(
+                        kind, lens, tile[X, k], tile[Y, k], tile[Z, k]
+                    )
                 for k in range(n if len(residuals) else 0):
                     residuals[start + k, 0], residuals[start + k, 1] = tile[RU, k], tile[RV, k]
                 if len(norms):

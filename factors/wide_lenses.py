@@ -76,7 +76,7 @@ def equirectangular_rays(angles_rad: Array) -> Array:
 
 @compiled(part=True)
 def project_equirectangular(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Longitude and latitude times fx and fy, see ``lens_kernels.projection_of``."""
+    """Longitude and latitude times fx and fy, see ``project_one``."""
     fx, fy = lens[0], lens[1]
     n2 = x * x + y * y + z * z
     # At the poles there is no longitude: the derivative is held, so that it is finite.
@@ -114,7 +114,7 @@ def _distort(lens, a, b):  # type: ignore[no-untyped-def]
 
 @compiled(part=True)
 def project_omnidirectional(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """The unified model with its Jacobian, see ``lens_kernels.projection_of``.
+    """The unified model with its Jacobian, see ``project_one``.
 
     Past the limiting field angle t0 the pixel moves on outwards from the limiting circle, in
     proportion to 1 + t - t0, so that it stays finite and continuous right to behind the camera.

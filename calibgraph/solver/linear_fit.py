@@ -121,11 +121,12 @@ def fit_camera(
     columns = _linearize(camera, block.block, fields_px)
     size, errors = len(columns) - 1, columns[-1].ravel()
     flat, values = columns[:-1].reshape(size, -1), np.zeros(size)
+    weighted = np.empty_like(flat)
     for _ in range(_MAX_ITERATIONS):
         squares = np.square((errors - values @ flat).reshape(2, -1)).sum(axis=0)
         scale = loss_scale or _LOSS_MEDIANS * math.sqrt(median(squares)) + 1e-12
         weights = np.tile(1.0 / (1.0 + squares / scale**2), 2)
-        weighted = flat * weights
+        np.multiply(flat, weights, out=weighted)
         hessian, before = weighted @ flat.T + _weak(size), values
         values = np.linalg.solve(hessian, weighted @ errors)
         if np.abs((values - before) @ flat).max() < _CONVERGED * scale:

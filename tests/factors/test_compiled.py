@@ -80,6 +80,20 @@ def test_a_second_process_does_not_compile_again(tmp_path: Path) -> None:
     assert found == [(f"{HUBER} 0", ""), (f"{HUBER} 1", "")]
 
 
+def test_a_second_process_finds_the_kernels_of_a_lens(tmp_path: Path) -> None:
+    """One that encloses another kernel would be compiled anew each time: numba cannot name it."""
+    code = (
+        "import numpy as np; from factors.kernel import accumulate, evaluate\n"
+        "from factors import Lens, ProjectionBlock; import gtsam\n"
+        "lens = Lens.pinhole(fx=500, fy=500, cx=320, cy=240)\n"
+        "block = ProjectionBlock(lens, np.ones((9, 3)), np.ones((9, 2)))\n"
+        "block.sums(gtsam.Pose3()), block.residuals(gtsam.Pose3())\n"
+        "print([sum(k(0, shared=False).stats.cache_hits.values()) for k in (accumulate, evaluate)])"
+    )
+    found = [run(code, NUMBA_CACHE_DIR=str(tmp_path))[0] for _ in range(2)]
+    assert found == ["[0, 0]", "[1, 1]"]
+
+
 @pytest.mark.slow
 def test_the_users_cache_folder_is_the_default(tmp_path: Path) -> None:
     found = [run(LOSS, XDG_CACHE_HOME=str(tmp_path), HOME=str(tmp_path)) for _ in range(2)]

@@ -241,6 +241,31 @@ def test_a_kill_before_and_after_a_snapshot_is_written_costs_nothing(
     calibrator.close()
 
 
+@pytest.mark.parametrize("done", [False, True])
+def test_of_updates_in_one_write_a_kill_leaves_all_or_none(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: bool
+) -> None:
+    """A snapshot is due with the third of six; those that were written come again, each once."""
+    monkeypatch.setattr(durable, "_SNAPSHOT_EVERY", 5)
+    state, copy = tmp_path / "state", tmp_path / "copy"
+    with DurableCalibrator(state, world.guess) as calibrator:
+        for table in world.tables[:3]:
+            calibrator.update(table)
+        with calibrator.in_one_write():
+            found = [calibrator.update(table) for table in world.tables[3:9]]
+            if not done:
+                shutil.copytree(state, copy)
+        if done:
+            shutil.copytree(state, copy)
+        found += map(calibrator.update, world.tables[9:])
+    assert [json_line(update) for update in found] == world.lines[3:]
+    with DurableCalibrator(copy, world.guess) as resumed:
+        assert resumed.tracker.frame == (found[5].frame if done else found[0].frame - 1)
+        assert [json_line(update) for update in resumed.repeated[3:]] == (
+            world.lines[3:9] if done else []
+        )
+
+
 @pytest.mark.parametrize("at", [0, 4, 9, 10, 13])
 def test_after_a_crash_the_last_line_comes_again(
     at: int, world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
