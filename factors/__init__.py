@@ -18,9 +18,9 @@ from factors.free_lens import (
     FreeLensBlock,
     free_lens_factor,
     free_lens_sums_factor,
-    linear_factor,
 )
 from factors.lens import Lens, LensModel
+from factors.linear import linear_factor
 from factors.loss import LOSSES, LossName, robust_noise
 from factors.pair import (
     PairBlock,
