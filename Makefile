@@ -75,6 +75,7 @@ bench: $(VENV)/test ## Compare ratios of processor times with the last release's
 	$(BIN)/python -m benchmarks.speed.stages data/sample
 	$(BIN)/python -m benchmarks.speed.kernel
 	$(BIN)/python -m benchmarks.speed.solve --frames 10 100 --cameras 2
+	$(BIN)/python -m benchmarks.speed.solve --frames 20 --cameras 12 --matches 500
 	$(BIN)/python -m benchmarks.speed.scaling --rows 1e3 1e5 1e7
 	$(BIN)/python -m benchmarks.speed.incremental
 	$(BIN)/python -m benchmarks.speed.cmrnext

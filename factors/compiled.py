@@ -40,14 +40,17 @@ for lock in (_decorating, _all_cores):
     )
 
 
-def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def compiled(*, part: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function without Python objects (``numba.njit``) when it is first called.
 
     It runs without Python's lock, and divides as numpy does.
 
     Args:
+        part: of other kernels: it compiles faster, and a call from Python would end the process.
         options: of ``numba.njit``, but for ``cache``.
     """
+    if part:
+        options["no_cpython_wrapper"] = True
 
     def decorate(function: Callable[..., Any]) -> Any:
         function.__qualname__ = _name(function, options)

@@ -57,11 +57,13 @@ def root_of_sums(sums):  # type: ignore[no-untyped-def]
     Returns:
         Both, and whether H is regular; if it is not, they mean nothing.
     """
-    total, units, hessian = np.zeros(28), np.empty(6), np.empty((6, 6))
-    jacobian, error = np.zeros((6, 7)), np.empty(7)
-    for r in range(len(sums)):
-        for k in range(28):
+    total, units, hessian = np.empty(28), np.empty(6), np.empty((6, 6))
+    jacobian, error = np.empty((6, 7)), np.empty(7)
+    for k in range(28):  # np.zeros, np.sum and slices compile slowly
+        total[k] = 0.0
+        for r in range(len(sums)):
             total[k] += sums[r, k]
+    jacobian[:] = 0.0
     place, rest_of_cost = 0, total[27]
     for i in range(6):
         for j in range(i, 6):

@@ -150,7 +150,7 @@ def epipolar_residual(
     return value * over, over * (derivative - value / square * half_of_square)
 
 
-@compiled()
+@compiled(part=True)
 def _form(R, t, x, y, derivative):  # type: ignore[no-untyped-def]
     """C(x, y); its derivative goes into ``derivative``, (6,)."""
     p0 = R[0, 0] * y[0] + R[0, 1] * y[1] + R[0, 2] * y[2]
@@ -169,7 +169,7 @@ def _form(R, t, x, y, derivative):  # type: ignore[no-untyped-def]
     return m0 * p0 + m1 * p1 + m2 * p2
 
 
-@compiled()
+@compiled(part=True)
 def _sampson(R, t, row, jacobian, scratch):  # type: ignore[no-untyped-def]
     """The residual of a feature; its derivative goes into ``jacobian``; ``scratch`` is (2, 6)."""
     ray_a, ray_b = row[0:3], row[9:12]

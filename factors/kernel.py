@@ -16,7 +16,7 @@ from numba import prange
 from numba.core.errors import NumbaWarning
 
 from factors.compiled import compiled
-from factors.kernel_projection import project, project_pinhole, project_rays
+from factors.kernel_projection import project_rays, projection_of_tiles
 from factors.kernel_sums import (
     apply_weights,
     scale_residuals,
@@ -27,7 +27,7 @@ from factors.kernel_sums import (
     weigh,
     whiten,
 )
-from factors.lens_kernels import LIMIT, PINHOLE, is_projectable
+from factors.lens_kernels import LIMIT, PINHOLE, domain_of
 from factors.tile import FAST, MATRICES, ROWS, RU, RV, TILE, X, Y, Z
 
 # Open3D brings an older libtbb than numba uses; numba then takes another library, as good.
@@ -40,6 +40,7 @@ COST, GRADIENT, HESSIAN = range(3)
 @cache
 def accumulate(kind: int, *, shared: bool = False) -> Any:
     """The kernel of sums over runs of correspondences; ``shared``: by all cores."""
+    project = projection_of_tiles(kind)
 
     @compiled(fastmath=FAST, parallel=shared)
     def accumulate_runs(lens, poses, columns, whitening, loss, scales, runs, wanted):  # type: ignore[no-untyped-def]
@@ -49,21 +50,21 @@ def accumulate(kind: int, *, shared: bool = False) -> Any:
         (1, 4, 4) and (1,) of all; ``columns`` (5, n) are x y z u v; ``whitening`` is (3, n):
         triangular matrices; (1, n): numbers; or (0, n): none.
         """
-        out = np.zeros((len(runs), 28))
+        out = np.empty((len(runs), 28))
         for i in prange(len(runs)):
-            T = poses[min(np.int64(i), len(poses) - 1)]
-            scale = scales[min(np.int64(i), len(scales) - 1)]
+            T = poses[np.int64(i) if len(poses) > 1 else 0]
+            scale = scales[np.int64(i) if len(scales) > 1 else 0]
             sums, tile = out[i], np.empty((ROWS, TILE))
+            for k in range(28):
+                sums[k] = 0.0
             for start in range(runs[i, 0], runs[i, 1], TILE):
                 n = min(TILE, runs[i, 1] - start)
                 rays = False
-                if kind == PINHOLE:
+                if kind == PINHOLE:  # noqa: SIM102 - a constant, of other lenses nothing is compiled
                     if lens[LIMIT] == math.inf and whitening.shape[0] < MATRICES:
                         rays = project_rays(lens, T, columns, start, n, tile)
-                    if not rays:
-                        project_pinhole(lens, T, columns, start, n, tile)
-                else:
-                    project(kind, lens, T, columns, start, n, tile)
+                if not rays:
+                    project(lens, T, columns, start, n, tile)
                 if rays:
                     scale_residuals(whitening, start, n, tile)
                 else:
@@ -76,9 +77,9 @@ def accumulate(kind: int, *, shared: bool = False) -> Any:
                     if wanted == HESSIAN:
                         sum_rays(lens, n, tile, sums)
                     sum_ray_gradients(lens, n, tile, sums)
-                elif wanted == HESSIAN:
-                    sum_tile(n, tile, sums)
                 else:
+                    if wanted == HESSIAN:
+                        sum_tile(n, tile, sums)
                     sum_tile_gradients(n, tile, sums)
         return out
 
@@ -88,6 +89,7 @@ def accumulate(kind: int, *, shared: bool = False) -> Any:
 @cache
 def evaluate(kind: int, *, shared: bool = False) -> Any:
     """The kernel of the residuals of runs of correspondences; ``shared``: by all cores."""
+    project, is_inside = projection_of_tiles(kind), domain_of(kind)
 
     @compiled(fastmath=FAST, parallel=shared)
     def evaluate_runs(lens, poses, columns, whitening, factor, runs, residuals, norms):  # type: ignore[no-untyped-def]
@@ -99,21 +101,17 @@ def evaluate(kind: int, *, shared: bool = False) -> Any:
         """
         valid = np.empty(columns.shape[1], np.bool_)
         for i in prange(len(runs)):
-            T, tile = poses[min(np.int64(i), len(poses) - 1)], np.empty((ROWS, TILE))
+            T, tile = poses[np.int64(i) if len(poses) > 1 else 0], np.empty((ROWS, TILE))
             for start in range(runs[i, 0], runs[i, 1], TILE):
                 n = min(TILE, runs[i, 1] - start)
                 fast = False
-                if kind == PINHOLE:
+                if kind == PINHOLE:  # noqa: SIM102 - as above
                     if lens[LIMIT] == math.inf:
                         fast = project_rays(lens, T, columns, start, n, tile)
-                    if not fast:
-                        fast = project_pinhole(lens, T, columns, start, n, tile)
-                else:
-                    project(kind, lens, T, columns, start, n, tile)
+                if not fast:
+                    fast = project(lens, T, columns, start, n, tile)
                 for k in range(n):
-                    valid[start + k] = fast or is_projectable(
-                        kind, lens, tile[X, k], tile[Y, k], tile[Z, k]
-                    )
+                    valid[start + k] = fast or is_inside(lens, tile[X, k], tile[Y, k], tile[Z, k])
                 for k in range(n if len(residuals) else 0):
                     residuals[start + k, 0], residuals[start + k, 1] = tile[RU, k], tile[RV, k]
                 if len(norms):
@@ -127,7 +125,7 @@ def evaluate(kind: int, *, shared: bool = False) -> Any:
     return evaluate_runs
 
 
-@compiled(fastmath=FAST)
+@compiled(part=True, fastmath=FAST)
 def fill_norms(whitening, start, n, tile, factor, norms):  # type: ignore[no-untyped-def]
     """Fill in the norms of a tile's residuals times a factor, plain and whitened."""
     ru, rv = tile[RU], tile[RV]

@@ -5,12 +5,21 @@ the rows that are taken out before a loop, and Python's exception on a division 
 ``error_model="numpy"``.
 """
 
+from functools import cache
+from typing import Any
+
 from factors.compiled import compiled
-from factors.lens_kernels import MIN_DEPTH_M, PINHOLE, project_one, subtract_columns
+from factors.lens_kernels import (
+    MIN_DEPTH_M,
+    PINHOLE,
+    difference_of,
+    project_radtan,
+    projection_of,
+)
 from factors.tile import FAST, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z
 
 
-@compiled(fastmath=FAST)
+@compiled(part=True, fastmath=FAST)
 def project_rays(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """Residuals of an undistorted pinhole, x/z, y/z and 1/z.
 
@@ -36,27 +45,39 @@ def project_rays(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-d
     return too_near == 0.0
 
 
-@compiled(inline="always")
-def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
-    """Residuals, their derivatives by the point, and the point in the camera frame."""
-    xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
-    us, vs = columns[3][start:], columns[4][start:]
-    ru, rv = tile[RU], tile[RV]
-    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
-    rx, ry, rz = tile[X], tile[Y], tile[Z]
-    for i in range(n):
-        px, py, pz = xs[i], ys[i], zs[i]
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-        u, v, ux[i], uy[i], uz[i], vx[i], vy[i], vz[i] = project_one(kind, lens, x, y, z)
-        ru[i], rv[i] = subtract_columns(kind, lens, u, us[i]), v - vs[i]
-        rx[i], ry[i], rz[i] = x, y, z
+@cache
+def projection_of_tiles(kind: int) -> Any:
+    """The kernel of residuals, their derivatives by the point, and the point in the camera frame.
+
+    It returns whether all points are known to lie inside the lens' domain.
+    """
+    if kind == PINHOLE:
+        return _project_pinhole
+    project, subtract = projection_of(kind), difference_of(kind)
+
+    @compiled(part=True, fastmath=FAST)
+    def run(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
+        xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
+        us, vs = columns[3][start:], columns[4][start:]
+        ru, rv = tile[RU], tile[RV]
+        ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
+        rx, ry, rz = tile[X], tile[Y], tile[Z]
+        for i in range(n):
+            px, py, pz = xs[i], ys[i], zs[i]
+            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            u, v, ux[i], uy[i], uz[i], vx[i], vy[i], vz[i] = project(lens, x, y, z)
+            ru[i], rv[i] = subtract(lens, u, us[i]), v - vs[i]
+            rx[i], ry[i], rz[i] = x, y, z
+        return False
+
+    return run
 
 
-@compiled(fastmath=FAST)
-def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
-    """``project`` for a pinhole: without branches, if no point lies outside the lens' domain.
+@compiled(part=True, fastmath=FAST)
+def _project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
+    """For a pinhole: without branches, if no point lies outside the lens' domain.
 
     Then the formulas are those of ``lens_kernels._radtan_inside``. False, if a point does.
     """
@@ -94,6 +115,7 @@ def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untype
         ux[i], uy[i], uz[i] = fxw * by_a, fxw * cross, -fxw * (by_a * a + cross * b)
         vx[i], vy[i], vz[i] = fyw * cross, fyw * by_b, -fyw * (cross * a + by_b * b)
         rx[i], ry[i], rz[i] = x, y, z
-    if outside > 0.0:
-        project(PINHOLE, lens, T, columns, start, n, tile)
+    for i in range(n if outside > 0.0 else 0):
+        u, v, ux[i], uy[i], uz[i], vx[i], vy[i], vz[i] = project_radtan(lens, rx[i], ry[i], rz[i])
+        ru[i], rv[i] = u - us[i], v - vs[i]
     return outside == 0.0

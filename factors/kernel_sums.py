@@ -9,7 +9,7 @@ from factors.tile import FAST, PRODUCT, PSI, RU, RV, UX, UY, UZ, VX, VY, VZ, A, 
 _SMALL = 1e-100  # far from the smallest float by more than four factors
 
 
-@compiled(fastmath=FAST)
+@compiled(part=True, fastmath=FAST)
 def whiten(whitening, start, n, tile):  # type: ignore[no-untyped-def]
     """Multiply residuals and derivatives by the whitening matrices, or by numbers."""
     if whitening.shape[0] == 0:
@@ -29,7 +29,7 @@ def whiten(whitening, start, n, tile):  # type: ignore[no-untyped-def]
         tile[VZ, i] *= s11
 
 
-@compiled(fastmath=FAST)
+@compiled(part=True, fastmath=FAST)
 def scale_residuals(whitening, start, n, tile):  # type: ignore[no-untyped-def]
     """Multiply residuals by their weights w, if these are numbers."""
     if whitening.shape[0] == 0:
@@ -40,7 +40,7 @@ def scale_residuals(whitening, start, n, tile):  # type: ignore[no-untyped-def]
         rv[i] *= weights[i]
 
 
-@compiled(fastmath=FAST)
+@compiled(part=True, fastmath=FAST)
 def weigh(loss, scale, n, tile):  # type: ignore[no-untyped-def]
     """Fill in the weights psi; return the sum of rho."""
     ru, rv, psi = tile[RU], tile[RV], tile[PSI]
@@ -56,7 +56,7 @@ def weigh(loss, scale, n, tile):  # type: ignore[no-untyped-def]
     return -_sum_of_logarithms(psi, n, tile[PRODUCT]) / k
 
 
-@compiled(fastmath=FAST)
+@compiled(part=True, fastmath=FAST)
 def _sum_of_logarithms(values, n, products):  # type: ignore[no-untyped-def]
     """The logarithm of the product of ``n`` values, taken before it leaves the range of a float.
 
@@ -80,61 +80,58 @@ def _sum_of_logarithms(values, n, products):  # type: ignore[no-untyped-def]
     return logarithms + math.log(even) + math.log(odd)
 
 
-@compiled(fastmath=FAST)
+@compiled(part=True, fastmath=FAST)
 def sum_tile(n, tile, out):  # type: ignore[no-untyped-def]
-    """Add J^T psi J and J^T psi r of a tile to 27 sums."""
-    h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = 0.0
-    h22 = h23 = h24 = h25 = h33 = h34 = h35 = h44 = h45 = h55 = 0.0
-    b0 = b1 = b2 = b3 = b4 = b5 = 0.0
+    """Add the 21 sums of H = J^T psi J of a tile.
+
+    q = X^-1 p has dq / d(rotation, translation) = ([q]x, -I), and g^T [q]x = (g x q)^T. With the
+    3x3 matrix m = psi g g^T, summed over u and v, and c = m [q]x, the blocks of H are [q]x^T c, c
+    and m, but for signs.
+    """
+    d00 = d01 = d02 = d11 = d12 = d22 = m00 = m01 = m02 = m11 = m12 = m22 = 0.0
+    c00 = c01 = c02 = c10 = c11 = c12 = c20 = c21 = c22 = 0.0
     rx, ry, rz, rp = tile[X], tile[Y], tile[Z], tile[PSI]
     ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
-    res_u, res_v = tile[RU], tile[RV]
     for i in range(n):
-        # q = X^-1 p:  dq / d(rotation, translation) = ([q]x, -I);  g^T [q]x = (g x q)^T.
         x, y, z, psi = rx[i], ry[i], rz[i], rp[i]
-        u3, u4, u5 = -ux[i], -uy[i], -uz[i]
-        v3, v4, v5 = -vx[i], -vy[i], -vz[i]
-        u0, u1, u2 = u5 * y - u4 * z, u3 * z - u5 * x, u4 * x - u3 * y
-        v0, v1, v2 = v5 * y - v4 * z, v3 * z - v5 * x, v4 * x - v3 * y
-        a0, a1, a2, a3, a4, a5 = psi * u0, psi * u1, psi * u2, psi * u3, psi * u4, psi * u5
-        c0, c1, c2, c3, c4, c5 = psi * v0, psi * v1, psi * v2, psi * v3, psi * v4, psi * v5
-        ru, rv = res_u[i], res_v[i]
-        h00 += a0 * u0 + c0 * v0
-        h01 += a0 * u1 + c0 * v1
-        h02 += a0 * u2 + c0 * v2
-        h03 += a0 * u3 + c0 * v3
-        h04 += a0 * u4 + c0 * v4
-        h05 += a0 * u5 + c0 * v5
-        h11 += a1 * u1 + c1 * v1
-        h12 += a1 * u2 + c1 * v2
-        h13 += a1 * u3 + c1 * v3
-        h14 += a1 * u4 + c1 * v4
-        h15 += a1 * u5 + c1 * v5
-        h22 += a2 * u2 + c2 * v2
-        h23 += a2 * u3 + c2 * v3
-        h24 += a2 * u4 + c2 * v4
-        h25 += a2 * u5 + c2 * v5
-        h33 += a3 * u3 + c3 * v3
-        h34 += a3 * u4 + c3 * v4
-        h35 += a3 * u5 + c3 * v5
-        h44 += a4 * u4 + c4 * v4
-        h45 += a4 * u5 + c4 * v5
-        h55 += a5 * u5 + c5 * v5
-        b0 += a0 * ru + c0 * rv
-        b1 += a1 * ru + c1 * rv
-        b2 += a2 * ru + c2 * rv
-        b3 += a3 * ru + c3 * rv
-        b4 += a4 * ru + c4 * rv
-        b5 += a5 * ru + c5 * rv
+        u0, u1, u2, v0, v1, v2 = ux[i], uy[i], uz[i], vx[i], vy[i], vz[i]
+        p0, p1, p2, q0, q1, q2 = psi * u0, psi * u1, psi * u2, psi * v0, psi * v1, psi * v2
+        xx, xy, xz = p0 * u0 + q0 * v0, p0 * u1 + q0 * v1, p0 * u2 + q0 * v2
+        yy, yz, zz = p1 * u1 + q1 * v1, p1 * u2 + q1 * v2, p2 * u2 + q2 * v2
+        # Of the rows of c^T: rotation about an axis, by x, y, z.
+        ax, ay, az = xy * z - xz * y, yy * z - yz * y, yz * z - zz * y
+        bx, by, bz = xz * x - xx * z, yz * x - xy * z, zz * x - xz * z
+        cx, cy, cz = xx * y - xy * x, xy * y - yy * x, xz * y - yz * x
+        d00 += ay * z - az * y
+        d01 += az * x - ax * z
+        d02 += ax * y - ay * x
+        d11 += bz * x - bx * z
+        d12 += bx * y - by * x
+        d22 += cx * y - cy * x
+        c00 += ax
+        c01 += ay
+        c02 += az
+        c10 += bx
+        c11 += by
+        c12 += bz
+        c20 += cx
+        c21 += cy
+        c22 += cz
+        m00 += xx
+        m01 += xy
+        m02 += xz
+        m11 += yy
+        m12 += yz
+        m22 += zz
     sums = (
-        h00, h01, h02, h03, h04, h05, h11, h12, h13, h14, h15, h22, h23, h24, h25, h33, h34, h35,
-        h44, h45, h55, b0, b1, b2, b3, b4, b5,
+        d00, d01, d02, -c00, -c01, -c02, d11, d12, -c10, -c11, -c12, d22, -c20, -c21, -c22,
+        m00, m01, m02, m11, m12, m22,
     )  # fmt: skip
-    for k in range(27):
+    for k in range(21):
         out[k] += sums[k]
 
 
-@compiled(fastmath=FAST)
+@compiled(part=True, fastmath=FAST)
 def apply_weights(whitening, start, n, tile):  # type: ignore[no-untyped-def]
     """Turn the residuals w r into psi w^2 r, and psi into psi w^2, if the weights are numbers."""
     ru, rv, psi = tile[RU], tile[RV], tile[PSI]
@@ -151,7 +148,7 @@ def apply_weights(whitening, start, n, tile):  # type: ignore[no-untyped-def]
         psi[i] *= w * w
 
 
-@compiled(fastmath=FAST)
+@compiled(part=True, fastmath=FAST)
 def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
     """Add the 21 sums of H of a tile of a pinhole, from a = x/z, b = y/z, w = 1/z, psi and psi r.
 
@@ -207,7 +204,7 @@ def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
         out[k] += sums[k]
 
 
-@compiled(fastmath=FAST)
+@compiled(part=True, fastmath=FAST)
 def sum_ray_gradients(lens, n, tile, out):  # type: ignore[no-untyped-def]
     """Add the gradient of a tile of a pinhole to the sums, see ``sum_rays``."""
     pull_u, pull_v = tile[RU], tile[RV]
@@ -228,7 +225,7 @@ def sum_ray_gradients(lens, n, tile, out):  # type: ignore[no-untyped-def]
         out[21 + k] += sums[k]
 
 
-@compiled(fastmath=FAST)
+@compiled(part=True, fastmath=FAST)
 def sum_tile_gradients(n, tile, out):  # type: ignore[no-untyped-def]
     """Add J^T psi r of a tile to the sums, see ``sum_tile``."""
     rx, ry, rz, rp = tile[X], tile[Y], tile[Z], tile[PSI]

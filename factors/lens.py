@@ -4,7 +4,7 @@ The formulas are OpenCV's (``projectPoints``, ``fisheye.projectPoints``, ``omnid
 inside the field of view in which they are one-to-one. Outside (behind the camera, or past the field
 angle at which the distortion polynomial folds back) OpenCV returns pixels that mean nothing; here
 such a point is reported as invalid, and its projection is continued continuously (see
-``lens_kernels.project_one``), so that an optimizer that steps there gets a large, finite error
+``lens_kernels.projection_of``), so that an optimizer that steps there gets a large, finite error
 instead of a NaN or a wrong small one.
 """
 
@@ -26,8 +26,8 @@ from factors.lens_kernels import (
     FISHEYE,
     OMNIDIRECTIONAL,
     PINHOLE,
-    is_projectable,
-    project_one,
+    domain_of,
+    projection_of,
 )
 from factors.wide_lenses import check_mirror, omnidirectional_limit
 
@@ -229,6 +229,8 @@ def _fisheye_limit(coefficients: Array) -> float:
 
 @cache
 def _are_projectable(kind: int) -> Any:
+    is_inside = domain_of(kind)
+
     @compiled()
     def run(lens, T, points):  # type: ignore[no-untyped-def]
         valid = np.empty(len(points), dtype=np.bool_)
@@ -237,7 +239,7 @@ def _are_projectable(kind: int) -> Any:
             x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
             y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
             z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-            valid[i] = is_projectable(kind, lens, x, y, z)
+            valid[i] = is_inside(lens, x, y, z)
         return valid
 
     return run
@@ -245,17 +247,18 @@ def _are_projectable(kind: int) -> Any:
 
 @cache
 def _project_many(kind: int) -> Any:
+    project, is_inside = projection_of(kind), domain_of(kind)
+
     @compiled()
     def run(lens, points, pixels, valid, jacobians):  # type: ignore[no-untyped-def]
         """Fill in (n, 2) pixels, and (n,) validity and (n, 6) derivatives where there is room."""
         for k in range(len(points)):
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
-            projection = project_one(kind, lens, x, y, z)
-            for row in range(2):
-                pixels[k, row] = projection[row]
+            projection = project(lens, x, y, z)
+            pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
             for place in range(6 if len(jacobians) else 0):
                 jacobians[k, place] = projection[2 + place]
             if len(valid):
-                valid[k] = is_projectable(kind, lens, x, y, z)
+                valid[k] = is_inside(lens, x, y, z)
 
     return run

@@ -1,6 +1,7 @@
 """The projections of the lens models, as kernels: which kinds there are, and their formulas."""
 
 import math
+from typing import Any
 
 from factors.compiled import compiled
 from factors.wide_lenses import (
@@ -17,24 +18,34 @@ LIMIT = 12
 """Index of the domain's limit in the packed parameters; infinite if a pinhole is undistorted."""
 
 
-@compiled(inline="always")
-def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Pixel (u, v) of a point in the camera frame and the rows of its Jacobian by x, y, z.
+def projection_of(kind: int) -> Any:
+    """The kernel (lens, x, y, z) of a kind of lens that projects a point of the camera frame.
 
-    Outside the lens' domain the projection is continued: a pinhole's depth is held at
-    ``MIN_DEPTH_M``; past the limiting radius the distorted point grows linearly along the ray from
-    the limiting circle; past the limiting field angle the distorted angle grows with slope one.
-    The continuation is continuous, and bounded for bounded points.
-
-    This and the functions of a kind below become parts of the kernel that calls them. If the kind
-    is a constant there, only its own branch is compiled.
+    It returns the pixel (u, v) and the rows of its Jacobian by x, y, z. Outside the lens' domain
+    the projection is continued: a pinhole's depth is held at ``MIN_DEPTH_M``; past the limiting
+    radius the distorted point grows linearly along the ray from the limiting circle; past the
+    limiting field angle the distorted angle grows with slope one. The continuation is continuous,
+    and bounded for bounded points.
     """
-    if kind == FISHEYE:
-        return _fisheye(lens, x, y, z)
-    if kind == OMNIDIRECTIONAL:
-        return project_omnidirectional(lens, x, y, z)
-    if kind == EQUIRECTANGULAR:
-        return project_equirectangular(lens, x, y, z)
+    return (project_radtan, _fisheye, project_omnidirectional, project_equirectangular)[kind]
+
+
+def domain_of(kind: int) -> Any:
+    """The kernel (lens, x, y, z) of whether a point lies inside a lens' injective domain."""
+    return (_is_in_cone, _is_in_angle, _is_in_angle, _is_off_the_poles)[kind]
+
+
+def difference_of(kind: int) -> Any:
+    """The kernel (lens, u, other) of the difference of two columns u [px].
+
+    Across the seam of a panorama the short way.
+    """
+    return _difference_across_seam if kind == EQUIRECTANGULAR else _difference
+
+
+@compiled(part=True, forceinline=True)
+def project_radtan(lens, x, y, z):  # type: ignore[no-untyped-def]
+    """A pinhole with its distortion, see :func:`projection_of`."""
     in_front = z > MIN_DEPTH_M
     w = 1.0 / (z if in_front else MIN_DEPTH_M)
     a, b = x * w, y * w
@@ -53,7 +64,7 @@ def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled()
+@compiled(part=True)
 def _radtan(lens, a, b):  # type: ignore[no-untyped-def]
     """Distorted normalised point and its 2x2 Jacobian (row major), continued past the limit."""
     limit = lens[LIMIT]
@@ -75,7 +86,7 @@ def _radtan(lens, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled()
+@compiled(part=True)
 def _radtan_inside(lens, a, b):  # type: ignore[no-untyped-def]
     k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
     k4, k5, k6 = lens[9], lens[10], lens[11]
@@ -96,7 +107,7 @@ def _radtan_inside(lens, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled()
+@compiled(part=True)
 def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
     """Kannala-Brandt; the angle from atan2, so that fields of view over 180 degrees are seen."""
     fx, fy = lens[0], lens[1]
@@ -134,26 +145,27 @@ def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled(inline="always")
-def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Whether a point of the camera frame lies inside the lens' injective domain."""
-    if kind in (FISHEYE, OMNIDIRECTIONAL):
-        return x * x + y * y + z * z > 0.0 and math.atan2(math.hypot(x, y), z) < lens[LIMIT]
-    if kind == EQUIRECTANGULAR:
-        return math.hypot(x, z) > MIN_POLAR_SHARE * abs(y)
-    return is_in_cone(lens, x, y, z)
-
-
-@compiled(inline="always")
-def is_in_cone(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Like :func:`is_projectable`, for a lens that looks ahead."""
+@compiled(part=True)
+def _is_in_cone(lens, x, y, z):  # type: ignore[no-untyped-def]
     return (z > MIN_DEPTH_M) & (x * x + y * y <= (lens[LIMIT] * z) ** 2)
 
 
-@compiled(inline="always")
-def subtract_columns(kind, lens, u, other):  # type: ignore[no-untyped-def]
-    """Difference of two columns u [px]; across the seam of a panorama the short way."""
-    if kind != EQUIRECTANGULAR:
-        return u - other
+@compiled(part=True)
+def _is_in_angle(lens, x, y, z):  # type: ignore[no-untyped-def]
+    return x * x + y * y + z * z > 0.0 and math.atan2(math.hypot(x, y), z) < lens[LIMIT]
+
+
+@compiled(part=True)
+def _is_off_the_poles(lens, x, y, z):  # type: ignore[no-untyped-def]
+    return math.hypot(x, z) > MIN_POLAR_SHARE * abs(y)
+
+
+@compiled(part=True)
+def _difference(lens, u, other):  # type: ignore[no-untyped-def]
+    return u - other
+
+
+@compiled(part=True)
+def _difference_across_seam(lens, u, other):  # type: ignore[no-untyped-def]
     turn = 2.0 * math.pi * lens[0]
     return u - other - turn * math.floor((u - other) / turn + 0.5)

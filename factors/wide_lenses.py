@@ -74,9 +74,9 @@ def equirectangular_rays(angles_rad: Array) -> Array:
     return np.column_stack([np.sin(right) * flat, np.sin(down), np.cos(right) * flat])
 
 
-@compiled()
+@compiled(part=True)
 def project_equirectangular(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Longitude and latitude times fx and fy, with the Jacobian, like ``project_one``."""
+    """Longitude and latitude times fx and fy, see ``lens_kernels.projection_of``."""
     fx, fy = lens[0], lens[1]
     n2 = x * x + y * y + z * z
     # At the poles there is no longitude: the derivative is held, so that it is finite.
@@ -95,7 +95,7 @@ def project_equirectangular(lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled()
+@compiled(part=True)
 def _distort(lens, a, b):  # type: ignore[no-untyped-def]
     """Distorted point of the plane, and its Jacobian (row major)."""
     k1, k2, p1, p2 = lens[5], lens[6], lens[7], lens[8]
@@ -112,9 +112,9 @@ def _distort(lens, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled()
+@compiled(part=True)
 def project_omnidirectional(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """The unified model with its Jacobian, like ``project_one``.
+    """The unified model with its Jacobian, see ``lens_kernels.projection_of``.
 
     Past the limiting field angle t0 the pixel moves on outwards from the limiting circle, in
     proportion to 1 + t - t0, so that it stays finite and continuous right to behind the camera.
@@ -144,7 +144,7 @@ def project_omnidirectional(lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled()
+@compiled(part=True)
 def _continue_omnidirectional(lens, x, y, z, theta):  # type: ignore[no-untyped-def]
     limit = lens[12]
     radius = math.sin(limit) / (math.cos(limit) + lens[4])

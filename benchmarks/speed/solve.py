@@ -1,8 +1,9 @@
 """Solve time: ours against SciPy (the paper's solver), Ceres, and separate GTSAM factors.
 
-    python -m benchmarks.speed.solve [--frames 10 100 1000] [--cameras 2 12] [--longest-s 300]
+    python -m benchmarks.speed.solve [--frames 10 100 1000] [--cameras 2 12] [--matches 1000]
+        [--longest-s 300]
 
-Simulated correspondences: N frames, 1000 matches each in every camera, 15 % outliers; a stereo
+Simulated correspondences: N frames, so many matches each in every camera, 15 % outliers; a stereo
 pair, or a ring of cameras. The column "what":
 
 * whole call: `calibgraph.solve(rig, table)` as users call it, with its defaults: preprocessing,
@@ -35,6 +36,7 @@ import numpy as np
 
 from benchmarks.speed.ceres import compile_program, solve_ceres, why_not
 from benchmarks.speed.solvers import (
+    MATCHES,
     Passes,
     Problem,
     solve_gtsam_cpp,
@@ -124,9 +126,9 @@ class Case:
     inliers: Problem
 
     @staticmethod
-    def draw(frames: int, cameras: int) -> Case:
+    def draw(frames: int, cameras: int, matches: int) -> Case:
         """The problem of a size."""
-        problem = Problem.draw(frames, cameras)
+        problem = Problem.draw(frames, cameras, matches)
         ours = solve_ours(problem)
         inliers = problem.without_outliers(ours.first)
         return Case((frames, cameras, len(problem.table)), problem, ours, inliers)
@@ -183,9 +185,9 @@ class Bench:
     ceres: Path | None
     rows: list[Timed] = field(default_factory=list)
 
-    def compare(self, frames: int, cameras: int) -> None:
+    def compare(self, frames: int, cameras: int, matches: int) -> None:
         """Time every solver on one problem."""
-        case = Case.draw(frames, cameras)
+        case = Case.draw(frames, cameras, matches)
         base: dict[str, float] = {}
         for solver in case.solvers(self.ceres):
             expected = self._expected(solver, case.size)
@@ -236,6 +238,7 @@ def main() -> None:
     )
     parser.add_argument("--frames", type=int, nargs="+", default=[10, 100, 1000])
     parser.add_argument("--cameras", type=int, nargs="+", default=[2, 12])
+    parser.add_argument("--matches", type=int, default=MATCHES)
     parser.add_argument("--longest-s", type=float, default=300.0)
     add_record_option(parser)
     options = parser.parse_args()
@@ -249,7 +252,7 @@ def main() -> None:
         bench = Bench(options.longest_s, None if missing else compile_program(Path(folder)))
         for cameras in options.cameras:
             for frames in options.frames:
-                bench.compare(frames, cameras)
+                bench.compare(frames, cameras, options.matches)
     table = Table("Solves of one objective", COLUMNS, tuple(row.cells() for row in bench.rows))
     publish("speed.solve", [table], record=options.record)
 

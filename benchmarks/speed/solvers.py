@@ -52,10 +52,10 @@ class Problem:
     rows: dict[str, Correspondences]
 
     @staticmethod
-    def draw(frames: int, cameras: int) -> Problem:
+    def draw(frames: int, cameras: int, matches: int = MATCHES) -> Problem:
         """A stereo pair, or a ring of cameras; the start is 0.5 deg and 5 cm off."""
         rig = rig_of("kitti") if cameras == 2 else ring(cameras)
-        table = simulate_correspondences(rig, frames=frames, matches=MATCHES, errors=ERRORS)
+        table = simulate_correspondences(rig, frames=frames, matches=matches, errors=ERRORS)
         guess = perturb(rig, rotation_deg=0.5, translation_m=0.05)
         return Problem(guess, table, {name: table.of_camera(name) for name in rig.cameras})
 

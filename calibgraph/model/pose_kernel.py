@@ -46,25 +46,24 @@ def exponential_times(twists, T, out):  # type: ignore[no-untyped-def]
         out[i, 2, 3] += w + second * c + third * (x * b - y * a)
 
 
-@compiled()
+@compiled(part=True)
 def _rotation_vector(R):  # type: ignore[no-untyped-def]
-    """The logarithm of a rotation matrix, by its quaternion."""
-    trace = R[0, 0] + R[1, 1] + R[2, 2]
-    largest = np.argmax(np.array([R[0, 0], R[1, 1], R[2, 2], trace]))
-    if largest == 3:  # noqa: PLR2004 - the trace
-        q = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace])
+    """The logarithm of the rotation of a (4, 4) transform, by its quaternion."""
+    q, trace = np.empty(4), R[0, 0] + R[1, 1] + R[2, 2]
+    i = 1 if R[1, 1] > R[0, 0] else 0
+    i = 2 if R[2, 2] > R[i, i] else i
+    if trace > R[i, i]:
+        q[0], q[1], q[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+        q[3] = 1.0 + trace
     else:
-        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
-        q = np.empty(4)
+        j, k = (i + 1) % 3, (i + 2) % 3
         q[i] = 1.0 - trace + 2.0 * R[i, i]
         q[j], q[k] = R[j, i] + R[i, j], R[k, i] + R[i, k]
         q[3] = R[k, j] - R[j, k]
-    if q[3] < 0.0:
-        q = -q
     sine = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
-    if sine == 0.0:
-        return np.zeros(3)
-    return q[:3] * (2.0 * math.atan2(sine, q[3]) / sine)
+    length = 2.0 * math.atan2(sine, abs(q[3])) / sine if sine > 0.0 else 0.0
+    length = -length if q[3] < 0.0 else length
+    return length * q[0], length * q[1], length * q[2]
 
 
 @compiled()
@@ -72,7 +71,7 @@ def logarithms(steps):  # type: ignore[no-untyped-def]
     """(f, 6) twists of (f, 4, 4) transforms."""
     out = np.empty((len(steps), 6))
     for i in range(len(steps)):
-        x, y, z = _rotation_vector(steps[i, :3, :3])
+        x, y, z = _rotation_vector(steps[i])
         u, v, w = steps[i, 0, 3], steps[i, 1, 3], steps[i, 2, 3]
         angle = math.sqrt(x * x + y * y + z * z)
         if angle < _SMALL_ANGLE:
@@ -81,12 +80,8 @@ def logarithms(steps):  # type: ignore[no-untyped-def]
             inward = (1.0 - angle / 2.0 / math.tan(angle / 2.0)) / (angle * angle)
         # The inverse of the left Jacobian: I - [w]x / 2 + inward [w]x^2.
         a, b, c = y * w - z * v, z * u - x * w, x * v - y * u
-        out[i] = (
-            x,
-            y,
-            z,
-            u - a / 2.0 + inward * (y * c - z * b),
-            v - b / 2.0 + inward * (z * a - x * c),
-            w - c / 2.0 + inward * (x * b - y * a),
-        )
+        out[i, 0], out[i, 1], out[i, 2] = x, y, z  # an assignment to out[i] compiles for seconds
+        out[i, 3] = u - a / 2.0 + inward * (y * c - z * b)
+        out[i, 4] = v - b / 2.0 + inward * (z * a - x * c)
+        out[i, 5] = w - c / 2.0 + inward * (x * b - y * a)
     return out

@@ -188,9 +188,9 @@ async def add_frames(id: TrackerId, request: Request, state: State, caller: Subm
     if media not in (*_LINES, ARROW):
         raise Problem(415, f"send {_LINES[0]}, a frame a line, or {ARROW}")
     body = await state.memory.read(request, caller.tenant, state.settings.frames_bytes)
-    answer = await ask_tracker(state, caller, id, "frames", body=body, media=media)
-    state.metrics.frames.inc(len(answer["updates"]))
-    return JSONResponse(answer)
+    taken = await ask_tracker(state, caller, id, "frames", body=body, media=media)
+    state.metrics.frames.inc(taken.count)
+    return Response(taken.body, media_type="application/json")
 
 
 @router.get("/{id}/state", responses=documented(404, 422, 429))

@@ -8,7 +8,7 @@ import shutil
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING, Any
 from calibgraph.child_process import Note, answer_requests, memory_limit
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.files import checked_model, write_text
-from calibgraph.service.tracker_request import ARROW, Refusal, TrackerRequest
+from calibgraph.service.tracker_request import ARROW, FramesTaken, Refusal, TrackerRequest
 from calibgraph.yaml_text import parse_yaml
 
 if TYPE_CHECKING:
     from calibgraph.tracking.durable import DurableCalibrator
     from calibgraph.tracking.history import History
     from calibgraph.tracking.streams import Item
+    from calibgraph.tracking.update import Update
 
 RIG, CONFIG, STATE, HISTORY, EVENTS = (
     "rig.yaml", "config.json", "state", "history.state", "events.jsonl",
@@ -148,39 +149,50 @@ def _open(folder: Path) -> _Open:
     config = config_from(json.loads((folder / CONFIG).read_text("utf-8")), "config")
     calibrator = DurableCalibrator(folder / STATE, load_rig(folder / RIG), config)
     tracker = _Open(folder, calibrator, History.load(folder / HISTORY))
-    if calibrator.repeated is not None:  # the process ended before it may have been noted
-        known = {json.dumps(event) for event in _events(folder)}
-        _note_events(folder, calibrator.repeated, known)
+    known = {json.dumps(event) for event in _events(folder)}
+    for update in calibrator.repeated:  # the process ended before they may have been noted
+        _note_events(folder, update, known)
     return tracker
 
 
-def _take_frames(tracker: _Open, request: TrackerRequest) -> dict[str, Any]:
-    """Take in frames; each update is on disk before it is in the answer."""
-    from calibgraph.tracking.streams import Refused
+def _take_frames(tracker: _Open, request: TrackerRequest) -> FramesTaken:
+    """Take in frames; one write brings them to disk before their updates are answered."""
     from calibgraph.tracking.update import json_line
 
-    updates: list[Any] = []
     refused: list[str] = []
-    known, last = 0, tracker.calibrator.tracker.frame
-    for item in _items(request, refused):
+    with tracker.calibrator.in_one_write():
+        updates, known = _take(tracker.calibrator, _items(request, refused), refused)
+    for update in updates:
+        tracker.history.add(update)
+        tracker.unsaved += 1
+        _note_events(tracker.folder, update, set())
+    if tracker.unsaved >= _SAVE_EVERY:
+        tracker.save_history()
+    lines = ", ".join(map(json_line, updates))
+    rest = json.dumps({"known": known, "refused": refused}).removeprefix("{")
+    return FramesTaken(len(updates), f'{{"updates": [{lines}], {rest}')
+
+
+def _take(
+    calibrator: DurableCalibrator, items: Iterable[Item], refused: list[str]
+) -> tuple[list[Update], int]:
+    """The updates of frames, and how many were known; what is refused is added to a list."""
+    from calibgraph.tracking.streams import Refused
+
+    updates: list[Update] = []
+    known, last = 0, calibrator.tracker.frame
+    for item in items:
         if isinstance(item, Refused):
             refused.append(item.message)
         elif last is not None and item.frame <= last:
             known += 1
         else:
             try:
-                update = tracker.calibrator.update(item.table, frame=item.frame)
+                updates.append(calibrator.update(item.table, frame=item.frame))
+                last = item.frame
             except CorrespondenceError as error:
                 refused.append(str(error))
-                continue
-            last = update.frame
-            tracker.history.add(update)
-            tracker.unsaved += 1
-            _note_events(tracker.folder, update, set())
-            updates.append(json.loads(json_line(update)))
-    if tracker.unsaved >= _SAVE_EVERY:
-        tracker.save_history()
-    return {"updates": updates, "known": known, "refused": refused}
+    return updates, known
 
 
 def _items(request: TrackerRequest, refused: list[str]) -> Iterator[Item]:
@@ -198,7 +210,7 @@ def _items(request: TrackerRequest, refused: list[str]) -> Iterator[Item]:
         refused.append(str(error))
 
 
-def _note_events(folder: Path, update: Any, known: set[str]) -> None:
+def _note_events(folder: Path, update: Update, known: set[str]) -> None:
     """Add an update's events to the list."""
     from calibgraph.tracking.update import json_line
 

@@ -24,3 +24,11 @@ class Refusal:
 
     status: int
     detail: str
+
+
+@dataclass(frozen=True)
+class FramesTaken:
+    """The answer to frames: how many were taken in, and the JSON of the updates, which is sent."""
+
+    count: int
+    body: str

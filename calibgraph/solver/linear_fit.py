@@ -147,6 +147,9 @@ def _linearize(camera: Camera, block: ProjectionBlock, fields_px: Array) -> Arra
     columns[-1] = camera.lens.subtract(block.pixels_px, pixels.T).T
     if block.sqrt_information is not None:
         s00, s01, s11 = block.sqrt_information.T
+        if not s01.any() and np.array_equal(s00, s11):
+            columns *= s00
+            return columns
         columns[:, 0] = s00 * columns[:, 0] + s01 * columns[:, 1]
         columns[:, 1] *= s11
     return columns

@@ -76,13 +76,15 @@ def _spreads(*, shared: bool) -> Any:
     return run
 
 
-@compiled()
+@compiled(part=True)
 def _spread(values, raw, start, cut, rounds):  # type: ignore[no-untyped-def]
     bits: Any = np.int64(0)
     for least, some in _BITS:
         if len(values) >= least:
             bits = max(bits, some)
-    edges = np.zeros((((_LARGEST - _LEAST) << bits) + 3), dtype=np.int64)
+    edges = np.empty((((_LARGEST - _LEAST) << bits) + 3), dtype=np.int64)
+    for b in range(len(edges)):  # np.zeros compiles slowly
+        edges[b] = 0
     work = np.empty(len(values))
     _fill_bins(values, raw, bits, work, edges)
     spread = start[1] * _quantile_below(work, edges, bits, math.inf, start[0])
@@ -95,7 +97,7 @@ def _spread(values, raw, start, cut, rounds):  # type: ignore[no-untyped-def]
     return spread
 
 
-@compiled(inline="always")
+@compiled(part=True)
 def _fill_bins(values, raw, bits, work, edges):  # type: ignore[no-untyped-def]
     """Put the finite values into ``work`` by bins, and where these begin into ``edges``."""
     first, last = _LEAST << bits, (_LARGEST << bits) + 1
@@ -115,7 +117,7 @@ def _fill_bins(values, raw, bits, work, edges):  # type: ignore[no-untyped-def]
             place[b] += 1
 
 
-@compiled()
+@compiled(part=True)
 def _quantile_below(work, edges, bits, limit, share):  # type: ignore[no-untyped-def]
     """The quantile of the values up to a limit, interpolated; NaN without any."""
     last = edges[-1] - 1
@@ -142,7 +144,7 @@ def _quantile_below(work, edges, bits, limit, share):  # type: ignore[no-untyped
     return below + (place - int(place)) * (above - below)
 
 
-@compiled(inline="always")
+@compiled(part=True)
 def _sort(values):  # type: ignore[no-untyped-def]
     """Sort in place, by Shell's method; numpy's own takes ten times longer to compile."""
     gap = len(values)

@@ -19,6 +19,7 @@ from calibgraph.model.geometry import transform, twists_between
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
+from calibgraph.solver.geodesic_median import geodesic_median
 from calibgraph.solver.grid import frame_edges
 from calibgraph.solver.pnp import (
     frame_pose,
@@ -29,8 +30,6 @@ from calibgraph.solver.pnp import (
 )
 from factors import ProjectionBlock, to_runs
 
-_MEDOID_OF = 500  # rotations at most: it is a start of the median, and its cost is quadratic
-_MEDIAN_STEPS, _CONVERGED_RAD = 100, 1e-12  # far below any rotation that matters
 _OUTLIER = 6.0  # median distances, 9 sigma of a Gaussian in three dimensions
 COMMON_SAMPLE = 1000
 """Matches of all frames, for a pose that single frames start from."""
@@ -239,42 +238,6 @@ def median_pose(T_camera_lidar: Array) -> Array:
 def _parts(T_camera_lidar: Array) -> tuple[Rotation, Array]:
     """The rotations and (f, 3) translations of (f, 4, 4)."""
     return Rotation.from_matrix(T_camera_lidar[:, :3, :3]), T_camera_lidar[:, :3, 3]
-
-
-def geodesic_median(rotations: Rotation) -> Rotation:
-    """Rotation with the least sum of angles to the given ones (Weiszfeld on SO(3))."""
-    quaternions = rotations.as_quat()
-    median = quaternions[_medoid(rotations)]
-    for _ in range(_MEDIAN_STEPS):
-        turns = quaternions @ _right_factor(median * (-1.0, -1.0, -1.0, 1.0))  # q * median^-1
-        sines, cosines = np.linalg.norm(turns[:, :3], axis=1), turns[:, 3]
-        angles = 2.0 * np.arctan2(sines, np.abs(cosines))
-        weights = 1.0 / np.maximum(angles, _CONVERGED_RAD)
-        per_sine = np.where(sines > 0, angles / np.where(sines > 0, sines, 1.0), 2.0)
-        step = (weights * per_sine * np.copysign(1.0, cosines)) @ turns[:, :3] / weights.sum()
-        length = float(np.linalg.norm(step))
-        half = 0.5 * np.sinc(length / (2 * np.pi))  # sin(length / 2) / length
-        median = np.array([*(half * step), np.cos(length / 2)]) @ _right_factor(median)
-        if length < _CONVERGED_RAD:
-            break
-    return Rotation.from_quat(median)
-
-
-def _right_factor(quaternion: Array) -> Array:
-    """(4, 4) M with p q = p M, of a quaternion q, x y z w."""
-    x, y, z, w = quaternion
-    return np.array([[w, -z, y, -x], [z, w, -x, -y], [-y, x, w, -z], [x, y, z, w]])
-
-
-def _medoid(rotations: Rotation) -> int:
-    """Index of the rotation with the least sum of angles to the others; of many, to a selection."""
-    quaternions = rotations.as_quat()
-    places = np.arange(len(quaternions))
-    if len(places) > _MEDOID_OF:
-        places = np.linspace(0, len(quaternions) - 1, _MEDOID_OF).round().astype(int)
-    selection = quaternions[places]
-    cosines = np.abs(selection @ selection.T).clip(max=1.0)
-    return int(places[np.argmin(np.arccos(cosines).sum(axis=0))])
 
 
 def half_sample_mode(samples: Sequence[float] | Array) -> float:

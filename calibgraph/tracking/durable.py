@@ -36,8 +36,8 @@ class DurableCalibrator:
         tracker: the calibrator that is kept on disk.
         damages: one line for each damaged part of the state that was found and is not used.
         resumed: whether there was a state to continue from.
-        repeated: after a crash, the last update before it, which may not have returned then; None
-            after a :meth:`close`.
+        repeated: after a crash, the updates since a snapshot, of which those of the last write may
+            not have returned then; none after a :meth:`close`.
 
     Args:
         folder: where the state is kept; one process at a time.
@@ -71,11 +71,13 @@ class DurableCalibrator:
                 with _of_this_version(Path(folder)):
                     self.tracker = IncrementalCalibrator.from_bytes(recovered.snapshot)
                 _require_same(Path(folder), self.tracker, rig, config or Config())
-            self.repeated: Update | None = None
+            self._held: list[bytes] | None = None
+            repeated: list[Update] = []
             for record in recovered.inputs:
                 with _of_this_version(Path(folder)):
                     frame, table = decode(record, "input")
-                    self.repeated = self.tracker.update(table, frame=frame)
+                    repeated.append(self.tracker.update(table, frame=frame))
+            self.repeated = tuple(repeated)
         except BaseException:
             self._database.close()
             raise
@@ -92,11 +94,30 @@ class DurableCalibrator:
         """
         table = with_metadata_per_frame(with_place(table, place))
         record = _record(table, frame)
-        self._continue_snapshot()  # before this update: the journal always holds the last one
-        update = self.tracker.update(table, frame=frame)
-        self._database.append(record)
-        self._pending += 1
-        return update
+        if self._held is not None:
+            update = self.tracker.update(table, frame=frame)
+            self._held.append(record)
+            return update
+        with self.in_one_write():
+            return self.update(table, frame=frame)
+
+    @contextmanager
+    def in_one_write(self) -> Iterator[None]:
+        """Updates inside are on disk when this has ended, and not before: by one write for all.
+
+        Raises:
+            OSError: if they cannot be written; then close this, and make a new one.
+        """
+        self._continue_snapshot()  # before the updates: the journal always holds the last one
+        held: list[bytes] = []
+        self._held = held
+        try:
+            yield
+        finally:
+            self._held = None
+            if held:
+                self._database.append(*held)
+                self._pending += len(held)
 
     def _continue_snapshot(self) -> None:
         """Encode the state when it is due, write it with the next update: neither waits long."""

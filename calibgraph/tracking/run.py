@@ -48,8 +48,8 @@ class Run:
         """
         count, known = 0, self.calibrator.tracker.frame if self.calibrator.resumed else None
         try:
-            if self.calibrator.repeated is not None:  # its line may not have been printed
-                self._report(self.calibrator.repeated)
+            for update in self.calibrator.repeated[-1:]:  # its line may not have been printed
+                self._report(update)
             for item in items:
                 if isinstance(item, Refused):
                     self._refuse(item.message)

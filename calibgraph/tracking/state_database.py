@@ -76,18 +76,21 @@ class StateDatabase:
             self.close()
             raise
 
-    def append(self, content: bytes) -> None:
-        """Add an input to the journal; it is durable when this returns.
+    def append(self, *contents: bytes) -> None:
+        """Add inputs to the journal; they are durable when this returns, all or none.
 
         Raises:
-            OSError: if it cannot be written; the earlier inputs are safe.
+            OSError: if they cannot be written; the earlier inputs are safe.
         """
-        number = self._number + 1
+        rows = [
+            (number, content, checksum(number, content))
+            for number, content in enumerate(contents, self._number + 1)
+        ]
+        last = self._number + len(rows)
         with self._writing() as connection:
-            row = number, content, checksum(number, content)
-            connection.execute("INSERT INTO journal VALUES (?, ?, ?)", row)
-            connection.execute("UPDATE status SET number = ?", (number,))
-        self._number = number
+            connection.executemany("INSERT INTO journal VALUES (?, ?, ?)", rows)
+            connection.execute("UPDATE status SET number = ?", (last,))
+        self._number = last
 
     @property
     def number(self) -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 from calibgraph.model.threshold import Threshold, in_unit, is_reachable
 from calibgraph.model.verdict import TOLERANCE
@@ -222,6 +223,7 @@ _ROWS = {row.key: row for row in THRESHOLDS}
 _LIMITS = {row.key: row for row in LIMITS}
 
 
+@lru_cache
 def threshold(key: str, tolerance: tuple[float, float] = TOLERANCE) -> Threshold:
     """The row of a key, with the limits for a tolerance [deg, cm]."""
     return _ROWS[key].at(tolerance)

@@ -19,13 +19,13 @@ from calibgraph import (
 from calibgraph.model.geometry import pose_difference
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver import stage1
+from calibgraph.solver.geodesic_median import geodesic_median
 from calibgraph.solver.pnp import frame_pose, normalized
 from calibgraph.solver.stage1 import (
     T_hat,
     aggregate,
     are_near_median,
     estimate_stage1,
-    geodesic_median,
     half_sample_mode,
 )
 

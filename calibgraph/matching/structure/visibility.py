@@ -15,9 +15,9 @@ from factors.compiled import compiled
 from factors.lens_kernels import (
     EQUIRECTANGULAR,
     PINHOLE,
-    is_projectable,
-    project_one,
-    subtract_columns,
+    difference_of,
+    domain_of,
+    projection_of,
 )
 
 Rows = NDArray[np.intp]
@@ -77,6 +77,8 @@ def find_places(
 
 @cache
 def _find_places(kind: int) -> Any:
+    project, subtract = projection_of(kind), difference_of(kind)
+
     @compiled()
     def run(lens, T, viewpoint, scale, rays_m, places):  # type: ignore[no-untyped-def]
         for w in range(rays_m.shape[0]):
@@ -86,12 +88,12 @@ def _find_places(kind: int) -> Any:
                 x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
                 y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
                 z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-                projection = project_one(kind, lens, x, y, z)
+                projection = project(lens, x, y, z)
                 u = projection[0]
                 if p == 0:
                     centre = u
                 elif kind == EQUIRECTANGULAR:  # a window across the seam of a panorama stays whole
-                    u = centre + subtract_columns(kind, lens, u, centre)
+                    u = centre + subtract(lens, u, centre)
                 places[w, p, 0] = round((u + 0.5) * scale[0] - 0.5)
                 places[w, p, 1] = round((projection[1] + 0.5) * scale[1] - 0.5)
 
@@ -112,6 +114,8 @@ def _least_cosine(camera: Camera) -> float:
 
 @cache
 def _find_in_view(kind: int) -> Any:
+    project, is_inside = projection_of(kind), domain_of(kind)
+
     @compiled()
     def run(lens, T, points, width, height, least_cosine, rows, views):  # type: ignore[no-untyped-def]
         count = 0
@@ -123,9 +127,9 @@ def _find_in_view(kind: int) -> Any:
             squared = x * x + y * y + z * z
             if least_cosine > 0 and (z <= 0 or z * z < least_cosine * least_cosine * squared):
                 continue
-            if not is_projectable(kind, lens, x, y, z):
+            if not is_inside(lens, x, y, z):
                 continue
-            projection = project_one(kind, lens, x, y, z)
+            projection = project(lens, x, y, z)
             u, v = projection[0] + 0.5, projection[1] + 0.5
             if u < 0 or v < 0 or u >= width or v >= height:
                 continue

@@ -56,7 +56,7 @@ def fill_features(cloud, members, counts, front, basis, out):  # type: ignore[no
         out[w, 8], out[w, 11] = _beside_trend(inverse, u, v, n), _beside_trend(shade, u, v, n)
 
 
-@compiled()
+@compiled(part=True)
 def _centre(values, n):  # type: ignore[no-untyped-def]
     """Subtract the mean of the first n; their standard deviation."""
     mean, power = 0.0, 0.0
@@ -68,7 +68,7 @@ def _centre(values, n):  # type: ignore[no-untyped-def]
     return math.sqrt(power / n)
 
 
-@compiled()
+@compiled(part=True)
 def _beside_trend(values, u, v, n):  # type: ignore[no-untyped-def]
     """The share of the variation of centred values that no linear function of u and v follows."""
     uu, uv, vv, along_u, along_v, power = 1e-12, 0.0, 1e-12, 0.0, 0.0, 0.0
@@ -81,7 +81,7 @@ def _beside_trend(values, u, v, n):  # type: ignore[no-untyped-def]
     return 1.0 - min(followed / max(power, 1e-12), 1.0)
 
 
-@compiled()
+@compiled(part=True)
 def _in_two_classes(values, n, ordered):  # type: ignore[no-untyped-def]
     """The largest share of the variation that lies between two classes (Otsu); sorts the values."""
     total, squares = 0.0, 0.0

@@ -23,8 +23,9 @@ def describe_windows(cloud, members, counts, keep_linear, moved_m, front, basis,
     rays_m, intensity_rank = cloud
     size = members.shape[1]
     inverse, intensity, ordered = np.empty(size), np.empty(size), np.empty(size)
-    trend_u, trend_v = np.zeros(size), np.zeros(size)
-    directions = np.empty((size, 3))
+    trend_u, trend_v, directions = np.empty(size), np.empty(size), np.empty((size, 3))
+    for i in range(size):
+        trend_u[i] = trend_v[i] = 0.0
     for w in range(len(members)):
         n = counts[w]
         for i in range(size):
@@ -57,7 +58,7 @@ def describe_windows(cloud, members, counts, keep_linear, moved_m, front, basis,
         reliability[w] = max(depth, shade)
 
 
-@compiled()
+@compiled(part=True)
 def _find_silhouette(inverse, n, ordered):  # type: ignore[no-untyped-def]
     """The inverse range of the near side of a window's silhouette; 0 if it has none.
 
@@ -78,7 +79,7 @@ def _find_silhouette(inverse, n, ordered):  # type: ignore[no-untyped-def]
     return near if wide and near > SILHOUETTE_RATIO * far else 0.0
 
 
-@compiled()
+@compiled(part=True)
 def _fill_trend(directions, n, trend_u, trend_v):  # type: ignore[no-untyped-def]
     """Fill an orthonormal basis of the linear functions of direction in a window.
 
@@ -111,7 +112,7 @@ def _fill_trend(directions, n, trend_u, trend_v):  # type: ignore[no-untyped-def
         trend_u[i], trend_v[i] = (cos * v - sin * u) * of_minor, (cos * u + sin * v) * of_major
 
 
-@compiled()
+@compiled(part=True)
 def _normalize(values, n, trend_u, trend_v, other, by_other, noise):  # type: ignore[no-untyped-def]
     """Centre and normalise values in place, orthogonal to the trend and to another column.
 
