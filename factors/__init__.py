@@ -17,6 +17,7 @@ from factors.free_lens import (
     FreeLens,
     FreeLensBlock,
     free_lens_factor,
+    free_lens_sums_factor,
     linear_factor,
 )
 from factors.lens import Lens, LensModel
@@ -64,6 +65,7 @@ __all__ = [
     "epipolar_residual",
     "displace",
     "free_lens_factor",
+    "free_lens_sums_factor",
     "linear_factor",
     "pair_block_factor",
     "pair_chain",

@@ -261,6 +261,19 @@ def free_lens_factor(keys: Sequence[int], block: FreeLensBlock) -> gtsam.CustomF
             these displaces the points.
         block: of the camera.
     """
+    return free_lens_sums_factor(keys, block.sums, len(block.lens))
+
+
+def free_lens_sums_factor(
+    keys: Sequence[int], sums: Callable[[Array, Array], BlockSums], parameters: int
+) -> gtsam.CustomFactor:
+    """The same of any quadratic.
+
+    Args:
+        keys: as there.
+        sums: of H, b and c at a (4, 4) T_camera_lidar and the (k,) values of the lens.
+        parameters: k.
+    """
 
     def error(
         factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
@@ -268,7 +281,7 @@ def free_lens_factor(keys: Sequence[int], block: FreeLensBlock) -> gtsam.CustomF
         *clouds, pose = (values.atPose3(key) for key in keys[:-1])
         seen = clouds[0].between(pose) if clouds else pose
         T_camera_cloud = seen.inverse().matrix()
-        found, jacobian = square_root(block.sums(T_camera_cloud, values.atVector(keys[-1])))
+        found, jacobian = square_root(sums(T_camera_cloud, values.atVector(keys[-1])))
         if jacobians is not None:
             parts = [jacobian[:, :6], jacobian[:, 6:]]
             if clouds:
@@ -277,7 +290,7 @@ def free_lens_factor(keys: Sequence[int], block: FreeLensBlock) -> gtsam.CustomF
                 jacobians[number] = np.asfortranarray(part)
         return found
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7 + len(block.lens)), list(keys), error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7 + parameters), list(keys), error)
 
 
 def linear_factor(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import checked_arguments, config_from, matcher_from
+from calibgraph.cli.arguments import bag_options_from, checked_arguments, config_from, matcher_from
 from calibgraph.cli.terminal import print_plain, terminal
 
 if TYPE_CHECKING:
@@ -41,6 +41,16 @@ def track(
         str | None,
         typer.Option(metavar="NAME", help="Match the frames of a dataset: structure or cmrnext."),
     ] = None,
+    estimate: Annotated[
+        str | None,
+        typer.Option(
+            metavar="offset",
+            help="Follow the time offset of each camera: how long after its points an image is "
+            "taken. The motion of the LiDAR must be known.",
+        ),
+    ] = None,
+    interval_s: options.IntervalOption = None,
+    motion: options.MotionOption = None,
     config: options.ConfigOption = None,
     preset: options.PresetOption = None,
     seed: options.ConfigSeedOption = None,
@@ -61,13 +71,22 @@ def track(
     from calibgraph.cli.tables import print_result
     from calibgraph.io.rigs import load_rig
     from calibgraph.tracking.command import Tracking, track
+    from calibgraph.tracking.offsets import require_offset_alone
 
     with checked_arguments():
-        settings = config_from(config, preset, seed=seed)
+        settings = config_from(config, preset, seed=seed, estimate=estimate)
+        require_offset_alone(settings)
         chosen = _tracking_matcher(matcher, weights, source, seed=settings.seed, device=device)
     console = terminal()
     wanted = Tracking(
-        rig=load_rig(rig), config=settings, out=out, every=every, follow=follow, matcher=chosen
+        rig=load_rig(rig),
+        config=settings,
+        out=out,
+        every=every,
+        follow=follow,
+        matcher=chosen,
+        interval_s=interval_s,
+        bag=bag_options_from(None, motion=motion),
     )
     result, written = track(wanted, source, notify=lambda text: print_plain(console, text))
     print_result(console, result, written)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -11,7 +12,13 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import to_T_lidar_camera
-from factors import BlockSums, PairBlock, ProjectionBlock, pair_block_factor
+from factors import (
+    BlockSums,
+    PairBlock,
+    ProjectionBlock,
+    free_lens_sums_factor,
+    pair_block_factor,
+)
 
 Numbers = NDArray[np.int64]
 
@@ -117,6 +124,50 @@ class QuadraticByPlace:
             )
             for row in map(int, np.flatnonzero(self.places == place))
         ]
+
+
+@dataclass(frozen=True, eq=False)
+class LateQuadraticByPlace:
+    """The same of a camera whose time offset is a variable.
+
+    Attributes:
+        places: as there.
+        T_lidar_camera: as there.
+        offsets: (p,) at the minima, in the units of the variable.
+        information: (p, 7, 7) of poses and offset there.
+        key: of the variable.
+    """
+
+    places: Numbers
+    T_lidar_camera: Sequence[gtsam.Pose3]
+    offsets: Array
+    information: Array
+    key: int
+
+    def with_variance(self, factor: float) -> LateQuadraticByPlace:
+        """Multiply the variance of the matches."""
+        return replace(self, information=self.information / factor)
+
+    def sums(self, T_camera_cloud: Array, values: Array) -> list[BlockSums]:
+        """H, b and c of every place with correspondences, by pose and offset.
+
+        Args:
+            T_camera_cloud: (p, 4, 4) of these places.
+            values: (1,) the offset.
+        """
+        return [self._sums(row, T, values) for row, T in enumerate(T_camera_cloud)]
+
+    def _sums(self, row: int, T_camera_cloud: Array, values: Array) -> BlockSums:
+        step = self.T_lidar_camera[row].localCoordinates(to_T_lidar_camera(T_camera_cloud))
+        step = np.append(step, values - self.offsets[row])
+        gradient = self.information[row] @ step
+        return BlockSums(self.information[row], gradient, step @ gradient)
+
+    def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
+        """The quadratic of one place, on the variables of these keys and the offset."""
+        rows = map(int, np.flatnonzero(self.places == place))
+        keys = cloud, matched, self.key
+        return [free_lens_sums_factor(keys, partial(self._sums, row), 1) for row in rows]
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,6 +30,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
     BlockByPlace,
+    LateQuadraticByPlace,
     PairByPlace,
     QuadraticByPlace,
     SummarizedByPlace,
@@ -58,6 +59,8 @@ from factors import (
     robust_noise,
 )
 
+Data = BlockByPlace | QuadraticByPlace | LateQuadraticByPlace | SummarizedByPlace | FreeLensByPlace
+
 
 @dataclass(frozen=True, eq=False)
 class LatentPoseModel:
@@ -77,7 +80,7 @@ class LatentPoseModel:
     """
 
     cameras: tuple[str, ...]
-    blocks: Mapping[str, BlockByPlace | QuadraticByPlace | SummarizedByPlace | FreeLensByPlace]
+    blocks: Mapping[str, Data]
     pairs: Sequence[PairByPlace]
     pose_graph: gtsam.NonlinearFactorGraph
     components: VarianceComponents
@@ -139,8 +142,12 @@ class LatentPoseModel:
     @cached_property
     def shared_graph(self) -> gtsam.NonlinearFactorGraph:
         """The factors of what all places share: of errors, pose graph, lenses."""
-        lenses = lens_graph(self.lenses, is_distorted=self.is_distorted)
-        return join(self.error_graph, self.pose_graph, lenses)
+        return join(self.error_graph, self.pose_graph, self.lens_graph)
+
+    @cached_property
+    def lens_graph(self) -> gtsam.NonlinearFactorGraph:
+        """Those of lenses."""
+        return lens_graph(self.lenses, is_distorted=self.is_distorted)
 
     @cached_property
     def error_graph(self) -> gtsam.NonlinearFactorGraph:

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import PairByPlace
+from calibgraph.graph.by_place import LateQuadraticByPlace, PairByPlace
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, paired_key
@@ -56,7 +56,7 @@ class LinearData:
         places, T_camera_cloud = block.places, np.tile(np.eye(4), (len(clouds), 1, 1))
         keys = [matched_at_key(int(place), number) for place in places]
         T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
-        if isinstance(block, FreeLensByPlace):
+        if isinstance(block, FreeLensByPlace | LateQuadraticByPlace):
             self._add_free_lens(block, keys, values, T_camera_cloud[places])
             return
         sums = block.sums(T_camera_cloud)
@@ -74,7 +74,11 @@ class LinearData:
             )  # fmt: skip
 
     def _add_free_lens(
-        self, block: FreeLensByPlace, keys: list[int], values: gtsam.Values, T_camera_cloud: Array
+        self,
+        block: FreeLensByPlace | LateQuadraticByPlace,
+        keys: list[int],
+        values: gtsam.Values,
+        T_camera_cloud: Array,
     ) -> None:
         """The same with a free lens, on o_p^-1 a_cp and s_c."""
         sums = block.sums(T_camera_cloud, values.atVector(block.key))

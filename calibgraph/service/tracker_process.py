@@ -130,11 +130,12 @@ def _create(request: TrackerRequest) -> None:
     from calibgraph.files import read_text
     from calibgraph.model.config import config_from
     from calibgraph.model.rig import Rig
+    from calibgraph.tracking.offsets import require_offset_alone
 
     folder = Path(request.folder)
     text = request.body.decode("utf-8")
     checked_model(Rig, parse_yaml(text, RIG), RIG)
-    config_from(json.loads(request.config), "config")
+    require_offset_alone(config_from(json.loads(request.config), "config"))
     write_text(folder / CONFIG, request.config)
     write_text(folder / RIG, text)
     read_text(folder / RIG)

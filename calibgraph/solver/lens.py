@@ -69,16 +69,40 @@ def lens_term(
         findings: the matcher's error.
     """
     by_place = FreeLensByPlace(placed, lens.free, 0)
-    T, values = _minimum(by_place, T_camera_lidar, lens)
-    hessians = np.array([one.hessian for one in by_place.sums(T, values)])
+    at = _minimum(by_place, T_camera_lidar, lens)
+    hessians = np.array([one.hessian for one in by_place.sums(*at)])
+    scatter = _frame_scatter(FreeLensBlock(placed.block, lens.free), placed, at)
+    counts = len(placed.block), len(placed.count_of_frame)
+    of_poses = within.at_place(findings.place_variance)[placed.places]
+    return lens_term_of(lens, (hessians, scatter, of_poses), counts, within, findings=findings)
+
+
+def lens_term_of(
+    lens: LensVariable,
+    shown: tuple[Array, Array, Array],
+    counts: tuple[float, float],
+    within: WithinPlace,
+    *,
+    findings: MatcherFindings,
+) -> LensTerm:
+    """The same from sums over matches.
+
+    Args:
+        lens: of the camera.
+        shown: (p, 6 + k, 6 + k) Hessians of independent matches at each place; (6 + k, 6 + k) sum
+            of the outer products of the gradients of frames; (p, 6, 6) covariance of a_cp about
+            m_c.
+        counts: of matches and of frames.
+        within: what its matches of one place share.
+        findings: the matcher's error.
+    """
+    hessians, scatter, of_poses = shown
     hessian = hessians.sum(axis=0) + weak_information(lens)
     covariance = np.linalg.inv(hessian)
-    scatter = _frame_scatter(FreeLensBlock(placed.block, lens.free), placed, (T, values), hessian)
-    matches = len(placed.block)
-    of_matches = MATCH_SHARE * matches if any(findings.systematic_sigmas) else 0.0
+    scatter = _allow_for_few_frames(scatter, hessian, *counts)
+    of_matches = MATCH_SHARE * counts[0] if any(findings.systematic_sigmas) else 0.0
     shared = within.efficiency * max(findings.place_variance * within.alike, of_matches)
     whole = within.efficiency**2 * (covariance @ scatter @ covariance) + shared * covariance
-    of_poses = within.at_place(findings.place_variance)[placed.places]
     excess = _positive((whole - _in_graph(hessians, of_poses, within.least, lens))[6:, 6:])
     compensating = np.asarray(-np.linalg.solve(hessian[:6, :6], hessian[:6, 6:]))
     return LensTerm(lens, excess, np.zeros((len(excess), 0)), compensating)
@@ -149,18 +173,21 @@ def _minimum(
     return np.tile(to_T_camera_lidar(pose), each), values
 
 
-def _frame_scatter(
-    free: FreeLensBlock, placed: BlockByPlace, at: tuple[Array, Array], hessian: Array
-) -> Array:
-    """(6 + k, 6 + k) sum of the outer products of the gradients of frames; few have usual ones."""
+def _frame_scatter(free: FreeLensBlock, placed: BlockByPlace, at: tuple[Array, Array]) -> Array:
+    """(6 + k, 6 + k) sum of the outer products of the gradients of frames."""
     counts = placed.count_of_frame[np.argsort(placed.place_of_frame, kind="stable")]
     columns = free.columns(at[0][0], at[1])
     pulls = (columns[:-1] * (free.loss(columns)[1] * columns[-1])).sum(axis=1)
     gradients = np.add.reduceat(pulls, np.cumsum(counts) - counts, axis=1).T
-    known, frames = error_components(), len(counts)
+    return np.asarray(gradients.T @ gradients)
+
+
+def _allow_for_few_frames(scatter: Array, hessian: Array, matches: float, frames: float) -> Array:
+    """The scatter, with some frames that scatter as usual."""
+    known = error_components()
     prior = known.prior_frames / known.pseudo_frames
-    usual = 1 + known.frame_correlation * (counts.mean() - 1)
-    own = gradients.T @ gradients + prior * usual * hessian / frames
+    usual = 1 + known.frame_correlation * (matches / frames - 1)
+    own = scatter + prior * usual * hessian / frames
     return np.asarray(own * frames / (prior + frames - 1))
 
 
@@ -191,14 +218,18 @@ def lens_estimates(fit: LatentPoseFit) -> dict[str, tuple[LensEstimate, ...]]:
     model, found = fit.linear.model, {}
     for number, term in model.lenses.items():
         own = [lens_key(number), model.reported_keys[number]]
-        covariance = fit.linear.covariance_of(own)
-        sigmas = np.sqrt(np.diag(covariance))
         values = fit.linear.values.atVector(own[0])
-        with_pose = np.abs(covariance / np.outer(sigmas, sigmas))[:, len(values) :]
-        found[model.cameras[number]] = tuple(
-            _estimate(term.variable, row, values, (sigmas, with_pose)) for row in range(len(values))
-        )
+        estimates = estimates_of(term.variable, values, fit.linear.covariance_of(own))
+        found[model.cameras[number]] = estimates
     return found
+
+
+def estimates_of(lens: LensVariable, values: Array, covariance: Array) -> tuple[LensEstimate, ...]:
+    """The parameters of a lens, by its (k,) values and their (k + 6, k + 6) joint with the pose."""
+    sigmas = np.sqrt(np.diag(covariance))
+    with_pose = np.abs(covariance / np.outer(sigmas, sigmas))[:, len(values) :]
+    rows = range(len(values))
+    return tuple(_estimate(lens, row, values, (sigmas, with_pose)) for row in rows)
 
 
 def _estimate(

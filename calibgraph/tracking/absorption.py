@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
@@ -48,7 +49,7 @@ def blocks_by_camera(state: State, table: Correspondences) -> dict[int, CameraBl
     if not len(table):
         return {}
     kept = preprocess(rig_at(state, state.T_lidar_camera), table, state.config)
-    blocks = camera_blocks(state.rig, kept.table, state.config)
+    blocks = camera_blocks(state.rig_in_time, kept.table, state.config)
     return {state.names.index(name): block for name, block in blocks.items()}
 
 
@@ -60,7 +61,11 @@ def at_minimum(state: State, closed: ClosedPlaces, more: Mapping[int, Sums] | No
         closed: its closed epochs.
         more: sums of further matches, per camera.
     """
-    poses = minimum(closed.equation_5(state, more), state.T_lidar_camera)
+    return with_poses(state, minimum(closed.equation_5(state, more), state.T_lidar_camera))
+
+
+def with_poses(state: State, poses: tuple[gtsam.Pose3, ...]) -> State:
+    """The state with other estimates in its open epoch."""
     last = replace(state.epochs[-1], T_lidar_camera=poses)
     return replace(state, epochs=(*state.epochs[:-1], last))
 
@@ -110,10 +115,11 @@ def agrees_at_its_place(state: State, closed: ClosedPlaces, camera: int, own: Ou
     one, frame = state.cameras[camera], state.live_frames[-1]
     if one.summary.walk or state.config.preset != "auto" or not states_places(state):
         return False
-    gated = Gated.at(own.T_lidar_camera, own.raw, one.scale, state.references[camera])
+    even = state.offsets is not None
+    gated = Gated.at(own.T_lidar_camera, own.raw, one.scale, state.references[camera], even=even)
     if gated is None:
         return False
-    state = with_open_frame(state, frame.add(camera, own.raw, gated))
+    state = with_open_frame(state, frame.add(camera, own.raw, gated, state.offsets))
     window, _ = closed.with_open_epoch(state, None)
     place = window.places.index(frame.place)
     displaced = Linearization.at(window.model, window.values).distances[place, [0, 1 + camera]]
@@ -161,10 +167,11 @@ def absorb(
     frame, used = state.epochs[-1].frames[-1], dict[int, int]()
     for camera, block in blocks.items():
         scale, reference = state.cameras[camera].scale, state.references[camera]
-        gated = Gated.at(state.T_lidar_camera[camera], block, scale, reference)
+        pose, even = state.T_lidar_camera[camera], state.offsets is not None
+        gated = Gated.at(pose, block, scale, reference, even=even)
         if gated is None:
             continue
-        frame = frame.add(camera, block, gated)
+        frame = frame.add(camera, block, gated, state.offsets)
         state = _count_absorbed(state, camera, gated)
         used[camera] = gated.used
     state = add_to_totals(with_open_frame(state, frame), frame)

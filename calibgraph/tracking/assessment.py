@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.graph.variables import lens_key
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
+from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES, sigmas_of_hessian
+from calibgraph.solver.lens import estimates_of
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.epoch_sums import estimates_of_halves, in_its_half
 from calibgraph.tracking.noise import median
+from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.tracking.sums import Sums, step_between
@@ -37,12 +41,22 @@ class Assessment:
             with too few frames.
         verdicts: per camera.
         window: the graph at its optimum, until the next frame.
+        lens: per camera whose time offset is estimated, its estimate.
     """
 
     T_lidar_camera: tuple[gtsam.Pose3, ...]
     joint_covariance: Array
     verdicts: dict[str, Verdict]
     window: Window
+    lens: dict[str, tuple[LensEstimate, ...]]
+
+    def offsets(self, state: State) -> Offsets | None:
+        """The time offsets with those of the graph; None if they are not estimated."""
+        offsets = state.offsets
+        if offsets is not None:
+            for name, (one,) in self.lens.items():
+                offsets = offsets.with_camera(state.names.index(name), one.value, one.sigma)
+        return offsets
 
     def newest(self, optimum: Optimum | None) -> Optimum | None:
         """The optimum of closed epochs, with the newer poses of this one."""
@@ -61,7 +75,7 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
         closed: its closed epochs.
         window: of the frame before, if of the same epoch.
     """
-    sums = closed.all_sums(state)
+    sums = closed.all_sums(state).pose
     halves = closed.halves + in_its_half(state, state.epochs[-1], len(state.epochs) - 1)
     window, conflicts = closed.with_open_epoch(state, window)
     keys, estimates = window.model.reported_keys, state.T_lidar_camera
@@ -74,7 +88,17 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
         own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
         apart = estimates_of_halves(state, halves, camera)
         verdicts[name] = _verdict(state, sums, camera, covariance, conflicts=own, halves=apart)
-    return Assessment(estimates, covariance, verdicts, window)
+    return Assessment(estimates, covariance, verdicts, window, _lens_estimates(window))
+
+
+def _lens_estimates(window: Window) -> dict[str, tuple[LensEstimate, ...]]:
+    model, found = window.model, {}
+    for number, term in model.lenses.items():
+        keys = [lens_key(number), model.reported_keys[number]]
+        values = window.values.atVector(keys[0])
+        estimates = estimates_of(term.variable, values, window.covariance(keys))
+        found[model.cameras[number]] = estimates
+    return found
 
 
 def _verdict(
@@ -167,9 +191,9 @@ def _counts(one: CameraState) -> dict[str, int]:
 
 
 def rig_at(state: State, T_lidar_camera: Sequence[gtsam.Pose3]) -> Rig:
-    """The rig with these estimates."""
+    """The rig with these estimates, and the present time offsets."""
     estimates = zip(state.names, T_lidar_camera, strict=True)
-    return state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
+    return state.rig_in_time.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
 
 
 def second_moments(assessment: Assessment) -> Array:
@@ -185,7 +209,8 @@ def to_calibration(state: State, assessment: Assessment) -> Calibration:
     joint = assessment.joint_covariance
     known = None if np.isnan(joint).any() else joint
     mounts = None if known is None else second_moments(assessment)
-    rig = rig_at(state, assessment.T_lidar_camera)
+    newest = replace(state, offsets=assessment.offsets(state))
+    rig = rig_at(newest, assessment.T_lidar_camera)
     return Calibration(
         rig=rig,
         initial_rig=state.rig,
@@ -202,4 +227,5 @@ def to_calibration(state: State, assessment: Assessment) -> Calibration:
         timings_s={},
         terms="full",
         config=state.config,
+        lens=assessment.lens,
     )

@@ -35,14 +35,12 @@ from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
     PlaceData,
-    Quadratics,
-    linearized,
     marginals_of_places,
     place_model,
-    quadratics_of,
     summary_factor,
 )
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
+from calibgraph.tracking.quadratics import Quadratics, linearized, quadratics_of
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, equation_5
 from calibgraph.tracking.window import Window
@@ -78,7 +76,10 @@ class ClosedPlaces:
     def of(state: State) -> ClosedPlaces:
         """Of a state's closed epochs, at the optimum that the state has, or else fitted."""
         frames = [frame for epoch in state.epochs[:-1] for frame in epoch.frames]
-        sums, earlier = state.places.add(sums_by_place(frames)), state.places
+        if state.offsets is None:
+            sums, earlier = state.places.add(sums_by_place(frames)), state.places
+        else:  # a match of an earlier epoch is of another offset
+            sums, earlier, frames = *2 * (_walked_sums(state),), []
         for camera in state.drifting:
             sums, earlier = sums.without(camera), earlier.without(camera)
         seen = FrameSpread.of(state, sums)
@@ -110,7 +111,9 @@ class ClosedPlaces:
     @cached_property
     def quadratics(self) -> Quadratics:
         """The matches of the graph near its optimum."""
-        return linearized(self.data, self.fit)
+        if self.state.offsets is not None:
+            return quadratics_of(self.state, self.sums)
+        return linearized(self.data.names, self.data.cameras, self.fit)
 
     @cached_property
     def marginals(self) -> list[gtsam.GaussianFactorGraph]:
@@ -138,7 +141,7 @@ class ClosedPlaces:
         self, state: State, more: Mapping[int, Sums] | None = None
     ) -> gtsam.NonlinearFactorGraph:
         """Eq. 5 of the paper with the sums of all frames, and more of some cameras."""
-        sums = self.all_sums(state)
+        sums = self.all_sums(state).pose
         for camera, own in (more or {}).items():
             sums = sums.replace_at(camera, sums[camera] + own)
         return equation_5(self._priors, state.references, sums)
@@ -163,6 +166,7 @@ class ClosedPlaces:
             window: of the frame before, if of the same epoch; it goes on if its graph allows.
         """
         frames = state.epochs[-1].frames
+        opened = (*frames, *state.live_frames[-1:])
         every = self.sums.add(sums_by_place(frames))
         for camera in state.drifting:  # its sums are as if of the present place
             own = self.all_sums(state)[camera]
@@ -170,7 +174,9 @@ class ClosedPlaces:
         earlier = self.quadratics | quadratics_of(state, every, state.drifting)
         seen = self.seen if self.is_settled else FrameSpread.of(state, every)
         if state.config.preset == "auto":
-            kept, rows = self._split(every, {f.place for f in (*frames, *state.live_frames[-1:])})
+            kept, rows = self._split(every, {f.place for f in opened})
+            if state.offsets is not None:
+                earlier, frames = quadratics_of(state, every, places=rows), ()
         else:  # the weights of a preset of the paper
             every = every.bounded(most=0)
             earlier = quadratics_of(state, every)
@@ -215,6 +221,15 @@ class ClosedPlaces:
         others = {names[row] for row in rows}
         kept = tuple(i for i, name in enumerate(self.data.names) if name not in others)
         return kept, sorted(rows)
+
+
+def _walked_sums(state: State) -> PlaceSums:
+    """The sums of closed epochs, each before the walk of the time offsets that comes after it."""
+    sums = state.places
+    for epoch in state.epochs[:-1]:
+        sums = sums.add(sums_by_place(epoch.frames))
+        sums = state.after_offset_walk(sums, len(epoch.frames))
+    return sums
 
 
 def settle(state: State) -> tuple[State, ClosedPlaces]:

@@ -11,9 +11,11 @@ from pathlib import Path
 from types import FrameType
 
 from calibgraph.errors import FileError
+from calibgraph.io.bags import BagOptions
 from calibgraph.io.dataset import load_dataset
 from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.clock import require_motion
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
 from calibgraph.report.as_json import print_line, require_stdout
@@ -38,6 +40,8 @@ class Tracking:
         every: take every so-many-th frame.
         follow: wait for new files.
         matcher: for the frames of datasets; None for tables.
+        interval_s: between neighbouring clouds of folders, whose registration shows the motion.
+        bag: how bags are read.
     """
 
     rig: Rig
@@ -46,6 +50,8 @@ class Tracking:
     every: int = 1
     follow: bool = False
     matcher: Matcher | None = None
+    interval_s: float | None = None
+    bag: BagOptions | None = None
 
 
 def track(
@@ -101,7 +107,10 @@ def _opened(
     else:
         drive = _drive(settings, settings.matcher, source)
         calibrator = DurableCalibrator(
-            folder, settings.rig, drive.config, begin=lambda: _first_rig(drive, notify)
+            folder,
+            settings.rig,
+            drive.config,
+            begin=lambda: _first_rig(drive, settings.rig, notify),
         )
         items = drive.items(calibrator.tracker)
     for damage in calibrator.damages:
@@ -112,18 +121,20 @@ def _opened(
 
 
 def _drive(settings: Tracking, matcher: Matcher, source: Sequence[Path]) -> DatasetDrive:
-    data, full = load_dataset(source, settings.rig), to_full_matcher(matcher)
+    data = load_dataset(source, settings.rig, bag=settings.bag, interval_s=settings.interval_s)
+    require_motion(settings.config.estimate, is_known=data.frames[0].twist_per_s is not None)
+    full = to_full_matcher(matcher)
     data = replace(data, frames=data.frames[:: settings.every])
     return DatasetDrive(data, full, settings.config.changed(stage1=full.stage1))
 
 
-def _first_rig(drive: DatasetDrive, notify: Notify) -> Rig:
-    """The rig of the first frames' batch; a warning if it is not reliable."""
+def _first_rig(drive: DatasetDrive, guess: Rig, notify: Notify) -> Rig:
+    """The guess at the poses of the first frames' batch; a warning if they are not reliable."""
     verdict = drive.start.verdict
     if verdict.status == "FAIL":
         reasons = "; ".join(verdict.reasons)
         notify(f"warning: the first frames give no reliable start: {reasons}")
-    return drive.start.rig
+    return guess.moved_to(drive.start.rig.T_camera_lidar)
 
 
 @contextmanager

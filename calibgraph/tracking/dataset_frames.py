@@ -85,7 +85,7 @@ class DatasetDrive:
                 table = self.matcher.match(alone, rig, round_index=index, progress=no_progress)
                 table = with_motion(table, alone)
                 if index != rounds[-1]:
-                    rig = _refined(rig, table, self.config)
+                    rig = _refined(rig, table, self.config.changed(estimate=()))
         except (CalibrationError, OSError) as error:
             return Refused(f"frame {frame.name} ({frame.index}): {error}")
         return StreamFrame(frame.index, table)

@@ -45,16 +45,16 @@ class EpochSummary:
     ungated: Sums
 
     @staticmethod
-    def empty() -> EpochSummary:
+    def empty(width: int = 6) -> EpochSummary:
         """Over no epochs."""
         w = len(STRENGTHS)
-        return EpochSummary(Sums.zeros(w), np.zeros(w), 0, Sums.zeros(2), 0, Sums.zeros())
+        walks, halves = Sums.zeros(w, width=width), Sums.zeros(2, width=width)
+        return EpochSummary(walks, np.zeros(w), 0, halves, 0, Sums.zeros())
 
     def shift_reference(self, step: Array) -> EpochSummary:
         """The sums about a reference that is moved by a tangent step."""
-        walks, halves, ungated = (
-            sums.shift_reference(step) for sums in (self.walks, self.halves, self.ungated)
-        )
+        walks, halves = (sums.shift_reference(step) for sums in (self.walks, self.halves))
+        ungated = self.ungated.shift_reference(step[: self.ungated.width])
         return replace(self, walks=walks, halves=halves, ungated=ungated)
 
     def add(self, epoch: Sums, ungated: Sums) -> EpochSummary:
@@ -71,26 +71,27 @@ class EpochSummary:
         """The sums after the random walk of an epoch.
 
         Args:
-            variance: (6,) of the configured walk over the epoch.
+            variance: (w, d) of the walks over the epoch.
             overconfidence: of the Hessian, see ``calibgraph.tracking.sums``.
         """
-        walks, kept = self.walks.after_walk(np.outer(STRENGTHS**2, variance), overconfidence)
+        walks, kept = self.walks.after_walk(variance, overconfidence)
         by = kept[self.walk]
         return replace(self, walks=walks, halves=self.halves * by, ungated=self.ungated * by)
 
-    def update_evidence(self, epoch: Sums, noise: Array) -> EpochSummary:
+    def update_evidence(self, walks: Sums, epoch: Sums, noise: Array) -> EpochSummary:
         """The summary with the walks' evidence updated by how well each predicts an epoch.
 
         Args:
-            epoch: its sums.
+            walks: (w,) the sums of the pose.
+            epoch: its sums, of the pose.
             noise: (6, 6) covariance of such a gradient at the true extrinsic.
         """
-        if not (self.walks.frames >= _LEAST_FRAMES).all():
+        if not (walks.frames >= _LEAST_FRAMES).all():
             return self
-        steps = np.linalg.solve(self.walks.hessian, -self.walks.gradient[..., None])[..., 0]
+        steps = np.linalg.solve(walks.hessian, -walks.gradient[..., None])[..., 0]
         score = epoch.gradient + steps @ epoch.hessian
-        spread = np.linalg.solve(self.walks.hessian, epoch.hessian[None])
-        covariance = noise + spread.transpose(0, 2, 1) @ self.walks.scatter @ spread
+        spread = np.linalg.solve(walks.hessian, epoch.hessian[None])
+        covariance = noise + spread.transpose(0, 2, 1) @ walks.scatter @ spread
         whitened = np.linalg.solve(covariance, score[..., None])[..., 0]
         distance = (score * whitened).sum(axis=1)
         logarithm = np.linalg.slogdet(covariance)[1]

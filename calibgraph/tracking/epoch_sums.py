@@ -13,8 +13,8 @@ from calibgraph.tracking.sums import Sums
 
 
 def sum_epochs(state: State, before: int | None = None) -> Sums:
-    """(n,) over all frames, or those before a frame's number."""
-    return sum_closed_epochs(state, before) + _until(state.epochs[-1], before)
+    """(n,) over all frames, or those before a frame's number, of the poses alone."""
+    return state.of_poses(sum_closed_epochs(state, before) + _until(state.epochs[-1], before))
 
 
 def sum_closed_epochs(state: State, before: int | None = None) -> Sums:
@@ -42,7 +42,7 @@ def in_its_half(state: State, epoch: Epoch, age: int) -> Sums:
 
 def estimates_of_halves(state: State, halves: Sums, camera: int) -> tuple[Array, Array] | None:
     """Two (4, 4) T_camera_lidar of a camera; None if one of them is undetermined."""
-    first, second = (halves[camera].step(half) for half in range(2))
+    first, second = (halves[camera].pose.step(half) for half in range(2))
     if first is None or second is None:
         return None
     reference = state.references[camera]
@@ -52,15 +52,12 @@ def estimates_of_halves(state: State, halves: Sums, camera: int) -> tuple[Array,
 def _after_epoch(state: State, sums: Sums, epoch: Epoch) -> Sums:
     """The sums after the random walk of an epoch."""
     strengths = STRENGTHS[[one.summary.walk for one in state.cameras]]
-    if not strengths.any():
+    variance = state.walk_variance(strengths, len(epoch.frames))
+    if not variance.any():
         return sums
-    variance = np.outer(strengths**2, state.walk_variance(len(epoch.frames)))
-    overconfidence = [state.overconfidence(camera) for camera in range(len(strengths))]
-    return sums.after_walk(variance, np.array(overconfidence))[0]
+    return sums.after_walk(variance, state.all_overconfidence)[0]
 
 
 def _until(epoch: Epoch, number: int | None) -> Sums:
-    earlier = [frame.sums for frame in epoch.frames if number is None or frame.number < number]
-    if len(earlier) == len(epoch.frames):
-        return epoch.sums
-    return Sums.stack([Sums.zeros(len(epoch.T_lidar_camera)), *earlier]).total()
+    earlier = [frame for frame in epoch.frames if number is None or frame.number < number]
+    return epoch.sums if len(earlier) == len(epoch.frames) else epoch.sums_of(earlier)

@@ -15,8 +15,10 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.drift import follow_drift, report_drift
+from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, inliers_of
+from calibgraph.tracking.offsets import Offsets, delayed
 from calibgraph.tracking.place_sums import sums_by_place
 from calibgraph.tracking.state import CameraState, State
 from calibgraph.tracking.steps import shift_between
@@ -24,16 +26,20 @@ from calibgraph.tracking.sums import Sums, step_between, sums_of_matches
 from factors import to_runs
 
 
-def close_epoch(state: State) -> tuple[State, list[Event]]:
+def close_epoch(state: State, offsets: Offsets | None) -> tuple[State, list[Event]]:
     """The state with its open epoch closed and a new one begun.
 
     A camera that drifts keeps the estimate of each epoch; any other has the newest in all of them.
+
+    Args:
+        state: after the last frame of the epoch.
+        offsets: the newest time offsets, if they are estimated.
     """
     epochs = tuple(_at_newest(state, epoch) for epoch in state.epochs)
     state = replace(state, epochs=epochs)
     if len(epochs) > state.config.tracking.live_epochs:
         state = _summarize_oldest(state)
-    state = _with_references(state, state.T_lidar_camera)
+    state = _with_references(state, state.T_lidar_camera, offsets)
     cameras = tuple(
         replace(camera_state, scale=camera_state.residuals.scale(state.config))
         if camera_state.started
@@ -43,7 +49,8 @@ def close_epoch(state: State) -> tuple[State, list[Event]]:
     state = replace(state, cameras=cameras)
     state = regate(state)
     epochs = state.epochs
-    epochs = (*epochs[:-1], _with_distortion(state, epochs[-1]), Epoch.empty(state.T_lidar_camera))
+    following = Epoch.empty(state.T_lidar_camera, state.width)
+    epochs = (*epochs[:-1], _with_distortion(state, epochs[-1]), following)
     return report_drift(replace(state, epochs=epochs))
 
 
@@ -61,9 +68,15 @@ def _with_distortion(state: State, epoch: Epoch) -> Epoch:
     return epoch
 
 
-def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State:
+def _with_references(
+    state: State, references: tuple[gtsam.Pose3, ...], offsets: Offsets | None
+) -> State:
     """The state with its sums about other references, but those of live frames."""
     steps = np.array([*map(step_between, state.references, references)])
+    if offsets is not None and state.offsets is not None:
+        later_s = offsets.values_s - state.offsets.values_s
+        steps = np.column_stack([steps, later_s])
+        state = _with_points_at(replace(state, offsets=offsets), later_s)
     cameras = tuple(
         replace(camera_state, summary=camera_state.summary.shift_reference(step))
         for camera_state, step in zip(state.cameras, steps, strict=True)
@@ -81,6 +94,35 @@ def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State
     )
 
 
+def at_offsets(state: State, offsets: Offsets) -> State:
+    """The state with its matches at other time offsets, within an epoch."""
+    return regate(_with_references(state, state.T_lidar_camera, offsets))
+
+
+def _with_points_at(state: State, later_s: Array) -> State:
+    """The state with the points of all kept matches some seconds later, (n,)."""
+    epochs = tuple(
+        replace(
+            epoch,
+            frames=tuple(
+                replace(f, raw={c: delayed(raw, later_s[c]) for c, raw in f.raw.items()})
+                for f in epoch.frames
+            ),
+        )
+        for epoch in state.epochs
+    )
+    cameras = tuple(
+        replace(
+            one,
+            outlier_frames=tuple(
+                replace(f, raw=delayed(f.raw, seconds)) for f in one.outlier_frames
+            ),
+        )
+        for one, seconds in zip(state.cameras, later_s, strict=True)
+    )
+    return replace(state, epochs=epochs, cameras=cameras)
+
+
 def _summarize_oldest(state: State) -> State:
     """The state with its oldest epoch added to the summaries."""
     epoch, *younger = state.epochs
@@ -93,7 +135,7 @@ def _summarize_oldest(state: State) -> State:
         summary = one.summary
         if epoch.sums.frames[camera]:
             summary = summary.add(epoch.sums[camera], _ungated(state, epoch, camera))
-        variance = state.walk_variance(len(epoch.frames))
+        variance = state.walk_variance(STRENGTHS, len(epoch.frames))
         summary = summary.propagate(variance, state.overconfidence(camera))
         state = state.with_camera(camera, replace(one, summary=summary))
     state = replace(
@@ -101,7 +143,8 @@ def _summarize_oldest(state: State) -> State:
         epochs=tuple(younger),
         distortion=tuple(map(add, state.distortion, epoch.distortion)),
     )
-    return _with_places(state, sums_by_place(_at_places(state, epoch)), drifted)
+    state = _with_places(state, sums_by_place(_at_places(state, epoch)), drifted)
+    return replace(state, places=state.after_offset_walk(state.places, len(epoch.frames)))
 
 
 def _at_places(state: State, epoch: Epoch) -> list[LiveFrame]:
@@ -156,14 +199,19 @@ def _update_evidence(state: State, camera: int, epoch: Epoch, by_places: Array) 
 
     The scatter of epochs is updated here too: by now, a move within the epoch has been detected.
     """
-    one, alone, sums = state.cameras[camera], state.scatter_of_frames(camera), epoch.sums[camera]
+    one, alone = state.cameras[camera], state.scatter_of_frames(camera)
+    score, sums = epoch.sums.pose.score[camera], state.of_pose(camera, epoch.sums[camera])
     noise = state.frame_noise(camera)
     if noise is None or alone is None or not sums.frames:
         return one
-    groups = tuple(group.add(sums.score, int(sums.frames), alone) for group in one.groups)
+    groups = tuple(group.add(score, int(sums.frames), alone) for group in one.groups)
     rows = pose_rows(camera)
+    if state.offsets is not None:
+        alone_7 = replace(epoch.sums[camera], scatter=np.zeros((7, 7)))
+        noise = noise + state.of_pose(camera, alone_7).scatter / sums.frames
     noise = noise * sums.frames + sums.hessian @ by_places[rows, rows] @ sums.hessian
-    return replace(one, summary=one.summary.update_evidence(sums, noise), groups=groups)
+    walks = state.of_pose(camera, one.summary.walks)
+    return replace(one, summary=one.summary.update_evidence(walks, sums, noise), groups=groups)
 
 
 def _select_walks(state: State) -> State:
@@ -217,6 +265,9 @@ def _regate_camera(
     here = block.frame_sums(T_lidar_camera, inliers.frame_edges)
     robust = robust_hessian(block, T_lidar_camera)
     true = convex_hessian(robust + raw.at(to_T_camera_lidar(gate)).gate_hessian(scale), robust)
+    if state.offsets is not None:
+        for frame in frames:
+            frame.sums.hessian[camera] = 0.0
     missing = true - sum(frame.sums.hessian[camera] for frame in frames)
     shares = here.hessian @ np.linalg.solve(here.hessian.sum(axis=0) + WEAK, missing)
     step = step_between(T_lidar_camera, state.references[camera])
@@ -234,11 +285,11 @@ def _gate_pose(
 ) -> gtsam.Pose3:
     """Where the gate is drawn: the minimum of all matches, as in a batch.
 
-    That of the matches within a gate is drawn to where the gate was before. A camera that drifts
-    keeps its estimate, which later epochs have a part in.
+    That of the matches within a gate is drawn to where the gate was before. A camera that drifts,
+    or whose time offset may, keeps its estimate, which later epochs have a part in.
     """
     one, reference = state.cameras[camera], state.references[camera]
-    if one.summary.walk:
+    if one.summary.walk or state.offsets is not None:
         return T_lidar_camera
     block, older = raw.with_scale(one.scale), one.summary.ungated
     for _ in range(_GATE_STEPS):

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _MOST_EVENTS = 1000
 _POSE = 6
+_NUMBERS = 7  # of a camera: its pose and its time offset
 
 
 class _Saved(BaseModel):
@@ -47,7 +48,7 @@ class _Saved(BaseModel):
         entries, n = self.entries, self.frames.size
         alike = {(T.shape, T.dtype.str) for T in self.origins.values()} <= {((4, 4), "<f8")}
         whole = (self.frames.shape, self.frames.dtype.str) == ((n,), "<i8") and n <= self.most
-        shape = n, len(self.origins), 2 * _POSE
+        shape = n, len(self.origins), 2 * _NUMBERS
         if not (alike and whole and (entries.shape, entries.dtype.str) == (shape, "<f8")):
             raise ValueError("its arrays contradict each other")
         return self
@@ -71,7 +72,7 @@ class History:
         self._origins: dict[str, Array] = {}  # T_camera_lidar that the entries are relative to
         self._begun: set[str] = set()
         self._frames = np.empty(0, dtype=np.int64)
-        self._entries = np.empty((0, 0, 2 * _POSE))  # per camera xi, sigma; NaN: not known
+        self._entries = np.empty((0, 0, 2 * _NUMBERS))  # xi, offset, sigmas; NaN: not known
         self._events: tuple[Event, ...] = ()
 
     def __len__(self) -> int:
@@ -106,7 +107,8 @@ class History:
 
     def _begin(self, update: Update) -> None:
         self._frames = np.empty(self._most, dtype=np.int64)
-        self._entries = np.full((self._most, len(update.T_camera_lidar), 2 * _POSE), np.nan)
+        shape = self._most, len(update.T_camera_lidar), 2 * _NUMBERS
+        self._entries = np.full(shape, np.nan)
         self._origins = dict(update.T_camera_lidar)
 
     def _make_place(self) -> None:
@@ -120,13 +122,15 @@ class History:
             self._stride *= 2
 
     def _entry(self, update: Update, name: str) -> Array:
-        """(12,) xi in T_camera_lidar = exp(xi) origin, and its sigmas; NaN before the start."""
+        """(14,) xi in T_camera_lidar = exp(xi) origin, time offset, sigmas; NaN: not known."""
         covariance = update.covariance.get(name)
-        entry = np.full(2 * _POSE, np.nan)
+        entry = np.full(2 * _NUMBERS, np.nan)
+        for one in update.lens.get(name, ()):
+            entry[_POSE], entry[-1] = one.value, one.sigma
         if covariance is not None:  # a camera may have started in an earlier run
             self._begun.add(name)
             variances = np.diag(covariance)
-            entry[_POSE:] = np.sqrt(np.where(variances >= 0, variances, np.nan))
+            entry[_NUMBERS:-1] = np.sqrt(np.where(variances >= 0, variances, np.nan))
         if name in self._begun:
             entry[:_POSE] = twist_between(update.T_camera_lidar[name], self._origins[name])
         return entry
@@ -143,7 +147,12 @@ class History:
         steps = [gtsam.Pose3.Expmap(xi).matrix() for xi in entries[known, :_POSE]]
         xi = np.array([twist_between(step, steps[-1]) for step in steps])
         xi[-1] = 0.0  # up to rounding it is
-        return Curve(self._frames[: self._held][known], xi, entries[known, _POSE:])
+        offsets, sigma = entries[known, _POSE], entries[known, _NUMBERS:]
+        if np.isnan(offsets).all():
+            sigma = sigma[:, :_POSE]
+        else:
+            xi = np.column_stack([xi, offsets - offsets[-1]])
+        return Curve(self._frames[: self._held][known], xi, sigma)
 
     def draw(self, path: Path) -> None:
         """Draw all cameras' curves with their 3-sigma bands and the events; PNG, atomically.

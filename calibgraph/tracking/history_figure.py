@@ -28,6 +28,7 @@ _EVENTS: dict[Kind, str] = {  # the more important first: their labels find a pl
     "back": "#3399D0",
 }
 _INSTEAD = "#000000"
+_POSE = 6
 
 _WIDTH_IN, _ROW_IN, _FRAME_IN = 16.0, 2.5, 1.5
 _LABEL_LEVELS = 2  # of labels over each other
@@ -50,7 +51,8 @@ class Curve:
         frames: (n,) numbers of frames, from its first own estimate to its newest.
         xi: (n, 6) of T_camera_lidar(frame) = exp(xi) T_camera_lidar(newest), xi = (rotation [rad],
             translation [m]) in the camera's axes. The last is zero.
-        sigma: (n, 6) standard deviations of xi; NaN with too few frames.
+            Where time offsets are estimated, (n, 7) with offset(frame) - offset(newest) [s].
+        sigma: (n, 6) or (n, 7) standard deviations of xi; NaN with too few frames.
     """
 
     frames: NDArray[np.int64]
@@ -68,13 +70,15 @@ def text_figure(text: str) -> Figure:
 def history_figure(
     curves: dict[str, Curve | None], events: Sequence[Event], first: int, newest: int
 ) -> Figure:
-    """A row per camera: rotation, translation."""
+    """A row per camera: rotation, translation, and the time offset where it is estimated."""
+    in_time = any(curve is not None and curve.xi.shape[1] > _POSE for curve in curves.values())
+    parts = _PARTS if in_time else _PARTS[:2]
     figure = new_picture(_WIDTH_IN, _FRAME_IN + _ROW_IN * len(curves))
-    panels = figure.subplots(len(curves), 2, sharex=True, squeeze=False)
+    panels = figure.subplots(len(curves), len(parts), sharex=True, squeeze=False)
     zero = first if newest >= _LARGE_NUMBER else 0
     for (name, curve), row in zip(curves.items(), panels, strict=True):
         own = [e for e in events if e.camera in (name, None) and e.kind != "started"]
-        for panel, part in zip(row, _PARTS, strict=True):
+        for panel, part in zip(row, parts, strict=True):
             panel.set_xlim(first - zero, newest - zero)
             panel.set_ylabel(f"{_shortened(name)}\n{part.title}", parse_math=False)
             panel.grid(color="0.9", linewidth=0.8)
@@ -94,7 +98,7 @@ def history_figure(
 
 @dataclass(frozen=True)
 class _Part:
-    """Half of xi: its rows, what they are, and how many units one rad or m is."""
+    """A part of xi: its rows, what they are, and how many units one rad, m or s is."""
 
     rows: slice
     title: str
@@ -104,6 +108,7 @@ class _Part:
 _PARTS = (
     _Part(slice(0, 3), "rotation [deg]", float(np.degrees(1.0))),
     _Part(slice(3, 6), "translation [cm]", 100.0),
+    _Part(slice(6, 7), "time offset [ms]", 1000.0),
 )
 
 
@@ -126,12 +131,13 @@ def _draw_curve(panel: Axes, part: _Part, curve: Curve | None, zero: int) -> Non
         return
     frames = curve.frames - zero
     xi, sigma = part.units * curve.xi[:, part.rows], part.units * curve.sigma[:, part.rows]
-    for value, deviation, colour in zip(xi.T, sigma.T, _AXES.values(), strict=True):
+    colours = [*_AXES.values()] if len(xi.T) > 1 else [_INSTEAD]
+    for value, deviation, colour in zip(xi.T, sigma.T, colours, strict=True):
         low, high = value - _SIGMAS * deviation, value + _SIGMAS * deviation
         panel.fill_between(frames, low, high, color=colour, alpha=0.17, linewidth=0, step="post")
         for edge in (low, high):  # so that overlapping bands can be distinguished
             panel.plot(frames, edge, color=colour, alpha=0.5, linewidth=0.6, drawstyle=_HELD)
-    for value, colour in zip(xi.T, _AXES.values(), strict=True):
+    for value, colour in zip(xi.T, colours, strict=True):
         panel.plot(frames, value, color=colour, linewidth=1.4, drawstyle=_HELD)
     panel.set_ylim(*_limits(xi, sigma))
 

@@ -10,10 +10,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
+from calibgraph.tracking.offset_sums import with_offset
+from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.sums import Gated, Sums
 
 NO_DISTORTION = DistortionEvidence.none(WEAK, places=1)
@@ -30,6 +33,8 @@ class LiveFrame:
         inliers: per camera, (m,) which of them are within the gate.
         sums: (n,) of them, per camera.
         place: name of the place that it is of; empty: not known.
+        twists_per_s: (n, 6) of the LiDAR, in the axes of each camera; None where no time offset is
+            estimated.
     """
 
     number: int
@@ -37,6 +42,13 @@ class LiveFrame:
     inliers: dict[int, NDArray[np.bool_]]
     sums: Sums
     place: str = ""
+    twists_per_s: Array | None = None
+
+    @property
+    def whole(self) -> Sums:
+        """(n,) its sums, with the time offset where that is estimated."""
+        known = self.twists_per_s
+        return self.sums if known is None else with_offset(self.sums, known)
 
     def without(self, camera: int) -> LiveFrame:
         """The frame without one camera's matches."""
@@ -45,19 +57,27 @@ class LiveFrame:
         sums = self.sums.replace_at(camera, Sums.zeros())
         return replace(self, raw=raw, inliers=inliers, sums=sums)
 
-    def add(self, camera: int, raw: CameraBlock, gated: Gated) -> LiveFrame:
+    def add(
+        self, camera: int, raw: CameraBlock, gated: Gated, offsets: Offsets | None
+    ) -> LiveFrame:
         """The frame with a camera's matches."""
+        twists = self.twists_per_s
+        if twists is not None and offsets is not None and raw.block.motion is not None:
+            twists = twists.copy()
+            twists[camera] = offsets.adjoints[camera] @ raw.block.motion[0, :6]
         return replace(
             self,
             raw={**self.raw, camera: raw},
             inliers={**self.inliers, camera: gated.inliers},
             sums=self.sums.replace_at(camera, gated.sums),
+            twists_per_s=twists,
         )
 
     @staticmethod
-    def empty(number: int, cameras: int, place: str = "") -> LiveFrame:
-        """A frame without matches."""
-        return LiveFrame(number, {}, {}, Sums.zeros(cameras), place)
+    def empty(number: int, cameras: int, place: str = "", *, in_time: bool = False) -> LiveFrame:
+        """A frame without matches; ``in_time``: with time offsets that are estimated."""
+        twists = np.zeros((cameras, 6)) if in_time else None
+        return LiveFrame(number, {}, {}, Sums.zeros(cameras), place, twists)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,22 +89,28 @@ class Epoch:
         T_lidar_camera: per camera, the estimate.
         distortion: per camera, of its matches in the scan distortion, as if of one place; in an
             open epoch, of the frames from which it has started there.
+        width: of its sums.
     """
 
     frames: tuple[LiveFrame, ...]
     T_lidar_camera: tuple[gtsam.Pose3, ...]
     distortion: tuple[DistortionEvidence, ...]
+    width: int = 6
 
     @staticmethod
-    def empty(T_lidar_camera: tuple[gtsam.Pose3, ...]) -> Epoch:
+    def empty(T_lidar_camera: tuple[gtsam.Pose3, ...], width: int = 6) -> Epoch:
         """Without frames."""
-        return Epoch((), T_lidar_camera, (NO_DISTORTION,) * len(T_lidar_camera))
+        return Epoch((), T_lidar_camera, (NO_DISTORTION,) * len(T_lidar_camera), width)
 
     @cached_property
     def sums(self) -> Sums:
         """(n,) over its frames, per camera."""
-        none = Sums.zeros(len(self.T_lidar_camera))
-        return Sums.stack([none, *(frame.sums for frame in self.frames)]).total()
+        return self.sums_of(self.frames)
+
+    def sums_of(self, frames: Iterable[LiveFrame]) -> Sums:
+        """(n,) over some of its frames, per camera."""
+        none = Sums.zeros(len(self.T_lidar_camera), width=self.width)
+        return Sums.stack([none, *(frame.whole for frame in frames)]).total()
 
     def with_distortion(self, camera: int, scale: ResidualScale) -> Epoch:
         """The epoch with a camera's evidence of the scan distortion computed anew.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 
@@ -13,8 +13,10 @@ from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
     cloud_at_key,
+    lens_key,
     matched_at_key,
     matched_key,
+    seen_lens_key,
 )
 from calibgraph.solver.elimination import start_values
 
@@ -29,6 +31,7 @@ class Optimum:
         clouds: per place, ``o_p``.
         matched: per place and camera (by its place in the rig), ``a_cp``.
         contradicting: places in ``rig.relative_poses`` of those that take no part.
+        lenses: by key, of the variables of ``calibgraph.graph.lens``.
     """
 
     shared: Mapping[int, gtsam.Pose3]
@@ -36,6 +39,7 @@ class Optimum:
     clouds: Mapping[str, gtsam.Pose3]
     matched: Mapping[str, Mapping[int, gtsam.Pose3]]
     contradicting: tuple[int, ...]
+    lenses: Mapping[int, Array] = field(default_factory=dict)
 
     @staticmethod
     def of(
@@ -48,12 +52,15 @@ class Optimum:
         matched: dict[str, dict[int, gtsam.Pose3]] = {name: {} for name in names}
         for place, camera in model.matched_places():
             matched[names[place]][camera] = values.atPose3(matched_at_key(place, camera))
+        lenses = {key(number) for key in (lens_key, seen_lens_key) for number in model.lenses}
+        vectors = {DISTORTION, *lenses}
         return Optimum(
-            {key: values.atPose3(key) for key in model.shared_keys if key != DISTORTION},
+            {key: values.atPose3(key) for key in model.shared_keys if key not in vectors},
             values.atVector(DISTORTION) if model.is_distorted else None,
             {name: values.atPose3(cloud_at_key(place)) for place, name in enumerate(names)},
             matched,
             contradicting,
+            {key: values.atVector(key) for key in sorted(lenses)},
         )
 
     def updated(self, newer: Optimum) -> Optimum:
@@ -64,6 +71,7 @@ class Optimum:
             {**self.clouds, **newer.clouds},
             {**self.matched, **newer.matched},
             self.contradicting,
+            {**self.lenses, **newer.lenses},
         )
 
     def values(
@@ -88,6 +96,9 @@ class Optimum:
         for key, pose in known.items():
             if values.exists(key):
                 values.update(key, pose)
+        for key, vector in self.lenses.items():
+            if values.exists(key):
+                values.update(key, vector)
         if model.is_distorted and self.distortion is not None:
             values.update(DISTORTION, self.distortion)
         return values

@@ -7,7 +7,7 @@ marginal on the cloud and the cameras as matches show them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import BlockByPlace, QuadraticByPlace, SummarizedByPlace
+from calibgraph.graph.by_place import (
+    LateQuadraticByPlace,
+    SummarizedByPlace,
+)
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
-from calibgraph.graph.linear_data import poses_of
-from calibgraph.graph.variables import cloud_at_key, matched_at_key
+from calibgraph.graph.variables import cloud_at_key, matched_at_key, seen_lens_key
 from calibgraph.model.error_components import error_components
-from calibgraph.model.geometry import invert_each, pose_rows, to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.curvature import convex_hessian
 from calibgraph.solver.data_by_place import block_by_place
 from calibgraph.solver.elimination import LatentPoseFit, join_linear
@@ -33,15 +35,12 @@ from calibgraph.solver.within_place import (
     relative_covariance,
 )
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
+from calibgraph.tracking.offset_terms import offset_term
 from calibgraph.tracking.place_sums import PlaceSums
+from calibgraph.tracking.quadratics import Data, Quadratics, by_place
 from calibgraph.tracking.state import State
-from calibgraph.tracking.sums import Sums, step_between
 
 Numbers = NDArray[np.int64]
-Data = BlockByPlace | QuadraticByPlace | SummarizedByPlace
-Quadratics = dict[int, dict[str, tuple[gtsam.Pose3, Array]]]
-"""Per camera and name of a place: the minimum T_lidar_camera, and (6, 6) information."""
-
 _PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a moved camera has few
 _EXACT = 1e-4  # rad and m: what is stated of places to be smaller counts as nothing
 
@@ -66,6 +65,7 @@ class FrameSpread:
         frames, the scatter is shrunk towards that of all its frames so far. Where the matcher
         states nothing of places it is wider if epochs scatter more than their frames suggest.
         """
+        sums = sums.pose
         (scatter, left), every = sums.within_places, sums.rows.total()
         hessian, reweighted, frames = every.hessian, every.reweighted, every.frames
         found = FrameSpread(np.tile(np.eye(6), (len(frames), 1, 1)), np.ones(len(frames)))
@@ -87,7 +87,7 @@ class FrameSpread:
         return WithinPlace.of(
             self.covariance[camera],
             float(self.efficiency[camera]),
-            roots=np.linalg.cholesky(sums.rows.reweighted[rows, camera] + WEAK),
+            roots=np.linalg.cholesky(sums.rows.pose.reweighted[rows, camera] + WEAK),
             frames=sums.frames[rows, camera] / sums.places[rows, camera],
             alike=float(sums.alike[camera]),
         )
@@ -125,7 +125,10 @@ class PlaceData:
         ]
         kept, cameras = [frame for frame in frames if frame.place in places], dict[int, Data]()
         for camera, one in enumerate(state.cameras):
-            quadratic = _by_place(earlier.get(camera, {}), [*places])
+            quadratic = by_place(state, camera, earlier.get(camera, {}), [*places])
+            if isinstance(quadratic, LateQuadraticByPlace):
+                cameras[camera] = quadratic
+                continue
             own = None if one.summary.walk else inliers_of(kept, camera)
             if own is not None:
                 block = block_by_place(own, one.scale, numbers)
@@ -134,19 +137,6 @@ class PlaceData:
             elif len(quadratic.places):
                 cameras[camera] = quadratic
         return PlaceData([*places], np.array([*places.values()], dtype=np.int64), cameras)
-
-
-def _by_place(
-    known: Mapping[str, tuple[gtsam.Pose3, Array]], names: Sequence[str]
-) -> QuadraticByPlace:
-    """The quadratics of a camera at those of some places where it has one."""
-    places = [place for place, name in enumerate(names) if name in known]
-    chosen = [known[names[place]] for place in places]
-    return QuadraticByPlace(
-        np.array(places, dtype=np.int64),
-        [pose for pose, _ in chosen],
-        np.array([information for _, information in chosen]).reshape(-1, 6, 6),
-    )
 
 
 def place_model(
@@ -161,9 +151,14 @@ def place_model(
         data: the matches of the places.
     """
     chosen, names = data.rows, state.names
-    blocks, shown = {}, {}
+    blocks, shown, lenses = {}, {}, {}
     for camera, matches in data.cameras.items():
         within = seen.within(sums, camera, chosen)
+        if state.offsets is not None:
+            rows = np.flatnonzero(sums.frames[:, camera])
+            own = seen.within(sums, camera, rows)
+            at_places = sums.rows[rows, camera]
+            lenses[camera] = offset_term(state, camera, at_places, own)
         blocks[names[camera]] = matches.with_variance(within.least)
         shown[names[camera]] = within, _distortion(state, camera, len(chosen))
     components = variance_components(state.findings, names, shown, places=len(chosen))
@@ -178,7 +173,7 @@ def place_model(
     )
     components = state.sizes.scale(components)
     none = gtsam.NonlinearFactorGraph()
-    return LatentPoseModel(names, blocks, (), none, components, state.config.of)
+    return LatentPoseModel(names, blocks, (), none, components, state.config.of, lenses)
 
 
 def marginals_of_places(fit: LatentPoseFit) -> list[gtsam.GaussianFactorGraph]:
@@ -207,58 +202,10 @@ def summary_factor(
     if marginals:
         factor, at = gtsam.HessianFactor(join_linear(*marginals)), gtsam.Values()
         for key in list(factor.keys()):
-            at.insert(key, values.atPose3(key))
+            is_vector = gtsam.symbolChr(key) == gtsam.symbolChr(seen_lens_key(0))
+            at.insert(key, values.atVector(key) if is_vector else values.atPose3(key))
         graph.add(gtsam.LinearContainerFactor(factor, at))
     return graph
-
-
-def quadratics_of(
-    state: State, sums: PlaceSums, cameras: Iterable[int] | None = None
-) -> Quadratics:
-    """The quadratics of some cameras, or all, at all places.
-
-    As those of matches that are kept: with the gradient of the robust cost, near the optimum of the
-    last epoch, and the Hessian by the weights of the matches there.
-    """
-    return {
-        camera: {
-            name: _quadratic(state, sums.rows[row, camera], name, camera)
-            for row, name in enumerate(sums.names)
-            if sums.frames[row, camera]
-        }
-        for camera in (range(len(state.cameras)) if cameras is None else cameras)
-    }
-
-
-def _quadratic(state: State, own: Sums, place: str, camera: int) -> tuple[gtsam.Pose3, Array]:
-    pose, information = state.pose_at(place, camera), own.reweighted + WEAK
-    if pose is None:
-        step = np.linalg.solve(convex_hessian(own.hessian, own.reweighted) + WEAK, -own.gradient)
-    else:
-        step = step_between(state.references[camera], pose)
-        step = step - np.linalg.solve(information, own.gradient + own.hessian @ step)
-    return state.references[camera].retract(step), information
-
-
-def linearized(data: PlaceData, fit: LatentPoseFit) -> Quadratics:
-    """The quadratics of all matches at the poses that their places have in a fit."""
-    values, count, found = fit.linear.values, len(data.names), Quadratics()
-    clouds = poses_of(values, map(cloud_at_key, range(count)))
-    for camera, matches in data.cameras.items():
-        places, T_camera_cloud = matches.places, np.tile(np.eye(4), (count, 1, 1))
-        keys = [matched_at_key(int(place), camera) for place in places]
-        T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
-        here = matches.sums(T_camera_cloud)
-        information = here.hessian + WEAK
-        steps = -np.linalg.solve(information, here.gradient[..., None])[..., 0]
-        found[camera] = {
-            data.names[place]: (
-                to_T_lidar_camera(T_camera_cloud[place]).retract(steps[place]),
-                information[place],
-            )
-            for place in places
-        }
-    return found
 
 
 def _distortion(state: State, camera: int, places: int) -> DistortionEvidence | None:

@@ -25,7 +25,7 @@ def sums_by_place(frames: Sequence[LiveFrame]) -> dict[str, Sums]:
     """(n,) sums of some frames at each of their places."""
     by_place: dict[str, list[Sums]] = {}
     for frame in frames:
-        by_place.setdefault(frame.place, []).append(frame.sums)
+        by_place.setdefault(frame.place, []).append(frame.whole)
     return {name: Sums.stack(sums).total() for name, sums in by_place.items()}
 
 
@@ -46,9 +46,15 @@ class PlaceSums:
     older_squared: Array
 
     @staticmethod
-    def empty(cameras: int) -> PlaceSums:
+    def empty(cameras: int, width: int = 6) -> PlaceSums:
         """Of no frames."""
-        return PlaceSums((_OLDER,), Sums.zeros(1, cameras), np.zeros(cameras), np.zeros(cameras))
+        rows = Sums.zeros(1, cameras, width=width)
+        return PlaceSums((_OLDER,), rows, np.zeros(cameras), np.zeros(cameras))
+
+    @property
+    def pose(self) -> PlaceSums:
+        """The sums of the poses, time offsets at their references."""
+        return replace(self, rows=self.rows.pose)
 
     @property
     def frames(self) -> Array:
@@ -85,7 +91,7 @@ class PlaceSums:
         return about_means, np.maximum(self.frames.sum(axis=0) - means, 0.0)
 
     def shift_reference(self, steps: Array) -> PlaceSums:
-        """The sums about references that are moved by (n, 6) tangent steps."""
+        """The sums about references that are moved by (n, d) tangent steps."""
         return replace(self, rows=self.rows.shift_reference(steps))
 
     def add(self, parts: Mapping[str, Sums]) -> PlaceSums:
@@ -104,7 +110,7 @@ class PlaceSums:
         names = (*(self.names[row] for row in others), name)
         if name in self.names:
             return replace(self, names=names, rows=self.rows[[*others, self.names.index(name)]])
-        new = Sums.zeros(len(self.means))
+        new = Sums.zeros(len(self.means), width=self.rows.width)
         rows = [*(self.rows[row] for row in others), new]
         return replace(self, names=names, rows=Sums.stack(rows))
 
@@ -128,7 +134,8 @@ class PlaceSums:
 
     def without(self, camera: int) -> PlaceSums:
         """The sums without those of a camera."""
-        rows = self.rows.replace_at((slice(None), camera), Sums.zeros())
+        none = Sums.zeros(width=self.rows.width)
+        rows = self.rows.replace_at((slice(None), camera), none)
         kept = np.arange(len(self.means)) != camera
         return replace(
             self, rows=rows, means=self.means * kept, older_squared=self.older_squared * kept
@@ -142,8 +149,9 @@ class PlaceSums:
             camera: by its place in the rig.
             own: its sums, discounted by its walk.
         """
-        part = replace(own, score=np.zeros(6), reweighted=_without_negative(own.hessian))
-        none = Sums.zeros(len(self.means))
+        reweighted = _without_negative(own.hessian)
+        part = replace(own, score=np.zeros_like(own.score), reweighted=reweighted)
+        none = Sums.zeros(len(self.means), width=own.width)
         return self.without(camera).add({name: none.replace_at(camera, part)})
 
 

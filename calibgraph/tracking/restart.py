@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.camera_block import CameraBlock, merge
 from calibgraph.tracking.cause import Cause, Steps, find_cause
 from calibgraph.tracking.drift import follow_drift
@@ -16,6 +17,7 @@ from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
+from calibgraph.tracking.offset_sums import with_offset
 from calibgraph.tracking.outlier_frames import refine
 from calibgraph.tracking.start import absorb_frames
 from calibgraph.tracking.state import DriftWatch, State, replace_item
@@ -154,7 +156,7 @@ def _restart_camera(
     )
     camera_state = replace(
         camera_state,
-        summary=EpochSummary.empty(),
+        summary=EpochSummary.empty(state.width),
         outlier_frames=(),
         agreements=(),
         moved_at=state.updates,
@@ -181,7 +183,8 @@ def _with_anchor_at(drift: DriftWatch | None, camera: int, step: Array) -> Drift
     """The watch with one camera's anchor moved by the step of that camera."""
     if drift is None:
         return None
-    own = drift.anchors[camera].shift_reference(step)
+    own = drift.anchors[camera]
+    own = own.shift_reference(np.pad(step, (0, own.width - len(step))))
     return replace(drift, anchors=drift.anchors.replace_at(camera, own))
 
 
@@ -219,7 +222,19 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         if own is not None:
             sums = replace(own.sums, frames=np.array(float(len(parts))))
             found = found.replace_at(camera, sums)
-    return found
+    return _with_uncertain_offsets(state, found, detected.since)
+
+
+def _with_uncertain_offsets(state: State, sums: Sums, since: int) -> Sums:
+    """The (n,) sums of frames since a step, which do not show the offset themselves."""
+    if state.offsets is None:
+        return sums
+    later = [frame for frame in state.live_frames if frame.number >= since]
+    twists = [f.twists_per_s for f in later if f.twists_per_s is not None]
+    share = sums.frames / np.maximum(state.total_frames, 1.0)
+    scatter = [s * state.total[pose_rows(c), pose_rows(c)] for c, s in enumerate(share)]
+    sums = replace(sums, scatter=np.array(scatter))
+    return state.of_poses(with_offset(sums, np.mean(twists, axis=0)))
 
 
 def _measure_steps(state: State, detected: DetectedStep) -> Measured:
@@ -228,5 +243,8 @@ def _measure_steps(state: State, detected: DetectedStep) -> Measured:
     new = [c for c in range(len(state.cameras)) if state.frame_noise(c) is None]
     guessed = {camera: after.hessian[camera] * _GUESSED_OVERCONFIDENCE for camera in new}
     own = {camera: before.scatter[camera] for camera in (*new, *state.drifting)}
+    if state.offsets is not None:
+        own = dict(enumerate(before.scatter))
+        guessed = {**dict(enumerate(after.scatter)), **guessed}
     by_places = shift_since(state, detected.since)
     return steps_between(state, (before, own), (after, guessed), by_places)

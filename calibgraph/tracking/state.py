@@ -29,6 +29,8 @@ from calibgraph.tracking.noise import (
     no_groups,
     widening,
 )
+from calibgraph.tracking.offset_sums import after_offset_walk, without_offset
+from calibgraph.tracking.offsets import Offsets, require_offset_alone
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.sums import Sums
@@ -126,6 +128,7 @@ class State:
         findings: of the errors that frames share, by their matcher.
         sizes: of these, as the data show them, over what the matcher states.
         optimum: of the graph of the closed epochs; None where it is not known.
+        offsets: time offsets of the cameras; None if they are not estimated.
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
         updates: number of updates.
@@ -146,6 +149,7 @@ class State:
     findings: MatcherFindings = MatcherFindings()
     sizes: VarianceRatios = VarianceRatios()
     optimum: Optimum | None = None
+    offsets: Offsets | None = None
     frame: int | None = None
     stamp_ns: int | None = None
     updates: int = 0
@@ -155,17 +159,20 @@ class State:
         """Before the first frame."""
         n = len(rig.cameras)
         guess = tuple(to_T_lidar_camera(T) for T in rig.T_camera_lidar.values())
+        require_offset_alone(config)
+        width = 7 if config.estimate else 6
         return State(
             rig=rig,
             config=config,
-            cameras=tuple(CameraState() for _ in range(n)),
+            cameras=tuple(CameraState(summary=EpochSummary.empty(width)) for _ in range(n)),
             references=guess,
-            epochs=(Epoch.empty(guess),),
+            epochs=(Epoch.empty(guess, width),),
             total=np.zeros((6 * n, 6 * n)),
             total_hessian=np.zeros((n, 6, 6)),
             total_frames=np.zeros(n),
-            places=PlaceSums.empty(n),
+            places=PlaceSums.empty(n, width),
             distortion=(NO_DISTORTION,) * n,
+            offsets=Offsets.initial(rig) if config.estimate else None,
         )
 
     @property
@@ -204,11 +211,55 @@ class State:
         """The state with one camera replaced."""
         return replace(self, cameras=replace_item(self.cameras, index, camera))
 
-    def walk_variance(self, frames: int) -> Array:
-        """(6,) variance of the configured walk over so many frames: rotation, translation."""
+    @property
+    def width(self) -> int:
+        """Of sums over several frames: 7 with time offsets."""
+        return self.epochs[-1].width
+
+    @property
+    def rig_in_time(self) -> Rig:
+        """The initial guess, with the present time offsets."""
+        return self.rig if self.offsets is None else self.offsets.put_into(self.rig)
+
+    def walk_variance(self, strengths: Array, frames: int) -> Array:
+        """(w, d) variance of walks of (w,) strengths over so many frames.
+
+        Of rotation and translation, in units of the configured walk, and of the time offset.
+        """
         tracking = self.config.tracking
         rotation = np.radians(tracking.walk_rotation_deg) ** 2
-        return np.repeat([rotation, tracking.walk_translation_m**2], 3) * frames
+        whole = np.repeat([rotation, tracking.walk_translation_m**2], 3) * frames
+        variance = np.outer(strengths**2, whole)
+        if self.offsets is None:
+            return variance
+        return np.insert(variance, 6, tracking.walk_time_offset_s**2 * frames, axis=1)
+
+    def after_offset_walk(self, sums: PlaceSums, frames: int) -> PlaceSums:
+        """The sums at all places after the walk of the time offsets over so many frames.
+
+        Walks of places that are left are taken for independent, and wider by their number: together
+        they then say no more of the present offset than one of them.
+        """
+        if self.offsets is None:
+            return sums
+        left = len(sums.names) - 1
+        counts = np.append(np.full(left, max(left, 1.0)), 1.0)
+        variance = counts[:, None, None] * self.walk_variance(np.zeros(1), frames)
+        rows = after_offset_walk(sums.rows, variance, self.all_overconfidence)
+        return replace(sums, rows=rows)
+
+    def of_poses(self, sums: Sums) -> Sums:
+        """(n,) sums of the poses alone: the offsets are as uncertain as their estimates."""
+        if self.offsets is None:
+            return sums
+        return without_offset(sums, self.offsets.sigmas_s**-2, self.all_overconfidence)
+
+    def of_pose(self, camera: int, sums: Sums) -> Sums:
+        """The same of (...) sums of one camera."""
+        if self.offsets is None:
+            return sums
+        information = self.offsets.sigmas_s[camera] ** -2
+        return without_offset(sums, information, np.array(self.overconfidence(camera)))
 
     def frame_noise(self, index: int) -> Array | None:
         """(6, 6) scatter of one frame's gradient of a camera; None while it is unknown.
@@ -246,6 +297,11 @@ class State:
         rows = pose_rows(index)
         share = np.linalg.solve(self.total_hessian[index], self.total[rows, rows])
         return max(1.0, float(np.trace(share)) / 6)
+
+    @property
+    def all_overconfidence(self) -> Array:
+        """(n,) of all cameras."""
+        return np.array([self.overconfidence(camera) for camera in range(len(self.cameras))])
 
 
 def block_diagonal(blocks: Array) -> Array:

@@ -32,6 +32,7 @@ from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
+from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import CameraState, DriftWatch, State
@@ -147,6 +148,6 @@ _KINDS: tuple[tuple[type, Callable[[Any], Any], Callable[[Any], Any]], ...] = (
       for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
                    EpochSummary, Sums, PlaceSums, Optimum, DistortionEvidence, MatcherFindings,
                    VarianceRatios, ResidualHistogram, ResidualScale, Correspondences, CameraBlock,
-                   ProjectionBlock, Lens, Event, Size)),
+                   ProjectionBlock, Lens, Event, Size, Offsets)),
 )  # fmt: skip
 _CODES = {kind: code for code, (kind, _, _) in enumerate(_KINDS)}

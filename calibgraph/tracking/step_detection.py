@@ -117,12 +117,12 @@ def detect_small_step(state: State) -> DetectedStep | None:
         if not epoch.frames:
             continue
         since = epoch.frames[0].number
-        before = sum_epochs(state, since)
+        before, later = sum_epochs(state, since), state.of_poses(after)
         for camera, camera_state in enumerate(state.cameras):
-            if not camera_state.started or _shift_excess(state, camera, before, after) <= best:
+            if not camera_state.started or _shift_excess(state, camera, before, later) <= best:
                 continue  # by what places share it is less still
             by_places = shift_since(state, since)
-            excess = _shift_excess(state, camera, before, after, by_places=by_places)
+            excess = _shift_excess(state, camera, before, later, by_places=by_places)
             if excess > best:
                 best, detected = excess, DetectedStep(since, frozenset([camera]))
     return detected
@@ -149,6 +149,8 @@ def _shift_excess(
         return 0.0
     hessian, rows = after.hessian[camera], pose_rows(camera)
     by_frames = before.scatter[camera] * (after.frames[camera] / (frames - 1))
+    if state.offsets is not None:  # both sides know the offset differently
+        by_frames = after.scatter[camera]
     by_frames = by_frames + hessian @ before.covariance(camera) @ hessian
     covariance = by_frames * state.inflation(camera)
     if by_places is not None:

@@ -6,9 +6,10 @@ A line holds a frame::
                                       "x_m": [...], "y_m": [...], "z_m": [...]}}}
 
 Optional in a camera: ``confidence``; ``i_uu_px``, ``i_uv_px`` and ``i_vv_px``; ``point_index``.
-Optional beside ``frame``: ``stamp_ns``; ``place``, where the vehicle is, a name or a number; and
-``metadata``, as of a table. A line with ``metadata`` alone is a header, and holds for the lines
-after it, as here for the error that all frames share::
+Optional beside ``frame``: ``stamp_ns``; ``place``, where the vehicle is, a name or a number;
+``twist_per_s``, the six columns ``wx_rad_s`` to ``vz_m_s`` of a table; and ``metadata``, as there.
+A line with ``metadata`` alone is a header, and holds for the lines after it, as here for the error
+that all frames share::
 
     {"metadata": {"systematic_rotation_rad": 0.001, "systematic_translation_m": 0.01}}
 """
@@ -37,6 +38,7 @@ MAX_LINE_BYTES = 64 * 2**20
 
 
 Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+Twist = Annotated[list[float], Field(min_length=6, max_length=6)]
 PlaceName = Annotated[str, Field(max_length=LONGEST_PLACE)] | Int64
 
 
@@ -113,6 +115,7 @@ class FrameLine(BaseModel):
     stamp_ns: Int64 = 0
     cameras: Annotated[dict[str, CameraColumns], Field(max_length=MAX_CAMERAS)]
     place: PlaceName | None = None
+    twist_per_s: Twist | None = None
     metadata: dict[str, Any] = {}
 
     def to_frame(self, header: Mapping[str, Any]) -> StreamFrame:
@@ -131,6 +134,8 @@ class FrameLine(BaseModel):
         if not any("point_index" in columns.given for columns in self.cameras.values()):
             tables = [replace(table, point_index=None) for table in tables]
         table = concatenate([_empty_table({**header, **self.metadata}), *tables])
+        if self.twist_per_s is not None:
+            table = replace(table, twist_per_s=np.tile(self.twist_per_s, (len(table), 1)))
         return StreamFrame(self.frame, with_place(table, self.place))
 
 

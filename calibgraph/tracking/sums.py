@@ -31,9 +31,13 @@ from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.within_place import WEAK
 from factors import smallest_scaled_eigenvalue
 
-_SHAPES: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (6, 6), (6,), (6, 6), (), ())
+_POSE = 6
+_MATRIX, _VECTOR, _NUMBER = 2, 1, 0
+_AXES = _MATRIX, _VECTOR, _MATRIX, _VECTOR, _MATRIX, _NUMBER, _NUMBER
+_SHARES = 0.5, 1.0  # of the true Hessian in that by weights
 _STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away
 _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
@@ -42,13 +46,15 @@ _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near
 class Sums:
     """Sums over frames. The leading axes (...), of cameras, places or others, are alike in all.
 
+    Of the pose, d is 6; with the time offset [s] of the camera last, d is 7.
+
     Attributes:
-        hessian: (..., 6, 6) true Hessian of the robust cost, in the tangent of T_lidar_camera.
-        gradient: (..., 6) at the reference, which ``State`` holds.
-        reweighted: (..., 6, 6) Hessian by the matches' weights in the loss: it is positive
+        hessian: (..., d, d) true Hessian of the robust cost, in the tangent of T_lidar_camera.
+        gradient: (..., d) at the reference, which ``State`` holds.
+        reweighted: (..., d, d) Hessian by the matches' weights in the loss: it is positive
             semidefinite, of however few.
-        score: (..., 6) sum of the frames' gradients, each at the estimate of its time.
-        scatter: (..., 6, 6) sum of the outer products of the same.
+        score: (..., d) sum of the frames' gradients, each at the estimate of its time.
+        scatter: (..., d, d) sum of the outer products of the same.
         frames, matches: (...) how many.
     """
 
@@ -61,9 +67,23 @@ class Sums:
     matches: Array
 
     @staticmethod
-    def zeros(*shape: int) -> Sums:
-        """Over no frames, with these leading axes."""
-        return Sums(*(np.zeros((*shape, *own)) for own in _SHAPES))
+    def zeros(*shape: int, width: int = _POSE) -> Sums:
+        """Over no frames, with these leading axes, and d."""
+        return Sums(*(np.zeros((*shape, *[width] * own)) for own in _AXES))
+
+    @property
+    def width(self) -> int:
+        """The number d."""
+        return int(self.gradient.shape[-1])
+
+    @property
+    def pose(self) -> Sums:
+        """The sums of the pose, the offset at its reference."""
+        if self.width == _POSE:
+            return self
+        rows = slice(_POSE)
+        cut = {_NUMBER: (), _VECTOR: (..., rows), _MATRIX: (..., rows, rows)}
+        return Sums(*(v[cut[own]] for v, own in zip(vars(self).values(), _AXES, strict=True)))
 
     @staticmethod
     def stack(parts: Sequence[Sums]) -> Sums:
@@ -81,8 +101,8 @@ class Sums:
         """All of them times (...) weights."""
         return Sums(
             *(
-                values * np.reshape(weight, (*np.shape(weight), *[1] * len(own)))
-                for values, own in zip(vars(self).values(), _SHAPES, strict=True)
+                values * np.reshape(weight, (*np.shape(weight), *[1] * own))
+                for values, own in zip(vars(self).values(), _AXES, strict=True)
             )
         )
 
@@ -102,7 +122,7 @@ class Sums:
         return Sums(*(values.sum(axis=0) for values in vars(self).values()))
 
     def shift_reference(self, steps: Array) -> Sums:
-        """The sums about references that are moved by (..., 6) tangent steps."""
+        """The sums about references that are moved by (..., d) tangent steps."""
         moved = (self.hessian @ steps[..., None])[..., 0]
         return replace(self, gradient=self.gradient + moved)
 
@@ -110,14 +130,14 @@ class Sums:
         """The sums after a random walk, and (...) which share of them is left.
 
         Args:
-            variance: (..., 6) of the walk.
+            variance: (..., d) of the walk.
             overconfidence: (...) k of the module's description.
         """
         by = variance / np.asarray(overconfidence)[..., None]
-        gain = np.linalg.inv(np.eye(6) + self.hessian * by[..., None, :])
+        gain = np.linalg.inv(np.eye(self.width) + self.hessian * by[..., None, :])
         hessian, back = gain @ self.hessian, gain.swapaxes(-1, -2)
         hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
-        kept = np.trace(gain, axis1=-2, axis2=-1) / 6
+        kept = np.trace(gain[..., :_POSE, :_POSE], axis1=-2, axis2=-1) / _POSE
         walked = replace(
             self * kept,
             hessian=hessian,
@@ -169,7 +189,12 @@ class Gated:
 
     @staticmethod
     def at(
-        T_lidar_camera: gtsam.Pose3, raw: CameraBlock, scale: ResidualScale, reference: gtsam.Pose3
+        T_lidar_camera: gtsam.Pose3,
+        raw: CameraBlock,
+        scale: ResidualScale,
+        reference: gtsam.Pose3,
+        *,
+        even: bool = False,
     ) -> Gated | None:
         """The matches near the minimum; None if too few are within the gate.
 
@@ -178,6 +203,8 @@ class Gated:
             raw: all of them.
             scale: of the residuals.
             reference: T_lidar_camera at which the gradient is taken.
+            even: let the true Hessian be a multiple of that by weights. A time offset shows by
+                differences of frames, in which the scatter of true Hessians would count.
         """
         residuals = raw.at(to_T_camera_lidar(T_lidar_camera))
         inliers = residuals.inliers(scale)
@@ -187,6 +214,9 @@ class Gated:
         block = raw.select(inliers).with_scale(scale)
         here = block.sums(pose)
         hessian = robust_hessian(block, pose) + residuals.gate_hessian(scale)
+        if even:
+            share = np.trace(np.linalg.solve(here.hessian + WEAK, hessian)) / _POSE
+            hessian = float(np.clip(share, *_SHARES)) * here.hessian
         gradient = here.gradient + hessian @ step_between(pose, reference)
         scatter = np.outer(here.gradient, here.gradient)
         counts = np.array(1.0), np.array(float(len(block)))

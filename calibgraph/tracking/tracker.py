@@ -12,6 +12,7 @@ from calibgraph.errors import CorrespondenceError, FileError, in_words
 from calibgraph.files import require_file, write_bytes
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.clock import require_motion
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
@@ -24,10 +25,11 @@ from calibgraph.tracking.absorption import (
     count_absent,
     select_agreeing,
     with_open_frame,
+    with_poses,
 )
-from calibgraph.tracking.assessment import Assessment, assess, rig_at, to_calibration
+from calibgraph.tracking.assessment import Assessment, assess, to_calibration
 from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
-from calibgraph.tracking.epochs import close_epoch
+from calibgraph.tracking.epochs import at_offsets, close_epoch
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import (
     PLACE,
@@ -37,6 +39,8 @@ from calibgraph.tracking.frame_order import (
     without_repeats,
 )
 from calibgraph.tracking.live_frames import LiveFrame
+from calibgraph.tracking.offset_search import explaining_offsets, follow
+from calibgraph.tracking.offsets import delayed
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
@@ -72,7 +76,7 @@ class IncrementalCalibrator:
     @property
     def rig(self) -> Rig:
         """The rig with the present estimates."""
-        return rig_at(self._state, self._assess().T_lidar_camera)
+        return self.calibration().rig
 
     @property
     def initial_rig(self) -> Rig:
@@ -135,6 +139,9 @@ class IncrementalCalibrator:
                 changed then.
         """
         table = with_common_error(table, self._state.config)
+        if len(table):
+            known = table.twist_per_s is not None
+            require_motion(self._state.config.estimate, is_known=known)
         table = with_metadata_per_frame(with_place(table, place))
         number, stamp = number_and_stamp(table, frame, self._state)
         new = without_repeats(self._state, table)
@@ -166,10 +173,13 @@ class IncrementalCalibrator:
             updates=state.updates + 1,
             findings=table.findings if len(table) else state.findings,
         )
-        self._state = with_open_frame(state, LiveFrame.empty(number, len(state.names), place))
+        in_time = state.offsets is not None
+        frame = LiveFrame.empty(number, len(state.names), place, in_time=in_time)
+        self._state = with_open_frame(state, frame)
 
     def _take(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
+        blocks = self._at_explaining_offsets(blocks)
         self._state, agreeing = select_agreeing(self._state, self._closed, blocks)
         self._state, used = absorb(self._state, self._closed, agreeing)
         self._state, events = start_cameras(self._state, table, blocks)
@@ -181,6 +191,18 @@ class IncrementalCalibrator:
         if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
             events += self._close_epoch()
         return make_update(self._state, self._assess(), tuple(events), used)
+
+    def _at_explaining_offsets(self, blocks: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
+        """The blocks, and the state, at the time offsets with which they agree."""
+        before, sums = self._state.offsets, self._closed.all_sums(self._state)
+        offsets = explaining_offsets(self._state, sums, blocks)
+        if offsets is None or before is None:
+            return blocks
+        state = with_poses(self._state, follow(self._state, sums, offsets))
+        self._state = replace(at_offsets(state, offsets), optimum=None)
+        self._rebuild()
+        later_s = offsets.values_s - before.values_s
+        return {camera: delayed(block, later_s[camera]) for camera, block in blocks.items()}
 
     def _refine(self) -> None:
         """Do a part of the work that the end of an epoch has left to the frames after it."""
@@ -258,10 +280,13 @@ class IncrementalCalibrator:
 
     def _close_epoch(self) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, begin another."""
-        state = self._state
+        state, offsets = self._state, self._state.offsets
         if self._assessed is not None:
             state = replace(state, optimum=self._assessed[1].newest(state.optimum))
-        self._state, events = close_epoch(state)
+            offsets = self._assessed[1].offsets(state)
+        if offsets is not None:
+            state = with_poses(state, follow(state, self._closed.all_sums(state), offsets))
+        self._state, events = close_epoch(state, offsets)
         detected = detect_small_step(self._state)
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import Verdict
 from calibgraph.report.as_json import finite
@@ -34,6 +35,7 @@ class Update:
         events: the events detected with this frame.
         used: per camera whose matches were absorbed, how many.
         left_out: cameras whose matches disagree with the estimate, and were not absorbed.
+        lens: per camera whose time offset is estimated, its estimate.
     """
 
     frame: int
@@ -44,6 +46,7 @@ class Update:
     events: tuple[Event, ...]
     used: dict[str, int]
     left_out: tuple[str, ...]
+    lens: dict[str, tuple[LensEstimate, ...]] = field(default_factory=dict)
 
 
 def make_update(
@@ -75,6 +78,7 @@ def make_update(
             for name, camera_state in zip(names, state.cameras, strict=True)
             if camera_state.agreements[-1:] == ((state.frame, False),)
         ),
+        lens=assessment.lens,
     )
 
 
@@ -104,6 +108,15 @@ def _camera(update: Update, name: str) -> dict[str, Any]:
         "actions": list(summarize({name: verdict}).actions),
         "used": update.used.get(name, 0),
         "left_out": name in update.left_out,
+        **{key: value for one in update.lens.get(name, ()) for key, value in _offset(one).items()},
+    }
+
+
+def _offset(one: LensEstimate) -> dict[str, Any]:
+    return {
+        "time_offset_s": one.value,
+        "time_offset_sigma_s": one.sigma,
+        "time_offset": one.describe(),
     }
 
 

@@ -60,7 +60,8 @@ class Window:
     def _update(
         self, model: LatentPoseModel, held: gtsam.NonlinearFactorGraph, start: gtsam.Values
     ) -> None:
-        graph = join(held, model.error_graph, model.place_graph, data_graph(model))
+        parts = model.error_graph, model.lens_graph, model.place_graph, data_graph(model)
+        graph = join(held, *parts)
         result = self._isam.update(graph, start, self._exchanged)
         self._exchanged = [*result.getNewFactorsIndices()][held.size() :]
         for _ in range(_MOST_STEPS):
@@ -73,5 +74,5 @@ class Window:
         return tuple(map(self.values.atPose3, keys))
 
     def covariance(self, keys: Sequence[int]) -> Array:
-        """(6 n, 6 n) joint marginal of some poses, in their tangents."""
+        """Joint marginal of some variables, in their tangents."""
         return np.asarray(self._isam.jointMarginalCovariance(keys).fullMatrix())

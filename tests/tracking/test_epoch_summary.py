@@ -25,7 +25,7 @@ def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
     )
     memory = EpochSummary.empty().add(epoch, Sums.zeros())
     variance = np.linspace(0.1, 0.6, 6)
-    after = memory.propagate(variance, overconfidence=3.0)
+    after = memory.propagate(np.outer(STRENGTHS**2, variance), overconfidence=3.0)
     for walk, strength in enumerate(STRENGTHS):
         expected = inverse_sandwich(memory, walk) + strength**2 * np.diag(variance)
         np.testing.assert_allclose(inverse_sandwich(after, walk), expected, rtol=1e-9)

@@ -39,8 +39,9 @@ from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.contradictions import pose_priors
 from calibgraph.tracking.frame_order import PLACE, with_place
-from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model, quadratics_of
+from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
+from calibgraph.tracking.quadratics import quadratics_of
 from calibgraph.tracking.steps import shift_covariance
 from calibgraph.tracking.stream_lines import frames_of_lines
 from calibgraph.tracking.streams import Refused, StreamFrame
