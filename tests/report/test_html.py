@@ -106,9 +106,7 @@ def test_a_new_lens_and_the_old_one_are_in_the_verdict(
     focal = LensEstimate("focal", "px", 717.66, 2.13, 718.86, 14.4, "z", 0.4)
     late = LensEstimate("offset", "s", 0.0203, 0.0028, 0.0, 0.05, "z", 0.4)
     text = write_page(replace(solved_pair, lens={"left": (focal, late)}), tmp_path)
-    line = (
-        "left: focal 717.7 +- 2.1 px, before 718.9 px; offset 0.0203 +- 0.0028 s, before 0.0000 s."
-    )
+    line = "left: focal 717.7 +- 2.1 px, before 718.9 px; offset 20.3 +- 2.8 ms, before 0.0 ms."
     assert line in text.split("</section>")[0]
 
 

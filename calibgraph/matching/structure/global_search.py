@@ -186,9 +186,9 @@ class Locator:
         """
         for name in self._missing():
             near = self._near[name]
-            if not _is_same_pose(near.body, self.best[name].body):
-                continue
-            if self._consider(name, near, ALONE):
+            enough = near.z_score >= least_z_score(ALONE)  # no second look: tunnels are alike
+            if enough and _is_same_pose(near.body, self.best[name].body):
+                self.located[name] = near
                 return True
         return False
 
