@@ -16,7 +16,13 @@ from calibgraph.files import sha256
 from calibgraph.io.bags import MESSAGE_SUFFIX, hash_message
 from calibgraph.io.clouds import load_cloud
 from calibgraph.io.images import load_image
-from calibgraph.io.motion import ScanMotion, register, twist_between
+from calibgraph.io.motion import (
+    PreparedScan,
+    ScanMotion,
+    prepare_scan,
+    register,
+    twist_between,
+)
 from calibgraph.io.videos import PICTURE_SUFFIX, hash_picture
 from calibgraph.model.rig import Camera
 
@@ -155,13 +161,23 @@ class DrivenFrame(Frame):
         return {**super().entry(), _MOTION: motion.entry()}
 
 
-def twist_by_scans(frame: Frame, beside: Sequence[tuple[Frame, float]]) -> Array:
+def scan_of(frame: Frame) -> PreparedScan:
+    """A frame's cloud, as :func:`twist_by_scans` uses it."""
+    return prepare_scan(frame.load_cloud()[:, :3].astype(np.float64))
+
+
+def twist_by_scans(
+    frame: Frame,
+    beside: Sequence[tuple[Frame, float]],
+    scans: Callable[[Frame], PreparedScan] = scan_of,
+) -> Array:
     """(6,) mean twist between a frame's scan and those before and after, by registration.
 
     Args:
         frame: whose twist is wanted.
         beside: the frames before and after in the recording, or one of them, and by how much later
             they are [s].
+        scans: as :func:`scan_of`, which may keep what it has prepared.
 
     Raises:
         DatasetError: if there is none, scans do not fit, or the speed is beyond that of a vehicle.
@@ -171,12 +187,10 @@ def twist_by_scans(frame: Frame, beside: Sequence[tuple[Frame, float]]) -> Array
             f"{frame.cloud_path}: has no neighbouring scan, which its motion is found from; give "
             "two frames or more, or leave --interval-s out"
         )
-    own, *others = (
-        one.load_cloud()[:, :3].astype(np.float64) for one in (frame, *(one for one, _ in beside))
-    )
+    own = scans(frame)
     twists = [
-        twist_between(np.eye(4), register(own, cloud, frame.cloud_path), later_s)
-        for cloud, (_, later_s) in zip(others, beside, strict=True)
+        twist_between(np.eye(4), register(own, scans(one), frame.cloud_path), later_s)
+        for one, later_s in beside
     ]
     twist = np.asarray(np.mean(twists, axis=0))
     if (speed_m_s := np.linalg.norm(twist[3:])) > _MOST_M_S:

@@ -22,7 +22,9 @@ from calibgraph.model.geometry import invert
 from factors import displace
 
 _COARSE_M, _FINE_M = 1.0, 0.25
-_REACH_M = 4.0  # of the coarse registration: 40 m/s in 0.1 s
+_REACHES_M = 4.0, 1.0  # of both registrations: 40 m/s in 0.1 s
+PreparedScan = tuple[tuple[Any, Any], tuple[Any, Any]]
+"""A thinned cloud of small_gicp and its tree, coarse and fine."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,16 @@ def twist_between(T_world_before: Array, T_world_after: Array, seconds: float) -
     return np.asarray(gtsam.Pose3.Logmap(step) / seconds, dtype=np.float64)
 
 
-def register(target_m: Array, source_m: Array, where: Path) -> Array:
-    """(4, 4) T_target_source of two scans, (n, 3) points each, coarse and then fine.
+def prepare_scan(points_m: Array) -> PreparedScan:
+    """Thin a scan, (n, 3), for :func:`register`; this takes longer than the registration."""
+    import small_gicp
+
+    coarse, fine = (small_gicp.preprocess_points(points_m, size) for size in (_COARSE_M, _FINE_M))
+    return coarse, fine
+
+
+def register(target: PreparedScan, source: PreparedScan, where: Path) -> Array:
+    """(4, 4) T_target_source of two scans, coarse and then fine.
 
     Raises:
         DatasetError: if they do not fit.
@@ -67,11 +77,8 @@ def register(target_m: Array, source_m: Array, where: Path) -> Array:
     import small_gicp
 
     T = np.eye(4)
-    for size_m, reach_m in ((_COARSE_M, _REACH_M), (_FINE_M, _COARSE_M)):
-        found = small_gicp.align(
-            target_m, source_m, T,
-            downsampling_resolution=size_m, max_correspondence_distance=reach_m,
-        )  # fmt: skip
+    for (cloud, tree), (moved, _), reach_m in zip(target, source, _REACHES_M, strict=True):
+        found = small_gicp.align(cloud, moved, tree, T, max_correspondence_distance=reach_m)
         T = np.asarray(found.T_target_source)
     if not found.converged:
         raise DatasetError(

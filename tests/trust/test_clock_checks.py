@@ -163,6 +163,7 @@ def registered(
         return np.asarray(np.linalg.matrix_power(T if steps > 0 else np.linalg.inv(T), abs(steps)))
 
     monkeypatch.setattr("calibgraph.io.frame.register", fit)
+    monkeypatch.setattr("calibgraph.io.frame.prepare_scan", lambda points: points)
     monkeypatch.setattr(
         Frame, "load_cloud", lambda self: np.full((1, 4), self.index, dtype=np.float32)
     )

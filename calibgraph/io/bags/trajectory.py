@@ -23,7 +23,7 @@ from calibgraph.io.bags.transforms import (
     stamped_transforms,
     values_of,
 )
-from calibgraph.io.motion import ScanMotion, register, twist_between
+from calibgraph.io.motion import ScanMotion, prepare_scan, register, twist_between
 from calibgraph.model.geometry import transform
 
 MotionOf = Callable[[BagFrame], ScanMotion]
@@ -118,9 +118,9 @@ class _ByScans:
                 f"{frame.cloud}: no scan within {_NEIGHBOUR_S} s before or after it, of which its "
                 "motion could be found; choose other frames, or --motion odometry or tf"
             )
-        cloud = _xyz(frame)
+        own = prepare_scan(_xyz(frame))
         twists = [
-            twist_between(np.eye(4), register(cloud, _xyz(other), frame.cloud),
+            twist_between(np.eye(4), register(own, prepare_scan(_xyz(other)), frame.cloud),
                           (other.stamp_ns - frame.stamp_ns) / 1e9)
             for other in near
         ]  # fmt: skip
