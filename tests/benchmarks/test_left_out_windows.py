@@ -58,4 +58,4 @@ def test_cells_tell_windows_that_are_right_from_windows_that_are_not() -> None:
     nats, share, z = map(float, cells(sample((1, -1)), kinds))
     assert nats < -0.9 and share == 1 and z > 1
     nats, share, z = map(float, cells(sample((5, 0)), kinds))
-    assert nats > 0.3 and share == 0 and z < 0
+    assert nats > 0 and share == 0 and z < 0
