@@ -102,7 +102,7 @@ def prior_sigma_s(camera: Camera) -> float:
 
 
 def with_motion_in_use(
-    rig: Rig, config: Config, table: Correspondences, before: CameraBlock | None
+    rig: Rig, config: Config, table: Correspondences, before: bool | None
 ) -> Correspondences:
     """The matches of a frame, with the motion of the LiDAR where a clock uses it.
 
@@ -110,7 +110,7 @@ def with_motion_in_use(
         rig: with the clocks of its cameras.
         config: settings.
         table: the matches.
-        before: matches of an earlier frame; None if there are none.
+        before: whether that of earlier frames is known; None if there are none.
 
     Raises:
         CorrespondenceError: if the motion is needed and not known, or not known of all frames.
@@ -120,7 +120,7 @@ def with_motion_in_use(
     used = config.estimate or any(c.time_offset_s or c.readout_s for c in rig.cameras.values())
     if not used:
         return replace(table, twist_per_s=None)
-    if before is not None and (before.block.motion is not None) != known:
+    if before is not None and before != known:
         found, earlier = ("no ", "one") if not known else ("a ", "none")
         raise CorrespondenceError(
             f"it has {found}motion of the LiDAR (twist_per_s), earlier frames have {earlier}; the "

@@ -27,8 +27,11 @@ from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, seen_lens_key
 from calibgraph.model.geometry import twist_between
 from calibgraph.simulation.rigs import rig_of
+from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.tracking.history import History
+from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.offset_sums import with_offset, without_offset
+from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums
 from calibgraph.tracking.update import json_line
 from tests.conftest import make_pair
@@ -246,16 +249,46 @@ def test_motion_that_no_clock_needs_may_come_and_go() -> None:
 
 
 def test_frames_without_motion_among_others_are_refused_where_a_clock_needs_it() -> None:
-    rig = make_pair()
-    late = {n: c.model_copy(update={"time_offset_s": 0.02}) for n, c in rig.cameras.items()}
-    tracker = IncrementalCalibrator(rig.model_copy(update={"cameras": late}))
-    *known, unknown = _motion_for_some(rig)
+    rig = _late_pair()
+    tracker = IncrementalCalibrator(rig)
+    *known, unknown = _motion_for_some(make_pair())
     for frame, table in enumerate(known):
         tracker.update(table, frame=frame)
     with pytest.raises(CorrespondenceError, match=r"no motion of the LiDAR .* earlier frames have"):
         tracker.update(unknown, frame=len(known))
     again = replace(known[-1], frame=known[-1].frame + 2)
     assert tracker.update(again, frame=len(known) + 1).frame == len(known) + 1
+
+
+def test_so_are_they_among_frames_from_which_a_tracker_has_not_started() -> None:
+    tracker = IncrementalCalibrator(_late_pair())
+    known = _motion_for_some(make_pair())[:-1]
+    tables = [replace(one, twist_per_s=None) for one in known]
+    for frame in range(2):
+        tracker.update(tables[frame], frame=frame)
+    tracker = IncrementalCalibrator.from_bytes(tracker.to_bytes())
+    with pytest.raises(CorrespondenceError, match=r"a motion of the LiDAR .* earlier frames have"):
+        tracker.update(known[2], frame=2)
+    for frame in range(3, 8):
+        update = tracker.update(tables[frame], frame=frame)
+    assert all(verdict.status != "FAIL" for verdict in update.verdicts.values())
+
+
+def test_frames_that_were_set_aside_tell_whether_the_motion_is_known() -> None:
+    rig = _late_pair()
+    known, unknown = _motion_for_some(make_pair())[-2:]
+    state = State.initial(rig, Config())
+    assert state.knows_motion is None
+    for table, expected in (known, True), (unknown, False):
+        frame = OutlierFrame(0, camera_blocks(rig, table, Config())["left"], gtsam.Pose3())
+        one = replace(state.cameras[0], outlier_frames=(frame,))
+        assert state.with_camera(0, one).knows_motion is expected
+
+
+def _late_pair() -> Rig:
+    rig = make_pair()
+    late = {n: c.model_copy(update={"time_offset_s": 0.02}) for n, c in rig.cameras.items()}
+    return rig.model_copy(update={"cameras": late})
 
 
 def _motion_for_some(rig: Rig) -> list[Correspondences]:
