@@ -224,19 +224,23 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         if own is not None:
             sums = replace(own.sums, frames=np.array(float(len(parts))))
             found = found.replace_at(camera, sums)
-    return _with_uncertain_offsets(state, found, detected.since)
+    return _with_uncertain_offsets(state, found, detected)
 
 
-def _with_uncertain_offsets(state: State, sums: Sums, since: int) -> Sums:
+def _with_uncertain_offsets(state: State, sums: Sums, detected: DetectedStep) -> Sums:
     """The (n,) sums of frames since a step, which do not show the offset themselves."""
     if state.offsets is None:
         return sums
-    later = [frame for frame in state.live_frames if frame.number >= since]
-    twists = [f.twists_per_s for f in later if f.twists_per_s is not None]
+    twists = np.zeros((len(state.cameras), 6))
+    for camera, to_camera in enumerate(state.offsets.adjoints):
+        motions = (part.block.motion for part in _blocks_since(state, detected, camera))
+        own = [motion[0, :6] for motion in motions if motion is not None]
+        if own:
+            twists[camera] = to_camera @ np.mean(own, axis=0)
     share = sums.frames / np.maximum(state.total_frames, 1.0)
     scatter = [s * state.total[pose_rows(c), pose_rows(c)] for c, s in enumerate(share)]
     sums = replace(sums, scatter=np.array(scatter))
-    return state.of_poses(with_offset(sums, np.mean(twists, axis=0)))
+    return state.of_poses(with_offset(sums, twists))
 
 
 def _measure_steps(state: State, detected: DetectedStep) -> Measured:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from calibgraph.simulation.rigs import rig_of
 from tests.tracking.drives import moved_later
@@ -43,3 +44,16 @@ def test_what_was_not_known_before_a_move_is_not_known_after_it() -> None:
     before, after = (updates[frame].lens["image_2"][0] for frame in (35, -1))
     assert not after.is_determined
     assert 0.95 * before.sigma < after.sigma < 0.051
+
+
+def test_frames_of_a_camera_that_has_moved_do_not_show_its_offset() -> None:
+    """Straight ahead at 10 m/s it leaves 36 cm, before the move and after it."""
+    rig, ahead = rig_of("kitti"), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.4])
+    after = moved(rig, "image_2", ahead)
+    truth, tables = late(
+        np.tile(STRAIGHT, (45, 1)), np.full(45, 0.02), rig_at=lambda k: after if k >= 40 else rig
+    )
+    events = [event for update in track(truth, tables) for event in update.events]
+    (size,) = [event.size for event in events if event.kind == "moved"]
+    assert size is not None
+    assert size.translation_sigma_cm == pytest.approx(2**0.5 * 36, rel=0.1)
