@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Self
 
 import gtsam
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from calibgraph.arrays import Array
 from calibgraph.files import write_bytes
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 _MOST_EVENTS = 1000
 _POSE = 6
 _NUMBERS = 7  # of a camera: its pose and its time offset
+_ENTRY_AXES = 3  # update, camera, number
 
 
 class _Saved(BaseModel):
@@ -42,6 +43,14 @@ class _Saved(BaseModel):
     frames: np.ndarray
     entries: np.ndarray
     events: tuple[Event, ...]
+
+    @field_validator("entries")
+    @classmethod
+    def _with_offsets(cls, entries: Array) -> Array:
+        """Earlier files have none: pose and its sigmas alone."""
+        if entries.ndim != _ENTRY_AXES or entries.shape[-1] != 2 * _POSE:
+            return entries
+        return np.insert(entries, [_POSE, 2 * _POSE], np.nan, axis=-1)
 
     @model_validator(mode="after")
     def _check_arrays(self) -> Self:
