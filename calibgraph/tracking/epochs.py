@@ -113,9 +113,7 @@ def _with_points_at(state: State, later_s: Array) -> State:
     cameras = tuple(
         replace(
             one,
-            outlier_frames=tuple(
-                replace(f, raw=delayed(f.raw, seconds)) for f in one.outlier_frames
-            ),
+            outlier_frames=tuple(frame.delayed(seconds) for frame in one.outlier_frames),
         )
         for one, seconds in zip(state.cameras, later_s, strict=True)
     )

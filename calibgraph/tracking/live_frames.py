@@ -16,7 +16,7 @@ from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.offset_sums import with_offset
-from calibgraph.tracking.offsets import Offsets
+from calibgraph.tracking.offsets import Offsets, delayed, motion_in
 from calibgraph.tracking.sums import Gated, Sums
 
 NO_DISTORTION = DistortionEvidence.none(WEAK, places=1)
@@ -143,6 +143,11 @@ class OutlierFrame:
     number: int
     raw: CameraBlock
     T_lidar_camera: gtsam.Pose3
+
+    def delayed(self, seconds: float) -> OutlierFrame:
+        """The frame with its points where they are some seconds later; its pose fits them."""
+        T_lidar_camera = motion_in(self.raw, seconds).compose(self.T_lidar_camera)
+        return replace(self, raw=delayed(self.raw, seconds), T_lidar_camera=T_lidar_camera)
 
 
 def inliers_of(frames: Iterable[LiveFrame], camera: int) -> CameraBlock | None:

@@ -129,12 +129,18 @@ def with_motion_in_use(
     return table
 
 
+def motion_in(raw: CameraBlock, seconds: float) -> gtsam.Pose3:
+    """Of the points of one frame as the LiDAR sees them; none if that of the LiDAR is unknown."""
+    motion = raw.block.motion
+    return gtsam.Pose3() if motion is None else gtsam.Pose3.Expmap(-seconds * motion[0, :6])
+
+
 def delayed(raw: CameraBlock, seconds: float) -> CameraBlock:
     """Matches of one frame with their points where they are some seconds later."""
     block = raw.block
     if block.motion is None or not seconds:
         return raw
-    step = gtsam.Pose3.Expmap(-seconds * block.motion[0, :6]).matrix()
+    step = motion_in(raw, seconds).matrix()
     points = block.points_lidar_m @ step[:3, :3].T + step[:3, 3]
     motion = block.motion + np.append(np.zeros(6), seconds)
     return replace(raw, block=replace(block, points_lidar_m=points, motion=motion))

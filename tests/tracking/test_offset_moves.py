@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calibgraph import Config
+from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.simulation.rigs import rig_of
+from calibgraph.solver.camera_block import camera_blocks
+from calibgraph.tracking.live_frames import OutlierFrame
 from tests.tracking.drives import moved_later
 from tests.tracking.late_drives import STRAIGHT, late, town, track
 from tests.tracking.steps import moved, step_of
@@ -57,3 +61,15 @@ def test_frames_of_a_camera_that_has_moved_do_not_show_its_offset() -> None:
     (size,) = [event.size for event in events if event.kind == "moved"]
     assert size is not None
     assert size.translation_sigma_cm == pytest.approx(2**0.5 * 36, rel=0.1)
+
+
+def test_a_frame_that_is_set_aside_keeps_its_errors_at_another_offset() -> None:
+    rig, (table,) = late(town(1, 0), np.zeros(1))
+    pose = to_T_lidar_camera(rig.T_camera_lidar["image_2"])
+    frame = OutlierFrame(0, camera_blocks(rig, table, Config())["image_2"], pose)
+    later = frame.delayed(0.1)
+    before, after = (
+        one.raw.errors_px(to_T_camera_lidar(one.T_lidar_camera))[0] for one in (frame, later)
+    )
+    assert np.allclose(after, before, atol=1e-6)
+    assert np.linalg.norm(later.T_lidar_camera.translation() - pose.translation()) > 0.5
