@@ -174,12 +174,15 @@ class LensTerm:
         by_distortion: (k, B) displacement of s_c by a unit of each scan distortion.
         compensating: (6, k) displacement of m_c by a unit of the difference of s_c and l_c that is
             no scan distortion: of the pose that fits best where the lens is wrong by as much.
+        earlier: value and standard deviation of a single parameter, in its unit, by data that are
+            in no other factor; None if there are none.
     """
 
     variable: LensVariable
     excess: Array
     by_distortion: Array
     compensating: Array
+    earlier: tuple[float, float] | None = None
 
     def shifts(self, number: int, *, is_distorted: bool) -> dict[int, Array]:
         """By key, the (6, ...) displacements of m_c by l_c, s_c and the scan distortion."""
@@ -196,6 +199,10 @@ def lens_graph(lenses: Mapping[int, LensTerm], *, is_distorted: bool) -> gtsam.N
         unit = np.eye(len(term.variable.free))
         for row in unit:
             graph.add(linear_factor([lens_key(number)], [row[None]], tail))
+        if term.earlier is not None:
+            value, sigma = term.earlier
+            noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+            graph.add(gtsam.PriorFactorVector(lens_key(number), np.array([value]), noise))
         keys, matrices = [lens_key(number), seen_lens_key(number)], [-unit, unit]
         if is_distorted:
             keys, matrices = [*keys, DISTORTION], [*matrices, -term.by_distortion]

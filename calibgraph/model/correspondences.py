@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
+MAX_TWIST = 6.0, 100.0  # rad/s and m/s: beyond those of a vehicle; swapped ones are seen
 MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
 _MAX_WHOLE = 2**63 - 1
 MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
@@ -231,11 +232,13 @@ class Correspondences:
         return pa.table(columns).replace_schema_metadata(metadata)
 
     def _check_values(self) -> None:
-        columns = {"pixel": self.pixels_px, "point": self.points_lidar_m, "twist": self.twist_per_s}
-        for what, values in columns.items():
-            if values is not None:
-                good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
-                self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
+        for what, values in {"pixel": self.pixels_px, "point": self.points_lidar_m}.items():
+            good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
+            self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
+        if (twist := self.twist_per_s) is not None:
+            good = (np.linalg.norm(twist.reshape(-1, 2, 3), axis=2) < MAX_TWIST).all(axis=1)
+            limits = "be under {:g} rad/s, then under {:g} m/s".format(*MAX_TWIST)
+            self._require(good, "twist", twist, f"{limits} (rotation first, in radians)")
         c = self.confidence
         self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
         if self.point_index is not None:

@@ -108,9 +108,7 @@ def lens_change(before: Camera, camera: Camera) -> str:
     starts, arrows = grid[coarse][known], change[coarse][known]
     factor = arrow_factor(arrows, float(size[0] / ARROW_COLUMNS))
     _add_arrows(axes, starts, factor * arrows)
-    axes.set_title(
-        f"pixels of a ray, after less before, drawn {factor:g} times as long", fontsize=9
-    )
+    axes.set_title(f"how far rays move in the image, drawn {factor:g} times as long", fontsize=9)
     return to_data_uri(figure)
 
 

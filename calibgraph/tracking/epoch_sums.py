@@ -14,7 +14,12 @@ from calibgraph.tracking.sums import Sums
 
 def sum_epochs(state: State, before: int | None = None) -> Sums:
     """(n,) over all frames, or those before a frame's number, of the poses alone."""
-    return state.of_poses(sum_closed_epochs(state, before) + _until(state.epochs[-1], before))
+    return state.of_poses(sum_all_epochs(state, before))
+
+
+def sum_all_epochs(state: State, before: int | None = None) -> Sums:
+    """The same with the time offsets, where they are estimated."""
+    return sum_closed_epochs(state, before) + _until(state.epochs[-1], before)
 
 
 def sum_closed_epochs(state: State, before: int | None = None) -> Sums:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import LateQuadraticByPlace
@@ -14,7 +16,8 @@ from calibgraph.graph.lens import LensTerm
 from calibgraph.graph.variables import seen_lens_key
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.solver.lens import lens_term_of
-from calibgraph.solver.within_place import WithinPlace
+from calibgraph.solver.within_place import WEAK, WithinPlace
+from calibgraph.tracking.epoch_sums import sum_all_epochs
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums
 
@@ -39,7 +42,53 @@ def offset_term(state: State, camera: int, sums: Sums, within: WithinPlace) -> L
     counts = float(total.matches), float(total.frames)
     term = lens_term_of(lens, shown, counts, within, findings=findings)
     bends = len(findings.bend_sigmas)
-    return LensTerm(lens, term.excess, np.zeros((1, bends)), term.compensating)
+    value_s, variance = _earlier(state, camera)
+    sigma, mean = lens.free.sigmas[0], lens.free.clock.offset_s
+    earlier = (value_s - mean) / sigma, variance**0.5 / sigma
+    known = earlier if np.isfinite(variance) else None
+    return LensTerm(lens, term.excess, np.zeros((1, bends)), term.compensating, known)
+
+
+def keep_offsets(state: State, cameras: Iterable[int], since: int) -> State:
+    """The state with what the frames before a move of some cameras show of their time offsets.
+
+    The number of a frame says since when. No less uncertain than the graph has them.
+    """
+    if state.offsets is None:
+        return state
+    sums, offsets = sum_all_epochs(state, since), state.offsets
+    later = sum(1 for frame in state.live_frames if frame.number >= since)
+    for camera in cameras:
+        known = _shown(state, camera, sums[camera])
+        offsets = offsets.with_earlier(camera, *known, state.updates - later)
+    return replace(state, offsets=offsets)
+
+
+def _shown(state: State, camera: int, own: Sums) -> tuple[float, float]:
+    """Value [s] and variance of an offset by (7,) sums and by earlier ones, without its prior."""
+    assert state.offsets is not None
+    value_s, free = state.offsets.values_s[camera], state.offsets.variable(state.rig, camera).free
+    prior, (earlier_s, variance) = free.sigmas[0] ** -2, _earlier(state, camera)
+    k, information = state.overconfidence(camera), np.array([prior, 1 / variance])
+    away_s = np.array([free.clock.offset_s, earlier_s]) - value_s
+    alone = np.diag(np.append(np.zeros(6), k * information.sum()))
+    inverse = np.linalg.inv(own.hessian + alone + block_diag(WEAK, 0.0))
+    gradient = own.gradient - np.append(np.zeros(6), k * (information @ away_s))
+    scatter = state.inflation(camera) * own.scatter + k * alone
+    found_s = float(value_s - (inverse @ gradient)[6])
+    variance = max((inverse @ scatter @ inverse)[6, 6], state.offsets.sigmas_s[camera] ** 2)
+    left = 1 / variance - prior
+    if left <= 0:
+        return 0.0, np.inf
+    return (found_s / variance - free.clock.offset_s * prior) / left, 1 / left
+
+
+def _earlier(state: State, camera: int) -> tuple[float, float]:
+    """Value [s] of an offset before its camera's last move, and variance after its walk since."""
+    assert state.offsets is not None
+    value_s, variance, at = state.offsets.earlier[camera].tolist()
+    walk = state.config.tracking.walk_time_offset_s**2 * (state.updates - at)
+    return value_s, variance + walk
 
 
 def late_quadratic(

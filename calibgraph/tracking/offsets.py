@@ -45,11 +45,14 @@ class Offsets:
         sigmas_s: (n,) standard deviations.
         adjoints: (n, 6, 6) from the twist of the LiDAR to that of each camera where it began: with
             those of newer estimates, frames of one twist would seem to show the offset.
+        earlier: (n, 3) what the frames before the last move of each camera show: value [s],
+            variance [s^2], and the number of updates then. A move of a mount leaves the clock.
     """
 
     values_s: Array
     sigmas_s: Array
     adjoints: Array
+    earlier: Array
 
     @staticmethod
     def initial(rig: Rig) -> Offsets:
@@ -57,13 +60,21 @@ class Offsets:
         cameras = rig.cameras.values()
         values = [clock_of(camera).offset_s for camera in cameras]
         sigmas = [prior_sigma_s(camera) for camera in cameras]
-        return Offsets(np.array(values), np.array(sigmas), np.tile(np.eye(6), (len(values), 1, 1)))
+        n, nothing = len(values), [0.0, np.inf, 0.0]
+        adjoints, earlier = np.tile(np.eye(6), (n, 1, 1)), np.tile(nothing, (n, 1))
+        return Offsets(np.array(values), np.array(sigmas), adjoints, earlier)
 
     def with_camera(self, camera: int, value_s: float, sigma_s: float) -> Offsets:
         """With one of them replaced."""
         values_s, sigmas_s = self.values_s.copy(), self.sigmas_s.copy()
         values_s[camera], sigmas_s[camera] = value_s, sigma_s
         return replace(self, values_s=values_s, sigmas_s=sigmas_s)
+
+    def with_earlier(self, camera: int, value_s: float, variance: float, at: int) -> Offsets:
+        """With what frames before a move of a camera show, and the number of updates then."""
+        earlier = self.earlier.copy()
+        earlier[camera] = value_s, variance, at
+        return replace(self, earlier=earlier)
 
     def with_axes(self, camera: int, T_lidar_camera: gtsam.Pose3) -> Offsets:
         """With a camera that begins at a pose."""
@@ -91,7 +102,7 @@ def prior_sigma_s(camera: Camera) -> float:
 
 
 def with_motion_in_use(
-    rig: Rig, config: Config, table: Correspondences, before: CameraBlock | None
+    rig: Rig, config: Config, table: Correspondences, before: bool | None
 ) -> Correspondences:
     """The matches of a frame, with the motion of the LiDAR where a clock uses it.
 
@@ -99,7 +110,7 @@ def with_motion_in_use(
         rig: with the clocks of its cameras.
         config: settings.
         table: the matches.
-        before: matches of an earlier frame; None if there are none.
+        before: whether that of earlier frames is known; None if there are none.
 
     Raises:
         CorrespondenceError: if the motion is needed and not known, or not known of all frames.
@@ -109,7 +120,7 @@ def with_motion_in_use(
     used = config.estimate or any(c.time_offset_s or c.readout_s for c in rig.cameras.values())
     if not used:
         return replace(table, twist_per_s=None)
-    if before is not None and (before.block.motion is not None) != known:
+    if before is not None and before != known:
         found, earlier = ("no ", "one") if not known else ("a ", "none")
         raise CorrespondenceError(
             f"it has {found}motion of the LiDAR (twist_per_s), earlier frames have {earlier}; the "

@@ -86,7 +86,7 @@ class PlaceSums:
 
         Further (n,) the number of frames that the means leave.
         """
-        about_means = _about_mean(self.rows[1:]).sum(axis=0) + self.rows.scatter[0]
+        about_means = self.rows[1:].scatter_about_mean.sum(axis=0) + self.rows.scatter[0]
         means = np.count_nonzero(self.frames[1:], axis=0) + self.means
         return about_means, np.maximum(self.frames.sum(axis=0) - means, 0.0)
 
@@ -124,7 +124,7 @@ class PlaceSums:
     def _merge_second(self) -> PlaceSums:
         """The second row added to the first."""
         second = self.rows[1]
-        second = replace(second, score=0.0 * second.score, scatter=_about_mean(second))
+        second = replace(second, score=0.0 * second.score, scatter=second.scatter_about_mean)
         return PlaceSums(
             (_OLDER, *self.names[2:]),
             self.rows.replace_at(1, self.rows[0] + second)[1:],
@@ -153,12 +153,6 @@ class PlaceSums:
         part = replace(own, score=np.zeros_like(own.score), reweighted=reweighted)
         none = Sums.zeros(len(self.means), width=own.width)
         return self.without(camera).add({name: none.replace_at(camera, part)})
-
-
-def _about_mean(sums: Sums) -> Array:
-    """(..., 6, 6) scatter about the mean of the frames' gradients."""
-    whole = np.maximum(sums.frames, 1.0)[..., None, None]
-    return np.asarray(sums.scatter - sums.score[..., :, None] * sums.score[..., None, :] / whole)
 
 
 def _without_negative(hessian: Array) -> Array:

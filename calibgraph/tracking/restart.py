@@ -18,6 +18,7 @@ from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
 from calibgraph.tracking.offset_sums import with_offset
+from calibgraph.tracking.offset_terms import keep_offsets
 from calibgraph.tracking.outlier_frames import refine
 from calibgraph.tracking.start import absorb_frames
 from calibgraph.tracking.state import DriftWatch, State, replace_item
@@ -61,6 +62,7 @@ def restart_after_step(state: State, detected: DetectedStep) -> tuple[State, tup
     for camera in detected.found_by - set(steps.cameras):  # nothing to compare with
         if near := detected.outlier_frames.get(camera):
             targets[camera] = near[-1].T_lidar_camera
+    state = keep_offsets(state, targets, detected.since)
     for camera, T_lidar_camera in targets.items():
         state = _restart_camera(
             state, camera, T_lidar_camera, _blocks_since(state, detected, camera)

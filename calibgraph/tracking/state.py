@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import reduce
+from itertools import chain
 from operator import add
 from typing import TypeVar
 
@@ -131,6 +132,18 @@ class State:
     def live_frames(self) -> tuple[LiveFrame, ...]:
         """The frames of all live epochs."""
         return tuple(frame for epoch in self.epochs for frame in epoch.frames)
+
+    @property
+    def knows_motion(self) -> bool | None:
+        """Whether that of the frames whose matches are kept is known; None if there are none."""
+        for one in self.cameras:
+            for table in one.waiting:
+                if len(table):
+                    return table.twist_per_s is not None
+        absorbed = (raw for frame in self.live_frames for raw in frame.raw.values())
+        set_aside = (frame.raw for one in self.cameras for frame in one.outlier_frames)
+        kept = next(chain(absorbed, set_aside), None)
+        return None if kept is None else kept.block.motion is not None
 
     @property
     def all_distortion(self) -> tuple[DistortionEvidence, ...]:

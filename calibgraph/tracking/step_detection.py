@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
+
+import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
 from calibgraph.tracking.epoch_sums import sum_epochs
-from calibgraph.tracking.live_frames import OutlierFrame
+from calibgraph.tracking.live_frames import Epoch, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.state import State
 from calibgraph.tracking.steps import shift_since
@@ -113,7 +115,8 @@ def detect_small_step(state: State) -> DetectedStep | None:
     best, detected = 0.0, None
     if any(_is_pending(camera_state) for camera_state in state.cameras):
         return None
-    afterwards = [*accumulate(epoch.sums for epoch in reversed(state.epochs))][::-1]
+    sums = [_scattered_as_usual(state, epoch) for epoch in reversed(state.epochs)]
+    afterwards = [*accumulate(sums)][::-1]
     for epoch, after in zip(state.epochs[1:], afterwards[1:], strict=True):
         if not epoch.frames:
             continue
@@ -127,6 +130,23 @@ def detect_small_step(state: State) -> DetectedStep | None:
             if excess > best:
                 best, detected = excess, DetectedStep(since, frozenset([camera]))
     return detected
+
+
+def _scattered_as_usual(state: State, epoch: Epoch) -> Sums:
+    """The (n,) sums of an epoch; with time offsets, scattered as frames about the means of epochs.
+
+    The scatter of its own frames is about the estimate, and so has a step in it.
+    """
+    if state.offsets is None:
+        return epoch.sums
+    poses = Sums.stack([one.sums.pose for one in state.epochs])
+    left = np.maximum(poses.frames - 1, 0).sum(axis=0)[:, None, None]
+    by_camera = poses.scatter_about_mean.sum(axis=0) / np.maximum(left, 1.0)
+    frames = [
+        replace(f, sums=replace(f.sums, scatter=f.sums.frames[:, None, None] * by_camera))
+        for f in epoch.frames
+    ]
+    return epoch.sums_of(frames)
 
 
 def _shift_excess(

@@ -77,6 +77,13 @@ class Sums:
         return int(self.gradient.shape[-1])
 
     @property
+    def scatter_about_mean(self) -> Array:
+        """(..., d, d) of the frames' gradients."""
+        whole = np.maximum(self.frames, 1.0)[..., None, None]
+        outer = self.score[..., :, None] * self.score[..., None, :]
+        return np.asarray(self.scatter - outer / whole)
+
+    @property
     def pose(self) -> Sums:
         """The sums of the pose, the offset at its reference."""
         if self.width == _POSE:

@@ -139,9 +139,8 @@ class IncrementalCalibrator:
         """
         table = with_common_error(table, self._state.config)
         if len(table):
-            kept = (raw for one in self._state.live_frames for raw in one.raw.values())
-            before = next(kept, None)
-            table = with_motion_in_use(self._state.rig, self._state.config, table, before)
+            known = self._state.knows_motion
+            table = with_motion_in_use(self._state.rig, self._state.config, table, known)
         table = with_metadata_per_frame(with_place(table, place))
         number, stamp = number_and_stamp(table, frame, self._state)
         new = without_repeats(self._state, table)

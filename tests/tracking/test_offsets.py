@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,7 @@ from calibgraph import (
     CorrespondenceError,
     Correspondences,
     IncrementalCalibrator,
-    MatcherErrors,
     Rig,
-    Update,
     concatenate,
     load_calibration,
     simulate_correspondences,
@@ -29,73 +26,28 @@ from calibgraph.graph.by_place import LateQuadraticByPlace
 from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, seen_lens_key
 from calibgraph.model.geometry import twist_between
-from calibgraph.simulation.clock_errors import put_clock_error
-from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.simulation.rigs import rig_of
+from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.tracking.history import History
+from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.offset_sums import with_offset, without_offset
+from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums
 from calibgraph.tracking.update import json_line
-from factors import Clock
 from tests.conftest import make_pair
 from tests.tracking.drives import content_of, moved_later
-
-ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.1)
-OFFSET = Config(estimate=("offset",))
-CONSTANT = OFFSET.changed(tracking={"walk_time_offset_s": 0.0})
-STRAIGHT = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
-RATE = 1.5e-5  # s from frame to frame: 45 ms in five minutes at 10 Hz
-
-
-def town(frames: int, seed: int) -> np.ndarray:
-    """Turns of 0.2 rad/s and speeds about 8 m/s, each of some seconds; 10 Hz."""
-    rng, t = np.random.default_rng([seed, 5]), np.arange(frames) / 10
-
-    def wave(period_s: float) -> np.ndarray:
-        parts = zip(period_s * rng.uniform(0.6, 1.6, 4), rng.uniform(0, 2 * np.pi, 4), strict=True)
-        return np.sum([np.sin(2 * np.pi * t / p + phase) for p, phase in parts], axis=0) / 2**0.5
-
-    yaw, ahead = 0.2 * wave(15.0), np.clip(8 + 3 * wave(25.0), 0, 15)
-    small = [0.01 * wave(3.0), 0.01 * wave(3.0)]
-    return np.column_stack([*small, yaw, ahead, 0.05 * wave(5.0), np.zeros(frames)])
-
-
-def late(
-    twists: np.ndarray, offsets_s: np.ndarray, seed: int = 0, moves_at: int | None = None
-) -> tuple[Rig, list[Correspondences]]:
-    """Two cameras like KITTI's, and frames of 100 matches, each late by its own offset."""
-    rig, frames = rig_of("kitti"), len(twists)
-    rig_at = moved_later(rig, frames if moves_at is None else moves_at)
-    drive = simulate_drive(rig_at, frames=frames, matches=100, errors=ERRORS, seed=seed)
-    clocks = [Clock(value) for value in offsets_s.tolist()]
-    tables = [put_clock_error(t, rig, twists, c) for t, c in zip(drive, clocks, strict=True)]
-    return rig, tables
-
-
-def track(rig: Rig, tables: Sequence[Correspondences], config: Config = OFFSET) -> list[Update]:
-    tracker = IncrementalCalibrator(rig, config)
-    return [tracker.update(table) for table in tables]
-
-
-def squared_errors(update: Update, truth: Rig) -> list[float]:
-    """Per camera, the mean over a pose of the squared error in the metric of its covariance."""
-    found = []
-    for name, T in truth.T_camera_lidar.items():
-        covariance = update.covariance[name]
-        assert covariance is not None
-        twist = twist_between(update.T_camera_lidar[name], T)
-        found.append(float(twist @ np.linalg.solve(covariance, twist)) / 6)
-    return found
-
-
-def offset_errors(update: Update, offset_s: float) -> list[float]:
-    """Per camera, the error of its offset in sigmas."""
-    return [(one.value - offset_s) / one.sigma for (one,) in update.lens.values()]
-
-
-def moves(updates: Sequence[Update]) -> list[str]:
-    events = [event for update in updates for event in update.events]
-    return [str(event) for event in events if event.kind != "started"]
+from tests.tracking.late_drives import (
+    CONSTANT,
+    OFFSET,
+    RATE,
+    STRAIGHT,
+    late,
+    moves,
+    offset_errors,
+    squared_errors,
+    town,
+    track,
+)
 
 
 def test_a_drifting_offset_is_followed_and_the_extrinsic_stays() -> None:
@@ -146,7 +98,9 @@ def test_the_first_turn_after_a_way_straight_ahead_is_no_move() -> None:
 
 
 def test_a_move_is_found_while_the_offset_drifts() -> None:
-    truth, tables = late(town(150, 2), 0.005 + RATE * np.arange(150), moves_at=120)
+    truth, tables = late(
+        town(150, 2), 0.005 + RATE * np.arange(150), rig_at=moved_later(rig_of("kitti"), 120)
+    )
     updates = track(truth, tables)
     (event,) = [e for update in updates for e in update.events if e.kind != "started"]
     assert (event.kind, event.camera, event.frame) == ("moved", "image_2", 120)
@@ -295,16 +249,46 @@ def test_motion_that_no_clock_needs_may_come_and_go() -> None:
 
 
 def test_frames_without_motion_among_others_are_refused_where_a_clock_needs_it() -> None:
-    rig = make_pair()
-    late = {n: c.model_copy(update={"time_offset_s": 0.02}) for n, c in rig.cameras.items()}
-    tracker = IncrementalCalibrator(rig.model_copy(update={"cameras": late}))
-    *known, unknown = _motion_for_some(rig)
+    rig = _late_pair()
+    tracker = IncrementalCalibrator(rig)
+    *known, unknown = _motion_for_some(make_pair())
     for frame, table in enumerate(known):
         tracker.update(table, frame=frame)
     with pytest.raises(CorrespondenceError, match=r"no motion of the LiDAR .* earlier frames have"):
         tracker.update(unknown, frame=len(known))
     again = replace(known[-1], frame=known[-1].frame + 2)
     assert tracker.update(again, frame=len(known) + 1).frame == len(known) + 1
+
+
+def test_so_are_they_among_frames_from_which_a_tracker_has_not_started() -> None:
+    tracker = IncrementalCalibrator(_late_pair())
+    known = _motion_for_some(make_pair())[:-1]
+    tables = [replace(one, twist_per_s=None) for one in known]
+    for frame in range(2):
+        tracker.update(tables[frame], frame=frame)
+    tracker = IncrementalCalibrator.from_bytes(tracker.to_bytes())
+    with pytest.raises(CorrespondenceError, match=r"a motion of the LiDAR .* earlier frames have"):
+        tracker.update(known[2], frame=2)
+    for frame in range(3, 8):
+        update = tracker.update(tables[frame], frame=frame)
+    assert all(verdict.status != "FAIL" for verdict in update.verdicts.values())
+
+
+def test_frames_that_were_set_aside_tell_whether_the_motion_is_known() -> None:
+    rig = _late_pair()
+    known, unknown = _motion_for_some(make_pair())[-2:]
+    state = State.initial(rig, Config())
+    assert state.knows_motion is None
+    for table, expected in (known, True), (unknown, False):
+        frame = OutlierFrame(0, camera_blocks(rig, table, Config())["left"], gtsam.Pose3())
+        one = replace(state.cameras[0], outlier_frames=(frame,))
+        assert state.with_camera(0, one).knows_motion is expected
+
+
+def _late_pair() -> Rig:
+    rig = make_pair()
+    late = {n: c.model_copy(update={"time_offset_s": 0.02}) for n, c in rig.cameras.items()}
+    return rig.model_copy(update={"cameras": late})
 
 
 def _motion_for_some(rig: Rig) -> list[Correspondences]:
