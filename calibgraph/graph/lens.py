@@ -201,8 +201,8 @@ def lens_graph(lenses: Mapping[int, LensTerm], *, is_distorted: bool) -> gtsam.N
             graph.add(linear_factor([lens_key(number)], [row[None]], tail))
         if term.earlier is not None:
             value, sigma = term.earlier
-            noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
-            graph.add(gtsam.PriorFactorVector(lens_key(number), np.array([value]), noise))
+            known = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+            graph.add(gtsam.PriorFactorVector(lens_key(number), np.array([value]), known))
         keys, matrices = [lens_key(number), seen_lens_key(number)], [-unit, unit]
         if is_distorted:
             keys, matrices = [*keys, DISTORTION], [*matrices, -term.by_distortion]
