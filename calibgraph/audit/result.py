@@ -120,8 +120,8 @@ class Audit:
         if self.deployed_verdict in (None, "PASS"):
             return ""
         return (
-            f"This result was {self.deployed_verdict} when it was made. A lens and an extrinsic "
-            "that are wrong together look right here, so read its report, too."
+            f"This result was {self.deployed_verdict} when it was made, and its report says why. A "
+            "lens and an extrinsic that are wrong together would look right here."
         )
 
 

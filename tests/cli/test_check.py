@@ -95,7 +95,10 @@ def test_the_recording_that_made_the_result_is_named_in_the_first_line(
 def test_a_result_that_was_doubtful_is_said_to_have_been(
     call: Call, calibrated_sample: CommandRun, tmp_path: Path
 ) -> None:
-    said, deployed = "This result was WARN when it was made.", tmp_path / "calibration.yaml"
+    said, deployed = (
+        "This result was WARN when it was made, and its report says why.",
+        tmp_path / "calibration.yaml",
+    )
     text = (calibrated_sample.folder / "calibration.yaml").read_text()
     given = (deployed, SAMPLE, "--frames", "0")
     for status in ("WARN", "PASS"):
