@@ -107,6 +107,23 @@ class Audit:
             return ("LiDAR",)
         return tuple(name for name, camera in self.cameras.items() if camera.status == "WRONG")
 
+    @property
+    def same_recording_note(self) -> str:
+        """A clause on what the recording that made the result cannot show; empty for another."""
+        if not self.same_recording:
+            return ""
+        return "this recording made it, and errors that it repeats are not seen: check another one"
+
+    @property
+    def deployed_verdict_note(self) -> str:
+        """Sentences on a deployed result that was not PASS; empty if it was, or is unknown."""
+        if self.deployed_verdict in (None, "PASS"):
+            return ""
+        return (
+            f"This result was {self.deployed_verdict} when it was made, and its report says why. A "
+            "lens and an extrinsic that are wrong together would look right here."
+        )
+
 
 def freeze(*arrays: Array | None) -> None:
     """Make arrays read-only."""

@@ -47,6 +47,7 @@ def check(
         Tolerance(tolerance_deg, tolerance_cm)
         matcher = matcher_from("structure", None, seed=seed, all_frames=frames is not None)
     data, deployed = dataset_from(dataset, rig, frames), load_rig(rig)
+    origin = provenance(rig, data)
     with progress_bar() as progress:
         audit = check(
             deployed,
@@ -57,7 +58,6 @@ def check(
             seed=seed,
             progress=progress,
         )
-    origin = provenance(rig, data)
     audit = replace(audit, same_recording=origin.same_recording, deployed_verdict=origin.verdict)
     if page is not None:
         from calibgraph.audit.page import write_audit_report

@@ -11,25 +11,21 @@ from calibgraph.audit.result import twist_cells
 from calibgraph.cli.tables import CAMERA_AXES_COLUMNS, add_number_columns, empty_table
 from calibgraph.cli.terminal import print_plain
 
-_SAME = "; this recording made it, and errors that it repeats are not seen: check another one"
-_DOUBTED = (
-    "This result was {} when it was made. A lens and an extrinsic that are wrong together look "
-    "right here, so read its report, too."
-)
 _COLOURS = {"OK": "green", "CANNOT TELL": "yellow", "WRONG": "red", "CHANGED": "red"}
 _LETTERS = 13  # of a result's name in a table; reasons have all of it
 
 
 def print_audit(console: Console, audit: Audit, page: Path | None = None) -> None:
     """Print the status with its reasons, the deviations per axis, and what was written."""
-    same = _SAME if audit.same_recording else ""
-    _print_status(console, audit.status, f"check: is the deployed calibration still right?{same}")
+    same = audit.same_recording_note
+    question = f"check: is the deployed calibration still right?{'; ' if same else ''}{same}"
+    _print_status(console, audit.status, question)
     if audit.lidar is not None:
         print_plain(console, f"  WRONG LiDAR: {audit.lidar.reason}; all cameras agree on it")
     for name, camera in audit.cameras.items():
         print_plain(console, f"  {camera.status} {name}: {camera.reason}")
-    if audit.deployed_verdict not in (None, "PASS"):
-        print_plain(console, f"  {_DOUBTED.format(audit.deployed_verdict)}")
+    if audit.deployed_verdict_note:
+        print_plain(console, f"  {audit.deployed_verdict_note}")
     console.print(audit_table(audit))
     console.print(
         "deviation: motion of the camera from where it is deployed, about and along its own axes; "

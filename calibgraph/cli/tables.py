@@ -173,14 +173,22 @@ def add_number_columns(table: Table, *headings: str) -> None:
         table.add_column(heading, justify="right", no_wrap=True)
 
 
+def _lens_words(pixels: float) -> str:
+    """How far a lens is from the reference's."""
+    if math.isnan(pixels):
+        return "the images differ in size from the reference, so lenses are not compared"
+    if math.isinf(pixels):
+        return "this lens or the reference's does not see all corners of the image"
+    return f"lens up to {pixels:.1f} px from the reference in the corners of the image"
+
+
 def print_evaluation(console: Console, errors: Evaluation, estimate: Path, reference: Path) -> None:
     """Print the errors, and the two files that were compared."""
     console.print(evaluation_table(errors))
     if errors.deviations:
         console.print(deviation_table(errors))
     for name, pixels in errors.lens_px.items():
-        far = f"up to {pixels:.1f} px" if math.isfinite(pixels) else "whole rays"
-        print_plain(console, f"{name}: lens {far} from the reference in the corners of the image")
+        print_plain(console, f"{name}: {_lens_words(pixels)}")
     for what, of in (("time offset", errors.time_offset_ms), ("read-out", errors.readout_ms)):
         for name, value in of.items():
             print_plain(console, f"{name}: {what} {value:+.1f} ms from the reference")

@@ -49,7 +49,14 @@ def track(
             "taken. The motion of the LiDAR must be known.",
         ),
     ] = None,
-    interval_s: options.IntervalOption = None,
+    interval_s: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="Time between neighbouring clouds of a folder, with --matcher: the motion of the "
+            "LiDAR is found by their registration. For --estimate offset. (default: unknown)",
+        ),
+    ] = None,
     motion: options.MotionOption = None,
     config: options.ConfigOption = None,
     preset: options.PresetOption = None,
@@ -76,6 +83,8 @@ def track(
     with checked_arguments():
         settings = config_from(config, preset, seed=seed, estimate=estimate)
         require_offset_alone(settings)
+        if not matcher:
+            _require_matcher_for(interval_s=interval_s, motion=motion)
         chosen = _tracking_matcher(matcher, weights, source, seed=settings.seed, device=device)
     console = terminal()
     wanted = Tracking(
@@ -92,6 +101,17 @@ def track(
     print_result(console, result, written)
     if result.verdict.status == "FAIL":
         raise typer.Exit(1)
+
+
+def _require_matcher_for(**given: float | str | None) -> None:
+    """Refuse options for clouds without a matcher: correspondences bring their motion."""
+    for name, value in given.items():
+        if value is not None:
+            option = f"--{name.replace('_', '-')}"
+            columns = "columns wx_rad_s to vz_m_s, lines have twist_per_s"
+            raise ValueError(
+                f"{option} goes with --matcher only: for the motion, tables have {columns}"
+            )
 
 
 def _tracking_matcher(

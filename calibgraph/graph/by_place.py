@@ -128,7 +128,7 @@ class QuadraticByPlace:
 
 @dataclass(frozen=True, eq=False)
 class LateQuadraticByPlace:
-    """The same of a camera whose time offset is a variable.
+    """As ``QuadraticByPlace``, of a camera whose time offset is a variable.
 
     Attributes:
         places: as there.

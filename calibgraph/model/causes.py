@@ -44,8 +44,8 @@ CAUSES: dict[str, Cause] = {
             "guess_length": "Give the translation of T_camera_lidar in metres.",
             "swapped_cameras": _SWAPPED,
             "point_distance": "Give the clouds in metres.",
-            "search": "Correct the guess, or widen --search-deg and --search-m; look at the images "
-            "and clouds of this camera with doctor.",
+            "search": "Correct the guess, or widen --search-deg and --search-m; see with "
+            "doctor whether images and clouds of this camera belong together.",
             "range_rotation": _FROM_RESULT, "range_translation": _FROM_RESULT,
         },
     ),

@@ -34,8 +34,8 @@ def require_motion(parts: Sequence[LensPart], *, is_known: bool) -> None:
     if clock and not is_known:
         raise CorrespondenceError(
             f"to estimate {', '.join(clock)}, the motion of the LiDAR must be known: give "
-            "--interval-s with folders, --motion with bags, twists_per_s with arrays, or the "
-            "columns wx_rad_s to vz_m_s of a table"
+            "--interval-s with folders, --motion with bags, twists_per_s with arrays, "
+            "twist_per_s with every line of JSON, or the columns wx_rad_s to vz_m_s of a table"
         )
 
 

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
+MAX_TWIST = 6.0, 100.0  # rad/s and m/s: beyond those of a vehicle; swapped ones are seen
+_TWIST_RULE = "be under 6 rad/s, then under 100 m/s (rotation first, in radians)"
 MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
 _MAX_WHOLE = 2**63 - 1
 MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
@@ -231,11 +233,12 @@ class Correspondences:
         return pa.table(columns).replace_schema_metadata(metadata)
 
     def _check_values(self) -> None:
-        columns = {"pixel": self.pixels_px, "point": self.points_lidar_m, "twist": self.twist_per_s}
-        for what, values in columns.items():
-            if values is not None:
-                good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
-                self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
+        for what, values in {"pixel": self.pixels_px, "point": self.points_lidar_m}.items():
+            good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
+            self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
+        if (twist := self.twist_per_s) is not None:
+            good = (np.linalg.norm(twist.reshape(-1, 2, 3), axis=2) < MAX_TWIST).all(axis=1)
+            self._require(good, "twist", twist, _TWIST_RULE)
         c = self.confidence
         self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
         if self.point_index is not None:
@@ -279,15 +282,12 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
     if not tables:
         raise ValueError("no tables to concatenate")
     names = tuple(sorted({name for table in tables for name in table.cameras}))
-    columns: dict[str, Any] = {
-        name: np.concatenate([getattr(table, name) for table in tables])
-        for name in ("frame", "pixels_px", "points_lidar_m", "confidence")
-    }
+    same = "frame", "pixels_px", "points_lidar_m", "confidence"
+    columns: dict[str, Any] = {n: np.concatenate([getattr(t, n) for t in tables]) for n in same}
     numbers = [np.array([names.index(n) for n in t.cameras], np.int32) for t in tables]
-    columns["camera_index"] = np.concatenate(
-        [number[t.camera_index] if len(t) else t.camera_index
-         for number, t in zip(numbers, tables, strict=True)]
-    )  # fmt: skip
+    pairs = zip(numbers, tables, strict=True)
+    found = [number[t.camera_index] if len(t) else t.camera_index for number, t in pairs]
+    columns["camera_index"] = np.concatenate(found)
     if any(table.information_px is not None for table in tables):
         columns["information_px"] = np.concatenate([
             np.tile([1.0, 0.0, 1.0], (len(t), 1)) if t.information_px is None else t.information_px

@@ -14,10 +14,23 @@ _GOLDEN = (1.0 + 5.0**0.5) / 2.0
 
 
 def has_other_lens(camera: Camera, other: Camera) -> bool:
-    """Whether images of one size come from lenses that differ."""
+    """Whether two lenses differ, or the sizes of their images."""
+    one, two = (
+        (each.width_px, each.height_px, each.model, each.lens.packed.tolist())
+        for each in (camera, other)
+    )
+    return one != two
+
+
+def corner_distance_px(camera: Camera, other: Camera) -> float:
+    """How far at most two lenses see the ray of a corner of the image apart.
+
+    Infinite where one of them has no such ray, NaN where the images differ in size.
+    """
     if (camera.width_px, camera.height_px) != (other.width_px, other.height_px):
-        return False
-    return (camera.model, camera.lens.packed.tolist()) != (other.model, other.lens.packed.tolist())
+        return float("nan")
+    apart = lens_difference(camera, other, corners_of(camera))
+    return float(np.nan_to_num(np.hypot(*apart.T), nan=np.inf).max())
 
 
 def lens_difference(camera: Camera, other: Camera, pixels_px: Array) -> Array:

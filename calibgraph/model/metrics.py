@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 from calibgraph.arrays import Array
 from calibgraph.errors import RigError
 from calibgraph.model.geometry import angle_deg, relative_transform, twist_between
-from calibgraph.model.lens_difference import corners_of, has_other_lens, lens_difference
+from calibgraph.model.lens_difference import corner_distance_px, has_other_lens
 from calibgraph.model.rig import Camera, Rig
 
 
@@ -63,7 +63,8 @@ class Evaluation:
     The pair ``"A->B"`` is T_B_A = T_B_lidar T_A_lidar^-1, which maps coordinates in A to
     coordinates in B; its errors are along the axes of B. ``deviations`` are of the cameras whose
     reference has a covariance. ``lens_px`` is how far at most the lenses see the ray of a corner of
-    the image apart, of cameras whose lenses differ, infinite where one of them has no such ray.
+    the image apart, of cameras whose lenses differ: infinite where one of them has no such ray, NaN
+    where the images differ in size.
     ``time_offset_ms`` and ``readout_ms`` are differences of the cameras of which both rigs state
     them.
     """
@@ -131,10 +132,9 @@ def _lens_px(estimate: Rig, reference: Rig) -> dict[str, float]:
     """Largest distance of the corners' rays, of cameras whose lenses differ."""
     both = {n: (reference.cameras[n], camera) for n, camera in estimate.cameras.items()}
     return {
-        name: float(np.nan_to_num(np.hypot(*apart.T), nan=np.inf).max())
+        name: corner_distance_px(before, after)
         for name, (before, after) in both.items()
         if has_other_lens(before, after)
-        for apart in [lens_difference(before, after, corners_of(before))]
     }
 
 

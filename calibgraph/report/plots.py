@@ -102,15 +102,13 @@ def lens_change(before: Camera, camera: Camera) -> str:
     change = lens_difference(before, camera, grid.reshape(-1, 2)).reshape(grid.shape)
     lengths = np.ma.masked_invalid(np.hypot(change[..., 0], change[..., 1]))
     lines = axes.contour(*sides, lengths, levels=5, colors=_INLIER, linewidths=1.0)
-    axes.clabel(lines, fontsize=8, fmt="%.2g px")
+    axes.clabel(lines, fontsize=8, fmt="%g px")
     coarse = (slice(_CONTOUR_FINENESS // 2, None, _CONTOUR_FINENESS),) * 2
     known = np.isfinite(change[coarse]).all(axis=-1)
     starts, arrows = grid[coarse][known], change[coarse][known]
     factor = arrow_factor(arrows, float(size[0] / ARROW_COLUMNS))
     _add_arrows(axes, starts, factor * arrows)
-    axes.set_title(
-        f"pixels of a ray, after less before, drawn {factor:g} times as long", fontsize=9
-    )
+    axes.set_title(f"how far rays move in the image, drawn {factor:g} times as long", fontsize=9)
     return to_data_uri(figure)
 
 

@@ -8,58 +8,29 @@ import shutil
 import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from calibgraph.child_process import Note, answer_requests, memory_limit
-from calibgraph.errors import CalibrationError, CorrespondenceError
+from calibgraph.errors import CalibrationError
 from calibgraph.files import checked_model, write_text
-from calibgraph.service.tracker_request import ARROW, FramesTaken, Refusal, TrackerRequest
+from calibgraph.service.open_tracker import HISTORY, OpenTracker, take_frames
+from calibgraph.service.tracker_request import Refusal, TrackerRequest
 from calibgraph.yaml_text import parse_yaml
 
-if TYPE_CHECKING:
-    from calibgraph.tracking.durable import DurableCalibrator
-    from calibgraph.tracking.history import History
-    from calibgraph.tracking.streams import Item
-    from calibgraph.tracking.update import Update
-
-RIG, CONFIG, STATE, HISTORY, EVENTS = (
-    "rig.yaml", "config.json", "state", "history.state", "events.jsonl",
-)  # fmt: skip
+RIG, CONFIG, STATE = "rig.yaml", "config.json", "state"
 
 _MOST_OPEN = 256
-_SAVE_EVERY = 50  # updates: after a kill, the plot lacks fewer
-_MOST_EVENTS = 200
 _THREADS = 8  # most of an update's time it waits for the disk
-
-
-@dataclass
-class _Open:
-    """A tracker that is in memory."""
-
-    folder: Path
-    calibrator: DurableCalibrator
-    history: History
-    unsaved: int = 0
-
-    def close(self) -> None:
-        self.save_history()
-        self.calibrator.close()
-
-    def save_history(self) -> None:
-        if self.unsaved:
-            self.history.save(self.folder / HISTORY)
-            self.unsaved = 0
 
 
 @dataclass
 class _Trackers:
     """The trackers of this process; those used last are in memory."""
 
-    held: OrderedDict[str, _Open] = field(default_factory=OrderedDict)
+    held: OrderedDict[str, OpenTracker] = field(default_factory=OrderedDict)
     locks: dict[str, threading.Lock] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -73,6 +44,8 @@ class _Trackers:
                 self._drop(request.folder)
                 return Refusal(413, "not enough memory; send fewer frames at once")
             except (CalibrationError, ValueError) as error:
+                if request.action == "frames":  # it may be in the middle of an update
+                    self._drop(request.folder)
                 return Refusal(422, _without_path(str(error), request.folder))
             except OSError as error:  # a write failed: the state on disk is what counts
                 self._drop(request.folder)
@@ -83,7 +56,7 @@ class _Trackers:
             _create(request)
             return _state(self._opened(request.folder))
         if request.action == "frames":
-            return _take_frames(self._opened(request.folder), request)
+            return take_frames(self._opened(request.folder), request)
         if request.action == "state":
             return _state(self._opened(request.folder))
         if request.action == "plot":
@@ -93,7 +66,7 @@ class _Trackers:
             shutil.rmtree(request.folder, ignore_errors=True)
         return None
 
-    def _opened(self, folder: str) -> _Open:
+    def _opened(self, folder: str) -> OpenTracker:
         with self.lock:
             tracker = self.held.get(folder)
             if tracker is not None:
@@ -113,7 +86,7 @@ class _Trackers:
         with self.lock:
             tracker = self.held.pop(folder, None)
         if tracker is not None:
-            tracker.calibrator.abandon()
+            tracker.abandon()
 
     def close(self) -> None:
         for tracker in self.held.values():
@@ -141,7 +114,7 @@ def _create(request: TrackerRequest) -> None:
     read_text(folder / RIG)
 
 
-def _open(folder: Path) -> _Open:
+def _open(folder: Path) -> OpenTracker:
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.config import config_from
     from calibgraph.tracking.durable import DurableCalibrator
@@ -149,95 +122,14 @@ def _open(folder: Path) -> _Open:
 
     config = config_from(json.loads((folder / CONFIG).read_text("utf-8")), "config")
     calibrator = DurableCalibrator(folder / STATE, load_rig(folder / RIG), config)
-    tracker = _Open(folder, calibrator, History.load(folder / HISTORY))
-    known = {json.dumps(event) for event in _events(folder)}
+    tracker = OpenTracker(folder, calibrator, History.load(folder / HISTORY))
+    known = {json.dumps(event) for event in tracker.events()}
     for update in calibrator.repeated:  # the process ended before they may have been noted
-        _note_events(folder, update, known)
+        tracker.note_events(update, known)
     return tracker
 
 
-def _take_frames(tracker: _Open, request: TrackerRequest) -> FramesTaken:
-    """Take in frames; one write brings them to disk before their updates are answered."""
-    from calibgraph.tracking.update import json_line
-
-    refused: list[str] = []
-    with tracker.calibrator.in_one_write():
-        updates, known = _take(tracker.calibrator, _items(request, refused), refused)
-    for update in updates:
-        tracker.history.add(update)
-        tracker.unsaved += 1
-        _note_events(tracker.folder, update, set())
-    if tracker.unsaved >= _SAVE_EVERY:
-        tracker.save_history()
-    lines = ", ".join(map(json_line, updates))
-    rest = json.dumps({"known": known, "refused": refused}).removeprefix("{")
-    return FramesTaken(len(updates), f'{{"updates": [{lines}], {rest}')
-
-
-def _take(
-    calibrator: DurableCalibrator, items: Iterable[Item], refused: list[str]
-) -> tuple[list[Update], int]:
-    """The updates of frames, and how many were known; what is refused is added to a list."""
-    from calibgraph.tracking.streams import Refused
-
-    updates: list[Update] = []
-    known, last = 0, calibrator.tracker.frame
-    for item in items:
-        if isinstance(item, Refused):
-            refused.append(item.message)
-        elif last is not None and item.frame <= last:
-            known += 1
-        else:
-            try:
-                updates.append(calibrator.update(item.table, frame=item.frame))
-                last = item.frame
-            except CorrespondenceError as error:
-                refused.append(str(error))
-    return updates, known
-
-
-def _items(request: TrackerRequest, refused: list[str]) -> Iterator[Item]:
-    """The frames of a body; a stream that breaks off is refused after its whole frames."""
-    from calibgraph.errors import FileError
-    from calibgraph.tracking.stream_lines import frames_of_lines
-    from calibgraph.tracking.stream_tables import frames_of_batches
-
-    try:
-        if request.content_type == ARROW:
-            yield from frames_of_batches(io.BytesIO(request.body), "frames")
-        else:
-            yield from frames_of_lines([request.body], "frames")
-    except FileError as error:
-        refused.append(str(error))
-
-
-def _note_events(folder: Path, update: Update, known: set[str]) -> None:
-    """Add an update's events to the list."""
-    from calibgraph.tracking.update import json_line
-
-    if not update.events:
-        return
-    lines = [json.dumps(event) for event in json.loads(json_line(update))["events"]]
-    with (folder / EVENTS).open("a", encoding="utf-8") as file:
-        file.writelines(f"{line}\n" for line in lines if line not in known)
-
-
-def _events(folder: Path) -> list[dict[str, Any]]:
-    path = folder / EVENTS
-    if not path.exists():
-        return []
-    lines = path.read_text("utf-8", errors="replace").splitlines()[-_MOST_EVENTS:]
-    return [event for line in lines if isinstance(event := _json(line), dict)]
-
-
-def _json(line: str) -> object:
-    try:
-        return json.loads(line)
-    except ValueError:  # the process ended while it was written
-        return None
-
-
-def _state(tracker: _Open) -> dict[str, Any]:
+def _state(tracker: OpenTracker) -> dict[str, Any]:
     """The last estimate, as ``--json`` prints results, and the last events."""
     from calibgraph.report.as_json import finite, result_summary
 
@@ -249,11 +141,11 @@ def _state(tracker: _Open) -> dict[str, Any]:
         "reasons": summary["reasons"],
         "summary": finite(summary["summary"]),
         "cameras": finite(summary["cameras"]),
-        "events": _events(tracker.folder),
+        "events": tracker.events(),
     }
 
 
-def _plot(tracker: _Open) -> bytes:
+def _plot(tracker: OpenTracker) -> bytes:
     """The extrinsics against time, PNG."""
     held = io.BytesIO()
     tracker.history.figure().savefig(held, format="png")

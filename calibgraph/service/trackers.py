@@ -24,6 +24,7 @@ _MOST_WAITING = 512
 _MOST_BYTES_WAITING = 64 * 2**20
 """Of one tenant, for one process."""
 _AGAIN = {"Retry-After": "1"}
+_KNOWN = "frames that were taken in are known"
 
 
 @dataclass(frozen=True)
@@ -162,10 +163,10 @@ def _checked(result: Callable[[], Any]) -> Any:
     try:
         answer = result()
     except ChildEndedError:
-        text = "the tracker's process ended; ask again: frames that were taken in are known"
-        raise Problem(503, text, _AGAIN) from None
+        raise Problem(503, f"the tracker's process ended; ask again: {_KNOWN}", _AGAIN) from None
     except ChildTimeoutError:
-        raise Problem(503, "the tracker is busy; send fewer frames at once", _AGAIN) from None
+        text = f"the tracker is busy; send fewer frames at once: {_KNOWN}"
+        raise Problem(503, text, _AGAIN) from None
     if isinstance(answer, Refusal):
         raise Problem(answer.status, answer.detail)
     return answer

@@ -10,14 +10,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 
-from calibgraph.errors import FileError
+from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bags import BagOptions
 from calibgraph.io.dataset import load_dataset
 from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.clock import require_motion
 from calibgraph.model.config import Config
+from calibgraph.model.result_files import OVERLAYS, REPORT_FILE
 from calibgraph.model.rig import Rig
+from calibgraph.outputs import PAGE_MARK, is_marked
 from calibgraph.report.as_json import print_line, require_stdout
 from calibgraph.tracking.dataset_frames import DatasetDrive
 from calibgraph.tracking.durable import DurableCalibrator
@@ -90,6 +92,9 @@ def track(
 
 def _write_results(folder: Path, result: Calibration, history: History | None) -> list[Path]:
     written = [result.save(folder)]
+    if is_marked(folder / REPORT_FILE, PAGE_MARK):  # of a result that this one replaces
+        for stale in (folder / REPORT_FILE, *folder.glob(OVERLAYS)):
+            stale.unlink(missing_ok=True)
     if history is not None:
         history.draw(folder / PICTURE)
         written.append(folder / PICTURE)
@@ -121,7 +126,10 @@ def _opened(
 
 
 def _drive(settings: Tracking, matcher: Matcher, source: Sequence[Path]) -> DatasetDrive:
-    data = load_dataset(source, settings.rig, bag=settings.bag, interval_s=settings.interval_s)
+    try:
+        data = load_dataset(source, settings.rig, bag=settings.bag, interval_s=settings.interval_s)
+    except ValueError as error:  # of an option: a wrong argument of the user
+        raise DatasetError(str(error)) from error
     require_motion(settings.config.estimate, is_known=data.frames[0].twist_per_s is not None)
     full = to_full_matcher(matcher)
     data = replace(data, frames=data.frames[:: settings.every])

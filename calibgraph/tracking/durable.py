@@ -23,7 +23,7 @@ from calibgraph.tracking.state_database import StateDatabase
 from calibgraph.tracking.tracker import IncrementalCalibrator
 from calibgraph.tracking.update import Update
 
-_SNAPSHOT_EVERY = 50  # updates: a restart repeats up to so many
+_SNAPSHOT_EVERY = 50  # updates: a restart repeats up to so many, and those of two writes
 
 
 class DurableCalibrator:
@@ -104,6 +104,8 @@ class DurableCalibrator:
     @contextmanager
     def in_one_write(self) -> Iterator[None]:
         """Updates inside are on disk when this has ended, and not before: by one write for all.
+
+        A snapshot waits for the end, so a restart after a kill repeats all of a long block.
 
         Raises:
             OSError: if they cannot be written; then close this, and make a new one.

@@ -283,7 +283,7 @@ def _gate_pose(
     """Where the gate is drawn: the minimum of all matches, as in a batch.
 
     That of the matches within a gate is drawn to where the gate was before. A camera that drifts,
-    or whose time offset may, keeps its estimate, which later epochs have a part in.
+    or whose time offset is estimated, keeps its estimate, which later epochs have a part in.
     """
     one, reference = state.cameras[camera], state.references[camera]
     if one.summary.walk or state.offsets is not None:

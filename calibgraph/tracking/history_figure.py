@@ -108,7 +108,7 @@ class _Part:
 _PARTS = (
     _Part(slice(0, 3), "rotation [deg]", float(np.degrees(1.0))),
     _Part(slice(3, 6), "translation [cm]", 100.0),
-    _Part(slice(6, 7), "time offset [ms]", 1000.0),
+    _Part(slice(6, 7), "time offset, less newest [ms]", 1000.0),
 )
 
 

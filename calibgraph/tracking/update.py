@@ -116,7 +116,7 @@ def _offset(one: LensEstimate) -> dict[str, Any]:
     return {
         "time_offset_s": one.value,
         "time_offset_sigma_s": one.sigma,
-        "time_offset": one.describe(),
+        "time_offset": "; ".join(filter(None, (one.change, one.describe()))),
     }
 
 

@@ -76,6 +76,24 @@ def test_a_single_camera_that_is_right(tmp_path: Path) -> None:
     assert "a turn of any camera about an axis by 0.29 deg, or a shift along one by 5.0 cm" in text
 
 
+def test_where_the_deployed_calibration_is_from_stands_beside_the_answer(tmp_path: Path) -> None:
+    """As in the terminal: an OK alone would hide a doubtful result, or a recording that made it."""
+    same = "This recording made it, and errors that it repeats are not seen: check another one."
+    doubted = "This result was WARN when it was made, and its report says why. A "
+    right = audit_with(RIGHT)
+    for audit, expected in (
+        (right, (False, False)),
+        (replace(right, deployed_verdict="PASS"), (False, False)),
+        (replace(right, same_recording=True), (True, False)),
+        (replace(right, deployed_verdict="WARN"), (False, True)),
+        (replace(right, same_recording=True, deployed_verdict="WARN"), (True, True)),
+    ):
+        text = page_of(audit, tmp_path)
+        assert (same in text, doubted in text) == expected
+        assert ("<dt>Where is it from?" in text) == any(expected)
+        assert ("Nothing: keep it in use." in text) != any(expected)
+
+
 def test_the_lidar_is_named_with_its_motion(tmp_path: Path) -> None:
     lidar = LidarAudit("turned about z by +1.00 deg", np.array([0, 0, 0.0175, 0, 0, 0]), SIGMA)
     text = page_of(audit_with(WRONG, WRONG, lidar=lidar), tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,10 @@ def test_the_recording_that_made_the_result_is_named_in_the_first_line(
 def test_a_result_that_was_doubtful_is_said_to_have_been(
     call: Call, calibrated_sample: CommandRun, tmp_path: Path
 ) -> None:
-    said, deployed = "This result was WARN when it was made.", tmp_path / "calibration.yaml"
+    said, deployed = (
+        "This result was WARN when it was made, and its report says why.",
+        tmp_path / "calibration.yaml",
+    )
     text = (calibrated_sample.folder / "calibration.yaml").read_text()
     given = (deployed, SAMPLE, "--frames", "0")
     for status in ("WARN", "PASS"):
@@ -117,6 +121,17 @@ def test_the_page_replaces_only_its_own(call: Call, tmp_path: Path) -> None:
     (recording / "cameras").mkdir(parents=True)
     found = call("check", REFERENCE, recording, "--page", recording / "cameras" / "check.html")
     assert "is among the data of" in error_line(*found)
+
+
+def test_a_malformed_result_is_refused_before_the_audit(
+    call: Call, calibrated_sample: CommandRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("calibgraph.audit.check", lambda *_, **__: pytest.fail("was measured"))
+    text = (calibrated_sample.folder / "calibration.yaml").read_text()
+    deployed = tmp_path / "calibration.yaml"
+    deployed.write_text(re.sub(r"^verdict:\n(  .*\n)+", "verdict: PASS\n", text, flags=re.M))
+    line = error_line(*call("check", deployed, SAMPLE, "--frames", "0"))
+    assert f"{deployed}: verdict: " in line
 
 
 @pytest.mark.parametrize(

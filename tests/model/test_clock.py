@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from calibgraph import (
+    CorrespondenceError,
     Correspondences,
     Rig,
     dataset_from_arrays,
@@ -16,11 +18,13 @@ from calibgraph import (
     import_rig,
     load_correspondences,
     load_rig,
+    simulate_correspondences,
 )
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.matching.run import with_motion
 from calibgraph.model.clock import at_pixels, seen_at_rows, when_taken
 from calibgraph.simulation.rigs import rig_of
+from tests.conftest import make_pair
 
 TWISTS = np.array([[0.01, 0.02, 0.3, 8.0, 0.1, 0.0], [0.0, 0.0, -0.2, 12.0, 0.0, 0.1]])
 
@@ -101,7 +105,7 @@ def test_half_a_motion_and_an_infinite_one_are_refused(tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text(text)
     with pytest.raises(FileError):
         load_correspondences(tmp_path / "table.csv")
-    with pytest.raises(CalibrationError, match="twist must be finite"):
+    with pytest.raises(CalibrationError, match="twist must be under"):
         rows(np.full((2, 6), np.inf))
 
 
@@ -131,3 +135,14 @@ def test_evaluation_compares_times_that_both_rigs_state() -> None:
     found = evaluate(rig_with(time_offset_s=0.021, readout_s=0.03), rig_with(time_offset_s=0.02))
     assert found.time_offset_ms == pytest.approx(dict.fromkeys(found.cameras, 1.0))
     assert found.readout_ms == {}
+
+
+def test_a_motion_that_no_vehicle_has_is_refused() -> None:
+    """Translation first, as ROS has it, or degrees."""
+    table = simulate_correspondences(make_pair(), frames=1, matches=20)
+    for twist in ([15.0, 0.0, 0.0, 0.0, 0.0, 0.2], [0.0, 0.0, 11.5, 15.0, 0.0, 0.0]):
+        twists = np.tile(twist, (len(table), 1))
+        with pytest.raises(CorrespondenceError, match=r"twist must be under 6 rad/s, then under"):
+            replace(table, twist_per_s=twists)
+    fine = replace(table, twist_per_s=np.tile([0.0, 0.0, 0.5, 40.0, 0.0, 0.0], (len(table), 1)))
+    assert fine.twist_per_s is not None

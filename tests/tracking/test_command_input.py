@@ -13,6 +13,7 @@ import pytest
 from calibgraph import (
     Correspondences,
 )
+from tests.conftest import Call
 from tests.tracking.drives import (
     World,
     as_lines,
@@ -82,3 +83,15 @@ def test_wrong_input_is_left_out_with_a_line_each_and_leaves_no_trace(
     for line, what in zip(messages, (*wrong, "is not JSON"), strict=True):
         assert what in line
     assert "Traceback" not in err
+
+
+@pytest.mark.parametrize("option", [("--interval-s", 0.1), ("--motion", "scans")])
+@pytest.mark.parametrize("estimate", [(), ("--estimate", "offset")])
+def test_options_for_clouds_are_refused_without_a_matcher(
+    world: World, call: Call, tmp_path: Path, option: tuple[object, ...], estimate: tuple[str, ...]
+) -> None:
+    out = tmp_path / "out"
+    code, text, err = call("track", world.rig, world.source, "--out", out, *option, *estimate)
+    assert (code, text) == (2, "")
+    assert f"{option[0]} goes with --matcher only" in err and err.count("\n") == 1
+    assert not out.exists()

@@ -140,7 +140,7 @@ def correlate(
 ) -> CorrelationMaps:
     """Correlate the images of a camera with their clouds, at all places.
 
-    The windows of a frame are at most so many, drawn by the seed; if dense, four times as close.
+    The windows of a frame are at most so many, drawn by the seed; if dense, twice as close.
     """
     cells = _to_angular_image(grays[0], camera).log_gray.size
     max_windows = max(1, min(max_windows, MAX_CELLS // (cells * len(grays))))

@@ -218,7 +218,7 @@ class Locator:
     def _search_for(self, name: str, effort: int) -> None:
         tries = TRIES[self._searches[name] + 1]
         z_score, least = self.best[name].z_score, least_z_score(tries)
-        before = f" (best z-score {z_score:.1f}, {least:.1f} needed)" if z_score > 0 else ""
+        before = f" (best z-score {z_score:.1f}, accepted from {least:.1f})" if z_score > 0 else ""
         self._report(f"searching: {name}{before}")
         self._searches[name] += 1
         found = self._search.everywhere(self._bodies[name], effort)

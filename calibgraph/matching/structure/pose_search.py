@@ -162,7 +162,9 @@ class PoseSearch:
         )
         found = [search.everywhere(body, effort=1) for body in rigid_bodies(self.rig)]
         evidence = [search._evidence(one) for one in found if math.isfinite(one.z_score)]
-        return float(np.mean(evidence)) if evidence else math.inf
+        if self.out_of_time() or not evidence:  # of a search that was cut, chance is not known
+            return math.inf
+        return float(np.mean(evidence))
 
     def seen_by(self, other: Body, body: Body) -> Body | None:
         """The body where a located one sees it; None if they see nothing in common."""

@@ -70,21 +70,22 @@ def train_windows(
     if not np.isfinite(before[0]).any():
         raise DatasetError("no camera has enough windows with structure to learn from")
     _learn(trainee, samples, settings, progress)
-    names = ", ".join(data.folders[0].name for data in datasets)
-    how = f"calibgraph train-windows, seed {settings.seed}: {len(samples)} cameras of {names}"
-    (first, last), (other_first, other_last) = (
-        _matched(one, _losses(trainee, of))
-        for one, of in zip(before, (samples, others), strict=True)
-    )
-    change, count = other_last - other_first, len(other_first)
-    known = count > 1 and bool(np.isfinite(change).all())
+    first, last = _matched(before[0], _losses(trainee, samples))
+    other_first, other_last = _matched(before[1], _losses(trainee, others))
     return WindowTraining(
-        trainee.to_network("".join(filter(str.isprintable, how))[:MAX_HOW]),
+        trainee.to_network(_origin(datasets, len(samples), settings)),
         (_mean(first), _mean(last)),
         (_mean(other_first), _mean(other_last)),
-        count,
-        float(np.std(change, ddof=1) / math.sqrt(count)) if known else math.nan,
+        len(other_first),
+        _standard_error(other_last - other_first),
     )
+
+
+def _origin(datasets: Sequence[Dataset], cameras: int, settings: WindowSettings) -> str:
+    """How the network was trained, as its file states it."""
+    names = ", ".join(data.folders[0].name for data in datasets)
+    how = f"calibgraph train-windows, seed {settings.seed}: {cameras} cameras of {names}"
+    return "".join(filter(str.isprintable, how))[:MAX_HOW]
 
 
 def _samples(
@@ -156,3 +157,10 @@ def _matched(before: Array, after: Array) -> tuple[Array, Array]:
 def _mean(losses: Array) -> float:
     """Infinite without any."""
     return float(losses.mean()) if len(losses) else math.inf
+
+
+def _standard_error(changes: Array) -> float:
+    """Of their mean; NaN of fewer than two, or if one is infinite."""
+    if len(changes) < 2 or not np.isfinite(changes).all():  # noqa: PLR2004
+        return math.nan
+    return float(np.std(changes, ddof=1) / math.sqrt(len(changes)))

@@ -26,6 +26,7 @@ from calibgraph.matching.structure.training.samples import (  # noqa: E402
     CameraWindows,
     camera_windows,
 )
+from calibgraph.matching.structure.training.train import _standard_error  # noqa: E402
 from calibgraph.matching.structure.window_weights import window_network  # noqa: E402
 from calibgraph.matching.trusted_data import load_trusted_dataset  # noqa: E402
 from calibgraph.model.clock import at_pixels  # noqa: E402
@@ -134,3 +135,9 @@ def test_recordings_without_matches_are_refused(trusted: Dataset, tmp_path: Path
     away = Dataset(trusted.rig.moved_to(turned), trusted.frames[:1], (tmp_path,))
     with pytest.raises(DatasetError, match="no camera has enough windows"):
         train_windows([away], settings=SMALL)
+
+
+def test_the_standard_error_is_unknown_of_one_camera_or_a_lost_one() -> None:
+    assert _standard_error(np.array([1.0, 2.0, 3.0])) == pytest.approx(1 / np.sqrt(3))
+    for changes in ([], [1.0], [1.0, np.inf]):
+        assert np.isnan(_standard_error(np.array(changes)))
