@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from operator import index
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.model.config import Config
@@ -194,9 +194,20 @@ def _require_same(folder: Path, tracker: IncrementalCalibrator, rig: Rig, config
             "choose another folder",
         )
     if tracker.config != config:
+        differing = "; ".join(_differences(tracker.config.model_dump(), config.model_dump()))
         raise FileError(
-            folder, "holds a state made with other settings; choose another folder, or those"
+            folder,
+            f"holds a state made with other settings ({differing}); take these or another folder",
         )
+
+
+def _differences(held: Mapping[str, Any], given: Mapping[str, Any]) -> Iterator[str]:
+    """The settings that differ, with both values."""
+    for key, value in given.items():
+        if isinstance(value, dict):
+            yield from _differences(held[key], value)
+        elif held[key] != value:
+            yield f"{key} {held[key]}, given {value}"
 
 
 def _without_guess(rig: Rig) -> dict[str, object]:

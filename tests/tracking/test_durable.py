@@ -116,7 +116,10 @@ def test_a_state_of_another_rig_or_config_is_refused_in_one_line(
     (tmp_path / "config.yaml").write_text("tracking: {epoch_frames: 7}\n")
     for arguments, reason in (
         ((tmp_path / "other.yaml", world.source), "another rig"),
-        ((world.rig, world.source, "--config", tmp_path / "config.yaml"), "other settings"),
+        (
+            (world.rig, world.source, "--config", tmp_path / "config.yaml"),
+            "(epoch_frames 10, given 7)",
+        ),
     ):
         code, text, err = call("track", *arguments, *out)
         assert (code, text) == (2, "")
