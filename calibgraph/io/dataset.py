@@ -248,7 +248,9 @@ def _indices(text: str, count: int) -> list[int]:
 def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
     if not paths:
         raise ValueError("no dataset folder given")
-    for path in paths:
+    for number, path in enumerate(paths):
+        if path.resolve() in {other.resolve() for other in paths[:number]}:
+            raise DatasetError(f"{path}: is given twice, and its frames would count twice")
         if is_bag(path) or published_format(path) or folder_layout(path).clouds.is_dir():
             continue
         if not path.is_dir():

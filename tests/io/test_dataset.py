@@ -34,6 +34,13 @@ def test_several_sequences_are_one_problem(tmp_path: Path) -> None:
     assert data.select("1:4").frames[-1].name == "06/000001"
 
 
+def test_a_folder_that_is_given_twice_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(SAMPLE)
+    for again in (SAMPLE, tmp_path / "link"):
+        with pytest.raises(DatasetError, match="is given twice"):
+            load_dataset([SAMPLE, again])
+
+
 def test_sequences_of_different_rigs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="its cameras differ"):
         load_dataset([written_kitti(tmp_path / "00"), SAMPLE])
