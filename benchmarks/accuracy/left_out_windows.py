@@ -2,17 +2,20 @@
 
     python -m benchmarks.accuracy.left_out_windows --scenes out/weights
 
-The windows of ``window_weights`` on every recording, scored by several weights: all alike (the
-hand-made score); the package's; and networks trained here on fewer windows of the same rendered
-scenes, alone, with the recordings whose licence lets anyone use them, with those of one rig at the
-poses that ``calibrate`` found itself, and, to compare, with all recordings of other rigs at their
-references. A recording takes no part in what it is judged by, nor does any of its rig, but for the
-column of self-training, which is of one rig by intention. Sharpness, one number, is fitted on the
-permissive recordings of other rigs.
+The windows of ``window_weights`` on every recording are scored by several weights:
 
-Likelihoods are of the nine shifts about the truth against all being alike, in nats of a window: 0
-tells nothing, lower is better. The share is that of windows whose best shift is within a step of
-the truth, each counted by its weight.
+    alike               1 for every window, the hand-made score
+    package             the shipped network
+    rendered            trained here, on fewer windows of the same rendered scenes
+    permissive          the same and the recordings whose licence lets anyone use them
+    self-trained        rendered, and one recording at the poses that ``calibrate`` found
+    others' references  rendered, and all recordings of other rigs at their references
+
+No recording of a rig trains the weights that judge it, except for self-training. Sharpness, one
+number, is fitted on the permissive recordings of other rigs.
+
+A window's likelihood is of the nine shifts about the truth against chance, in nats: 0 says nothing,
+lower is better. The share counts windows whose best shift is within a step of the truth, by weight.
 """
 
 from __future__ import annotations
@@ -107,7 +110,7 @@ Trained = dict[frozenset[str], Weights]
 def weights_for(
     rig: str, drawn: list[Sample], recorded: Mapping[str, Sample], trained: Trained, seed: int
 ) -> Iterator[tuple[Weights, float]]:
-    """Each kind's weights and sharpness, none of which knows the rig, but for self-training."""
+    """Weights and sharpness of each kind; self-training alone may have seen the rig."""
     others = {name for other, names in rigs().items() if other != rig for name in names}
     permissive = others & {*PERMISSIVE}
     for names in ({ALIKE}, {PACKAGE}, set[str](), permissive, {OWN}, others):
@@ -138,7 +141,7 @@ def _loss(sample: Sample, weights: np.ndarray, sharpness: float) -> float:
 
 
 def cells(sample: Sample, kinds: Sequence[tuple[Weights, float]]) -> list[str]:
-    """Likelihoods of all kinds, then shares, then z-scores."""
+    """A recording's row: the likelihood by each kind of weights, the shares, the z-scores."""
     scores = np.nan_to_num(sample.scores.numpy(), nan=-np.inf)
     row, column = np.divmod(scores.reshape(len(scores), -1).argmax(axis=1), scores.shape[2])
     right = np.maximum(np.abs(row - REACH), np.abs(column - REACH)) <= 1

@@ -3,7 +3,7 @@
     python -m benchmarks.speed.solve [--frames 10 100 1000] [--cameras 2 12] [--matches 1000]
         [--longest-s 300]
 
-Simulated correspondences: N frames, so many matches each in every camera, 15 % outliers; a stereo
+Simulated correspondences: N frames with the given matches per camera, 15 % outliers; a stereo
 pair, or a ring of cameras. The column "what":
 
 * whole call: `calibgraph.solve(rig, table)` as users call it, with its defaults: preprocessing,

@@ -152,7 +152,7 @@ class LateQuadraticByPlace:
         """H, b and c of every place with correspondences, by pose and offset.
 
         Args:
-            T_camera_cloud: (p, 4, 4) of these places.
+            T_camera_cloud: (p, 4, 4), one pose per place.
             values: (1,) the offset.
         """
         return [self._sums(row, T, values) for row, T in enumerate(T_camera_cloud)]
@@ -164,7 +164,7 @@ class LateQuadraticByPlace:
         return BlockSums(self.information[row], gradient, step @ gradient)
 
     def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
-        """The quadratic of one place, on the variables of these keys and the offset."""
+        """The quadratic of one place: a factor on its cloud, its camera and the time offset."""
         rows = map(int, np.flatnonzero(self.places == place))
         keys = cloud, matched, self.key
         return [free_lens_sums_factor(keys, partial(self._sums, row), 1) for row in rows]
