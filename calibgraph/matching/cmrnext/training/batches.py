@@ -1,9 +1,7 @@
-"""Batches of training samples, drawn in the background on all cores: a GPU waits for them."""
+"""Batches of training samples, drawn in the background."""
 
-from collections import deque
 from collections.abc import Iterator, Sequence
-from functools import partial
-from itertools import islice
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -11,7 +9,6 @@ from calibgraph.errors import DatasetError
 from calibgraph.matching.cmrnext.training.samples import Sample, make_sample
 from calibgraph.matching.cmrnext.training.scenes import Scene
 from calibgraph.matching.cmrnext.training.settings import TrainSettings
-from calibgraph.parallel import core_pool, count_cores
 
 _TRIES = 20  # to draw a scene with enough points in the image
 
@@ -24,13 +21,12 @@ def draw_batches(
     Raises:
         DatasetError: if no scene has enough points in the image.
     """
-    draw = partial(_draw_batch, scenes, settings)
-    with core_pool() as cores:
-        steps = iter(range(start, settings.steps))
-        coming = deque(cores.submit(draw, step) for step in islice(steps, count_cores() + 1))
-        while coming:
-            samples = coming.popleft().result()
-            coming.extend(cores.submit(draw, step) for step in islice(steps, 1))
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        coming = pool.submit(_draw_batch, scenes, settings, start)
+        for step in range(start, settings.steps):
+            samples = coming.result()
+            if step + 1 < settings.steps:
+                coming = pool.submit(_draw_batch, scenes, settings, step + 1)
             yield samples
 
 
