@@ -37,7 +37,9 @@ def image_checks(evidence: RunEvidence) -> Checks:
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
         text = f"the images could not be checked: {error}"
         return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
-    return evidence.grade_by_images(checks)
+    missed = run.correspondences.findings.missed  # their poses are none to check
+    found = {name: of_camera for name, of_camera in checks.items() if name not in missed}
+    return evidence.grade_by_images(found)
 
 
 def check_images(
