@@ -37,9 +37,7 @@ def image_checks(evidence: RunEvidence) -> Checks:
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
         text = f"the images could not be checked: {error}"
         return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
-    missed = run.correspondences.findings.missed  # their poses are none to check
-    found = {name: of_camera for name, of_camera in checks.items() if name not in missed}
-    return evidence.grade_by_images(found)
+    return evidence.grade_by_images(checks)
 
 
 def check_images(
@@ -56,10 +54,14 @@ def check_images(
     a rotation).
 
     Returns:
-        Checks of every camera.
+        Checks of every camera but those that a search did not find: theirs is no pose to check.
     """
+    missed = table.findings.missed
+    cameras = {name: camera for name, camera in rig.cameras.items() if name not in missed}
+    if not cameras:
+        return {}
     evidence = measure_image_evidence(
-        dataset, rig, places=table.places, seed=seed, progress=progress
+        dataset, Rig(cameras=cameras), places=table.places, seed=seed, progress=progress
     )
     of_time = {name: pairing_checks(found) for name, found in evidence.items()}
     names = {frame.index: frame.name for frame in dataset.frames}
