@@ -20,7 +20,6 @@ from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.verdict import Check
 from calibgraph.progress import Stopwatch
-from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.clock_checks import (
     _with_known_motion,
@@ -31,6 +30,7 @@ from calibgraph.trust.clock_checks import (
 from calibgraph.trust.lens_parameter import RESIDUALS, LensParameter
 from calibgraph.trust.run_evidence import RunEvidence
 from factors import Clock
+from tests.draws.clocks import draw_twists, put_clock_error
 from tests.solver.test_lens import FIVE_SIGMAS, simulated
 
 STRAIGHT = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
