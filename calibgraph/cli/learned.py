@@ -1,6 +1,5 @@
 """The commands of the learned matcher: what is in a file of weights, and training."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,28 +31,21 @@ def weights(
         print_weights(terminal(), checkpoint.summary(), out)
 
 
-def _print_train_settings(requested: bool) -> None:
-    if requested:
-        from calibgraph.files import commented_defaults
-        from calibgraph.matching.cmrnext import TrainSettings
+def _print_settings_option(module: str, settings: str) -> Any:
+    """``--print-settings`` of a training, whose settings are a model of that name in a module."""
 
-        print(commented_defaults(TrainSettings))
-        raise typer.Exit
+    def print_settings(requested: bool) -> None:
+        if requested:
+            from importlib import import_module
 
+            from calibgraph.files import commented_defaults
 
-def _print_window_settings(requested: bool) -> None:
-    if requested:
-        from calibgraph.files import commented_defaults
-        from calibgraph.matching.structure.training import WindowSettings
+            print(commented_defaults(getattr(import_module(module), settings)))
+            raise typer.Exit
 
-        print(commented_defaults(WindowSettings))
-        raise typer.Exit
-
-
-def _print_settings_option(callback: Callable[[bool], None]) -> Any:
     return typer.Option(
         "--print-settings",
-        callback=callback,
+        callback=print_settings,
         is_eager=True,
         help="Print a settings file with all defaults and what they mean, and exit.",
     )
@@ -80,7 +72,9 @@ def train(
             help="Settings of the training, YAML. (default: the published training's)",
         ),
     ] = None,
-    print_settings: Annotated[bool, _print_settings_option(_print_train_settings)] = False,
+    print_settings: Annotated[
+        bool, _print_settings_option("calibgraph.matching.cmrnext", "TrainSettings")
+    ] = False,
     held_out: Annotated[
         list[Path] | None,
         typer.Option(
@@ -167,7 +161,10 @@ def train_windows(
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Settings of the training, YAML.")
     ] = None,
-    print_settings: Annotated[bool, _print_settings_option(_print_window_settings)] = False,
+    print_settings: Annotated[
+        bool,
+        _print_settings_option("calibgraph.matching.structure.training", "WindowSettings"),
+    ] = False,
     held_out: Annotated[
         list[Path] | None,
         typer.Option(
