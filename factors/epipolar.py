@@ -32,8 +32,6 @@ from factors.rays import ray_spreads, unproject
 
 Array = NDArray[np.float64]
 
-_COLUMNS = 18  # of a feature: f_a, F_a by columns, f_b, F_b by columns
-
 
 @dataclass(frozen=True, eq=False)
 class EpipolarBlock(RobustBlock):
