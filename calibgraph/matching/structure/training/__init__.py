@@ -1,13 +1,9 @@
 """Training of the windows' weights on the pose that their matches give. Needs torch."""
 
-try:
-    import torch as _torch  # noqa: F401
-except ModuleNotFoundError as error:
-    from calibgraph.errors import CalibrationError
+from calibgraph.errors import needs_extra
 
-    raise CalibrationError(
-        "training needs torch, which is not installed: pip install 'calibgraph[learned]'"
-    ) from error
+with needs_extra("learned", "training needs torch"):
+    import torch as _torch  # noqa: F401
 
 from calibgraph.matching.structure.training.settings import (
     WindowSettings,
