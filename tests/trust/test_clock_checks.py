@@ -13,7 +13,7 @@ import pytest
 from calibgraph import Config, Correspondences, Rig, solve
 from calibgraph.io.bags import MESSAGE_SUFFIX
 from calibgraph.io.dataset import Dataset
-from calibgraph.io.frame import Frame, MovingFrame
+from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.io.motion import ScanMotion
 from calibgraph.matching.protocol import Matcher, to_full_matcher
@@ -129,7 +129,7 @@ def run_of(
 def moving_frames(twists: np.ndarray) -> list[Frame]:
     motions = [ScanMotion(tuple(twist.tolist()), 0.0) for twist in twists]
     return [
-        MovingFrame(n, str(n), Path(f"{n}.pcd"), {}, find_motion=lambda found=found: found)
+        Frame(n, str(n), Path(f"{n}.pcd"), {}, find_motion=lambda found=found: found)
         for n, found in enumerate(motions)
     ]
 
