@@ -106,9 +106,9 @@ def train(
 ) -> None:
     """Train a CMRNext network by perturbing trusted extrinsics."""
     from calibgraph.cli.tables import print_validation
+    from calibgraph.files import load_model
     from calibgraph.io.rigs import load_rig
     from calibgraph.matching.cmrnext import TrainSettings, train
-    from calibgraph.matching.cmrnext.training.settings import load_settings
     from calibgraph.matching.trusted_data import load_held_out, load_trusted_dataset, split
 
     given = {"config": config, "seed": seed, "from": start}
@@ -118,8 +118,8 @@ def train(
                 raise ValueError(
                     f"--{option}: --resume goes on with the settings in {out}; leave out"
                 )
-        chosen = TrainSettings() if config is None else load_settings(config)
-        chosen = chosen if seed is None else chosen.changed(seed=seed)
+        own = {} if seed is None else {"seed": seed}
+        chosen = load_model(TrainSettings, config, **own)
     trusted = load_rig(rig) if rig else None
     data = [load_trusted_dataset(folder, trusted) for folder in dataset]
     if held_out:
@@ -184,16 +184,12 @@ def train_windows(
     If recordings held out get no better, nothing is written, and the exit code is 2.
     """
     from calibgraph.errors import CalibrationError
-    from calibgraph.matching.structure.training import (
-        WindowSettings,
-        load_window_settings,
-        train_windows,
-    )
+    from calibgraph.files import load_model
+    from calibgraph.matching.structure.training import WindowSettings, train_windows
     from calibgraph.matching.structure.window_weights import load_window_network
     from calibgraph.matching.trusted_data import load_held_out, load_trusted_dataset, split
 
-    chosen = WindowSettings() if config is None else load_window_settings(config)
-    chosen = chosen if seed is None else chosen.model_copy(update={"seed": seed})
+    chosen = load_model(WindowSettings, config, **({} if seed is None else {"seed": seed}))
     begun = None if start is None else load_window_network(start)
     data = [load_trusted_dataset(folder) for folder in recording]
     others = load_held_out(held_out or (), data)
