@@ -16,9 +16,9 @@ from calibgraph.matching.protocol import Start, to_full_matcher
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.progress import Progress, no_progress
 from calibgraph.rounds import match_in_rounds
-from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
 from factors import Clock
 from tests.conftest import SAMPLE
+from tests.draws.clocks import draw_twists, put_clock_error
 
 
 class Minimal:
