@@ -14,7 +14,12 @@ from benchmarks.accuracy.ledger import Record
 from benchmarks.accuracy.verdicts import STATUSES, class_of
 from calibgraph.model.verdict import TOLERANCE, ErrorProbability
 from calibgraph.trust.lens_parameter import probability_of_lens
-from calibgraph.trust.probability import contributions, probability_beyond, worst_severities
+from calibgraph.trust.probability import (
+    CHANCE,
+    contributions,
+    probability_beyond,
+    worst_severities,
+)
 
 Array = np.ndarray
 
@@ -35,7 +40,7 @@ class Sample:
         kind: of the case.
         severities: per kind of check.
         by_bar: the probability that its error bar alone allows.
-        by_lens: that of a wrong lens.
+        by_values: that of checks whose value is one: a wrong lens, a pose found by chance.
         off: whether it is off.
         right: whether it is right: well within the tolerance.
         statuses: per kind of check, the worst.
@@ -46,7 +51,7 @@ class Sample:
     kind: str
     severities: dict[str, float]
     by_bar: float
-    by_lens: float
+    by_values: float
     off: bool
     right: bool
     statuses: dict[str, str]
@@ -59,8 +64,8 @@ class Sample:
 
     @property
     def given(self) -> float:
-        """The probability by its error bar and its lens."""
-        return 1 - (1 - self.by_bar) * (1 - self.by_lens)
+        """The probability by its error bar and such checks."""
+        return 1 - (1 - self.by_bar) * (1 - self.by_values)
 
 
 def samples_of(records: Iterable[Record]) -> list[Sample]:
@@ -80,7 +85,7 @@ def _sample(record: Record, camera: Record) -> Sample:
         kind=record["kind"],
         severities=worst_severities((kind, severity) for kind, _, _, severity, _ in checks),
         by_bar=_beyond(camera),
-        by_lens=probability_of_lens((kind, status, value) for kind, status, value, *_ in checks),
+        by_values=_by_values(checks),
         off=which == "off",
         right=which == "right",
         statuses=_worst_statuses(checks),
@@ -94,6 +99,12 @@ def _beyond(camera: Record) -> float:
         return float(camera["beyond"])
     rows = camera["covariance"]
     return probability_beyond(None if rows is None else np.array(rows), TOLERANCE)
+
+
+def _by_values(checks: Sequence[Sequence[Any]]) -> float:
+    values = [(kind, status, value) for kind, status, value, *_ in checks]
+    by_chance = max((value or 0.0 for kind, _, value in values if kind == CHANCE), default=0.0)
+    return 1 - (1 - probability_of_lens(values)) * (1 - by_chance)
 
 
 def _worst_statuses(checks: Sequence[Sequence[Any]]) -> dict[str, str]:
@@ -115,7 +126,7 @@ def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[ErrorProbab
         for s in samples
     ]
     return [
-        ErrorProbability(1 - (1 - p) * (1 - s.by_lens), s.by_bar)
+        ErrorProbability(1 - (1 - p) * (1 - s.by_values), s.by_bar)
         for p, s in zip(grossly, samples, strict=True)
     ]
 

@@ -17,7 +17,7 @@ def sample(
 ) -> Sample:
     status = ("PASS", "WARN", "FAIL")[min(int(severity), 2)]
     return Sample(
-        level="data", kind="good", severities={kind: severity}, by_bar=by_bar, by_lens=0.0,
+        level="data", kind="good", severities={kind: severity}, by_bar=by_bar, by_values=0.0,
         off=off, right=not off, statuses={kind: status}, worst=severity,
     )  # fmt: skip
 
@@ -69,3 +69,13 @@ def test_a_camera_that_was_not_found_is_no_sample() -> None:
     (only,) = samples_of([record])
     assert (only.vote, only.worst, only.by_bar) == ("WARN", 1.2, 0.25)
     assert only.right and not only.off
+
+
+def test_a_pose_found_by_chance_counts_beside_a_wrong_lens() -> None:
+    checks = [["chance", "PASS", 0.25, 0.5, False], ["lens_focal_length", "WARN", 0.2, 1.5, False]]
+    camera: Record = {
+        "error_deg": 0.1, "error_cm": 1.0, "covariance": None, "beyond": 0.0, "checks": checks,
+    }  # fmt: skip
+    (only,) = samples_of([{"level": "data", "kind": "good", "cameras": {"left": camera}}])
+    assert only.by_values == pytest.approx(1 - 0.75 * 0.8)
+    assert only.severities == {}  # neither is one of the graded checks
