@@ -24,6 +24,7 @@ from calibgraph.io.motion import (
     twist_between,
 )
 from calibgraph.io.videos import PICTURE_SUFFIX, hash_picture
+from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
 
 _MICROSECONDS_DIGITS, _NANOSECONDS_DIGITS = 16, 18  # of a stamp
@@ -119,15 +120,36 @@ class Frame:
         return files if motion is None else {**files, _MOTION: motion.entry()}
 
 
-def scan_of(frame: Frame) -> PreparedScan:
-    """A frame's cloud, as :func:`twist_by_scans` uses it."""
-    return prepare_scan(frame.load_cloud()[:, :3].astype(np.float64))
+class ScanSteps:
+    """Steps between frames by registration: each scan is prepared once, each pair fitted once."""
+
+    def __init__(self) -> None:
+        self._scans, self._steps = dict[Path, PreparedScan](), dict[tuple[Path, Path], Array]()
+
+    def between(self, frame: Frame, other: Frame) -> Array:
+        """(4, 4) T_frame_other.
+
+        Raises:
+            DatasetError: if the scans do not fit.
+        """
+        one, two = frame.cloud_path, other.cloud_path
+        if (two, one) in self._steps:
+            return invert(self._steps[two, one])
+        if (one, two) not in self._steps:
+            self._steps[one, two] = register(self._prepared(frame), self._prepared(other), one)
+        return self._steps[one, two]
+
+    def _prepared(self, frame: Frame) -> PreparedScan:
+        if frame.cloud_path not in self._scans:
+            points = frame.load_cloud()[:, :3].astype(np.float64)
+            self._scans[frame.cloud_path] = prepare_scan(points)
+        return self._scans[frame.cloud_path]
 
 
 def twist_by_scans(
     frame: Frame,
     beside: Sequence[tuple[Frame, float]],
-    scans: Callable[[Frame], PreparedScan] = scan_of,
+    steps: ScanSteps | None = None,
 ) -> Array:
     """(6,) mean twist between a frame's scan and those before and after, by registration.
 
@@ -135,7 +157,7 @@ def twist_by_scans(
         frame: whose twist is wanted.
         beside: the frames before and after in the recording, or one of them, and by how much later
             they are [s].
-        scans: as :func:`scan_of`, which may keep what it has prepared.
+        steps: those that are known; none.
 
     Raises:
         DatasetError: if there is none, scans do not fit, or the speed is beyond that of a vehicle.
@@ -145,10 +167,9 @@ def twist_by_scans(
             f"{frame.cloud_path}: has no neighbouring scan, which its motion is found from; give "
             "two frames or more, or leave --interval-s out"
         )
-    own = scans(frame)
+    steps = steps or ScanSteps()
     twists = [
-        twist_between(np.eye(4), register(own, scans(one), frame.cloud_path), later_s)
-        for one, later_s in beside
+        twist_between(np.eye(4), steps.between(frame, one), later_s) for one, later_s in beside
     ]
     twist = np.asarray(np.mean(twists, axis=0))
     if (speed_m_s := np.linalg.norm(twist[3:])) > _MOST_M_S:
