@@ -51,7 +51,8 @@ SCHEMA = pa.schema(
 )
 """probability_off: by more than the tolerance. T_camera_lidar: (4, 4) by rows, null when failed;
 covariance: (6, 6) of xi in T_camera_lidar = exp(xi) estimate, null without an error bar; of:
-alignment or mount, null in rows of earlier versions, which are alignments. A vehicle that failed before its cameras were known has one row with an empty camera."""
+alignment or mount, null in rows of earlier versions, which are alignments. A vehicle that failed
+before its cameras were known has one row with an empty camera."""
 
 
 def read_rows(uri: str, storage_options: Mapping[str, Any] | None = None) -> pa.Table:
