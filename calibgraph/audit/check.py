@@ -16,7 +16,7 @@ from calibgraph.audit.matching import Matching, match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
 from calibgraph.audit.significance import Tolerance
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.files import checked_model, read_yaml
+from calibgraph.files import load_model
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.frame import hash_source
 from calibgraph.io.kept_frames import keep_frames
@@ -224,7 +224,7 @@ def provenance(rig: Path, data: Dataset) -> Provenance:
     path = rig / CALIBRATION_FILE if rig.is_dir() else rig
     if not is_calibration_file(path):
         return Provenance()
-    result = checked_model(_Result, read_yaml(path), path)
+    result = load_model(_Result, path)
     if result.config.of != "alignment":
         raise FileError(
             path, f"has poses of the {result.config.of}, and check compares alignments; give the "
