@@ -160,6 +160,7 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         error_sources=evidence.error_sources,
         lens=solution.lens,
         bootstrap=evidence.bootstrap,
+        places=solution.correspondences.places.of_frames(solution.correspondences.frame),
         correspondences=solution.correspondences,
         camera_matches=solution.camera_matches,
         build_graph=solution.graph,
