@@ -204,7 +204,7 @@ def _update_evidence(state: State, camera: int, epoch: Epoch, by_places: Array) 
     groups = tuple(group.add(score, int(sums.frames), alone) for group in one.groups)
     rows = pose_rows(camera)
     if state.offsets is not None:
-        alone_7 = replace(epoch.sums[camera], scatter=np.zeros((7, 7)))
+        alone_7 = epoch.sums[camera].change(scatter=np.zeros((7, 7)))
         noise = noise + state.of_pose(camera, alone_7).scatter / sums.frames
     noise = noise * sums.frames + sums.hessian @ by_places[rows, rows] @ sums.hessian
     walks = state.of_pose(camera, one.summary.walks)

@@ -222,7 +222,7 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         T_lidar_camera = refine(raw, start, camera_state.scale, state.config)
         own = Gated.at(T_lidar_camera, raw, camera_state.scale, state.references[camera])
         if own is not None:
-            sums = replace(own.sums, frames=np.array(float(len(parts))))
+            sums = own.sums.change(frames=np.array(float(len(parts))))
             found = found.replace_at(camera, sums)
     return _with_uncertain_offsets(state, found, detected)
 
@@ -239,7 +239,7 @@ def _with_uncertain_offsets(state: State, sums: Sums, detected: DetectedStep) ->
             twists[camera] = to_camera @ np.mean(own, axis=0)
     share = sums.frames / np.maximum(state.total_frames, 1.0)
     scatter = [s * state.total[pose_rows(c), pose_rows(c)] for c, s in enumerate(share)]
-    sums = replace(sums, scatter=np.array(scatter))
+    sums = sums.change(scatter=np.array(scatter))
     return state.of_poses(with_offset(sums, twists))
 
 

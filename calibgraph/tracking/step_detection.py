@@ -143,7 +143,7 @@ def _scattered_as_usual(state: State, epoch: Epoch) -> Sums:
     left = np.maximum(poses.frames - 1, 0).sum(axis=0)[:, None, None]
     by_camera = poses.scatter_about_mean.sum(axis=0) / np.maximum(left, 1.0)
     frames = [
-        replace(f, sums=replace(f.sums, scatter=f.sums.frames[:, None, None] * by_camera))
+        replace(f, sums=f.sums.change(scatter=f.sums.frames[:, None, None] * by_camera))
         for f in epoch.frames
     ]
     return epoch.sums_of(frames)
