@@ -180,7 +180,7 @@ def absorb(
 
 def _count_absorbed(state: State, camera: int, gated: Gated) -> State:
     """The state with a camera's block counted as absorbed, and its residuals counted."""
-    one = count_residuals(state.cameras[camera], gated.residuals)
+    one = count_residuals(state.cameras[camera], gated.residuals, gated.inliers)
     agreements = (*one.agreements, (state.frame or 0, True))[-_LAST_FRAMES:]
     one = replace(one, agreements=agreements)
     given = len(gated.residuals.errors_px)

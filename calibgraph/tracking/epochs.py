@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from operator import add
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
@@ -227,54 +229,74 @@ _GATE_STEPS = 3  # of Gauss-Newton: each leaves about a third of the way
 
 def regate(state: State) -> State:
     """The state with its live frames gated, and linearized, at the newest estimates."""
-    frames = {
-        f.number: replace(f, inliers=dict(f.inliers), sums=f.sums.copy()) for f in state.live_frames
-    }
-    for camera, one in enumerate(state.cameras):
-        epochs = state.epochs if one.summary.walk else state.epochs[-1:]
-        for epoch in epochs:
-            group = epoch.frames if one.summary.walk else state.live_frames
-            own = [frames[f.number] for f in group if camera in f.raw]
-            if own:
-                _regate_camera(state, camera, own, epoch.T_lidar_camera[camera])
+    live = state.live_frames
+    if not live:
+        return state
+    inliers, sums = [dict(frame.inliers) for frame in live], Sums.stack([f.sums for f in live])
+    for camera in range(len(state.cameras)):
+        for own, pose in _linearized_together(state, camera):
+            found, shown = _regate_camera(state, camera, [live[row] for row in own], pose)
+            sums.packed[own, camera] = shown.packed
+            for row, rows in zip(own, found, strict=True):
+                inliers[row][camera] = rows
+    frames = iter(
+        LiveFrame(f.number, f.raw, inliers[row], sums[row], f.place, f.twists_per_s)
+        for row, f in enumerate(live)
+    )
     epochs = tuple(
-        replace(epoch, frames=tuple(frames[f.number] for f in epoch.frames))
-        for epoch in state.epochs
+        replace(epoch, frames=tuple(islice(frames, len(epoch.frames)))) for epoch in state.epochs
     )
     return replace(state, epochs=epochs)
 
 
+def _linearized_together(state: State, camera: int) -> Iterator[tuple[list[int], gtsam.Pose3]]:
+    """The live frames of a camera, by their places among all, that have one estimate."""
+    end, rows = 0, list[int]()
+    for epoch in state.epochs:
+        first, end = end, end + len(epoch.frames)
+        rows += [first + i for i, frame in enumerate(epoch.frames) if camera in frame.raw]
+        if rows and state.cameras[camera].summary.walk:
+            yield rows, epoch.T_lidar_camera[camera]
+            rows = []
+    if rows:
+        yield rows, state.T_lidar_camera[camera]
+
+
 def _regate_camera(
     state: State, camera: int, frames: Sequence[LiveFrame], T_lidar_camera: gtsam.Pose3
-) -> None:
-    """Fill in a camera's inliers of frames, and their sums at an estimate.
+) -> tuple[list[NDArray[np.bool_]], Sums]:
+    """A camera's inliers of (f) frames, and (f,) their sums at an estimate.
 
     Hessians of frames are as they were, but for a share of what their sum is now.
     """
     scale, raw = state.cameras[camera].scale, merge([frame.raw[camera] for frame in frames])
     gate = _gate_pose(state, camera, raw, T_lidar_camera)
     rows = raw.within_gate(to_T_camera_lidar(gate), scale.gate_px)
-    for frame, found in zip(frames, np.split(rows, raw.frame_edges[1:-1]), strict=True):
-        if np.count_nonzero(found) >= MIN_MATCHES:
-            frame.inliers[camera] = found
-    inliers = raw.select(np.concatenate([frame.inliers[camera] for frame in frames]))
+    found = [
+        new if np.count_nonzero(new) >= MIN_MATCHES else frame.inliers[camera]
+        for frame, new in zip(frames, np.split(rows, raw.frame_edges[1:-1]), strict=True)
+    ]
+    inliers = raw.select(np.concatenate(found))
     block = inliers.with_scale(scale)
     here = block.frame_sums(T_lidar_camera, inliers.frame_edges)
     robust = robust_hessian(block, T_lidar_camera)
     true = convex_hessian(robust + raw.at(to_T_camera_lidar(gate)).gate_hessian(scale), robust)
+    hessian = Sums.stack([frame.sums[camera] for frame in frames]).hessian
     if state.offsets is not None:
-        for frame in frames:
-            frame.sums.hessian[camera] = 0.0
-    missing = true - sum(frame.sums.hessian[camera] for frame in frames)
+        hessian = np.zeros_like(hessian)
+    missing = true - hessian.sum(axis=0)
     shares = here.hessian @ np.linalg.solve(here.hessian.sum(axis=0) + WEAK, missing)
-    step = step_between(T_lidar_camera, state.references[camera])
-    for row, frame in enumerate(frames):
-        sums, score = frame.sums, here.gradient[row]
-        sums.hessian[camera] += (shares[row] + shares[row].T) / 2
-        sums.gradient[camera] = score + sums.hessian[camera] @ step
-        sums.reweighted[camera] = here.hessian[row]
-        sums.score[camera], sums.scatter[camera] = score, np.outer(score, score)
-        sums.matches[camera] = np.count_nonzero(frame.inliers[camera])
+    hessian = hessian + (shares + shares.swapaxes(1, 2)) / 2
+    step, score = step_between(T_lidar_camera, state.references[camera]), here.gradient
+    return found, Sums.of(
+        hessian=hessian,
+        gradient=score + hessian @ step,
+        reweighted=here.hessian,
+        score=score,
+        scatter=score[:, :, None] * score[:, None, :],
+        frames=np.ones(len(frames)),
+        matches=inliers.frame_counts.astype(np.float64),
+    )
 
 
 def _gate_pose(

@@ -187,8 +187,8 @@ def _repeats(state: State, camera: int, table: Correspondences) -> bool:
     last = _last_hashes(state, camera)
     if last is None or not len(table):
         return False
-    again = np.isin(last, point_hashes(table.points_lidar_m))
-    return bool(again.mean() > REPEATED_SHARE)
+    new = {*point_hashes(table.points_lidar_m).tolist()}  # faster than arrays, of some hundred
+    return sum(one in new for one in last.tolist()) > REPEATED_SHARE * len(last)
 
 
 def _last_hashes(state: State, camera: int) -> np.ndarray | None:

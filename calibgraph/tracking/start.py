@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.calibration import Calibration
@@ -105,7 +106,7 @@ def _start_camera(state: State, camera: int, T_lidar_camera: gtsam.Pose3) -> Sta
     scale = histogram.scale(state.config)  # the gate by which inliers are counted below
     camera_state = replace(state.cameras[camera], started=True, waiting=(), refused=(), scale=scale)
     for one in residuals:
-        camera_state = count_residuals(camera_state, one)
+        camera_state = count_residuals(camera_state, one, one.inliers(scale))
     state = state.with_camera(camera, camera_state)
     state = replace(state, references=replace_item(state.references, camera, T_lidar_camera))
     return absorb_frames(state, camera, usable, T_lidar_camera)
@@ -149,11 +150,13 @@ def absorb_frames(
     return state.with_camera(camera, state.cameras[camera].count(**counts))
 
 
-def count_residuals(camera_state: CameraState, residuals: BlockResiduals) -> CameraState:
-    """The camera with a frame's residuals counted."""
-    share = float(np.mean(residuals.inliers(camera_state.scale)))
-    newest = [share, median(residuals.errors_px)]
-    recent = np.vstack([camera_state.recent, newest])[-HISTORY:]
+def count_residuals(
+    camera_state: CameraState, residuals: BlockResiduals, inliers: NDArray[np.bool_]
+) -> CameraState:
+    """The camera with a frame's residuals counted, and which of them are within the gate."""
+    share = np.count_nonzero(inliers) / len(inliers)
+    newest = [[share, median(residuals.errors_px)]]
+    recent = np.concatenate([camera_state.recent[1 - HISTORY :], newest])
     return replace(camera_state, recent=recent, residuals=camera_state.residuals.add(residuals))
 
 
