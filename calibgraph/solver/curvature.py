@@ -88,7 +88,15 @@ def curvature_at(at: FittedObjective, robust_hessians: Mapping[str, Array]) -> C
 
 def convex_hessian(hessian: Array, otherwise: Array) -> Array:
     """The Hessian if it is positive definite; few matches near the gate may spoil it."""
-    return hessian if np.linalg.eigvalsh(hessian)[0] > 0 else otherwise
+    return hessian if _is_positive_definite(hessian) else otherwise
+
+
+def _is_positive_definite(hessian: Array) -> bool:
+    try:
+        np.linalg.cholesky(hessian)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def unknown(chosen: Sequence[bool]) -> Array:
@@ -158,6 +166,6 @@ def robust_hessian(block: ProjectionBlock, T_lidar_camera: gtsam.Pose3) -> Array
     gradients = block.gradients_at_each(retract_all(near, _STEPS))
     hessian = (gradients[:6] - gradients[6:]) / (2 * _STEP)
     hessian = (hessian + hessian.T) / 2
-    if np.linalg.eigvalsh(hessian)[0] > 0:
+    if _is_positive_definite(hessian):
         return hessian
     return block.sums(T_lidar_camera).hessian

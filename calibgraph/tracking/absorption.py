@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -20,6 +19,7 @@ from calibgraph.tracking.assessment import rig_at
 from calibgraph.tracking.cause import chance_limit, squared_sigmas
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
 from calibgraph.tracking.place_model import states_places

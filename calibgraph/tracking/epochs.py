@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from itertools import islice
 from operator import add
 
@@ -20,6 +19,7 @@ from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, inliers_of
 from calibgraph.tracking.offsets import Offsets, delayed
 from calibgraph.tracking.place_sums import sums_by_place

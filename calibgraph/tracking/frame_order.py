@@ -174,7 +174,7 @@ def without_repeats(state: State, table: Correspondences) -> Correspondences:
     repeated = [
         name
         for camera, name in enumerate(state.names)
-        if name in table.cameras and _repeats(state, camera, table.of_camera(name))
+        if name in table.cameras and _repeats(state, camera, table)
     ]
     if not repeated:
         return table
@@ -184,10 +184,11 @@ def without_repeats(state: State, table: Correspondences) -> Correspondences:
 
 def _repeats(state: State, camera: int, table: Correspondences) -> bool:
     """Whether a camera's points are those of the last frame that it has any of."""
-    last = _last_hashes(state, camera)
-    if last is None or not len(table):
+    last, own = _last_hashes(state, camera), table.cameras.index(state.names[camera])
+    points = table.points_lidar_m[table.camera_index == own]
+    if last is None or not len(points):
         return False
-    new = {*point_hashes(table.points_lidar_m).tolist()}  # faster than arrays, of some hundred
+    new = {*point_hashes(points).tolist()}  # faster than arrays, of some hundred
     return sum(one in new for one in last.tolist()) > REPEATED_SHARE * len(last)
 
 

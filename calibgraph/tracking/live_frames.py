@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -15,6 +15,7 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.offset_sums import with_offset
 from calibgraph.tracking.offsets import Offsets, delayed, motion_in
 from calibgraph.tracking.sums import Gated, Sums

@@ -186,7 +186,7 @@ def marginals_of_places(fit: LatentPoseFit) -> list[gtsam.GaussianFactorGraph]:
     """Per place its marginal on the cloud and the cameras as matches show them everywhere."""
     model, placed = fit.linear.model, fit.linear.placed
     keys = [[cloud_at_key(place)] for place in range(model.places)]
-    for place, camera in model.matched_places():
+    for place, camera in model.matched_places:
         keys[place].insert(0, matched_at_key(place, camera))
     place_of_key = {key: place for place, own in enumerate(keys) for key in own}
     graphs = [gtsam.GaussianFactorGraph() for _ in keys]

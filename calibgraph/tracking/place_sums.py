@@ -7,11 +7,12 @@ Older ones are one row: its frames' errors count as those of as many places as a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.sums import Sums
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -16,6 +15,7 @@ from calibgraph.tracking.drift import follow_drift
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
 from calibgraph.tracking.offset_sums import with_offset
 from calibgraph.tracking.offset_terms import keep_offsets

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -25,6 +24,7 @@ from calibgraph.solver.camera_block import (
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import Epoch
 from calibgraph.tracking.noise import ResidualHistogram, median
 from calibgraph.tracking.state import HISTORY, State, replace_item

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from itertools import chain
 from operator import add
@@ -20,6 +20,7 @@ from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import NO_DISTORTION, Epoch, LiveFrame
 from calibgraph.tracking.noise import inflation, widening
 from calibgraph.tracking.offset_sums import after_offset_walk, without_offset

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import accumulate
 
 import numpy as np
@@ -13,6 +13,7 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
 from calibgraph.tracking.epoch_sums import sum_epochs
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import Epoch, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.state import State

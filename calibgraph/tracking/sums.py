@@ -32,7 +32,7 @@ from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBl
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.within_place import WEAK
-from factors import smallest_scaled_eigenvalue
+from factors import smallest_scaled_eigenvalue, smallest_scaled_eigenvalues
 
 _POSE = 6
 _MATRICES, _VECTORS = ("hessian", "reweighted", "scatter"), ("gradient", "score")
@@ -192,6 +192,13 @@ class Sums:
             scatter=gain @ self.scatter @ back + hessian * variance[..., None, :] @ hessian,
         )
         return walked, kept
+
+    @property
+    def are_determined(self) -> NDArray[np.bool_]:
+        """(...) whether all directions of the pose are."""
+        hessians = self.pose.hessian
+        values = smallest_scaled_eigenvalues(hessians.reshape(-1, _POSE, _POSE))
+        return (values > _LEAST_EIGENVALUE).reshape(hessians.shape[:-2])
 
     def step(self, camera: int) -> Array | None:
         """(6,) from a camera's reference to the minimum of its sums; None if undetermined."""

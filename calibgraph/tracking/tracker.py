@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -37,6 +36,7 @@ from calibgraph.tracking.frame_order import (
     with_place,
     without_repeats,
 )
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.offset_search import explaining_offsets, follow
 from calibgraph.tracking.offsets import delayed, with_motion_in_use
