@@ -58,10 +58,9 @@ class LiveFrame:
         sums = self.sums.replace_at(camera, Sums.zeros())
         return replace(self, raw=raw, inliers=inliers, sums=sums)
 
-    def add(
-        self, camera: int, raw: CameraBlock, gated: Gated, offsets: Offsets | None
-    ) -> LiveFrame:
-        """The frame with a camera's matches."""
+    def add(self, camera: int, gated: Gated, offsets: Offsets | None, *, row: int = 0) -> LiveFrame:
+        """The frame with a camera's matches: those of a row of the gated frames."""
+        raw, inliers = gated.of_frame(row)
         twists = self.twists_per_s
         if twists is not None and offsets is not None and raw.block.motion is not None:
             twists = twists.copy()
@@ -69,8 +68,8 @@ class LiveFrame:
         return replace(
             self,
             raw={**self.raw, camera: raw},
-            inliers={**self.inliers, camera: gated.inliers},
-            sums=self.sums.replace_at(camera, gated.sums),
+            inliers={**self.inliers, camera: inliers},
+            sums=self.sums.replace_at(camera, gated.sums[row]),
             twists_per_s=twists,
         )
 

@@ -220,10 +220,11 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         start = near[-1].T_lidar_camera if near else state.T_lidar_camera[camera]
         raw = merge(parts)
         T_lidar_camera = refine(raw, start, camera_state.scale, state.config)
-        own = Gated.at(T_lidar_camera, raw, camera_state.scale, state.references[camera])
-        if own is not None:
-            sums = own.sums.change(frames=np.array(float(len(parts))))
-            found = found.replace_at(camera, sums)
+        scale, reference = camera_state.scale, state.references[camera]
+        together = np.array([0, len(raw)])
+        own = Gated.at(T_lidar_camera, raw, scale, reference, edges=together).sums[0]
+        if own.matches:
+            found = found.replace_at(camera, own.change(frames=np.array(float(len(parts)))))
     return _with_uncertain_offsets(state, found, detected)
 
 

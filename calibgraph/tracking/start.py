@@ -133,9 +133,10 @@ def absorb_frames(
             found = (
                 None if raw is None else Gated.at(T_lidar_camera, raw, scale, reference, even=even)
             )
-            if raw is not None and found is not None:
-                frame = frame.add(camera, raw, found, state.offsets)
-                counts.update(absorbed=1, given=len(raw.frame), used=found.used)
+            if raw is not None and found is not None and found.sums.matches[0]:
+                frame = frame.add(camera, found, state.offsets)
+                used = int(found.sums.matches[0])
+                counts.update(absorbed=1, given=len(raw.frame), used=used)
             frames.append(frame)
         epochs.append(
             replace(
@@ -153,10 +154,11 @@ def absorb_frames(
 def count_residuals(
     camera_state: CameraState, residuals: BlockResiduals, inliers: NDArray[np.bool_]
 ) -> CameraState:
-    """The camera with a frame's residuals counted, and which of them are within the gate."""
-    share = np.count_nonzero(inliers) / len(inliers)
-    newest = [[share, median(residuals.errors_px)]]
-    recent = np.concatenate([camera_state.recent[1 - HISTORY :], newest])
+    """The camera with the residuals of frames counted, and which of them are within the gate."""
+    inner = residuals.block.frame_edges[1:-1]
+    shares = [np.count_nonzero(own) / len(own) for own in np.split(inliers, inner)]
+    medians = [*map(median, np.split(residuals.errors_px, inner))]
+    recent = np.vstack([camera_state.recent, np.column_stack([shares, medians])])[-HISTORY:]
     return replace(camera_state, recent=recent, residuals=camera_state.residuals.add(residuals))
 
 

@@ -29,10 +29,10 @@ from calibgraph.graph.objective import join
 from calibgraph.graph.variables import camera_key
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
-from calibgraph.solver.curvature import convex_hessian, robust_hessian
+from calibgraph.solver.curvature import convex_hessian, robust_hessians_of
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.within_place import WEAK
-from factors import smallest_scaled_eigenvalue, smallest_scaled_eigenvalues
+from factors import smallest_scaled_eigenvalue, smallest_scaled_eigenvalues, to_runs
 
 _POSE = 6
 _MATRICES, _VECTORS = ("hessian", "reweighted", "scatter"), ("gradient", "score")
@@ -224,22 +224,25 @@ def step_between(one: gtsam.Pose3, two: gtsam.Pose3) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Gated:
-    """One frame's matches of a camera, gated at a T_lidar_camera.
+    """Matches of a camera, gated at one T_lidar_camera.
 
     Attributes:
         residuals: of all of them, there.
         inliers: (m,) which of them are within the gate.
-        sums: of these.
+        sums: (f,) of these, frame by frame; none of a frame with too few.
     """
 
     residuals: BlockResiduals
     inliers: NDArray[np.bool_]
     sums: Sums
 
-    @property
-    def used(self) -> int:
-        """How many are within the gate."""
-        return int(self.sums.matches)
+    def of_frame(self, row: int) -> tuple[CameraBlock, NDArray[np.bool_]]:
+        """A frame's matches, and which of them are within the gate."""
+        raw = self.residuals.block
+        if raw.frames == 1:
+            return raw, self.inliers
+        first, end = raw.frame_edges[row : row + 2]
+        return raw.select(np.arange(first, end)), self.inliers[first:end]
 
     @staticmethod
     def at(
@@ -249,8 +252,9 @@ class Gated:
         reference: gtsam.Pose3,
         *,
         even: bool = False,
-    ) -> Gated | None:
-        """The matches near the minimum; None if too few are within the gate.
+        edges: NDArray[np.int64] | None = None,
+    ) -> Gated:
+        """The matches near the minimum.
 
         Args:
             T_lidar_camera: where they are linearized.
@@ -259,30 +263,36 @@ class Gated:
             reference: T_lidar_camera at which the gradient is taken.
             even: let the true Hessian be a multiple of that by weights. A time offset shows by
                 differences of frames, in which the scatter of true Hessians would count.
+            edges: (f + 1,) of what counts as a frame; None: the frames.
         """
-        residuals = raw.at(to_T_camera_lidar(T_lidar_camera))
+        residuals, edges = (
+            raw.at(to_T_camera_lidar(T_lidar_camera)),
+            raw.frame_edges if edges is None else edges,
+        )
         inliers = residuals.inliers(scale)
-        if np.count_nonzero(inliers) < MIN_MATCHES:
-            return None
+        counts = np.add.reduceat(inliers, edges[:-1], dtype=np.int64)
+        enough = counts >= MIN_MATCHES
+        inside = np.concatenate([[0], counts.cumsum()])
         pose = residuals.T_lidar_camera
         block = raw.select(inliers).with_scale(scale)
-        here = block.sums(pose)
-        hessian = robust_hessian(block, pose) + residuals.gate_hessian(scale)
+        here = block.frame_sums(pose, inside)
+        hessian = robust_hessians_of(block, pose, here.hessian, to_runs(inside))
+        hessian = hessian + residuals.gate_hessians(scale, edges)
         if even:
-            share = np.trace(np.linalg.solve(here.hessian + WEAK, hessian)) / _POSE
-            hessian = float(np.clip(share, *_SHARES)) * here.hessian
-        gradient = here.gradient + hessian @ step_between(pose, reference)
-        scatter = np.outer(here.gradient, here.gradient)
-        sums = Sums.zeros().change(
+            shares = np.linalg.solve(here.hessian + WEAK, hessian)
+            share = np.trace(shares, axis1=1, axis2=2) / _POSE
+            hessian = np.clip(share, *_SHARES)[:, None, None] * here.hessian
+        score = here.gradient
+        sums = Sums.of(
             hessian=hessian,
-            gradient=gradient,
+            gradient=score + hessian @ step_between(pose, reference),
             reweighted=here.hessian,
-            score=here.gradient,
-            scatter=scatter,
-            frames=np.array(1.0),
-            matches=np.array(float(len(block))),
+            score=score,
+            scatter=score[:, :, None] * score[:, None, :],
+            frames=np.ones(len(counts)),
+            matches=counts.astype(np.float64),
         )
-        return Gated(residuals, inliers, sums)
+        return Gated(residuals, inliers, sums if enough.all() else sums * enough.astype(np.float64))
 
 
 def equation_5(

@@ -22,7 +22,7 @@ from calibgraph.tracking.absorption import (
     blocks_by_camera,
     count_absent,
     select_agreeing,
-    with_open_frame,
+    with_open_frames,
     with_poses,
 )
 from calibgraph.tracking.assessment import Assessment, assess, to_calibration
@@ -174,17 +174,18 @@ class IncrementalCalibrator:
         )
         in_time = state.offsets is not None
         frame = LiveFrame.empty(number, len(state.names), place, in_time=in_time)
-        self._state = with_open_frame(state, frame)
+        self._state = with_open_frames(state, frame)
 
     def _take(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
         blocks = self._at_explaining_offsets(blocks)
         self._state, agreeing = select_agreeing(self._state, self._closed, blocks)
-        self._state, used = absorb(self._state, self._closed, agreeing)
+        self._state, (used,) = absorb(self._state, self._closed, agreeing)
         self._state, events = start_cameras(self._state, table, blocks)
         if events:
             self._rebuild()
-        self._state, seen = count_absent(self._state, used)
+        last = self._state.frame or 0, self._state.stamp_ns
+        self._state, seen = count_absent(self._state, used, last)
         events += seen + self._restart_after_step()
         self._refine()
         if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
