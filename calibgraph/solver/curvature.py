@@ -163,7 +163,7 @@ def robust_hessian(block: ProjectionBlock, T_lidar_camera: gtsam.Pose3) -> Array
         T_lidar_camera: where; the Hessian is in its tangent.
     """
     gradients = block.gradients_at_each(_steps_from(T_lidar_camera))[None]
-    return _convex(gradients, lambda: block.sums(T_lidar_camera).hessian[None])[0]
+    return np.asarray(_convex(gradients, lambda: block.sums(T_lidar_camera).hessian[None])[0])
 
 
 def robust_hessians_of(
@@ -180,8 +180,8 @@ def _steps_from(T_lidar_camera: gtsam.Pose3) -> Array:
 
 def _convex(gradients: Array, reweighted: Callable[[], Array]) -> Array:
     """(r, 6, 6) by (r, 12, 6) gradients to both sides; the other where it is not convex."""
-    hessians = (gradients[:, :6] - gradients[:, 6:]) / (2 * _STEP)
-    hessians = np.asarray(hessians + hessians.swapaxes(1, 2)) / 2
+    halves: Array = (gradients[:, :6] - gradients[:, 6:]) / (4 * _STEP)
+    hessians = halves + halves.swapaxes(1, 2)
     if not _is_positive_definite(hessians):
-        hessians = np.array([*map(convex_hessian, hessians, reweighted())])
-    return np.asarray(hessians)
+        return np.array([*map(convex_hessian, hessians, reweighted())])
+    return hessians

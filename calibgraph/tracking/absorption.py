@@ -19,6 +19,7 @@ from calibgraph.tracking.assessment import rig_at
 from calibgraph.tracking.cause import chance_limit
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.frame_order import Incoming
 from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
@@ -227,18 +228,16 @@ def add_to_totals(state: State, frames: Sequence[LiveFrame]) -> State:
     )
 
 
-def count_absent(
-    state: State, used: Collection[int], frame: tuple[int, int | None]
-) -> tuple[State, list[Event]]:
+def count_absent(state: State, used: Collection[int], frame: Incoming) -> tuple[State, list[Event]]:
     """The state with the frames without usable matches counted; events ``blind`` and ``back``.
 
     Args:
         state: after a frame, or more.
         used: the cameras whose matches of the frame were absorbed, by their places in the rig.
-        frame: its number and time.
+        frame: this one.
     """
     events = []
-    limit, (number, stamp_ns) = state.config.tracking.blind_frames, frame
+    limit, number, stamp_ns = state.config.tracking.blind_frames, frame.number, frame.stamp_ns
     for camera, camera_state in enumerate(state.cameras):
         if not camera_state.started:
             continue

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.graph.objective import projection_graph
 from calibgraph.model.config import Config
@@ -33,6 +34,16 @@ def agrees(block: CameraBlock, T_lidar_camera: gtsam.Pose3, camera_state: Camera
     share = inlier_share(block, T_lidar_camera, camera_state.scale)
     enough = share * len(block.frame) >= MIN_MATCHES
     return enough and share >= AGREEMENT * camera_state.inlier_share
+
+
+def agreeing_frames(
+    block: CameraBlock, T_lidar_camera: gtsam.Pose3, camera_state: CameraState
+) -> NDArray[np.bool_]:
+    """(f,) the same of each frame of a block."""
+    inside = block.within_gate(to_T_camera_lidar(T_lidar_camera), camera_state.scale.gate_px)
+    counts = np.add.reduceat(inside, block.frame_edges[:-1], dtype=np.int64)
+    least = AGREEMENT * camera_state.inlier_share * block.frame_counts
+    return np.asarray((counts >= MIN_MATCHES) & (counts >= least))
 
 
 def find_outlier_frame(

@@ -47,9 +47,9 @@ def detect_step(state: State) -> DetectedStep | None:
     It is accepted when enough outlier frames agree with each other, and every other camera has had
     as many frames to show whether it moved too.
     """
-    needed = state.config.tracking.step_frames
-    if not any(_has_enough(camera_state, needed) for camera_state in state.cameras):
+    if not may_have_moved(state):
         return None
+    needed = state.config.tracking.step_frames
     clusters = {c: _cluster(camera_state) for c, camera_state in enumerate(state.cameras)}
     found_by = {
         c: near
@@ -70,6 +70,12 @@ def detect_step(state: State) -> DetectedStep | None:
     if waiting and longest < needed + _PATIENCE:
         return None
     return DetectedStep(since, frozenset(found_by), clusters)
+
+
+def may_have_moved(state: State) -> bool:
+    """Whether outlier frames may show a step."""
+    needed = state.config.tracking.step_frames
+    return any(_has_enough(camera_state, needed) for camera_state in state.cameras)
 
 
 def _has_enough(camera_state: CameraState, needed: int) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import gtsam
@@ -14,8 +16,6 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.shared_error import with_common_error
 from calibgraph.tracking.absorption import (
     absorb,
     at_minimum,
@@ -29,23 +29,19 @@ from calibgraph.tracking.assessment import Assessment, assess, to_calibration
 from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
 from calibgraph.tracking.epochs import at_offsets, close_epoch
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import (
-    PLACE,
-    number_and_stamp,
-    with_metadata_per_frame,
-    with_place,
-    without_repeats,
-)
+from calibgraph.tracking.frame_group import Blocks, usual_frames
+from calibgraph.tracking.frame_order import PLACE, Incoming, incoming, with_place, without_repeats
 from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.offset_search import explaining_offsets, follow
-from calibgraph.tracking.offsets import delayed, with_motion_in_use
+from calibgraph.tracking.offsets import delayed
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.step_detection import detect_small_step, detect_step
-from calibgraph.tracking.update import Update, make_update
+from calibgraph.tracking.stream_tables import StreamFrame
+from calibgraph.tracking.update import Update, make_updates
 
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
 
@@ -64,7 +60,7 @@ class IncrementalCalibrator:
 
     _state: State
     _epoch_start: State
-    _since_epoch_start: list[tuple[int, Correspondences]]
+    _since_epoch_start: list[tuple[Incoming, ...]]
 
     _assessed: tuple[State, Assessment] | None = None
     _closed: ClosedPlaces
@@ -137,23 +133,46 @@ class IncrementalCalibrator:
                 have, a frame that does not come after the last one, or wrong metadata. Nothing has
                 changed then.
         """
-        table = with_common_error(table, self._state.config)
-        if len(table):
-            known = self._state.knows_motion
-            table = with_motion_in_use(self._state.rig, self._state.config, table, known)
-        table = with_metadata_per_frame(with_place(table, place))
-        number, stamp = number_and_stamp(table, frame, self._state)
-        new = without_repeats(self._state, table)
+        one = incoming(self._state, with_place(table, place), frame)
+        new = without_repeats(self._state, one.table)
         blocks = blocks_by_camera(self._state, new)
+        with self._undone_on_error([one]):
+            return self._take(one, new, blocks)
+
+    def update_together(self, frames: Sequence[StreamFrame]) -> list[Update]:
+        """Take in the first of some frames at once: one solve, one assessment.
+
+        As many as show nothing unusual, at most up to the end of an epoch. All their updates have
+        the estimate after the last of them, within 0.1 sigma of what :meth:`update` would give.
+
+        Returns:
+            Their updates; none if the first frame has to be taken in by :meth:`update`. Nothing has
+            changed then.
+        """
+        group, blocks = usual_frames(self._state, frames)
+        if not group:
+            return []
+        try:
+            with self._undone_on_error(group):
+                return self._take_together(group, blocks)
+        except CorrespondenceError:  # of one of them
+            return []
+
+    @contextmanager
+    def _undone_on_error(self, frames: Sequence[Incoming]) -> Iterator[None]:
+        """Frames are taken in inside; after an error of any kind nothing of them remains."""
         start, since = self._epoch_start, list(self._since_epoch_start)
         try:
-            self._begin_frame(number, stamp, table)
-            return self._take(new, blocks)
-        except BaseException as error:  # of any kind: nothing of the frame must remain
+            for one in frames:
+                self._begin_frame(one)
+            self._since_epoch_start.append(tuple(frames))
+            yield
+        except BaseException as error:
             self._resume(start)
-            for earlier, its_table in since:
-                self.update(its_table, frame=earlier)
+            for earlier in since:
+                self._repeat(earlier)
             if isinstance(error, _UNSOLVABLE):
+                number = frames[0].number
                 raise CorrespondenceError(
                     f"frame {number}: with its matches the estimate cannot be solved for "
                     f"({str(error).strip().splitlines()[0]}); it is left out",
@@ -161,22 +180,29 @@ class IncrementalCalibrator:
                 ) from error
             raise
 
-    def _begin_frame(self, number: int, stamp: int | None, table: Correspondences) -> None:
-        self._since_epoch_start.append((number, table))
-        state = self._state
-        place = table.metadata.get(PLACE, "")
+    def _repeat(self, frames: Sequence[Incoming]) -> None:
+        """Take in again what has been taken in at once."""
+        if len(frames) == 1:
+            self.update(frames[0].table, frame=frames[0].number)
+            return
+        again = [StreamFrame(one.number, one.table) for one in frames]
+        if len(self.update_together(again)) < len(frames):
+            raise StateError("has frames that do not go together")
+
+    def _begin_frame(self, one: Incoming) -> None:
+        state, place = self._state, one.table.metadata.get(PLACE, "")
         state = replace(
             state,
-            frame=number,
-            stamp_ns=state.stamp_ns if stamp is None else stamp,
+            frame=one.number,
+            stamp_ns=one.stamp_ns,
             updates=state.updates + 1,
-            findings=table.findings if len(table) else state.findings,
+            findings=one.table.findings if len(one.table) else state.findings,
         )
         in_time = state.offsets is not None
-        frame = LiveFrame.empty(number, len(state.names), place, in_time=in_time)
+        frame = LiveFrame.empty(one.number, len(state.names), place, in_time=in_time)
         self._state = with_open_frames(state, frame)
 
-    def _take(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> Update:
+    def _take(self, one: Incoming, table: Correspondences, blocks: Blocks) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
         blocks = self._at_explaining_offsets(blocks)
         self._state, agreeing = select_agreeing(self._state, self._closed, blocks)
@@ -184,15 +210,31 @@ class IncrementalCalibrator:
         self._state, events = start_cameras(self._state, table, blocks)
         if events:
             self._rebuild()
-        last = self._state.frame or 0, self._state.stamp_ns
-        self._state, seen = count_absent(self._state, used, last)
+        self._state, seen = count_absent(self._state, used, one)
         events += seen + self._restart_after_step()
-        self._refine()
-        if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
-            events += self._close_epoch()
-        return make_update(self._state, self._assess(), tuple(events), used)
+        events += self._end_frames(1)
+        (update,) = make_updates(self._state, self._assess(), [(one, events, used)])
+        return update
 
-    def _at_explaining_offsets(self, blocks: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
+    def _take_together(self, group: Sequence[Incoming], blocks: Blocks) -> list[Update]:
+        """Absorb frames that all agree with the estimates."""
+        self._state, used = absorb(self._state, self._closed, blocks, len(group))
+        taken = []
+        for one, own in zip(group, used, strict=True):
+            self._state, events = count_absent(self._state, own, one)
+            taken.append((one, events, own))
+        taken[-1][1].extend(self._end_frames(len(group)))
+        return make_updates(self._state, self._assess(), taken)
+
+    def _end_frames(self, count: int) -> list[Event]:
+        """The rest of the work of some frames, and the end of the epoch if they fill it."""
+        frames = len(self._state.epochs[-1].frames)
+        for step in range(frames - count + 1, frames + 1):
+            self._refine(step)
+        full = frames >= self._state.config.tracking.epoch_frames
+        return self._close_epoch() if full else []
+
+    def _at_explaining_offsets(self, blocks: Blocks) -> Blocks:
         """The blocks, and the state, at the time offsets with which they agree."""
         before, sums = self._state.offsets, self._closed.all_sums(self._state)
         offsets = explaining_offsets(self._state, sums, blocks)
@@ -204,9 +246,9 @@ class IncrementalCalibrator:
         later_s = offsets.values_s - before.values_s
         return {camera: delayed(block, later_s[camera]) for camera, block in blocks.items()}
 
-    def _refine(self) -> None:
+    def _refine(self, step: int) -> None:
         """Do a part of the work that the end of an epoch has left to the frames after it."""
-        state, step = self._state, len(self._state.epochs[-1].frames)
+        state = self._state
         if self._closed.state.findings != state.findings:
             self._closed = ClosedPlaces.of(state)
         if step <= STEPS and len(state.epochs) > 1:
@@ -235,8 +277,8 @@ class IncrementalCalibrator:
         try:
             tracker = IncrementalCalibrator(state.rig, state.config)
             tracker._resume(state)
-            for number, table in since:
-                tracker.update(table, frame=number)
+            for frames in since:
+                tracker._repeat(frames)
         except Exception as error:  # of any kind: parts of the state may contradict each other
             raise StateError(f"is no tracker's state ({in_words(error)})") from error
         return tracker

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +17,7 @@ from calibgraph.model.verdict import Verdict
 from calibgraph.report.as_json import finite
 from calibgraph.tracking.assessment import Assessment, covariance_by_camera
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.frame_order import Incoming
 from calibgraph.tracking.state import State
 
 
@@ -49,37 +50,37 @@ class Update:
     lens: dict[str, tuple[LensEstimate, ...]] = field(default_factory=dict)
 
 
-def make_update(
+def make_updates(
     state: State,
     assessment: Assessment,
-    events: tuple[Event, ...],
-    used: Mapping[int, int],
-) -> Update:
-    """The update after the last frame of a state.
+    taken: Sequence[tuple[Incoming, Sequence[Event], Mapping[int, int]]],
+) -> list[Update]:
+    """The updates after the last frames of a state.
 
     Args:
-        state: after the frame.
+        state: after the frames.
         assessment: of its estimates.
-        events: detected with the frame.
-        used: per camera, by its place in the rig, how many matches were absorbed.
+        taken: the frames that were taken in at once; the events detected with each, and per camera,
+            by its place in the rig, how many of its matches were absorbed.
     """
     names = state.names
-    poses = map(to_T_camera_lidar, assessment.T_lidar_camera)
-    return Update(
-        frame=state.frame or 0,
-        stamp_ns=state.stamp_ns,
-        T_camera_lidar=dict(zip(names, poses, strict=True)),
-        covariance=covariance_by_camera(assessment, names),
-        verdicts=assessment.verdicts,
-        events=events,
-        used={names[camera]: count for camera, count in used.items()},
-        left_out=tuple(
-            name
-            for name, camera_state in zip(names, state.cameras, strict=True)
-            if camera_state.agreements[-1:] == ((state.frame, False),)
-        ),
-        lens=assessment.lens,
-    )
+    poses = dict(zip(names, map(to_T_camera_lidar, assessment.T_lidar_camera), strict=True))
+    covariance = covariance_by_camera(assessment, names)
+    last = {n: one.agreements[-1:] for n, one in zip(names, state.cameras, strict=True)}
+    return [
+        Update(
+            frame=one.number,
+            stamp_ns=one.stamp_ns,
+            T_camera_lidar=poses,
+            covariance=covariance,
+            verdicts=assessment.verdicts,
+            events=tuple(events),
+            used={names[camera]: count for camera, count in used.items()},
+            left_out=tuple(n for n in names if last[n] == ((one.number, False),)),
+            lens=assessment.lens,
+        )
+        for one, events, used in taken
+    ]
 
 
 def json_line(update: Update) -> str:
