@@ -231,8 +231,11 @@ class IncrementalCalibrator:
         frames = len(self._state.epochs[-1].frames)
         for step in range(frames - count + 1, frames + 1):
             self._refine(step)
-        full = frames >= self._state.config.tracking.epoch_frames
-        return self._close_epoch() if full else []
+        if frames < self._state.config.tracking.epoch_frames:
+            return []
+        if count > 1:
+            self._assess()  # its optimum is where the next epoch starts
+        return self._close_epoch()
 
     def _at_explaining_offsets(self, blocks: Blocks) -> Blocks:
         """The blocks, and the state, at the time offsets with which they agree."""
