@@ -40,6 +40,7 @@ class DurableCalibrator:
         resumed: whether there was a state to continue from.
         repeated: after a crash, the updates since a snapshot, of which those of the last write may
             not have returned then; none after a :meth:`close`.
+        last_repeated: those of the last call among them.
 
     Args:
         folder: where the state is kept; one process at a time.
@@ -74,7 +75,9 @@ class DurableCalibrator:
                 _require_same(Path(folder), self.tracker, rig, config or Config())
             self._held: list[bytes] | None = None
             with _of_this_version(Path(folder)):
-                self.repeated = tuple(chain.from_iterable(map(self._repeat, recovered.inputs)))
+                inputs = [*map(self._repeat, recovered.inputs)]
+            self.repeated = tuple(chain.from_iterable(inputs))
+            self.last_repeated = inputs[-1] if inputs else []
             self._pending = len(self.repeated)
         except BaseException:
             self._database.close()

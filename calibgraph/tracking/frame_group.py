@@ -21,7 +21,7 @@ from calibgraph.tracking.frame_order import Incoming, incoming, without_repeats
 from calibgraph.tracking.outlier_frames import agreeing_frames
 from calibgraph.tracking.state import State
 from calibgraph.tracking.step_detection import may_have_moved
-from calibgraph.tracking.stream_tables import StreamFrame
+from calibgraph.tracking.stream_tables import Item, Refused, StreamFrame
 from calibgraph.tracking.update import Update
 
 Blocks = dict[int, CameraBlock]
@@ -62,6 +62,25 @@ def update_all(
                 continue
         taken += len(updates)
         yield updates
+
+
+def in_groups(items: Iterable[Item], most: int) -> Iterator[list[StreamFrame] | Refused]:
+    """Frames in the order of their numbers, at most so many at once; what is none, by itself."""
+    held = list[StreamFrame]()
+    for item in items:
+        follows = isinstance(item, StreamFrame) and (not held or item.frame > held[-1].frame)
+        if held and not follows:
+            yield held
+            held = []
+        if isinstance(item, Refused):
+            yield item
+            continue
+        held.append(item)
+        if len(held) >= most:
+            yield held
+            held = []
+    if held:
+        yield held
 
 
 def usual_frames(state: State, frames: Iterable[StreamFrame]) -> tuple[list[Incoming], Blocks]:

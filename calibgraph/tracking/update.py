@@ -85,20 +85,36 @@ def make_updates(
 
 def json_line(update: Update) -> str:
     """The update as one line of JSON; units are in the keys, matrices row by row."""
-    cameras = {name: _camera(update, name) for name in update.T_camera_lidar}
-    content = {
-        "frame": update.frame,
-        "stamp_ns": update.stamp_ns,
-        "cameras": cameras,
-        "events": [_event(event) for event in update.events],
-    }
+    return json_lines([update])[0]
+
+
+def json_lines(updates: Sequence[Update]) -> list[str]:
+    """A line of each update; what frames that were taken in at once share is encoded once."""
+    estimates: dict[int, dict[str, str]] = {}
+    lines = []
+    for update in updates:
+        shared = id(update.T_camera_lidar)
+        if shared not in estimates:
+            estimates[shared] = {name: _estimate(update, name) for name in update.T_camera_lidar}
+        cameras = ", ".join(
+            f"{_json(name)}: {{{text}, {_of_frame(update, name)}}}"
+            for name, text in estimates[shared].items()
+        )
+        head = f'"frame": {update.frame}, "stamp_ns": {_json(update.stamp_ns)}'
+        events = _json([_event(event) for event in update.events])
+        lines.append(f'{{{head}, "cameras": {{{cameras}}}, "events": {events}}}')
+    return lines
+
+
+def _json(content: Any) -> str:
     return json.dumps(finite(content), allow_nan=False)
 
 
-def _camera(update: Update, name: str) -> dict[str, Any]:
+def _estimate(update: Update, name: str) -> str:
+    """The members of a camera's object that hold for all frames."""
     covariance, verdict = update.covariance[name], update.verdicts[name]
     sigmas = None if covariance is None else np.sqrt(np.diag(covariance))
-    return {
+    content = {
         "T_camera_lidar": update.T_camera_lidar[name].tolist(),
         "covariance": None if covariance is None else covariance.tolist(),
         "rotation_sigma_deg": None if sigmas is None else np.degrees(sigmas[:3]).tolist(),
@@ -107,10 +123,14 @@ def _camera(update: Update, name: str) -> dict[str, Any]:
         "cannot_tell": verdict.cannot_tell,
         "reasons": list(verdict.reasons),
         "actions": list(summarize({name: verdict}).actions),
-        "used": update.used.get(name, 0),
-        "left_out": name in update.left_out,
         **{key: value for one in update.lens.get(name, ()) for key, value in _offset(one).items()},
     }
+    return _json(content)[1:-1]
+
+
+def _of_frame(update: Update, name: str) -> str:
+    """The other members."""
+    return f'"used": {update.used.get(name, 0)}, "left_out": {_json(name in update.left_out)}'
 
 
 def _offset(one: LensEstimate) -> dict[str, Any]:
