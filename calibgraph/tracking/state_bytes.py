@@ -10,13 +10,13 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import gtsam
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import InstanceOf, TypeAdapter, ValidationError
+from pydantic import Field, InstanceOf, TypeAdapter, ValidationError
 
 from calibgraph.errors import CalibrationError, in_words
 from calibgraph.files import describe
@@ -49,7 +49,9 @@ _VERSION = 9
 _DIGEST = hashlib.sha256().digest_size
 _TREES: dict[Kind, TypeAdapter[Any]] = {
     "state": TypeAdapter(tuple[InstanceOf[State], tuple[tuple[InstanceOf[Incoming], ...], ...]]),
-    "input": TypeAdapter(tuple[tuple[int | None, InstanceOf[Correspondences]], ...]),
+    "input": TypeAdapter(
+        Annotated[tuple[tuple[int | None, InstanceOf[Correspondences]], ...], Field(min_length=1)]
+    ),
     "history": TypeAdapter(dict[str, Any]),
 }
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
