@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from calibgraph.arrays import Array
@@ -20,6 +22,14 @@ def sum_epochs(state: State, before: int | None = None) -> Sums:
 def sum_all_epochs(state: State, before: int | None = None) -> Sums:
     """The same with the time offsets, where they are estimated."""
     return sum_closed_epochs(state, before) + _until(state.epochs[-1], before)
+
+
+def sums_before_epochs(state: State) -> Iterator[Sums]:
+    """(n,) over the frames before each live epoch, of the poses alone."""
+    sums = Sums.stack([one.summary.selected for one in state.cameras])
+    for epoch in state.epochs:
+        yield state.of_poses(sums)
+        sums = _after_epoch(state, sums + epoch.sums, epoch)
 
 
 def sum_closed_epochs(state: State, before: int | None = None) -> Sums:

@@ -232,7 +232,7 @@ def _repeats(state: State, camera: int, table: Correspondences) -> bool:
     if last is None or not len(points):
         return False
     new = {*point_hashes(points).tolist()}  # faster than arrays, of some hundred
-    return sum(one in new for one in last.tolist()) > REPEATED_SHARE * len(last)
+    return sum(map(new.__contains__, last.tolist())) > REPEATED_SHARE * len(last)
 
 
 def _last_hashes(state: State, camera: int) -> np.ndarray | None:

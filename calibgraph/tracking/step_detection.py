@@ -12,7 +12,7 @@ from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
-from calibgraph.tracking.epoch_sums import sum_epochs
+from calibgraph.tracking.epoch_sums import sums_before_epochs
 from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import Epoch, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
@@ -124,11 +124,12 @@ def detect_small_step(state: State) -> DetectedStep | None:
         return None
     sums = [_scattered_as_usual(state, epoch) for epoch in reversed(state.epochs)]
     afterwards = [*accumulate(sums)][::-1]
-    for epoch, after in zip(state.epochs[1:], afterwards[1:], strict=True):
+    befores = sums_before_epochs(state)
+    next(befores)
+    for epoch, before, after in zip(state.epochs[1:], befores, afterwards[1:], strict=True):
         if not epoch.frames:
             continue
-        since = epoch.frames[0].number
-        before, later = sum_epochs(state, since), state.of_poses(after)
+        since, later = epoch.frames[0].number, state.of_poses(after)
         for camera, camera_state in enumerate(state.cameras):
             if not camera_state.started or _shift_excess(state, camera, before, later) <= best:
                 continue  # by what places share it is less still
