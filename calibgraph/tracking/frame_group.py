@@ -121,7 +121,8 @@ def _alike(state: State, frames: Iterable[StreamFrame]) -> list[Incoming]:
             one = incoming(state, frame.table, frame.frame, last)
         except CorrespondenceError:
             break
-        if group and _columns(group[0].table) != _columns(one.table):
+        known = {*one.table.cameras} <= {*state.names}
+        if not known or (group and _columns(group[0].table) != _columns(one.table)):
             break
         group.append(one)
         last = one.number, one.stamp_ns
