@@ -235,13 +235,14 @@ def _walked_sums(state: State) -> PlaceSums:
     return sums
 
 
-def settle(state: State) -> tuple[State, ClosedPlaces]:
-    """The state with optimum and variance ratios of its closed epochs, while these are few.
+def settle(state: State, *, together: bool) -> tuple[State, ClosedPlaces]:
+    """The state with optimum and variance ratios of its closed epochs.
 
-    Later an epoch changes little, and the frames after it do the work step by step.
+    When these are many an epoch changes little, and the frames after it do the work step by step;
+    but not if they come together.
     """
-    closed = ClosedPlaces.of(state)
-    if closed.is_settled:
+    closed, state = ClosedPlaces.of(state), replace(state, is_refined=together)
+    if closed.is_settled and not together:
         return state, closed
     for step in range(1, STEPS + 1):
         state, closed = refine(state, closed, step)

@@ -72,6 +72,7 @@ class State:
         findings: of the errors that frames share, by their matcher.
         sizes: of these, as the data show them, over what the matcher states.
         optimum: of the graph of the closed epochs; None where it is not known.
+        is_refined: whether it is exact, so that nothing is left to the frames of the open epoch.
         offsets: time offsets of the cameras; None if they are not estimated.
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
@@ -93,6 +94,7 @@ class State:
     findings: MatcherFindings = MatcherFindings()
     sizes: VarianceRatios = VarianceRatios()
     optimum: Optimum | None = None
+    is_refined: bool = False
     offsets: Offsets | None = None
     frame: int | None = None
     stamp_ns: int | None = None

@@ -233,9 +233,7 @@ class IncrementalCalibrator:
             self._refine(step)
         if frames < self._state.config.tracking.epoch_frames:
             return []
-        if count > 1:
-            self._assess()  # its optimum is where the next epoch starts
-        return self._close_epoch()
+        return self._close_epoch(together=count > 1)
 
     def _at_explaining_offsets(self, blocks: Blocks) -> Blocks:
         """The blocks, and the state, at the time offsets with which they agree."""
@@ -253,8 +251,8 @@ class IncrementalCalibrator:
         """Do a part of the work that the end of an epoch has left to the frames after it."""
         state = self._state
         if self._closed.state.findings != state.findings:
-            self._closed = ClosedPlaces.of(state)
-        if step <= STEPS and len(state.epochs) > 1:
+            self._closed, state = ClosedPlaces.of(state), replace(state, is_refined=False)
+        if step <= STEPS and len(state.epochs) > 1 and not state.is_refined:
             self._state, self._closed = refine(state, self._closed, step)
 
     def _assess(self) -> Assessment:
@@ -323,7 +321,7 @@ class IncrementalCalibrator:
         self._rebuild()
         return list(events)
 
-    def _close_epoch(self) -> list[Event]:
+    def _close_epoch(self, *, together: bool) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, begin another."""
         state, offsets = self._state, self._state.offsets
         if self._assessed is not None:
@@ -336,5 +334,5 @@ class IncrementalCalibrator:
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
             events += more
-        self._resume(*settle(self._state))
+        self._resume(*settle(self._state, together=together))
         return events
