@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-import gtsam
 import numpy as np
 
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
@@ -19,14 +18,15 @@ from calibgraph.tracking.assessment import rig_at
 from calibgraph.tracking.cause import chance_limit
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import Incoming
+from calibgraph.tracking.frame_order import PLACE, Incoming
 from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
 from calibgraph.tracking.place_model import states_places
 from calibgraph.tracking.start import count_residuals
 from calibgraph.tracking.state import State
-from calibgraph.tracking.sums import Gated, Sums, minimum, sums_of_matches
+from calibgraph.tracking.sums import Sums, minimum, sums_of_matches
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
@@ -38,6 +38,20 @@ def with_open_frames(state: State, *frames: LiveFrame) -> State:
     last, numbers = state.epochs[-1], {frame.number for frame in frames}
     others = (f for f in last.frames if f.number not in numbers)
     return replace(state, epochs=(*state.epochs[:-1], replace(last, frames=(*others, *frames))))
+
+
+def begin_frame(state: State, one: Incoming) -> State:
+    """The state with a frame begun, none of whose matches is absorbed."""
+    state = replace(
+        state,
+        frame=one.number,
+        stamp_ns=one.stamp_ns,
+        updates=state.updates + 1,
+        findings=one.table.findings if len(one.table) else state.findings,
+    )
+    place, in_time = one.table.metadata.get(PLACE, ""), state.offsets is not None
+    frame = LiveFrame.empty(one.number, len(state.names), place, in_time=in_time)
+    return with_open_frames(state, frame)
 
 
 def blocks_by_camera(state: State, table: Correspondences) -> dict[int, CameraBlock]:
@@ -62,13 +76,7 @@ def at_minimum(state: State, closed: ClosedPlaces, more: Mapping[int, Sums] | No
         closed: its closed epochs.
         more: sums of further matches, per camera.
     """
-    return with_poses(state, minimum(closed.equation_5(state, more), state.T_lidar_camera))
-
-
-def with_poses(state: State, poses: tuple[gtsam.Pose3, ...]) -> State:
-    """The state with other estimates in its open epoch."""
-    last = replace(state.epochs[-1], T_lidar_camera=poses)
-    return replace(state, epochs=(*state.epochs[:-1], last))
+    return state.at_poses(minimum(closed.equation_5(state, more), state.T_lidar_camera))
 
 
 def select_agreeing(

@@ -73,6 +73,15 @@ def incoming(
     return Incoming(number, last[1] if stamp is None else stamp, table)
 
 
+def unsolvable(number: int, error: BaseException) -> CorrespondenceError:
+    """Why a frame is left out whose estimate cannot be solved for."""
+    return CorrespondenceError(
+        f"frame {number}: with its matches the estimate cannot be solved for "
+        f"({str(error).strip().splitlines()[0]}); it is left out",
+        frame=number,
+    )
+
+
 def number_and_stamp(
     table: Correspondences, frame: int | None, last: tuple[int | None, int | None]
 ) -> tuple[int, int | None]:

@@ -16,9 +16,10 @@ from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.offset_sums import with_offset
 from calibgraph.tracking.offsets import Offsets, delayed, motion_in
-from calibgraph.tracking.sums import Gated, Sums
+from calibgraph.tracking.sums import Sums
 
 NO_DISTORTION = DistortionEvidence.none(WEAK, places=1)
 """Without matches."""

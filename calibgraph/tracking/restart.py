@@ -16,6 +16,7 @@ from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
 from calibgraph.tracking.offset_sums import with_offset
 from calibgraph.tracking.offset_terms import keep_offsets
@@ -24,7 +25,7 @@ from calibgraph.tracking.start import absorb_frames
 from calibgraph.tracking.state import DriftWatch, State, replace_item
 from calibgraph.tracking.step_detection import DetectedStep
 from calibgraph.tracking.steps import shift_since, steps_between
-from calibgraph.tracking.sums import Gated, Sums, step_between
+from calibgraph.tracking.sums import Sums, step_between
 
 Measured = tuple[Steps, dict[int, Array]]
 

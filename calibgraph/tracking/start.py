@@ -25,10 +25,10 @@ from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.live_frames import Epoch
 from calibgraph.tracking.noise import ResidualHistogram, median
 from calibgraph.tracking.state import HISTORY, State, replace_item
-from calibgraph.tracking.sums import Gated
 
 _TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt
 

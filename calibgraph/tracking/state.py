@@ -165,6 +165,11 @@ class State:
             return None
         return self.optimum.pose_at(place, camera)
 
+    def at_poses(self, T_lidar_camera: tuple[gtsam.Pose3, ...]) -> State:
+        """The state with other estimates in its open epoch."""
+        last = replace(self.epochs[-1], T_lidar_camera=T_lidar_camera)
+        return replace(self, epochs=(*self.epochs[:-1], last))
+
     def with_camera(self, index: int, camera: CameraState) -> State:
         """The state with one camera replaced."""
         return replace(self, cameras=replace_item(self.cameras, index, camera))

@@ -19,22 +19,24 @@ from calibgraph.model.rig import Rig
 from calibgraph.tracking.absorption import (
     absorb,
     at_minimum,
+    begin_frame,
     blocks_by_camera,
     count_absent,
     select_agreeing,
-    with_open_frames,
-    with_poses,
 )
 from calibgraph.tracking.assessment import Assessment, assess, to_calibration
 from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
-from calibgraph.tracking.epochs import at_offsets, close_epoch
+from calibgraph.tracking.epochs import at_explaining_offsets, close_epoch
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_group import Blocks, usual_frames
-from calibgraph.tracking.frame_order import PLACE, Incoming, incoming, with_place, without_repeats
+from calibgraph.tracking.frame_order import (
+    Incoming,
+    incoming,
+    unsolvable,
+    with_place,
+    without_repeats,
+)
 from calibgraph.tracking.frozen import replace
-from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.offset_search import explaining_offsets, follow
-from calibgraph.tracking.offsets import delayed
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
@@ -50,8 +52,8 @@ class IncrementalCalibrator:
     """All cameras' extrinsics, updated frame by frame.
 
     Each frame costs the same, however many came before: live epochs keep their matches, older ones
-    are a summary of constant size, a quadratic about the estimate at the time (true Hessian, so the
-    next order is the third), with the gate of that time. All else is as in a batch.
+    are a quadratic about the estimate at the time (true Hessian, so the next order is the third),
+    with the gate of that time. All else is as in a batch.
 
     Args:
         rig: cameras with their initial guess, and independently known relative poses.
@@ -61,9 +63,8 @@ class IncrementalCalibrator:
     _state: State
     _epoch_start: State
     _since_epoch_start: list[tuple[Incoming, ...]]
-
-    _assessed: tuple[State, Assessment] | None = None
     _closed: ClosedPlaces
+    _assessed: tuple[State, Assessment] | None = None
 
     def __init__(self, rig: Rig, config: Config | None = None) -> None:
         self._resume(State.initial(rig, config or Config()))
@@ -107,9 +108,8 @@ class IncrementalCalibrator:
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """The graph whose optimum and marginal are reported, as :meth:`Solution.graph`.
 
-        Its variables are those of ``calibgraph.graph.variables``. Places that no frame of the open
-        epoch is of are one factor. With a preset of the paper it is Eq. 5, whose optimum alone is
-        reported.
+        Its variables are those of ``calibgraph.graph.variables``; places that no frame of the open
+        epoch is of are one factor. With a preset of the paper it is Eq. 5, without its marginal.
         """
         if self.config.preset != "auto":
             return self._closed.equation_5(self._state)
@@ -142,12 +142,8 @@ class IncrementalCalibrator:
     def update_together(self, frames: Sequence[StreamFrame]) -> list[Update]:
         """Take in the first of some frames at once: one solve, one assessment.
 
-        As many as show nothing unusual, at most up to the end of an epoch. All their updates have
-        the estimate after the last of them, within 0.1 sigma of what :meth:`update` would give.
-
-        Returns:
-            Their updates; none if the first frame has to be taken in by :meth:`update`. Nothing has
-            changed then.
+        As many as show nothing unusual, up to the end of an epoch. All their updates have the
+        estimate after the last of them. None is taken in if the first needs :meth:`update`.
         """
         group, blocks = usual_frames(self._state, frames)
         if not group:
@@ -164,7 +160,7 @@ class IncrementalCalibrator:
         start, since = self._epoch_start, list(self._since_epoch_start)
         try:
             for one in frames:
-                self._begin_frame(one)
+                self._state = begin_frame(self._state, one)
             self._since_epoch_start.append(tuple(frames))
             yield
         except BaseException as error:
@@ -172,47 +168,36 @@ class IncrementalCalibrator:
             for earlier in since:
                 self._repeat(earlier)
             if isinstance(error, _UNSOLVABLE):
-                number = frames[0].number
-                raise CorrespondenceError(
-                    f"frame {number}: with its matches the estimate cannot be solved for "
-                    f"({str(error).strip().splitlines()[0]}); it is left out",
-                    frame=number,
-                ) from error
+                raise unsolvable(frames[0].number, error) from error
             raise
 
     def _repeat(self, frames: Sequence[Incoming]) -> None:
         """Take in again what has been taken in at once."""
-        if len(frames) == 1:
-            self.update(frames[0].table, frame=frames[0].number)
-            return
         again = [StreamFrame(one.number, one.table) for one in frames]
-        if len(self.update_together(again)) < len(frames):
+        if len(again) == 1:
+            self.update(again[0].table, frame=again[0].frame)
+        elif len(self.update_together(again)) < len(frames):
             raise StateError("has frames that do not go together")
-
-    def _begin_frame(self, one: Incoming) -> None:
-        state, place = self._state, one.table.metadata.get(PLACE, "")
-        state = replace(
-            state,
-            frame=one.number,
-            stamp_ns=one.stamp_ns,
-            updates=state.updates + 1,
-            findings=one.table.findings if len(one.table) else state.findings,
-        )
-        in_time = state.offsets is not None
-        frame = LiveFrame.empty(one.number, len(state.names), place, in_time=in_time)
-        self._state = with_open_frames(state, frame)
 
     def _take(self, one: Incoming, table: Correspondences, blocks: Blocks) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
-        blocks = self._at_explaining_offsets(blocks)
+        sums = self._closed.all_sums(self._state)
+        state, blocks = at_explaining_offsets(self._state, sums, blocks)
+        if state is not self._state:
+            self._state = state
+            self._rebuild()
         self._state, agreeing = select_agreeing(self._state, self._closed, blocks)
         self._state, (used,) = absorb(self._state, self._closed, agreeing)
         self._state, events = start_cameras(self._state, table, blocks)
         if events:
             self._rebuild()
         self._state, seen = count_absent(self._state, used, one)
-        events += seen + self._restart_after_step()
-        events += self._end_frames(1)
+        detected = detect_step(self._state)
+        if detected is not None:  # moved so far that frames disagree with the estimate
+            self._state, moved = restart_after_step(self._state, detected)
+            self._rebuild()
+            seen += moved
+        events += seen + self._end_frames(1)
         (update,) = make_updates(self._state, self._assess(), [(one, events, used)])
         return update
 
@@ -234,18 +219,6 @@ class IncrementalCalibrator:
         if frames < self._state.config.tracking.epoch_frames:
             return []
         return self._close_epoch(together=count > 1)
-
-    def _at_explaining_offsets(self, blocks: Blocks) -> Blocks:
-        """The blocks, and the state, at the time offsets with which they agree."""
-        before, sums = self._state.offsets, self._closed.all_sums(self._state)
-        offsets = explaining_offsets(self._state, sums, blocks)
-        if offsets is None or before is None:
-            return blocks
-        state = with_poses(self._state, follow(self._state, sums, offsets))
-        self._state = replace(at_offsets(state, offsets), optimum=None)
-        self._rebuild()
-        later_s = offsets.values_s - before.values_s
-        return {camera: delayed(block, later_s[camera]) for camera, block in blocks.items()}
 
     def _refine(self, step: int) -> None:
         """Do a part of the work that the end of an epoch has left to the frames after it."""
@@ -312,24 +285,13 @@ class IncrementalCalibrator:
         self._closed, self._assessed = closed or ClosedPlaces.of(self._state), None
         self._state = at_minimum(self._state, self._closed)
 
-    def _restart_after_step(self) -> list[Event]:
-        """Restart what has moved so far that frames disagree with the estimate."""
-        detected = detect_step(self._state)
-        if detected is None:
-            return []
-        self._state, events = restart_after_step(self._state, detected)
-        self._rebuild()
-        return list(events)
-
     def _close_epoch(self, *, together: bool) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, begin another."""
         state, offsets = self._state, self._state.offsets
         if self._assessed is not None:
             state = replace(state, optimum=self._assessed[1].newest(state.optimum))
             offsets = self._assessed[1].offsets(state)
-        if offsets is not None:
-            state = with_poses(state, follow(state, self._closed.all_sums(state), offsets))
-        self._state, events = close_epoch(state, offsets)
+        self._state, events = close_epoch(state, offsets, self._closed.all_sums(state))
         detected = detect_small_step(self._state)
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
