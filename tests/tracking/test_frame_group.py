@@ -22,10 +22,10 @@ from calibgraph import (
     solve,
 )
 from calibgraph.model.correspondences import concatenate
-from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.tracking.frame_group import in_groups, update_all
 from calibgraph.tracking.stream_tables import Refused, StreamFrame
 from calibgraph.tracking.update import Update, json_line
+from tests.draws.drives import simulate_drive
 from tests.tracking.drives import ERRORS, drive, pair_of
 
 EPOCH = 10
