@@ -88,7 +88,7 @@ class Calibration:
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
             ``images``, a file per camera.
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
-        warnings: of ``calibrate``: about the dataset and its guess, found before the search.
+        warnings: of ``calibrate``: about the dataset, its guess, and a lens that did not settle.
         correspondences: of ``solve``, those that the preprocessing kept; of ``calibrate``, those of
             its last round.
         camera_matches: what cameras see in common, with the surfaces that were used; None if it was

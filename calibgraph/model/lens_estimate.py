@@ -14,6 +14,15 @@ _TIED, _TIED_SHARE = 0.999, 0.5
 """From this correlation with the pose on, half the prior: the prior of the pose narrows it, too."""
 
 _NONE = 0.005  # correlations that are shown as 0.00
+_NEEDED = {
+    "focal": "several distances, towards the corners, too",
+    "aspect": "near things at the sides, above and below",
+    "centre_x": "near and far things over the whole image",
+    "centre_y": "near and far things over the whole image",
+    "offset": "turns and changes of speed",
+    "readout": "turns and changes of speed",
+}
+"""Of a distortion coefficient: below."""
 _LEAST_S = 1e-6  # that a rig may state
 _LEFT_SIGMAS = 2.0  # from the prior: beyond, they have
 
@@ -78,8 +87,13 @@ class LensEstimate:
         pair = f"with {self.direction} {self.correlation:.2f}" if self.correlation > _NONE else ""
         if self.is_determined:
             return pair
-        needed = "; record turns and changes of speed" if self.name in ("offset", "readout") else ""
-        return "; ".join(filter(None, (f"not determined by these data{needed}", pair)))
+        undetermined = f"not determined by these data; record {self.needed}"
+        return "; ".join(filter(None, (undetermined, pair)))
+
+    @property
+    def needed(self) -> str:
+        """What to record, so that the data determine it."""
+        return _NEEDED.get(self.name, "matches near the corners of the image")
 
 
 POSE_PARAMETERS = tuple(
@@ -127,6 +141,14 @@ def _sigmas_of(camera: Camera, estimates: Sequence[LensEstimate]) -> dict[str, A
         known = camera.intrinsics_sigma_px or IntrinsicsSigma()
         found["intrinsics_sigma_px"] = known.model_copy(update=pixels)
     return found
+
+
+def unsettled(parts: Sequence[str], change: float, repeats: int) -> str:
+    """A warning that what is estimated still changes by some sigmas when it is matched again."""
+    return (
+        f"{', '.join(parts)}: after {repeats} repeats of the matching still changes by "
+        f"{change:.1f} sigma; estimate fewer parts, or give more frames"
+    )
 
 
 def change_of_lens(

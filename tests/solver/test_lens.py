@@ -24,6 +24,7 @@ from calibgraph.graph.lens import LensSigmas, LensVariable
 from calibgraph.graph.variables import aligned_key, body_key, lens_key
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import twist_between
+from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import IntrinsicsSigma
 from calibgraph.report.as_json import result_summary
 from calibgraph.simulation.lens_errors import put_lens_error
@@ -218,6 +219,23 @@ def test_the_rig_gets_the_lens_and_without_the_flag_keeps_its_own(
         assert camera.intrinsics_px.fx == pytest.approx(found.lens[name][0].value, rel=1e-9)
         assert found.initial_rig.cameras[name] == wrong.cameras[name]
         assert "uncertain lenses and clocks" in found.error_sources[name].translation
+
+
+@pytest.mark.parametrize(
+    ("name", "needed"),
+    [
+        ("focal", "record several distances, towards the corners, too"),
+        ("aspect", "record near things at the sides, above and below"),
+        ("centre_y", "record near and far things over the whole image"),
+        ("k1", "record matches near the corners of the image"),
+        ("p2", "record matches near the corners of the image"),
+        ("readout", "record turns and changes of speed"),
+    ],
+)
+def test_what_is_not_determined_names_what_to_record(name: str, needed: str) -> None:
+    one = LensEstimate(name, "", 1.0, 0.1, 1.0, 0.1, "z", 0.5)
+    assert one.describe() == f"not determined by these data; {needed}; with z 0.50"
+    assert replace(one, sigma=0.01).describe() == "with z 0.50"
 
 
 def test_the_rig_states_how_well_its_new_lens_is_known(
