@@ -35,6 +35,7 @@ from calibgraph.solver.solution import Solution
 from tests.solver.test_elimination import STATED
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
+ORDERS_OF = {"fisheye": ("k1", "k2", "k3", "k4"), "omni": ("xi", "k1", "k2", "p1", "p2")}
 FIVE_SIGMAS = 5.0  # one of 3 million
 
 
@@ -219,6 +220,28 @@ def test_the_rig_gets_the_lens_and_without_the_flag_keeps_its_own(
         assert camera.intrinsics_px.fx == pytest.approx(found.lens[name][0].value, rel=1e-9)
         assert found.initial_rig.cameras[name] == wrong.cameras[name]
         assert "uncertain lenses and clocks" in found.error_sources[name].translation
+
+
+@pytest.mark.parametrize("name", ["fisheye", "omni"])
+def test_lenses_that_see_all_round_are_estimated(name: str) -> None:
+    """Focal length and k1 wrong at once; xi of a unified lens stays."""
+    camera, first = next(iter(rig_of(name).cameras.items()))
+    truth = Rig(cameras={camera: first})
+    table = simulate_correspondences(truth, frames=10, matches=150, errors=ERRORS, seed=0)
+    wrong = put_lens_error(put_lens_error(truth, "focal", 0.01), "distortion", 0.02)
+    before = solve_joint(wrong, table)
+    after = solve_joint(wrong, table, Config(estimate="focal,distortion"))
+    worst = [max(squared_errors(found, truth)) for found in (before, after)]
+    assert worst[1] < chi2.isf(1e-6, 6) < worst[0]
+    for camera, estimates in after.lens.items():
+        right, found = truth.cameras[camera], after.solved_rig.cameras[camera]
+        coefficients = dict(zip(ORDERS_OF[name], right.distortion, strict=True))
+        values = {"focal": right.intrinsics_px.fx, **coefficients}
+        for one in estimates:
+            assert abs(one.value - values[one.name]) < FIVE_SIGMAS * one.sigma
+        assert estimates[0].is_determined and estimates[1].is_determined
+        if name == "omni":
+            assert found.distortion[0] == right.distortion[0]
 
 
 @pytest.mark.parametrize(
