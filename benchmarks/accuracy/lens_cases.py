@@ -41,8 +41,7 @@ OTHER_RIGS = (
 DRIVES = ("00", "05", "06", "07", "08", "kitti_raw_0005")
 DISTORTED = ("vlp16_distorted", "opencalib_a", "acfr_vlp16_fisheye")
 INTERVAL_S, START_DEG, START_M, SEED = 0.1, 1.0, 0.1, 1
-FAR_SIGMAS = 3.0
-OFF_DEG, OFF_CM = 0.5, 10.0
+FAR_SIGMAS, OFF_DEG, OFF_CM = 3.0, 0.5, 10.0
 WIDE_SIGMA = 0.3  # of radial coefficients, where nothing is known of them
 FIXED = "fixed"
 
