@@ -28,10 +28,10 @@ from calibgraph import (
 )
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import twist_between
-from calibgraph.simulation.lens_errors import put_lens_error
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.solution import Solution
+from tests.draws.lenses import put_lens_error
 
 Array = NDArray[np.float64]
 

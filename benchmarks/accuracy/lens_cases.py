@@ -27,8 +27,8 @@ from benchmarks.tables import ROOT, Table, add_record_option
 from calibgraph import Calibration, Config, Dataset, Rig, calibrate, evaluate, load_dataset, perturb
 from calibgraph.model.geometry import twist_between
 from calibgraph.model.rig import Camera
-from calibgraph.simulation.lens_errors import put_lens_error
 from factors.free_lens import COEFFICIENT_NUMBERS
+from tests.draws.lenses import put_lens_error
 
 KITTI = ("05", "06", "07", "08", "06+07+08")
 SPOILT = (

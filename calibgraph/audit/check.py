@@ -16,7 +16,7 @@ from calibgraph.audit.matching import Matching, match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
 from calibgraph.audit.significance import Tolerance
 from calibgraph.errors import CorrespondenceError
-from calibgraph.files import checked_model, read_yaml
+from calibgraph.files import load_model
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.frame import hash_source
 from calibgraph.io.kept_frames import keep_frames
@@ -219,7 +219,7 @@ def provenance(rig: Path, data: Dataset) -> Provenance:
     path = rig / CALIBRATION_FILE if rig.is_dir() else rig
     if not is_calibration_file(path):
         return Provenance()
-    result = checked_model(_Result, read_yaml(path), path)
+    result = load_model(_Result, path)
     names = {Path(source).name for source in result.inputs}
     clouds = (frame.cloud_path for frame in data.frames if frame.cloud_path.name in names)
     same = any(hash_source(cloud) in result.inputs.values() for cloud in clouds)

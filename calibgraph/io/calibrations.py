@@ -10,7 +10,7 @@ from pydantic import AliasChoices, BaseModel, BeforeValidator, Field, StrictBool
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, holds_truth_value, read_yaml, sha256
+from calibgraph.files import checked_model, holds_truth_value, load_model, read_yaml, sha256
 from calibgraph.io.camera_match_tables import load_camera_matches
 from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
@@ -254,7 +254,7 @@ def error_bars(path: Path) -> dict[str, Array | None] | None:
     """
     if not is_calibration_file(path):
         return None
-    found = checked_model(_ErrorBars, read_yaml(path), path)
+    found = load_model(_ErrorBars, path)
     return {
         name: covariance if found.error_bar_holds.get(name) else None
         for name, covariance in found.covariance.items()

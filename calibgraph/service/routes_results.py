@@ -16,7 +16,7 @@ from calibgraph.model.result_files import CALIBRATION_FILE, REPORT_FILE
 from calibgraph.service.access import Reader
 from calibgraph.service.problems import Problem, documented
 from calibgraph.service.requests import FILES, RESULT, SUMMARY
-from calibgraph.service.routes_jobs import JobId, find_job
+from calibgraph.service.routes_jobs import JobId, find_job, no_such_job
 from calibgraph.service.state import Service, State
 
 router = APIRouter(prefix="/v1/jobs/{id}")
@@ -53,7 +53,7 @@ def result(id: JobId, state: State, caller: Reader) -> Response:
     try:
         return Response(path.read_bytes(), media_type="application/json")  # a few kilobytes
     except FileNotFoundError:
-        raise _expired() from None
+        raise no_such_job() from None
 
 
 @router.get(
@@ -91,7 +91,8 @@ def report(id: JobId, state: State, caller: Reader) -> Response:
     path = _result_folder(state, caller, id) / FILES / REPORT_FILE
     if not path.exists():
         raise Problem(404, "no report was asked for")
-    return _file(path, "text/html", {"Content-Security-Policy": REPORT_POLICY})
+    policy = {"Content-Security-Policy": REPORT_POLICY}
+    return FileResponse(path, media_type="text/html", headers=policy)
 
 
 @router.get(
@@ -135,13 +136,3 @@ def _zipped(files: Sequence[Path]) -> bytes:
 
 def _attachment(name: str) -> dict[str, str]:
     return {"Content-Disposition": f'attachment; filename="{name}"'}
-
-
-def _expired() -> Problem:
-    return Problem(404, "no such job; finished jobs are removed after some time")
-
-
-def _file(path: Path, media_type: str, headers: dict[str, str] | None = None) -> Response:
-    if not path.exists():  # it has expired meanwhile
-        raise _expired()
-    return FileResponse(path, media_type=media_type, headers=headers)

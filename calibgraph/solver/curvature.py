@@ -56,11 +56,14 @@ class Curvature:
         return covariance
 
 
-def invert_or_none(hessian: Array) -> Array | None:
-    """The inverse of a positive semidefinite matrix, None where a direction is not determined."""
+def invert_or_none(hessian: Array, *, least: float = _SINGULAR) -> Array | None:
+    """The inverse of a positive semidefinite matrix, None where a direction is not determined.
+
+    ``least`` is the smallest eigenvalue, of a unit diagonal, over the largest.
+    """
     scaled, units = unit_diagonal(hessian)
     values, vectors = np.linalg.eigh(scaled)
-    if values[0] <= _SINGULAR * values[-1]:
+    if values[0] <= least * values[-1]:
         return None
     inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
     return inverse

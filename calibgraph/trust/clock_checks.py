@@ -9,7 +9,6 @@ A constant motion straight ahead is equivalent to a camera that is mounted furth
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 
@@ -18,9 +17,8 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.io.frame import Frame, scan_of, seconds_between, twist_by_scans
+from calibgraph.io.frame import Frame, ScanSteps, seconds_between, twist_by_scans
 from calibgraph.io.kept_frames import KeptFrame
-from calibgraph.io.motion import PreparedScan
 from calibgraph.matching.run import with_motion
 from calibgraph.model.clock import at_pixels, clock_of
 from calibgraph.model.correspondences import Correspondences
@@ -142,36 +140,27 @@ def _without_times(rig: Rig) -> Rig:
 
 def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
     """Some frames with their motion, None of too few; whether scans show that of any of them."""
-    frames, registered, scans = [], False, dict[int, PreparedScan]()
-
-    def kept_scan(frame: Frame) -> PreparedScan:
-        if frame.index not in scans:
-            scans[frame.index] = scan_of(frame)
-        return scans[frame.index]
-
+    frames, registered, steps = [], False, ScanSteps()
     for frame in spread_out(dataset.frames, MAX_FRAMES):
         twist = frame.twist_per_s
         if twist is not None:
             frames.append(frame)
         elif (
-            isinstance(frame, KeptFrame)
-            and (found := _register(dataset, frame, kept_scan)) is not None
+            isinstance(frame, KeptFrame) and (found := _register(dataset, frame, steps)) is not None
         ):
             frames.append(replace(frame, twist=found))
             registered = True
     return dataset.only(frames) if len(frames) >= MIN_FRAMES else None, registered
 
 
-def _register(
-    dataset: Dataset, frame: Frame, scans: Callable[[Frame], PreparedScan]
-) -> Array | None:
+def _register(dataset: Dataset, frame: Frame, steps: ScanSteps) -> Array | None:
     """(6,) the twist by both neighbours, if they are as far away as of one drive."""
     near = [dataset.neighbour(frame, sign) for sign in (-1, 1)]
     known = [(other, _later_s(frame, other)) for other in near if other is not None]
     if len(known) < len(near) or not all(later_s for _, later_s in known):
         return None
     try:
-        before, after = (twist_by_scans(frame, [one], scans) for one in known)
+        before, after = (twist_by_scans(frame, [one], steps) for one in known)
     except DatasetError:  # they do not fit
         return None
     jerk = np.linalg.norm(after[3:] - before[3:])

@@ -54,10 +54,14 @@ def check_images(
     a rotation).
 
     Returns:
-        Checks of every camera.
+        Checks of every camera but those that a search did not find: theirs is no pose to check.
     """
+    missed = table.findings.missed
+    cameras = {name: camera for name, camera in rig.cameras.items() if name not in missed}
+    if not cameras:
+        return {}
     evidence = measure_image_evidence(
-        dataset, rig, places=table.places, seed=seed, progress=progress
+        dataset, Rig(cameras=cameras), places=table.places, seed=seed, progress=progress
     )
     of_time = {name: pairing_checks(found) for name, found in evidence.items()}
     names = {frame.index: frame.name for frame in dataset.frames}

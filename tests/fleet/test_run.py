@@ -17,7 +17,7 @@ from calibgraph.fleet.engines import ProcessEngine
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import Summary, run_fleet
 from calibgraph.fleet.task import RETRIES, Limits, Outcome, Task
-from calibgraph.simulation.fleet_rows import write_fleet
+from tests.draws.fleets import write_fleet
 
 POISON = Path(__file__).parent / "poison"
 GOOD, ILL, BROKEN = "car-00001", ("segfault", "hungry", "endless", "bug"), "broken"

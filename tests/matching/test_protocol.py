@@ -16,9 +16,9 @@ from calibgraph.matching.protocol import Start, to_full_matcher
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.progress import Progress, no_progress
 from calibgraph.rounds import match_in_rounds
-from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
 from factors import Clock
 from tests.conftest import SAMPLE
+from tests.draws.clocks import draw_twists, put_clock_error
 
 
 class Minimal:
@@ -218,6 +218,7 @@ FINDINGS = MatcherFindings(
     failed_share={"left": 0.25},
     found={"left": 18.0},
     missed={"right": 3.0},
+    chance={"left": 1e-5, "right": 0.7},
     range_rotation_deg=20.0,
     range_translation_m=1.5,
     systematic_rotation_rad=0.001,
@@ -230,6 +231,7 @@ METADATA = {
     "failed_share": {"left": 0.25},
     "found": {"left": 18.0},
     "missed": {"right": 3.0},
+    "chance": {"left": 1e-5, "right": 0.7},
     "range_rotation_deg": 20.0,
     "range_translation_m": 1.5,
     "systematic_rotation_rad": 0.001,

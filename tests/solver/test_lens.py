@@ -27,11 +27,11 @@ from calibgraph.model.geometry import twist_between
 from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import IntrinsicsSigma
 from calibgraph.report.as_json import result_summary
-from calibgraph.simulation.lens_errors import put_lens_error
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.lens import lens_estimates
 from calibgraph.solver.solution import Solution
+from tests.draws.lenses import put_lens_error
 from tests.solver.test_elimination import STATED
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)

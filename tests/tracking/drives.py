@@ -18,10 +18,10 @@ from calibgraph import (
     MatcherErrors,
     Rig,
 )
-from calibgraph.simulation.correspondences import simulate_drive
-from calibgraph.simulation.place_draws import Drawn
 from calibgraph.tracking.update import json_line
 from tests.conftest import make_camera
+from tests.draws.drives import simulate_drive
+from tests.draws.places import Drawn
 
 FRAMES = 14
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)

@@ -29,7 +29,6 @@ from calibgraph.model.geometry import (
     twist_between,
 )
 from calibgraph.model.rig import IntrinsicsSigma
-from calibgraph.simulation.place_draws import Drawn, draw_places, tied
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.elimination import fit_latent_poses, start_values
 from calibgraph.solver.joint import solve_joint
@@ -48,6 +47,7 @@ from calibgraph.tracking.streams import Refused, StreamFrame
 from calibgraph.tracking.window import Window
 from calibgraph.trust.evidence import Evidence
 from tests.conftest import stereo_relative_pose
+from tests.draws.places import Drawn, draw_places, tied
 from tests.tracking.drives import drive, pair_of, track_draw
 from tests.tracking.test_place_sums import part
 
