@@ -12,7 +12,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
-from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.lens_estimate import LensEstimate, with_sigmas
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
@@ -214,7 +214,7 @@ def to_calibration(state: State, assessment: Assessment) -> Calibration:
     newest = replace(state, offsets=assessment.offsets(state))
     rig = rig_at(newest, assessment.T_lidar_camera)
     return Calibration(
-        rig=rig,
+        rig=with_sigmas(rig, assessment.lens),
         initial_rig=state.rig,
         covariance=covariance_by_camera(assessment, state.names),
         joint_covariance=known,
