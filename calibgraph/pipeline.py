@@ -162,6 +162,7 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         lens=solution.lens,
         lens_covariance=evidence.lens_covariance,
         bootstrap=evidence.bootstrap,
+        places=solution.correspondences.places.of_frames(solution.correspondences.frame),
         correspondences=solution.correspondences,
         camera_matches=solution.camera_matches,
         build_graph=solution.graph,

@@ -20,6 +20,7 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.error_sources import ErrorSources, left_out
 from calibgraph.model.lens_estimate import LensEstimate, joint_parameters
+from calibgraph.model.places import Groups
 from calibgraph.model.rig import Rig
 from calibgraph.model.summary import Summary, summarize
 from calibgraph.model.verdict import Verdict, rig_verdict
@@ -87,6 +88,7 @@ class Calibration:
             frames drawn with replacement, like ``covariance``, as a check of it.
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
             ``images``, a file per camera.
+        places: frame numbers of each place; empty if nobody looked for places, and of ``track``.
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
         warnings: of ``calibrate``: about the dataset, its guess, and a lens that did not settle.
         correspondences: of ``solve``, those that the preprocessing kept; of ``calibrate``, those of
@@ -118,6 +120,7 @@ class Calibration:
     lens_covariance: dict[str, Array] = field(default_factory=dict)
     bootstrap: dict[str, Array] = field(default_factory=dict)
     frames: tuple[dict[str, Any], ...] = ()
+    places: Groups = ()
     rounds: tuple[Mapping[str, Any], ...] = ()
     warnings: tuple[str, ...] = ()
     correspondences: Correspondences | None = None
@@ -279,6 +282,7 @@ class Calibration:
             "residuals": {name: vars(value) for name, value in self.residuals.items()},
             "counts": self.counts,
             "frames_used": list(self.frames),
+            "places": [list(place) for place in self.places],
             "rounds": list(self.rounds),
             "warnings": list(self.warnings),
             "initial_rig": self.initial_rig.model_dump(),

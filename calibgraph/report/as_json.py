@@ -46,6 +46,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
         "reasons": list(result.verdict.reasons),
         "summary": result.summary.to_mapping(),
         "warnings": list(result.warnings),
+        "places": [list(place) for place in result.places],
         "cameras": cameras,
         "pairs": {name: _sigmas(result, name) for name in result.pair_covariance},
         "timings_s": result.timings_s,

@@ -84,11 +84,12 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
         estimates = window.T_lidar_camera(keys)
     covariance, few = window.covariance(keys), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
-    verdicts = {}
+    verdicts, apart = {}, estimates_of_halves(state, halves)
     for camera, name in enumerate(state.names):
         own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
-        apart = estimates_of_halves(state, halves, camera)
-        verdicts[name] = _verdict(state, sums, camera, covariance, conflicts=own, halves=apart)
+        verdicts[name] = _verdict(
+            state, sums, camera, covariance, conflicts=own, halves=apart.get(camera)
+        )
     return Assessment(estimates, covariance, verdicts, window, _lens_estimates(window))
 
 
