@@ -109,15 +109,18 @@ def lens_term_of(
 
 
 def lens_errors(at: FittedObjective) -> dict[int, Array]:
-    """Per number of a camera, (6, 6) covariance of its mount by what is not estimated of its lens.
+    """Per number of a camera, (6, 6) covariance of its pose by what is not estimated of its lens.
 
     Of the pose that fits the matches of a lens which errs as that of a calibrated camera, or as the
-    rig states, and of a clock whose errors the rig states; in the tangent of T_lidar_camera.
+    rig states, and of a clock whose errors the rig states; in the tangent of T_lidar_camera. An
+    alignment makes up for a lens alike in every recording, but for a clock by the speed.
     """
-    found = {}
+    found, is_mount = {}, at.objective.config.of == "mount"
     for name, block in at.projections.items():
         camera = at.objective.rig.cameras[name]
-        lens = LensVariable.of(camera, _uncertain_parts(camera), LensSigmas.calibrated(camera))
+        clock = _stated_clock(camera) if is_mount or block.motion is not None else []
+        parts = [*(_uncertain_lens(camera) if is_mount else ()), *clock]
+        lens = LensVariable.of(camera, parts, LensSigmas.calibrated(camera))
         estimated = at.objective.lenses[name].free.parameters if name in at.objective.lenses else ()
         names = enumerate(lens.free.parameters, start=6)
         rows = [row for row, parameter in names if parameter not in estimated]
@@ -128,14 +131,18 @@ def lens_errors(at: FittedObjective) -> dict[int, Array]:
     return found
 
 
-def _uncertain_parts(camera: Camera) -> list[LensPart]:
-    """Of a panorama the format determines the lens; of clocks nothing is usual."""
+def _uncertain_lens(camera: Camera) -> tuple[LensPart, ...]:
+    """Of a panorama the format determines the lens."""
+    return () if camera.model == "equirectangular" else _LENS
+
+
+def _stated_clock(camera: Camera) -> list[LensPart]:
+    """Of clocks nothing is usual."""
     stated: dict[LensPart, float | None] = {
         "offset": camera.time_offset_sigma_s,
         "readout": camera.readout_sigma_s,
     }
-    lens = () if camera.model == "equirectangular" else _LENS
-    return [*lens, *(part for part, sigma in stated.items() if sigma)]
+    return [part for part, sigma in stated.items() if sigma]
 
 
 def _in_graph(hessians: Array, of_poses: Array, least: float, lens: LensVariable) -> Array:
