@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.service.tracker_request import ARROW, FramesTaken, TrackerRequest
+from calibgraph.service.tracker_request import ARROW, FramesTaken, Refusal, TrackerRequest
 
 if TYPE_CHECKING:
     from calibgraph.tracking.durable import DurableCalibrator
@@ -104,18 +104,24 @@ class _Taken:
     refused: list[str] = field(default_factory=list)
 
 
-def take_frames(tracker: OpenTracker, request: TrackerRequest) -> FramesTaken:
+def take_frames(tracker: OpenTracker, request: TrackerRequest) -> FramesTaken | Refusal:
     """Take in the frames of a request; they are on disk before their updates are answered.
 
-    Whatever ends a long request, the frames of its earlier writes are known then.
+    Whatever ends a long request, the frames of its earlier writes are known then. One with a motion
+    that no vehicle has is refused whole: its slower frames look right, and are not.
 
     Raises:
         OSError: if they cannot be written; then abandon the tracker, and open it anew.
     """
+    from calibgraph.tracking.streams import Refused
     from calibgraph.tracking.update import json_line
 
     taken = _Taken()
-    items = _items(request, taken.refused)
+    read = [*_items(request, taken.refused)]
+    for item in read:
+        if isinstance(item, Refused) and item.by_motion:
+            return Refusal(422, f"{item.message}; none of these frames was taken in")
+    items = iter(read)
     while _take_by_one_write(tracker, items, taken):
         pass
     lines = ", ".join(map(json_line, taken.updates))
@@ -152,7 +158,7 @@ def _take(calibrator: DurableCalibrator, item: Item, taken: _Taken) -> None:
         try:
             taken.updates.append(calibrator.update(item.table, frame=item.frame))
         except CorrespondenceError as error:
-            taken.refused.append(str(error))
+            taken.refused.append(item.why_not(error))
 
 
 def _items(request: TrackerRequest, refused: list[str]) -> Iterator[Item]:

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from calibgraph.errors import CorrespondenceError
+from calibgraph.errors import CorrespondenceError, MotionError
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
 from calibgraph.tracking.update import Update, json_line
 
 Notify = Callable[[str], None]
+
+MOTION_FRAMES = 100
+"""Once in so many frames, a motion that no vehicle has is an outlier of the odometry: its frame is
+left out. Earlier or oftener, its unit or order is wrong, and slower frames are wrong unseen."""
 
 
 @dataclass
@@ -28,6 +32,7 @@ class Run:
         updates: frames taken in.
         refused: input that was not a frame, or a frame that was left out.
         skipped: frames at the beginning that an earlier run had taken in already.
+        sound: how many updates have come since a motion that no vehicle has.
     """
 
     calibrator: DurableCalibrator
@@ -37,6 +42,7 @@ class Run:
     updates: int = 0
     refused: int = 0
     skipped: int = 0
+    sound: int = 0
 
     def follow(self, items: Iterable[Item], *, every: int, stop: Callable[[], bool]) -> None:
         """Update with each frame until there are no more, or ``stop()``.
@@ -45,6 +51,10 @@ class Run:
             items: the frames.
             every: take every so-many-th frame.
             stop: called after each frame.
+
+        Raises:
+            MotionError: if several of ``MOTION_FRAMES`` have a motion that no vehicle has, or one
+                of the first.
         """
         count, known = 0, self.calibrator.tracker.frame if self.calibrator.resumed else None
         try:
@@ -52,7 +62,7 @@ class Run:
                 self._report(update)
             for item in items:
                 if isinstance(item, Refused):
-                    self._refuse(item.message)
+                    self._refuse(item.message, by_motion=item.by_motion)
                 else:
                     if count % every == 0:
                         self._take(item, known)
@@ -81,12 +91,18 @@ class Run:
         try:
             update = self.calibrator.update(frame.table, frame=frame.frame)
         except CorrespondenceError as error:
-            self._refuse(str(error))
+            self._refuse(frame.why_not(error))
             return
         self.updates += 1
+        self.sound += 1
         self._report(update)
 
-    def _refuse(self, message: str) -> None:
+    def _refuse(self, message: str, *, by_motion: bool = False) -> None:
+        if by_motion and self.sound < MOTION_FRAMES:
+            raise MotionError(
+                f"{message}; correct the motion of all frames, and take another --out"
+            )
+        self.sound = 0 if by_motion else self.sound
         self.refused += 1
         self.notify(f"left out: {message}")
 

@@ -62,6 +62,7 @@ def test_a_file_that_is_no_saved_tracker_is_refused_in_one_line(pair: Rig, tmp_p
         (b"", "begins with '', expected 'calibgraph-tracker-state/8'"),
         (b"calibgraph-tracker-state/9\n" + data[head:], "begins with 'calibgraph-tracker-state/9'"),
         (b"calibgraph-tracker-file/1\n" + data[head:], "begins with 'calibgraph-tracker-file/1'"),
+        (b"x\x9c\xed\x00" + bytes(100), "begins with 'x', expected"),
         (b"SQLite format 3\0" + bytes(100), "begins with 'SQLite format 3"),
     ):
         path.write_bytes(wrong)
