@@ -54,7 +54,9 @@ CAUSES: dict[str, Cause] = {
         "Pair each image with the cloud of its own instant: correct the time stamps or the offset.",
         {"own_clouds": "", "clouds of another time": "", "repeated frames": "",
          **dict.fromkeys(("time_offset", "lens_time_offset"), "Correct the time stamps, or "
-                         "estimate the time of the images: --estimate offset.")},
+                         "estimate the time of the images: --estimate offset."),
+         "time_prior": "Check that the stamps of images and clouds, and the motion, are right. "
+         "Then correct the named time in the rig, or state its sigma."},
     ),
     "lens": Cause(
         "the intrinsics",
@@ -67,6 +69,8 @@ CAUSES: dict[str, Cause] = {
                f"estimate the lens: --estimate {part}."
                for by in ("lens_", "") for name, part in _ESTIMATED_AS.items()},
             "lens_skew": "", "skew": "",
+            "lens_prior": "Check that the lens belongs to these images; then correct the named "
+            "value in the rig, or state intrinsics_sigma_px and distortion_sigma.",
             "focal_sensitivity": "Verify the focal length: here the position depends on it.",
         },
     ),

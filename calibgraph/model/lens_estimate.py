@@ -47,6 +47,11 @@ class LensEstimate:
         return left or self.sigma < share * self.prior_sigma
 
     @property
+    def prior_sigmas(self) -> float:
+        """How many standard deviations of the prior the estimate lies from what the rig states."""
+        return abs(self.value - self.prior) / self.prior_sigma
+
+    @property
     def printed(self) -> tuple[str, str, str, str]:
         """Value, sigma, prior and its sigma in ``printed_unit``, to two digits of the sigma."""
         scale = 1e3 if self.unit == "s" else 1.0

@@ -84,12 +84,14 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
         estimates = window.T_lidar_camera(keys)
     covariance, few = window.covariance(keys), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
-    verdicts = {}
+    verdicts, lens = {}, _lens_estimates(window)
     for camera, name in enumerate(state.names):
         own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
         apart = estimates_of_halves(state, halves, camera)
-        verdicts[name] = _verdict(state, sums, camera, covariance, conflicts=own, halves=apart)
-    return Assessment(estimates, covariance, verdicts, window, _lens_estimates(window))
+        verdicts[name] = _verdict(
+            state, sums, camera, covariance, conflicts=own, halves=apart, lens=lens.get(name, ())
+        )
+    return Assessment(estimates, covariance, verdicts, window, lens)
 
 
 def _lens_estimates(window: Window) -> dict[str, tuple[LensEstimate, ...]]:
@@ -110,6 +112,7 @@ def _verdict(
     *,
     conflicts: tuple[Conflict, ...],
     halves: tuple[Array, Array] | None,
+    lens: tuple[LensEstimate, ...],
 ) -> Verdict:
     name, one = state.names[camera], state.cameras[camera]
     if not one.started:
@@ -130,6 +133,7 @@ def _verdict(
         terms="full",
         scatter_only=not state.findings.states_common_error,
         tolerance=state.config.tolerance,
+        lens=lens,
     )
     return Verdict((*check_estimate(estimate), *_recent_checks(state, one)))
 
