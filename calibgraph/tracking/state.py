@@ -22,7 +22,7 @@ from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.live_frames import NO_DISTORTION, Epoch, LiveFrame
 from calibgraph.tracking.noise import inflation, widening
-from calibgraph.tracking.offset_sums import after_offset_walk, without_offset
+from calibgraph.tracking.offset_sums import without_offset
 from calibgraph.tracking.offsets import Offsets, require_offset_alone
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
@@ -188,20 +188,6 @@ class State:
         if self.offsets is None:
             return variance
         return np.insert(variance, 6, tracking.walk_time_offset_s**2 * frames, axis=1)
-
-    def after_offset_walk(self, sums: PlaceSums, frames: int) -> PlaceSums:
-        """The sums at all places after the walk of the time offsets over so many frames.
-
-        Walks of places that are left are taken for independent, and wider by their number: together
-        they then say no more of the present offset than one of them.
-        """
-        if self.offsets is None:
-            return sums
-        left = len(sums.names) - 1
-        counts = np.append(np.full(left, max(left, 1.0)), 1.0)
-        variance = counts[:, None, None] * self.walk_variance(np.zeros(1), frames)
-        rows = after_offset_walk(sums.rows, variance, self.all_overconfidence)
-        return replace(sums, rows=rows)
 
     def of_poses(self, sums: Sums) -> Sums:
         """(n,) sums of the poses alone: the offsets are as uncertain as their estimates."""

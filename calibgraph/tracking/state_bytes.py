@@ -43,7 +43,7 @@ from factors import Lens, ProjectionBlock
 
 Kind = Literal["state", "input", "history"]
 
-_VERSION = 8
+_VERSION = 9
 """Earlier ones held other sums, or were of another encoding."""
 
 _DIGEST = hashlib.sha256().digest_size
