@@ -135,7 +135,7 @@ def _verdict(
         tolerance=state.config.tolerance,
         lens=lens,
     )
-    return Verdict((*check_estimate(estimate), *_recent_checks(state, one)))
+    return Verdict((*check_estimate(estimate), *_recent_checks(state, one, lens)))
 
 
 def _start_check(state: State, one: CameraState) -> Verdict:
@@ -149,7 +149,7 @@ def _start_check(state: State, one: CameraState) -> Verdict:
     )
 
 
-def _recent_checks(state: State, one: CameraState) -> list[Check]:
+def _recent_checks(state: State, one: CameraState, lens: tuple[LensEstimate, ...]) -> list[Check]:
     """Checks of a camera's last frames."""
     checks = []
     if one.absent >= state.config.tracking.blind_frames:
@@ -157,6 +157,7 @@ def _recent_checks(state: State, one: CameraState) -> list[Check]:
         checks.append(Check("blind frames", "WARN", text, one.absent))
     if one.summary.walk:
         text = "drifts: the estimate follows, over fewer frames"
+        text += "".join(f"; {each.trade_off}" for each in lens if each.trade_off)
         checks.append(Check("drift", "WARN", text))
     agreements = [good for _, good in one.agreements]
     if agreements:

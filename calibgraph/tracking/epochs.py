@@ -200,6 +200,7 @@ def _update_evidence(state: State, camera: int, epoch: Epoch, by_places: Array) 
     noise = state.frame_noise(camera)
     if noise is None or alone is None or not sums.frames:
         return one
+    alone = alone + state.score_by_offset(camera, epoch.sums[camera]) / sums.frames
     groups = tuple(group.add(score, int(sums.frames), alone) for group in one.groups)
     rows = pose_rows(camera)
     if state.offsets is not None:

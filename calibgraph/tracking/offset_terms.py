@@ -112,20 +112,48 @@ def keep_offsets(state: State, cameras: Iterable[int], since: int) -> State:
 def _shown(state: State, camera: int, own: Sums) -> tuple[float, float]:
     """Value [s] and variance of an offset by (7,) sums and by earlier ones, without its prior."""
     assert state.offsets is not None
+    free = state.offsets.variable(state.rig, camera).free
+    step, covariance = _estimate(state, camera, own)
+    found_s = float(state.offsets.values_s[camera] + step[6])
+    prior, variance = free.sigmas[0] ** -2, covariance[6, 6]
+    variance = max(variance, state.offsets.sigmas_s[camera] ** 2)
+    left = 1 / variance - prior
+    if left <= 0:
+        return 0.0, np.inf
+    return (found_s / variance - free.clock.offset_s * prior) / left, 1 / left
+
+
+def _estimate(state: State, camera: int, own: Sums) -> tuple[Array, Array]:
+    """(7,) step and (7, 7) covariance of pose and offset by sums, with all else that is known."""
+    assert state.offsets is not None
     value_s, free = state.offsets.values_s[camera], state.offsets.variable(state.rig, camera).free
-    prior, (earlier_s, variance) = free.sigmas[0] ** -2, _earlier(state, camera)
-    k, information = state.overconfidence(camera), np.array([prior, 1 / variance])
+    earlier_s, variance = _earlier(state, camera)
+    k, information = state.overconfidence(camera), np.array([free.sigmas[0] ** -2, 1 / variance])
     away_s = np.array([free.clock.offset_s, earlier_s]) - value_s
     alone = np.diag(np.append(np.zeros(6), k * information.sum()))
     inverse = np.linalg.inv(own.hessian + alone + block_diag(WEAK, 0.0))
     gradient = own.gradient - np.append(np.zeros(6), k * (information @ away_s))
     scatter = state.inflation(camera) * own.scatter + k * alone
-    found_s = float(value_s - (inverse @ gradient)[6])
-    variance = max((inverse @ scatter @ inverse)[6, 6], state.offsets.sigmas_s[camera] ** 2)
-    left = 1 / variance - prior
-    if left <= 0:
-        return 0.0, np.inf
-    return (found_s / variance - free.clock.offset_s * prior) / left, 1 / left
+    return -inverse @ gradient, inverse @ scatter @ inverse
+
+
+def score_after(state: State, camera: int, before: Sums, after: Sums) -> tuple[Array, Array]:
+    """(6,) gradient of later frames at the estimate by earlier ones, and its (6, 6) covariance.
+
+    Both sets have one offset but for its walk. So an error of the offset displaces both, and counts
+    only as far as their motions differ.
+
+    Args:
+        state: of the tracker.
+        camera: by its place in the rig.
+        before: (7,) sums of the earlier frames.
+        after: of the later ones.
+    """
+    step, covariance = _estimate(state, camera, before)
+    covariance[6, 6] += state.config.tracking.walk_time_offset_s**2 * after.frames
+    by = after.hessian[:6]
+    noise = state.inflation(camera) * after.scatter[:6, :6]
+    return after.gradient[:6] + by @ step, noise + by @ covariance @ by.T
 
 
 def _earlier(state: State, camera: int) -> tuple[float, float]:

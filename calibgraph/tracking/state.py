@@ -195,6 +195,13 @@ class State:
             return sums
         return without_offset(sums, self.offsets.sigmas_s**-2, self.all_overconfidence)
 
+    def score_by_offset(self, camera: int, sums: Sums) -> Array:
+        """(6, 6) covariance of the score of frames by the offset of their camera, by (7,) sums."""
+        if self.offsets is None:
+            return np.zeros((6, 6))
+        follows = sums.hessian[:6, 6] * self.offsets.sigmas_s[camera]
+        return np.outer(follows, follows)
+
     def of_pose(self, camera: int, sums: Sums) -> Sums:
         """The same of (...) sums of one camera."""
         if self.offsets is None:
