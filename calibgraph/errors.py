@@ -6,6 +6,8 @@ Every message is one line: what is wrong, where, what was found and what to do.
 from __future__ import annotations
 
 import tokenize
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 _WORDS: dict[type[Exception] | tuple[type[Exception], ...], str] = {
@@ -47,6 +49,20 @@ def in_words(error: BaseException) -> str:
         if isinstance(error, kinds):
             return words
     return getattr(error, "strerror", None) or str(error) or "it is damaged"
+
+
+@contextmanager
+def needs_extra(extra: str, what: str) -> Iterator[None]:
+    """Within, packages of an optional extra are imported, which ``what`` names with their use.
+
+    Raises:
+        CalibrationError: if one is missing.
+    """
+    try:
+        yield
+    except ImportError as error:
+        install = f"pip install 'calibgraph[{extra}]'"
+        raise CalibrationError(f"{what}: {install} ({error})") from error
 
 
 class FileError(CalibrationError):

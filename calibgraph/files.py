@@ -234,6 +234,16 @@ def checked_model(model: type[Model], content: Any, path: Path | str) -> Model:
         raise FileError(path, describe(error)) from error
 
 
+def load_model(model: type[Model], path: Path | str | None, **given: Any) -> Model:
+    """A pydantic model from a YAML file, by default (None) without one; given values count first.
+
+    Raises:
+        FileError: if the file is missing, has an unknown key or a wrong value.
+    """
+    content = {} if path is None else read_yaml(Path(path))
+    return checked_model(model, {**content, **given}, path or model.__name__)
+
+
 def describe(error: ValidationError) -> str:
     """First problem of a pydantic error, in one line; a misspelt key before a missing one."""
     first = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")

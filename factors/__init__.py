@@ -12,7 +12,7 @@ from factors.conditioning import (
     smallest_scaled_eigenvalues,
     unit_diagonal,
 )
-from factors.epipolar import EpipolarBlock, epipolar_residual
+from factors.epipolar import EpipolarBlock
 from factors.free_lens import (
     FreeLens,
     FreeLensBlock,
@@ -24,14 +24,11 @@ from factors.linear import linear_factor
 from factors.loss import LOSSES, LossName, robust_noise
 from factors.pair import (
     PairBlock,
-    epipolar_factor,
     pair_block_factor,
     pair_chain,
-    pair_projection_factor,
     pair_run_sums,
     pair_sums,
     placed_pair_factor,
-    surface_factor,
 )
 from factors.pose import (
     biased_between_factor,
@@ -43,7 +40,7 @@ from factors.pose import (
 )
 from factors.projection import projection_factor, projection_residual
 from factors.rays import ray_spreads, unproject
-from factors.surface import SurfaceBlock, surface_residual
+from factors.surface import SurfaceBlock
 
 __all__ = [
     "LOSSES",
@@ -61,15 +58,12 @@ __all__ = [
     "block_factor",
     "camera_prior_factor",
     "displaced_between_factor",
-    "epipolar_factor",
-    "epipolar_residual",
     "displace",
     "free_lens_factor",
     "free_lens_sums_factor",
     "linear_factor",
     "pair_block_factor",
     "pair_chain",
-    "pair_projection_factor",
     "pair_run_sums",
     "pair_sums",
     "placed_pair_factor",
@@ -84,8 +78,6 @@ __all__ = [
     "smallest_scaled_eigenvalue",
     "smallest_scaled_eigenvalues",
     "square_root",
-    "surface_factor",
-    "surface_residual",
     "to_runs",
     "unit_diagonal",
     "unproject",

@@ -4,11 +4,11 @@ The machine code is kept in ``NUMBA_CACHE_DIR`` if that is set, else in the user
 else beside the source. Where nothing can be written, kernels are compiled in memory, and one line
 on standard error (by ``logging``) reports it once.
 
-numba compares the source file of a kernel alone, and not what the file imports. So a kernel may use
-the kernels and constants of its own folder and of ``factors``, and the cache is one of all files of
-these two and of the versions of Python, numpy and numba: a change of any of them begins another.
-Environments with other versions thus do not overwrite each other's code while it is in use. A
-kernel may enclose numbers, but no other kernel: numba would not find its code again.
+numba compares the source file of a kernel alone, and not what the file imports. So the cache is one
+of the files that define what the kernels of a file use, of the options below, and of the versions
+of Python, numpy and numba: a change of any of them begins another, a change elsewhere keeps it, and
+environments with other versions do not overwrite each other's code while it is in use. A kernel
+may enclose numbers, but no other kernel: numba would not find its code again.
 """
 
 import hashlib
@@ -27,6 +27,8 @@ from typing import Any
 import numba
 import numpy as np
 import platformdirs
+
+from factors.kernel_source import source_files
 
 _UNUSED_S = 7 * 86400.0  # a folder of code that no process has used for so long is removed
 _COMMON: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
@@ -57,7 +59,7 @@ def compiled(*, part: bool = False, **options: Any) -> Callable[[Callable[..., A
         function.__qualname__ = _name(function, options)
         with _decorating:
             before = _config.CACHE_DIR
-            folder = _folder(Path(function.__code__.co_filename).parent)
+            folder = _folder(function.__module__)
             _config.CACHE_DIR = str(folder or before)  # numba reads it where it decorates
             try:
                 jit = numba.njit(cache=folder is not None, **_COMMON, **options)
@@ -96,12 +98,13 @@ def _name(function: Callable[..., Any], options: Mapping[str, Any]) -> str:
 
 
 @cache
-def _folder(source: Path) -> Path | None:
-    """Where the code of the kernels of a folder is kept; None if nothing can be written."""
-    digest = hashlib.sha256(f"{numba.__version__} {np.__version__} {sys.version}".encode())
-    for file in sorted({*source.glob("*.py"), *Path(__file__).parent.glob("*.py")}):
+def _folder(module: str) -> Path | None:
+    """Where the code of the kernels of a module is kept; None if nothing can be written."""
+    versions = f"{numba.__version__} {np.__version__} {sys.version} {sorted(_COMMON.items())}"
+    digest = hashlib.sha256(versions.encode())
+    for file in source_files(module):
         digest.update(file.read_bytes())
-    name, chosen = f"{source.name}-{digest.hexdigest()[:16]}", _config.CACHE_DIR
+    name, chosen = f"{module}-{digest.hexdigest()[:16]}", _config.CACHE_DIR
     user, beside = platformdirs.user_cache_path("calibgraph"), Path(__file__).parent / "__pycache__"
     reasons = []
     for place in [Path(chosen)] if chosen else [user, beside]:

@@ -1,4 +1,4 @@
-"""Epipolar residuals of two cameras on rays, so that any lens will do: a block, and one factor.
+"""Epipolar residuals of two cameras on rays, so that any lens will do.
 
 For unit rays f_a, f_b of one feature and the relative pose (R, t) = T_a_b, both rays and the
 baseline lie in one plane where
@@ -31,8 +31,6 @@ from factors.loss import loss_and_weight, loss_id
 from factors.rays import ray_spreads, unproject
 
 Array = NDArray[np.float64]
-
-_COLUMNS = 18  # of a feature: f_a, F_a by columns, f_b, F_b by columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,40 +112,6 @@ class EpipolarBlock(RobustBlock):
         R, t = np.ascontiguousarray(T_a_b.rotation().matrix()), np.asarray(T_a_b.translation())
         residuals: Array = _residuals(R, t, self._rays)
         return residuals
-
-
-def epipolar_residual(
-    T_a_b: gtsam.Pose3, lenses: tuple[Lens, Lens], pixels_px: tuple[Array, Array]
-) -> tuple[float, Array]:
-    """Sampson's residual of one feature and its derivative, in numpy: the reference.
-
-    Args:
-        T_a_b: maps coordinates in b to coordinates in a.
-        lenses: of a and of b.
-        pixels_px: (2,) the feature in a and in b.
-
-    Returns:
-        The residual [px]; (6,) its Jacobian in GTSAM's tangent of ``T_a_b``.
-    """
-    (ray_a, spread_a), (ray_b, spread_b) = (
-        (ray := unproject(lens, pixel)[0], ray_spreads(lens, ray)[0])
-        for lens, pixel in zip(lenses, pixels_px, strict=True)
-    )
-    R, t = T_a_b.rotation().matrix(), T_a_b.translation()
-
-    def form(x: Array, y: Array) -> tuple[float, Array]:
-        """C(x, y) and its derivative: d(R y) = R (omega x y), d t = R v."""
-        turned, normal = R @ y, np.cross(x, t)
-        by_rotation, by_translation = np.cross(y, R.T @ normal), R.T @ np.cross(turned, x)
-        return float(normal @ turned), np.concatenate([by_rotation, by_translation])
-
-    value, derivative = form(ray_a[0], ray_b[0])
-    sides = [form(side, ray_b[0]) for side in spread_a.T]
-    sides += [form(ray_a[0], side) for side in spread_b.T]
-    square = sum(c * c for c, _ in sides)
-    half_of_square = np.sum([c * d for c, d in sides], axis=0)
-    over = 1.0 / math.sqrt(square)
-    return value * over, over * (derivative - value / square * half_of_square)
 
 
 @compiled(part=True)

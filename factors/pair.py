@@ -18,15 +18,12 @@ from collections.abc import Callable
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from factors.block import ProjectionBlock, to_runs
 from factors.block_sums import BlockSums, square_root
-from factors.epipolar import EpipolarBlock, epipolar_residual
-from factors.lens import Lens
-from factors.loss import robust_noise
-from factors.projection import projection_residual
-from factors.surface import SurfaceBlock, surface_residual
+from factors.epipolar import EpipolarBlock
+from factors.surface import SurfaceBlock
 
 Array = NDArray[np.float64]
 
@@ -56,7 +53,7 @@ def pair_block_factor(key_a: int, key_b: int, block: PairBlock) -> gtsam.CustomF
         return found[1]
 
     rows = 13 if isinstance(block, SurfaceBlock) else 7
-    return _factor_on_two_poses(gtsam.noiseModel.Unit.Create(rows), key_a, key_b, residual)
+    return factor_on_two_poses(gtsam.noiseModel.Unit.Create(rows), key_a, key_b, residual)
 
 
 def placed_pair_factor(
@@ -96,7 +93,11 @@ def _error_and_jacobian(
     """(13,) error and (13, 12) Jacobian, or (7,) and (7, 12)."""
     if isinstance(block, SurfaceBlock):
         return square_root(block.sums(T_lidar_a, T_lidar_b))
-    error, jacobian = square_root(block.sums(T_lidar_a.between(T_lidar_b)))
+    T_a_b = T_lidar_a.between(T_lidar_b)
+    if isinstance(block, ProjectionBlock):
+        error, jacobian = block.error_and_jacobian(T_a_b)
+    else:
+        error, jacobian = square_root(block.sums(T_a_b))
     return error, jacobian @ pair_chain(T_lidar_a, T_lidar_b)
 
 
@@ -140,108 +141,7 @@ def pair_chain(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> Array:
     return np.hstack([-T_b_a.AdjointMap(), np.eye(6)])
 
 
-def pair_projection_factor(
-    key_a: int,
-    key_b: int,
-    lens_b: Lens,
-    point_a_m: ArrayLike,
-    pixel_b_px: ArrayLike,
-    *,
-    sqrt_information: ArrayLike | None = None,
-    loss: str = "cauchy",
-    scale: float = 4.0,
-) -> gtsam.CustomFactor:
-    """One feature with depth: residual ``pi_b(T_b T_a^-1 X_a) - u_b``. The reference of the block.
-
-    Args:
-        key_a: the variable ``T_lidar_a``.
-        key_b: the variable ``T_lidar_b``.
-        lens_b: of camera B.
-        point_a_m: (3,) X_a in A's frame.
-        pixel_b_px: (2,) u_b.
-        sqrt_information: (2, 2) upper triangular whitening matrix [1/px]; identity if None.
-        loss: name of the robust loss.
-        scale: whitened residual norm at which the loss bends.
-    """
-    point = np.asarray(point_a_m, dtype=np.float64)
-    pixel = np.asarray(pixel_b_px, dtype=np.float64)
-    whitening = np.eye(2) if sqrt_information is None else np.asarray(sqrt_information)
-
-    def residual(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> tuple[Array, Array]:
-        T_a_b = T_lidar_a.between(T_lidar_b)
-        error, jacobian = projection_residual(lens_b, T_a_b, point, pixel)
-        return error, jacobian @ pair_chain(T_lidar_a, T_lidar_b)
-
-    base = gtsam.noiseModel.Gaussian.SqrtInformation(whitening)
-    noise = robust_noise(base, loss=loss, scale=scale)
-    return _factor_on_two_poses(noise, key_a, key_b, residual)
-
-
-def surface_factor(
-    key_a: int,
-    key_b: int,
-    lens_b: Lens,
-    ray_a: ArrayLike,
-    plane_lidar_per_m: ArrayLike,
-    pixel_b_px: ArrayLike,
-    *,
-    loss: str = "cauchy",
-    scale: float = 4.0,
-) -> gtsam.CustomFactor:
-    """One feature on a surface of the LiDAR. The reference of ``SurfaceBlock``.
-
-    Args:
-        key_a: the variable ``T_lidar_a``.
-        key_b: the variable ``T_lidar_b``.
-        lens_b: of camera B.
-        ray_a: (3,) the feature's unit ray in A's frame.
-        plane_lidar_per_m: (3,) q, with q . p = 1 for points p of the surface in the LiDAR frame.
-        pixel_b_px: (2,) the feature in B.
-        loss: name of the robust loss.
-        scale: residual norm [px] at which the loss bends.
-    """
-    ray, plane, pixel = (
-        np.asarray(value, dtype=np.float64) for value in (ray_a, plane_lidar_per_m, pixel_b_px)
-    )
-
-    def residual(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> tuple[Array, Array]:
-        return surface_residual((T_lidar_a, T_lidar_b), lens_b, ray, plane, pixel)
-
-    noise = robust_noise(gtsam.noiseModel.Unit.Create(2), loss=loss, scale=scale)
-    return _factor_on_two_poses(noise, key_a, key_b, residual)
-
-
-def epipolar_factor(
-    key_a: int,
-    key_b: int,
-    lenses: tuple[Lens, Lens],
-    pixels_px: tuple[ArrayLike, ArrayLike],
-    *,
-    loss: str = "cauchy",
-    scale: float = 4.0,
-) -> gtsam.CustomFactor:
-    """One feature without depth: Sampson's residual [px]. The reference of ``EpipolarBlock``.
-
-    Args:
-        key_a: the variable ``T_lidar_a``.
-        key_b: the variable ``T_lidar_b``.
-        lenses: of A and of B.
-        pixels_px: (2,) the feature in A and in B.
-        loss: name of the robust loss.
-        scale: residual [px] at which the loss bends.
-    """
-    pixel_a, pixel_b = (np.asarray(pixel, dtype=np.float64) for pixel in pixels_px)
-
-    def residual(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> tuple[Array, Array]:
-        T_a_b = T_lidar_a.between(T_lidar_b)
-        error, jacobian = epipolar_residual(T_a_b, lenses, (pixel_a, pixel_b))
-        return np.array([error]), jacobian[None] @ pair_chain(T_lidar_a, T_lidar_b)
-
-    noise = robust_noise(gtsam.noiseModel.Unit.Create(1), loss=loss, scale=scale)
-    return _factor_on_two_poses(noise, key_a, key_b, residual)
-
-
-def _factor_on_two_poses(
+def factor_on_two_poses(
     noise: gtsam.noiseModel.Base,
     key_a: int,
     key_b: int,

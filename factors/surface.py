@@ -7,7 +7,7 @@ X = T_lidar_camera = (R, c), its inverse range w from A, and w times its place i
 
 and the residual is pi_b(y) - u_b. Here the range follows from the pose of A, as that of the real
 feature does: where A moves, its ray meets the surface in another point. With w held constant (then
-f / w is the point X_a, fixed in A's frame), the residual is that of ``pair_projection_factor``, and
+f / w is the point X_a, fixed in A's frame), the residual is that of a point with a known depth, and
 a wrong pose of A becomes a wrong relative pose. Written with the inverse range, a ray that no
 longer meets the plane passes smoothly through infinity.
 """
@@ -126,46 +126,6 @@ class SurfaceBlock(RobustBlock):
 
 _LEAST_K = 1e-9  # in place of less: A's centre is on the plane
 _WIDTHS = {"rays_a": 3, "planes_lidar_per_m": 3, "pixels_b_px": 2}
-
-
-def surface_residual(
-    poses: tuple[gtsam.Pose3, gtsam.Pose3],
-    lens_b: Lens,
-    ray_a: Array,
-    plane_lidar_per_m: Array,
-    pixel_b_px: Array,
-) -> tuple[Array, Array]:
-    """Residual of one feature and its derivative, in numpy: the reference.
-
-    Args:
-        poses: ``T_lidar_a`` and ``T_lidar_b``.
-        lens_b: of camera B.
-        ray_a: (3,) f.
-        plane_lidar_per_m: (3,) q.
-        pixel_b_px: (2,) u_b.
-
-    Returns:
-        (2,) residual [px]; (2, 12) Jacobian in GTSAM's tangents of both poses, first A's.
-    """
-    (R_a, c_a), (R_b, c_b) = ((pose.rotation().matrix(), pose.translation()) for pose in poses)
-    g, k = R_a.T @ plane_lidar_per_m, 1.0 - plane_lidar_per_m @ c_a
-    w = g @ ray_a / k
-    R_b_a, t = R_b.T @ R_a, R_b.T @ (c_a - c_b)
-    y = R_b_a @ ray_a + w * t
-    by_poses = np.hstack(
-        [
-            -R_b_a @ _skew(ray_a) + np.outer(t, np.cross(ray_a, g)) / k,
-            w * R_b_a + w * np.outer(t, g) / k,
-            _skew(y),
-            -w * np.eye(3),
-        ]
-    )
-    pixel, by_point = lens_b.project_with_jacobian(y)
-    return lens_b.subtract(pixel, pixel_b_px)[0], by_point[0] @ by_poses
-
-
-def _skew(v: Array) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 @dataclass(frozen=True, eq=False)

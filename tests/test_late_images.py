@@ -17,9 +17,9 @@ from calibgraph import (
     perturb,
 )
 from calibgraph.matching.structure import StructureMatcher
-from calibgraph.simulation.clock_errors import draw_twists
 from factors import Clock, displace
 from tests.conftest import SAMPLE
+from tests.draws.clocks import draw_twists
 
 CAMERA = "front_left"
 OFFSET_S, READOUT_S = 0.03, 0.02

@@ -26,9 +26,9 @@ from benchmarks.accuracy.lens import (
 )
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import Config, Dataset, calibrate, evaluate, load_dataset, perturb
-from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
 from calibgraph.solver.joint import solve_joint
 from factors import Clock
+from tests.draws.clocks import draw_twists, put_clock_error
 
 CASES = (
     ("offset", 0.0, 0.0), ("offset", 0.005, 0.0), ("offset", 0.02, 0.0), ("offset", 0.1, 0.0),

@@ -25,7 +25,7 @@ from benchmarks.accuracy.uncertainty import ERRORS, draw_shared, state_shared
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import Calibration, Drift, drift, simulate_correspondences, solve
 from calibgraph.audit.judgement import CAMERA_AXES
-from calibgraph.simulation.place_draws import displaced, stereo
+from tests.draws.places import displaced, stereo
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator

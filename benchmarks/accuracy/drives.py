@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 
 from calibgraph import Camera, IncrementalCalibrator, Intrinsics, MatcherErrors, Rig, perturb
-from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.tracking.history import History
+from tests.draws.drives import simulate_drive
 
 FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)

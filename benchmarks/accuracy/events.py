@@ -31,7 +31,7 @@ from benchmarks.accuracy.drives import (
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import IncrementalCalibrator, Rig, perturb
 from calibgraph.model.geometry import twist_between
-from calibgraph.simulation.correspondences import simulate_drive
+from tests.draws.drives import simulate_drive
 
 
 @dataclass(frozen=True)

@@ -29,14 +29,14 @@ from numpy.typing import NDArray
 from calibgraph import Config, Dataset, Rig, calibrate, dataset_from_arrays, perturb
 from calibgraph.model.geometry import relative_transform, twist_between
 from calibgraph.simulation.cameras import CameraRays, Imaging, camera_rays, trace_light
-from calibgraph.simulation.clock_errors import draw_twists
-from calibgraph.simulation.lens_errors import put_lens_error
 from calibgraph.simulation.lidar import lidar_of, ring_gains, scan
 from calibgraph.simulation.recording import build_drive
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.simulation.scan_errors import ScanErrors
 from calibgraph.simulation.world import World
 from factors import Clock
+from tests.draws.clocks import draw_twists
+from tests.draws.lenses import put_lens_error
 
 FRAMES, STEP_M, STRIP_PX = 5, 15.0, 16
 ERRORS = ScanErrors(beam_mrad=2.0, dark_m=0.02)

@@ -26,15 +26,15 @@ from benchmarks.accuracy.uncertainty import calibration, left_frames, nees_of, p
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import Config, Rig, concatenate
 from calibgraph.model.geometry import twist_between
-from calibgraph.simulation.place_draws import (
+from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.solution import Solution
+from calibgraph.trust.evidence import Evidence
+from tests.draws.places import (
     FRAMES,
     Drawn,
     draw_places,
     tied,
 )
-from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.solution import Solution
-from calibgraph.trust.evidence import Evidence
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator

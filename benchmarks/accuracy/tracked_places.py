@@ -22,7 +22,7 @@ from benchmarks.tables import Table, publish
 from calibgraph import Config, IncrementalCalibrator
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
-from calibgraph.simulation.place_draws import Drawn, draw_places
+from tests.draws.places import Drawn, draw_places
 
 Array = NDArray[np.float64]
 

@@ -42,10 +42,10 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
     twist_between,
 )
-from calibgraph.simulation.place_draws import FIFTH, Drawn, displaced, stereo, tied
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Evidence
+from tests.draws.places import FIFTH, Drawn, displaced, stereo, tied
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator

@@ -20,7 +20,7 @@ from calibgraph import (
     concatenate,
     perturb,
 )
-from calibgraph.simulation.correspondences import simulate_drive
+from tests.draws.drives import simulate_drive
 
 Rng = np.random.Generator
 

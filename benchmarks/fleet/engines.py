@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.tables import ROOT, Table, add_record_option, publish
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import run_fleet
-from calibgraph.simulation.fleet_rows import write_fleet
+from tests.draws.fleets import write_fleet
 from tests.fleet.killing import kill_at_random
 
 

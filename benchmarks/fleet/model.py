@@ -24,7 +24,7 @@ from calibgraph.fleet.findings import Finding, find_changes
 from calibgraph.fleet.model import FleetModel, fit_fleet
 from calibgraph.fleet.observations import observe
 from calibgraph.model.geometry import twists_between
-from calibgraph.simulation.fleet_rows import Fleet, errors_of, simulate_fleet
+from tests.draws.fleets import Fleet, errors_of, simulate_fleet
 
 
 @dataclass

@@ -26,12 +26,12 @@ from calibgraph.graph.objective import pose_key, prior_graph
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.optimizer import to_values
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from calibgraph.tracking import warm_up_tracker
 from factors import block_factor
+from tests.draws.drives import simulate_drive
 
 RIG = Rig(
     cameras={"left": camera((0.3, 0.1, -0.1), 0), "right": camera((0.3, -0.4, -0.1), 0)},

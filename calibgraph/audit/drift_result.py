@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias
 
 from calibgraph.arrays import Array
 from calibgraph.audit.judgement import CAMERA_AXES
-from calibgraph.audit.result import LidarAudit, by_unit, freeze, lidar_summary
+from calibgraph.audit.result import Compared, LidarAudit, by_unit, freeze, lidar_summary
 from calibgraph.errors import CalibrationError
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.model.calibration import Calibration
@@ -21,28 +21,18 @@ _ORDER: tuple[DriftStatus, ...] = ("OK", "CANNOT TELL", "CHANGED")
 
 
 @dataclass(frozen=True, eq=False)
-class CameraDrift:
+class CameraDrift(Compared):
     """One camera in one result.
 
+    ``deviation`` is xi in T_others_here = exp(xi), the pose of the camera by this result in its
+    frame by the other results.
+
     Attributes:
-        status: OK, CANNOT TELL or CHANGED.
-        reason: one sentence: what was found and, where nothing can be told, what to record.
-        deviation: (6,) xi in T_others_here = exp(xi), the pose of the camera by this result in its
-            frame by the other results: rotation [rad], translation [m]; None if not compared.
-        sigma: (6,) standard deviations of ``deviation``.
-        detectable: (6,) smallest change per axis that would be significant with 90 % probability.
         axes: which of the six CHANGED, in this order.
     """
 
     status: DriftStatus
-    reason: str
-    deviation: Array | None = None
-    sigma: Array | None = None
-    detectable: Array | None = None
     axes: tuple[int, ...] = ()
-
-    def __post_init__(self) -> None:
-        freeze(self.deviation, self.sigma, self.detectable)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +115,7 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
         "cameras": {
             name: {
                 "results": {
-                    result: _camera_summary(each)
+                    result: each.summary(axes=[CAMERA_AXES[axis] for axis in each.axes])
                     for result, each in zip(drift.results, entries, strict=True)
                 },
                 "trend": _trend_summary(drift.trends.get(name)),
@@ -137,17 +127,6 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
             for result, lidar in zip(drift.results, drift.lidar, strict=True)
             if lidar is not None
         },
-    }
-
-
-def _camera_summary(camera: CameraDrift) -> dict[str, Any]:
-    return {
-        "status": camera.status,
-        "reason": camera.reason,
-        "axes": [CAMERA_AXES[axis] for axis in camera.axes],
-        **by_unit("deviation", camera.deviation),
-        **by_unit("sigma", camera.sigma),
-        **by_unit("detectable", camera.detectable),
     }
 
 
@@ -212,6 +191,11 @@ def _require_same_rig(
         raise CalibrationError(
             f"{name}: has the cameras {', '.join(b)}, {first} has {', '.join(a)}; give results of "
             "one rig"
+        )
+    if two.config.of != one.config.of:
+        raise CalibrationError(
+            f"{name}: has poses of the {two.config.of}, {first} of the {one.config.of}, which are "
+            "different quantities; solve one of them again with the other's --of"
         )
     for camera, other in b.items():
         parts = {"T_camera_lidar", *IMAGE_TIMES}

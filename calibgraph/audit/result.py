@@ -19,29 +19,53 @@ _ORDER: tuple[AuditStatus, ...] = ("OK", "CANNOT TELL", "WRONG")
 
 
 @dataclass(frozen=True, eq=False)
-class CameraAudit:
-    """The audit of one camera's extrinsic.
+class Compared:
+    """A camera's pose, compared with another one of it.
 
     Attributes:
-        status: OK, CANNOT TELL or WRONG.
+        status: OK, CANNOT TELL, or WRONG or CHANGED.
         reason: one sentence: what was found and, where nothing can be told, what to record.
-        deviation: (6,) xi in T_deployed_now = exp(xi), the pose of the camera now in its frame as
-            deployed: rotation [rad], translation [m]; None if nothing was measured.
+        deviation: (6,) xi of its pose in its frame by the other one: rotation [rad], translation
+            [m]; None if nothing was measured.
         sigma: (6,) standard deviations of ``deviation``; None without an error bar.
         detectable: (6,) smallest change per axis that these data tell from none, with 90 %
-            probability at 95 % confidence; None without an error bar.
-        z_score: agreement of image and cloud at the measured extrinsic; None if unknown.
+            probability; None without an error bar.
     """
 
-    status: AuditStatus
+    status: str
     reason: str
     deviation: Array | None = None
     sigma: Array | None = None
     detectable: Array | None = None
-    z_score: float | None = None
 
     def __post_init__(self) -> None:
         freeze(self.deviation, self.sigma, self.detectable)
+
+    def summary(self, **own: object) -> dict[str, Any]:
+        """As plain values, with those of a kind of comparison."""
+        return {
+            "status": self.status,
+            "reason": self.reason,
+            **own,
+            **by_unit("deviation", self.deviation),
+            **by_unit("sigma", self.sigma),
+            **by_unit("detectable", self.detectable),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class CameraAudit(Compared):
+    """The audit of one camera's extrinsic.
+
+    ``deviation`` is xi in T_deployed_now = exp(xi), the pose of the camera now in its frame as
+    deployed.
+
+    Attributes:
+        z_score: agreement of image and cloud at the measured extrinsic; None if unknown.
+    """
+
+    status: AuditStatus
+    z_score: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,20 +166,11 @@ def audit_summary(audit: Audit) -> dict[str, Any]:
         "frames": audit.frames,
         "same_recording": audit.same_recording,
         "deployed_verdict": audit.deployed_verdict,
-        "cameras": {name: _camera_summary(camera) for name, camera in audit.cameras.items()},
+        "cameras": {
+            name: camera.summary(z_score=camera.z_score) for name, camera in audit.cameras.items()
+        },
         "lidar": None if audit.lidar is None else lidar_summary(audit.lidar),
         "timings_s": dict(audit.timings_s),
-    }
-
-
-def _camera_summary(camera: CameraAudit) -> dict[str, Any]:
-    return {
-        "status": camera.status,
-        "reason": camera.reason,
-        "z_score": camera.z_score,
-        **by_unit("deviation", camera.deviation),
-        **by_unit("sigma", camera.sigma),
-        **by_unit("detectable", camera.detectable),
     }
 
 

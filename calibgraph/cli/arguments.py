@@ -173,11 +173,8 @@ def terms_from(name: str) -> Terms:
 
 def require_service() -> None:
     """Check that the server's packages are there."""
-    from calibgraph.errors import CalibrationError
+    from calibgraph.errors import needs_extra
 
-    try:
+    with needs_extra("service", "the server needs fastapi and uvicorn"):
         import fastapi  # noqa: F401
         import uvicorn  # noqa: F401
-    except ImportError as error:
-        message = f"{error.name} is missing; install the extra: pip install '.[service]'"
-        raise CalibrationError(message) from error

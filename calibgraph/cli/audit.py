@@ -11,7 +11,13 @@ from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_fr
 from calibgraph.cli.options import DatasetArgument, FramesOption, JsonOption, SeedOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
-_EXIT_CODES = {"OK": 0, "WRONG": 1, "CANNOT TELL": 3}
+DegreesOption = Annotated[
+    float, typer.Option(metavar="DEG", help="Largest deviation about an axis that is OK.")
+]
+CentimetresOption = Annotated[
+    float, typer.Option(metavar="CM", help="Largest deviation along an axis that is OK.")
+]
+_EXIT_CODES = {"OK": 0, "WRONG": 1, "CHANGED": 1, "CANNOT TELL": 3}
 
 
 def check(
@@ -19,12 +25,8 @@ def check(
         Path, typer.Argument(metavar="RIG", help="The deployed calibration: a result or a rig.")
     ],
     dataset: DatasetArgument,
-    tolerance_deg: Annotated[
-        float, typer.Option(metavar="DEG", help="Largest deviation about an axis that is OK.")
-    ] = 0.5,
-    tolerance_cm: Annotated[
-        float, typer.Option(metavar="CM", help="Largest deviation along an axis that is OK.")
-    ] = 10.0,
+    tolerance_deg: DegreesOption = 0.5,
+    tolerance_cm: CentimetresOption = 10.0,
     frames: FramesOption = None,
     seed: SeedOption = 0,
     page: Annotated[
@@ -74,9 +76,6 @@ def check(
     raise typer.Exit(_EXIT_CODES[audit.status])
 
 
-_DRIFT_EXIT_CODES = {"OK": 0, "CHANGED": 1, "CANNOT TELL": 3}
-
-
 def drift(
     results: Annotated[
         list[Path],
@@ -93,12 +92,8 @@ def drift(
             "days. (default: the order given)",
         ),
     ] = None,
-    tolerance_deg: Annotated[
-        float, typer.Option(metavar="DEG", help="Largest deviation about an axis that is OK.")
-    ] = 0.5,
-    tolerance_cm: Annotated[
-        float, typer.Option(metavar="CM", help="Largest deviation along an axis that is OK.")
-    ] = 10.0,
+    tolerance_deg: DegreesOption = 0.5,
+    tolerance_cm: CentimetresOption = 10.0,
     own_lenses: Annotated[
         bool,
         typer.Option(
@@ -138,7 +133,7 @@ def drift(
 
         print_drift(terminal(), found)
         print_plain(terminal(), f"{plot}: written" if plot is not None else "nothing was written")
-    raise typer.Exit(_DRIFT_EXIT_CODES[found.status])
+    raise typer.Exit(_EXIT_CODES[found.status])
 
 
 def _parse_days(text: str) -> list[float]:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import checked_arguments, config_from, terms_from
-from calibgraph.cli.matching_options import MatchingOptions, with_matching_options
+from calibgraph.cli.arguments import checked_arguments
+from calibgraph.cli.option_groups import MatchingOptions, SolveOptions, expand_groups
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 if TYPE_CHECKING:
@@ -19,20 +19,13 @@ if TYPE_CHECKING:
     from calibgraph.model.correspondences import Correspondences
 
 
-@with_matching_options
+@expand_groups
 def calibrate(
     dataset: options.DatasetArgument,
     matching: MatchingOptions,
-    config: options.ConfigOption = None,
-    preset: options.PresetOption = None,
-    terms: options.TermsOption = "full",
     out: options.OutOption = Path("calibration"),
-    seed: options.ConfigSeedOption = None,
-    bootstrap: options.BootstrapOption = None,
-    tolerance_deg: options.ToleratedDegOption = None,
-    tolerance_cm: options.ToleratedCmOption = None,
-    of: options.OfOption = None,
-    estimate: options.EstimateOption = None,
+    *,
+    solving: SolveOptions,
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
@@ -40,14 +33,7 @@ def calibrate(
     from calibgraph.report.html import write_result
 
     with checked_arguments():
-        given = {
-            "tolerance_deg": tolerance_deg,
-            "tolerance_cm": tolerance_cm,
-            "of": of,
-            "estimate": estimate,
-        }
-        settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
-        checked_terms = terms_from(terms)
+        settings, terms = solving.checked()
         chosen = matching.find_matcher(seed=settings.seed)
     data = matching.load_dataset(dataset)
     with progress_bar() as progress:
@@ -55,7 +41,7 @@ def calibrate(
             data,
             matcher=chosen,
             config=settings,
-            terms=checked_terms,
+            terms=terms,
             time_limit_s=matching.limit_s,
             progress=progress,
         )
@@ -64,7 +50,7 @@ def calibrate(
     _print_and_exit(result, written, as_json=as_json)
 
 
-@with_matching_options
+@expand_groups
 def match(
     dataset: options.DatasetArgument,
     matching: MatchingOptions,
@@ -91,6 +77,7 @@ def match(
     _print_table_and_exit(run.correspondences, out, as_json=as_json)
 
 
+@expand_groups
 def solve(
     rig: options.RigArgument,
     correspondences: Annotated[
@@ -100,19 +87,12 @@ def solve(
             help="Table, .parquet or .csv, or a folder of .parquet files; larger than memory too.",
         ),
     ],
-    terms: options.TermsOption = "full",
-    preset: options.PresetOption = None,
-    config: options.ConfigOption = None,
     out: options.OutOption = Path("calibration"),
+    *,
+    solving: SolveOptions,
     camera_matches: options.CameraMatchesOption = None,
-    seed: options.ConfigSeedOption = None,
-    bootstrap: options.BootstrapOption = None,
-    tolerance_deg: options.ToleratedDegOption = None,
-    tolerance_cm: options.ToleratedCmOption = None,
     common_deg: options.CommonDegOption = None,
     common_cm: options.CommonCmOption = None,
-    of: options.OfOption = None,
-    estimate: options.EstimateOption = None,
     print_graph: options.PrintGraphOption = False,
     graph: options.GraphOption = None,
     as_json: options.JsonOption = False,
@@ -127,21 +107,12 @@ def solve(
     from calibgraph.report.html import write_result
 
     with checked_arguments():
-        given = {
-            "tolerance_deg": tolerance_deg,
-            "tolerance_cm": tolerance_cm,
-            "common_deg": common_deg,
-            "common_cm": common_cm,
-            "of": of,
-            "estimate": estimate,
-        }
-        settings = config_from(config, preset, seed=seed, bootstrap=bootstrap, **given)
-        checked_terms = terms_from(terms)
+        settings, terms = solving.checked(common_deg=common_deg, common_cm=common_cm)
         if print_graph and as_json:
             raise ValueError("--print-graph and --json both print; choose one")
     with progress_bar("solving"), checked_arguments():
         seen = None if camera_matches is None else load_camera_matches(camera_matches)
-        result = solve(load_rig(rig), correspondences, settings, checked_terms, camera_matches=seen)
+        result = solve(load_rig(rig), correspondences, settings, terms, camera_matches=seen)
         result = result.with_inputs({str(path): sha256(path)
                                      for path in table_files(correspondences)})  # fmt: skip
         written = write_result(result, out)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calibgraph.cli.arguments import checked_arguments
+from calibgraph.cli.option_groups import expand_groups
 from calibgraph.cli.terminal import print_plain, terminal
 from calibgraph.io.formats.names import EXPORT_FORMATS, IMPORT_FORMATS
 
@@ -18,41 +20,69 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from calibgraph.io.formats.rig_import import RigParts
     from calibgraph.model.rig import Rig
 
 _LIST = "list"
 
-FilesArgument = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="FILE...",
-        help=f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
-    ),
-]
-RenameOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="OLD=NEW",
-        help="Another name of a camera, as its folder in the dataset; may be repeated.",
-    ),
-]
-LidarFrameOption = Annotated[
-    str | None,
-    typer.Option(metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"),
-]
-CameraFrameOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=FRAME",
-        help="Frame of a camera, where the names differ; may be repeated. A frame with 'optical' "
-        "in its name is x right, y down, z forward, others are x forward, z up.",
-    ),
-]
-SizeOption = Annotated[
-    str | None,
-    typer.Option(metavar="WIDTHxHEIGHT", help="Image size, for files that have none."),
-]
-"""Those of the files of others."""
+
+@dataclass(frozen=True, kw_only=True)
+class RigFilesOptions:
+    """The files of other programs that hold a rig together."""
+
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE...",
+            help=f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
+        ),
+    ]
+    rename: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="OLD=NEW",
+            help="Another name of a camera, as its folder in the dataset; may be repeated.",
+        ),
+    ] = None
+    lidar_frame: Annotated[
+        str | None,
+        typer.Option(metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"),
+    ] = None
+    camera_frame: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FRAME",
+            help="Frame of a camera, where the names differ; may be repeated. A frame with "
+            "'optical' in its name is x right, y down, z forward, others are x forward, z up.",
+        ),
+    ] = None
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="WIDTHxHEIGHT", help="Image size, for files that have none."),
+    ] = None
+
+    def read(self) -> RigParts:
+        """What the files hold."""
+        from calibgraph.io.formats.rig_import import read_rig_parts
+
+        named = [_parse_file(text) for text in self.files]
+        return read_rig_parts(
+            [path for _, path in named],
+            names={path: name for name, path in named if name},
+            rename=parse_names("--rename", self.rename),
+            lidar_frame=self.lidar_frame,
+            camera_frames=parse_names("--camera-frame", self.camera_frame),
+        )
+
+    @property
+    def size_px(self) -> tuple[int, int] | None:
+        """Width and height of images whose file has none."""
+        if self.size is None:
+            return None
+        match = re.fullmatch(r"(\d+)x(\d+)", self.size)
+        if match is None:
+            raise ValueError(f"--size {self.size!r}: give WIDTHxHEIGHT, as 1920x1200")
+        return int(match[1]), int(match[2])
 
 
 def _list_formats(format: str) -> str:
@@ -78,7 +108,9 @@ def export(
             help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="File to write.")],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="File to write; of camera_info a folder.")
+    ],
     camera: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME", help="Only this camera; may be repeated. (default: all)"),
@@ -153,13 +185,10 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
         raise ValueError(f"--lidar-pose {text!r}: {error}") from error
 
 
+@expand_groups
 def import_(
-    files: FilesArgument,
+    files: RigFilesOptions,
     out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Rig file to write.")],
-    rename: RenameOption = None,
-    lidar_frame: LidarFrameOption = None,
-    camera_frame: CameraFrameOption = None,
-    size: SizeOption = None,
     tie_deg: Annotated[
         float,
         typer.Option(
@@ -172,20 +201,12 @@ def import_(
 ) -> None:
     """Build a rig file from files of others, and print where each camera looks and sits."""
     from calibgraph.io.formats.describe import describe_rig
-    from calibgraph.io.formats.rig_import import read_rig_parts
     from calibgraph.outputs import yaml_mark
 
-    named = [parse_file(text) for text in files]
     with checked_arguments():
-        parts = read_rig_parts(
-            [path for _, path in named],
-            names={path: name for name, path in named if name},
-            rename=parse_names("--rename", rename),
-            lidar_frame=lidar_frame,
-            camera_frames=parse_names("--camera-frame", camera_frame),
-        )
+        parts = files.read()
         rig = parts.to_rig(
-            size_px=None if size is None else parse_size(size),
+            size_px=files.size_px,
             relative_sigma_deg=tie_deg,
             relative_sigma_cm=100.0 * tie_m,
         )
@@ -207,7 +228,7 @@ def print_doubts(rig: Rig, notes: Sequence[str] = ()) -> None:
         print_plain(terminal(), f"warning: {line}")
 
 
-def parse_file(text: str) -> tuple[str, Path]:
+def _parse_file(text: str) -> tuple[str, Path]:
     """The camera's name, if there is one before ``=``, and the file."""
     name, equals, file = text.partition("=")
     return (name, Path(file)) if equals and not Path(text).exists() else ("", Path(text))
@@ -223,11 +244,3 @@ def parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
         if count > 1:
             raise ValueError(f"{option} {name}=...: given {count} times; give it once")
     return {name: value for name, _, value in pairs}
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Width and height."""
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
-    if match is None:
-        raise ValueError(f"--size {text!r}: give WIDTHxHEIGHT, as 1920x1200")
-    return int(match[1]), int(match[2])

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibgraph.cli import exchange
 from calibgraph.cli.arguments import bag_options_from, checked_arguments
-from calibgraph.cli.exchange import parse_names
+from calibgraph.cli.exchange import RigFilesOptions, parse_names, print_doubts
+from calibgraph.cli.option_groups import expand_groups
 from calibgraph.cli.options import JsonOption, SeedOption, TopicOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
@@ -31,8 +31,9 @@ ForwardOption = Annotated[
 ]
 
 
+@expand_groups
 def guess(
-    files: exchange.FilesArgument,
+    files: RigFilesOptions,
     out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Rig file to write.")],
     mount: MountOption = None,
     dataset: Annotated[
@@ -50,41 +51,29 @@ def guess(
         ),
     ] = None,
     forward: ForwardOption = "+x",
-    rename: exchange.RenameOption = None,
-    lidar_frame: exchange.LidarFrameOption = None,
-    camera_frame: exchange.CameraFrameOption = None,
-    size: exchange.SizeOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Write a rig to begin a calibration with, by words, a URDF or a search, and how good it is."""
     from calibgraph.guessing.guess import guess_rig
-    from calibgraph.io.formats.rig_import import read_rig_parts
     from calibgraph.outputs import yaml_mark
 
-    named = [exchange.parse_file(text) for text in files]
     with checked_arguments(), progress_bar("reading") as progress:
-        parts = read_rig_parts(
-            [path for _, path in named],
-            names={path: name for name, path in named if name},
-            rename=exchange.parse_names("--rename", rename),
-            lidar_frame=lidar_frame,
-            camera_frames=exchange.parse_names("--camera-frame", camera_frame),
-        )
+        parts = files.read()
         found = guess_rig(
             parts,
-            mountings=exchange.parse_names("--mount", mount),
+            mountings=parse_names("--mount", mount),
             data=dataset or None,
             search=search or (),
             forward=forward,
-            size_px=None if size is None else exchange.parse_size(size),
+            size_px=files.size_px,
             seed=seed,
             progress=progress,
         )
     found.save(out, first_line=yaml_mark("guess"))
     if as_json:
         print_json(found.to_mapping())
-    exchange.print_doubts(found.rig, parts.notes)
+    print_doubts(found.rig, parts.notes)
     for line in found.lines:
         print_plain(terminal(), line)
     print_plain(terminal(), f"{out}: written; check the sentences above against the vehicle")

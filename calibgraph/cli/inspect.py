@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import bag_options_from, checked_arguments
+from calibgraph.cli.arguments import checked_arguments
+from calibgraph.cli.option_groups import DatasetOptions, expand_groups
 from calibgraph.cli.options import JsonOption, SeedOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
@@ -148,21 +149,16 @@ def view(
         print_plain(terminal(), f"{path}: written; the verdict is {loaded.verdict.status}")
 
 
+@expand_groups
 def doctor(
     dataset: options.DatasetArgument,
-    rig: options.RigOption = None,
-    frames: options.FramesOption = None,
+    chosen: DatasetOptions,
     out: Annotated[
         Path | None,
         typer.Option(
             metavar="DIR", help="Folder for guess_CAMERA.png: the guess on an image of each camera."
         ),
     ] = None,
-    topic: options.TopicOption = None,
-    every_s: options.EverySecondsOption = None,
-    tolerance_s: options.ToleranceOption = None,
-    stamps: options.StampsOption = None,
-    motion: options.MotionOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""
@@ -174,12 +170,10 @@ def doctor(
     if out is not None:
         require_place_for_folder(out)
         require_outside_dataset(out, dataset)
-    bag = bag_options_from(
-        topic, every_s=every_s, tolerance_s=tolerance_s, stamps=stamps, motion=motion
-    )
+    bag = chosen.bag
     with checked_arguments(), progress_bar("reading"):
-        guess = load_rig(rig) if rig else None
-        found = diagnose(dataset, guess, frames=frames, bag=bag, pictures=out)
+        guess = load_rig(chosen.rig) if chosen.rig else None
+        found = diagnose(dataset, guess, frames=chosen.frames, bag=bag, pictures=out)
     if as_json:
         print_json(found.to_mapping())
     else:

@@ -1,6 +1,5 @@
 """The commands of the learned matcher: what is in a file of weights, and training."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,28 +31,21 @@ def weights(
         print_weights(terminal(), checkpoint.summary(), out)
 
 
-def _print_train_settings(requested: bool) -> None:
-    if requested:
-        from calibgraph.files import commented_defaults
-        from calibgraph.matching.cmrnext import TrainSettings
+def _print_settings_option(module: str, settings: str) -> Any:
+    """``--print-settings`` of a training, whose settings are a model of that name in a module."""
 
-        print(commented_defaults(TrainSettings))
-        raise typer.Exit
+    def print_settings(requested: bool) -> None:
+        if requested:
+            from importlib import import_module
 
+            from calibgraph.files import commented_defaults
 
-def _print_window_settings(requested: bool) -> None:
-    if requested:
-        from calibgraph.files import commented_defaults
-        from calibgraph.matching.structure.training import WindowSettings
+            print(commented_defaults(getattr(import_module(module), settings)))
+            raise typer.Exit
 
-        print(commented_defaults(WindowSettings))
-        raise typer.Exit
-
-
-def _print_settings_option(callback: Callable[[bool], None]) -> Any:
     return typer.Option(
         "--print-settings",
-        callback=callback,
+        callback=print_settings,
         is_eager=True,
         help="Print a settings file with all defaults and what they mean, and exit.",
     )
@@ -80,7 +72,9 @@ def train(
             help="Settings of the training, YAML. (default: the published training's)",
         ),
     ] = None,
-    print_settings: Annotated[bool, _print_settings_option(_print_train_settings)] = False,
+    print_settings: Annotated[
+        bool, _print_settings_option("calibgraph.matching.cmrnext", "TrainSettings")
+    ] = False,
     held_out: Annotated[
         list[Path] | None,
         typer.Option(
@@ -112,9 +106,9 @@ def train(
 ) -> None:
     """Train a CMRNext network by perturbing trusted extrinsics."""
     from calibgraph.cli.tables import print_validation
+    from calibgraph.files import load_model
     from calibgraph.io.rigs import load_rig
     from calibgraph.matching.cmrnext import TrainSettings, train
-    from calibgraph.matching.cmrnext.training.settings import load_settings
     from calibgraph.matching.trusted_data import load_held_out, load_trusted_dataset, split
 
     given = {"config": config, "seed": seed, "from": start}
@@ -124,8 +118,8 @@ def train(
                 raise ValueError(
                     f"--{option}: --resume goes on with the settings in {out}; leave out"
                 )
-        chosen = TrainSettings() if config is None else load_settings(config)
-        chosen = chosen if seed is None else chosen.changed(seed=seed)
+        own = {} if seed is None else {"seed": seed}
+        chosen = load_model(TrainSettings, config, **own)
     trusted = load_rig(rig) if rig else None
     data = [load_trusted_dataset(folder, trusted) for folder in dataset]
     if held_out:
@@ -167,7 +161,10 @@ def train_windows(
     config: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Settings of the training, YAML.")
     ] = None,
-    print_settings: Annotated[bool, _print_settings_option(_print_window_settings)] = False,
+    print_settings: Annotated[
+        bool,
+        _print_settings_option("calibgraph.matching.structure.training", "WindowSettings"),
+    ] = False,
     held_out: Annotated[
         list[Path] | None,
         typer.Option(
@@ -187,16 +184,12 @@ def train_windows(
     If recordings held out get no better, nothing is written, and the exit code is 2.
     """
     from calibgraph.errors import CalibrationError
-    from calibgraph.matching.structure.training import (
-        WindowSettings,
-        load_window_settings,
-        train_windows,
-    )
+    from calibgraph.files import load_model
+    from calibgraph.matching.structure.training import WindowSettings, train_windows
     from calibgraph.matching.structure.window_weights import load_window_network
     from calibgraph.matching.trusted_data import load_held_out, load_trusted_dataset, split
 
-    chosen = WindowSettings() if config is None else load_window_settings(config)
-    chosen = chosen if seed is None else chosen.model_copy(update={"seed": seed})
+    chosen = load_model(WindowSettings, config, **({} if seed is None else {"seed": seed}))
     begun = None if start is None else load_window_network(start)
     data = [load_trusted_dataset(folder) for folder in recording]
     others = load_held_out(held_out or (), data)

@@ -24,104 +24,20 @@ CameraMatchesOption = Annotated[
         help="Features that cameras have in common: camera_matches.parquet of a result.",
     ),
 ]
-MatcherOption = Annotated[
-    str,
-    typer.Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences."),
-]
-_STRUCTURE = "Matcher structure"
-SearchDegOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="DEG|none",
-        help="Largest rotation error of the guess, per axis; none: no search, for a guess within "
-        "about 2.5 deg and 25 cm. The guess itself is tried first. (default: 20)",
-        rich_help_panel=_STRUCTURE,
-    ),
-]
-SearchMetresOption = Annotated[
-    str | None,
-    typer.Option(
-        "--search-m",
-        metavar="M|none",
-        help="Largest translation error of the guess, per axis; or none. (default: 1.5)",
-        rich_help_panel=_STRUCTURE,
-    ),
-]
-WindowWeightsOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE|none",
-        help="Weights of windows of train-windows, in place of the package's; none: all windows "
-        "count alike.",
-        rich_help_panel=_STRUCTURE,
-    ),
-]
-TimeLimitOption = Annotated[
-    float | None,
-    typer.Option(
-        min=0.001,
-        metavar="SECONDS",
-        help="Stop matching after this time; a result of fewer rounds is marked as partial. "
-        "[default: 1800 with structure, else none; inf for none]",
-    ),
-]
-_CMRNEXT = "Matcher cmrnext"
+CMRNEXT = "Matcher cmrnext"
 WeightsOption = Annotated[
     list[Path] | None,
     typer.Option(
         metavar="FILE...",
         help="Weights of the networks, .tar or .safetensors, in the order in which they run; a "
         "file may be repeated: --weights iter1.tar iter5.tar iter5.tar iter6.tar.",
-        rich_help_panel=_CMRNEXT,
-    ),
-]
-StartFromOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="frame|joint",
-        help="Where a network starts: at each frame's own pose by the network before, or at the "
-        "joint solve. (default: frame)",
-        rich_help_panel=_CMRNEXT,
+        rich_help_panel=CMRNEXT,
     ),
 ]
 DeviceOption = Annotated[
     str | None,
     typer.Option(
-        metavar="auto|cpu|cuda", help="Torch device. (default: auto)", rich_help_panel=_CMRNEXT
-    ),
-]
-IterationsOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        max=1000,
-        help="Iterations of each network's recurrent update (default: 12).",
-        rich_help_panel=_CMRNEXT,
-    ),
-]
-HalfOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--half-resolution/--full-resolution",
-        help="Halve the images or not (default: as stored with the weights, else from 1400 px "
-        "width on).",
-        rich_help_panel=_CMRNEXT,
-    ),
-]
-OcclusionOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--occlusion-filter",
-        help="Leave out points that nearer surfaces occlude.",
-        rich_help_panel=_CMRNEXT,
-    ),
-]
-BatchOption = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        help="Images per batch (default: 1 on a CPU, 4 on a GPU).",
-        rich_help_panel=_CMRNEXT,
+        metavar="auto|cpu|cuda", help="Torch device. (default: auto)", rich_help_panel=CMRNEXT
     ),
 ]
 FramesOption = Annotated[
@@ -132,15 +48,7 @@ FramesOption = Annotated[
         "all; of more than 30 the matcher structure takes 30: spread, clear ones)",
     ),
 ]
-IntervalOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="SECONDS",
-        help="Time between neighbouring clouds of a folder: the motion of the LiDAR is found by "
-        "their registration. For --estimate offset or readout. (default: unknown)",
-    ),
-]
-_BAGS = "ROS bags"
+BAGS = "ROS bags"
 TopicOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -148,33 +56,7 @@ TopicOption = Annotated[
         help="Topic of a camera's images, of the clouds as lidar=/TOPIC, or of odometry=/TOPIC; "
         "may be repeated. "
         "(default: found by the messages' types)",
-        rich_help_panel=_BAGS,
-    ),
-]
-EverySecondsOption = Annotated[
-    float | None,
-    typer.Option(
-        min=0.001,
-        metavar="SECONDS",
-        help="One frame in this time; only its surroundings are read. (default: all frames)",
-        rich_help_panel=_BAGS,
-    ),
-]
-ToleranceOption = Annotated[
-    float | None,
-    typer.Option(
-        min=0,
-        metavar="SECONDS",
-        help="Largest difference of the stamps of a cloud and its images. (default: 0.05)",
-        rich_help_panel=_BAGS,
-    ),
-]
-StampsOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="header|record",
-        help="Stamps of the sensors, or of recording. (default: header)",
-        rich_help_panel=_BAGS,
+        rich_help_panel=BAGS,
     ),
 ]
 MotionOption = Annotated[
@@ -183,7 +65,7 @@ MotionOption = Annotated[
         metavar="none|odometry|tf|scans",
         help="Correct clouds for the motion of the vehicle, to the stamps of the images: by "
         "Odometry, /tf, or registration of neighbouring scans. (default: none)",
-        rich_help_panel=_BAGS,
+        rich_help_panel=BAGS,
     ),
 ]
 ConfigOption = Annotated[
@@ -193,45 +75,7 @@ PresetOption = Annotated[
     str | None,
     typer.Option(metavar="auto|kitti|walkley", help="Settings of the solve by name."),
 ]
-OfOption = Annotated[
-    str | None,
-    typer.Option(
-        "--of",
-        metavar="alignment|mount",
-        help="Poses to report: where the LiDAR's points meet the images, or where the sensors are "
-        "mounted, less certain. (default: alignment)",
-    ),
-]
-EstimateOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="PART,...",
-        help="Estimate each camera's lens and clock too: focal, aspect, centre, distortion, or "
-        "lens for all but aspect; offset, readout, or clock for both. The rig may state how well "
-        "they are known.",
-    ),
-]
-TermsOption = Annotated[
-    str,
-    typer.Option(metavar="full|reprojection|priors|stage1", help="Terms of the objective."),
-]
 OutOption = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result.")]
-BootstrapOption = Annotated[
-    int | None,
-    typer.Option(
-        min=2,
-        max=100_000,
-        help="Check the covariance: solve N times with frames drawn with replacement.",
-    ),
-]
-ToleratedDegOption = Annotated[
-    float | None,
-    typer.Option(metavar="DEG", help="Rotation by which a PASS may be off; by default 0.5."),
-]
-ToleratedCmOption = Annotated[
-    float | None,
-    typer.Option(metavar="CM", help="Distance by which a PASS may be off; by default 10."),
-]
 CommonDegOption = Annotated[
     float | None,
     typer.Option(

@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, Protocol
 
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import CalibrationError, needs_extra
 from calibgraph.fleet.child import Child, run_in_kept_child
 from calibgraph.fleet.task import Outcome, Task
 from calibgraph.parallel import count_cores
@@ -181,10 +181,7 @@ def _require(module: str, extra: str = "") -> Any:
     """An optional package."""
     from importlib import import_module
 
-    try:
-        return import_module(module)
-    except ImportError as error:
-        name = extra or module
-        raise CalibrationError(
-            f"--engine {name}: {module} is not installed; pip install 'calibgraph[{name}]'"
-        ) from error
+    name = extra or module
+    with needs_extra(name, f"--engine {name} needs {module}"):
+        found = import_module(module)
+    return found

@@ -153,7 +153,7 @@ def arrow_reads(path: Path) -> Iterator[None]:
     try:
         yield
     except (pa.ArrowException, OSError, ValueError) as error:
-        kind = "CSV" if path.suffix == ".csv" else "Parquet"
+        kind = {".csv": "CSV", ".feather": "Feather"}.get(path.suffix.lower(), "Parquet")
         message = f"cannot be read as {kind} ({error}); is it complete? write it again"
         raise FileError(path, message) from error
 

@@ -22,7 +22,7 @@ from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.clouds import read_cloud_notes
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, published_format
 from calibgraph.io.formats.describe import describe_rig
-from calibgraph.io.frame import DrivenFrame, Frame, MovingFrame, twist_by_scans
+from calibgraph.io.frame import Frame, twist_by_scans
 from calibgraph.io.frame_files import RigRead
 from calibgraph.io.rigs import read_rig
 from calibgraph.model.rig import Rig
@@ -187,9 +187,7 @@ def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
         near = [i for i in (place - 1, place + 1) if 0 <= i < len(frames)]
         beside = [(frames[i], float(times_s[i] - times_s[place])) for i in near]
         find = partial(twist_by_scans, one, beside)
-        driven.append(
-            DrivenFrame(one.index, one.name, one.cloud_path, one.image_paths, find_twist=find)
-        )
+        driven.append(replace(one, find_twist=find))
     return tuple(driven)
 
 
@@ -204,8 +202,13 @@ def _with_bag(data: Dataset, path: Path, prefix: str, options: BagOptions) -> Da
 
 
 def _bag_frame(found: BagFrame, start: int, prefix: str, find: MotionOf | None) -> Frame:
-    named = start + found.number, f"{prefix}{found.stamp_ns}", found.cloud, found.images
-    return Frame(*named) if find is None else MovingFrame(*named, partial(find, found))
+    return Frame(
+        start + found.number,
+        f"{prefix}{found.stamp_ns}",
+        found.cloud,
+        found.images,
+        find_motion=None if find is None else partial(find, found),
+    )
 
 
 def _with(data: Dataset, frames: tuple[Frame, ...], recorded: tuple[Frame, ...]) -> Dataset:

@@ -1,7 +1,6 @@
 """Feather files: tables of Arrow."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,33 +9,24 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.files import require_file
+from calibgraph.io.correspondence_tables import arrow_reads
 
 
 def feather_columns(path: Path) -> tuple[str, ...]:
     """The names of all columns of a file."""
-    with _damage_named(path):
+    with arrow_reads(path):
         return tuple(_read_table(path).column_names)
 
 
 def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Columns of a file, as arrays of one length."""
-    with _damage_named(path):
+    with arrow_reads(path):
         table = _read_table(path)
         for name in columns:
             if name not in table.column_names:
                 found = ", ".join(table.column_names)
                 raise FileError(path, f"column {name!r} is missing; found {found}")
         return {name: _array(path, table, name) for name in columns}
-
-
-@contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
-    import pyarrow as pa
-
-    try:
-        yield
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise FileError(path, f"cannot be read as Feather ({error}); is it complete?") from error
 
 
 def _read_table(path: Path) -> Any:

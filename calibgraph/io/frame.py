@@ -1,7 +1,7 @@
 """A frame: one cloud and the images taken with it; the cloud as recorded, or without motion."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -24,6 +24,7 @@ from calibgraph.io.motion import (
     twist_between,
 )
 from calibgraph.io.videos import PICTURE_SUFFIX, hash_picture
+from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
 
 _MICROSECONDS_DIGITS, _NANOSECONDS_DIGITS = 16, 18  # of a stamp
@@ -53,31 +54,44 @@ class Frame:
         name: the files' stem, or a bag's stamp; after the sequence's name if there are several.
         cloud_path: the cloud's file, or its address in a bag.
         image_paths: the image's file or address in a bag or video, per camera that has one.
+        find_motion: computes the motion during the scan, for which the cloud is then corrected.
+        find_twist: computes (6,) the twist of the LiDAR where the cloud is as recorded.
+
+    The motion and the twist are computed once, when they are needed.
     """
 
     index: int
     name: str
     cloud_path: Path
     image_paths: dict[str, Path]
+    find_motion: Callable[[], ScanMotion] | None = field(default=None, kw_only=True)
+    find_twist: Callable[[], Array] | None = field(default=None, kw_only=True)
 
-    @property
+    @cached_property
     def motion(self) -> ScanMotion | None:
         """For which the cloud is corrected; None if it is as recorded."""
-        return None
+        return None if self.find_motion is None else self.find_motion()
 
     @property
     def is_corrected(self) -> bool:
         """Whether its cloud is corrected for motion."""
-        return False
+        return self.find_motion is not None
 
-    @property
+    @cached_property
     def twist_per_s(self) -> Array | None:
         """(6,) of the LiDAR: rotation [rad/s], translation [m/s]; None if it is unknown."""
+        if self.find_twist is not None:
+            return self.find_twist()
         return None if self.motion is None else np.array(self.motion.twist_per_s)
+
+    @property
+    def T_world_lidar(self) -> Array | None:
+        """(4, 4) of the LiDAR in a frame fixed to the ground; None if no poses are given."""
+        return None if self.motion is None else self.motion.T_world_lidar
 
     def load_cloud(self) -> NDArray[np.float32]:
         """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`."""
-        return load_cloud(self.cloud_path)
+        return load_cloud(self.cloud_path, self.motion)
 
     def load_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width, 3) image, BGR; see :func:`calibgraph.io.images.load_image`."""
@@ -98,78 +112,49 @@ class Frame:
         return {str(path): hash_source(path) for path in paths}
 
     def entry(self) -> dict[str, Any]:
-        """The frame's number and files, as a result keeps them."""
-        return {
+        """The frame's number, files and motion if it is known, as a result keeps them."""
+        files = {
             "frame": self.index,
             "name": self.name,
             "cloud": str(self.cloud_path),
             "images": {name: str(path) for name, path in self.image_paths.items()},
         }
+        motion = self.motion
+        if self.find_twist is not None:
+            motion = ScanMotion(tuple(np.asarray(self.twist_per_s).tolist()), 0.0)
+        return files if motion is None else {**files, _MOTION: motion.entry()}
 
 
-@dataclass(frozen=True, eq=False)
-class MovingFrame(Frame):
-    """A frame whose cloud is corrected for the motion during its scan.
+class ScanSteps:
+    """Steps between frames by registration: each scan is prepared once, each pair fitted once."""
 
-    Attributes:
-        find_motion: computes the motion; called once, when the cloud or the entry is needed.
-    """
+    def __init__(self) -> None:
+        self._scans, self._steps = dict[Path, PreparedScan](), dict[tuple[Path, Path], Array]()
 
-    find_motion: Callable[[], ScanMotion]
+    def between(self, frame: Frame, other: Frame) -> Array:
+        """(4, 4) T_frame_other.
 
-    @property
-    def motion(self) -> ScanMotion:
-        """During the scan."""
-        return self._found_motion
+        Raises:
+            DatasetError: if the scans do not fit.
+        """
+        one, two = frame.cloud_path, other.cloud_path
+        if (two, one) in self._steps:
+            return invert(self._steps[two, one])
+        if (one, two) not in self._steps:
+            self._steps[one, two] = register(self._prepared(frame), self._prepared(other), one)
+        return self._steps[one, two]
 
-    @property
-    def is_corrected(self) -> bool:
-        """It is."""
-        return True
-
-    @cached_property
-    def _found_motion(self) -> ScanMotion:
-        return self.find_motion()
-
-    def load_cloud(self) -> NDArray[np.float32]:
-        """(n, 4) x y z [m] at the stamp of the images, intensity."""
-        return load_cloud(self.cloud_path, self.motion)
-
-    def entry(self) -> dict[str, Any]:
-        """The frame's number, files and motion, as a result keeps them."""
-        return {**super().entry(), _MOTION: self.motion.entry()}
-
-
-@dataclass(frozen=True, eq=False)
-class DrivenFrame(Frame):
-    """A frame whose cloud is as recorded, of a LiDAR with a known motion.
-
-    Attributes:
-        find_twist: computes (6,) the twist; called once, when it is needed.
-    """
-
-    find_twist: Callable[[], Array]
-
-    @cached_property
-    def twist_per_s(self) -> Array:
-        """(6,) rotation [rad/s] and translation [m/s]."""
-        return self.find_twist()
-
-    def entry(self) -> dict[str, Any]:
-        """The frame's number, files and motion, as a result keeps them."""
-        motion = ScanMotion(tuple(self.twist_per_s.tolist()), 0.0)
-        return {**super().entry(), _MOTION: motion.entry()}
-
-
-def scan_of(frame: Frame) -> PreparedScan:
-    """A frame's cloud, as :func:`twist_by_scans` uses it."""
-    return prepare_scan(frame.load_cloud()[:, :3].astype(np.float64))
+    def _prepared(self, frame: Frame) -> PreparedScan:
+        if frame.cloud_path not in self._scans:
+            points = frame.load_cloud()[:, :3].astype(np.float64)
+            self._scans[frame.cloud_path] = prepare_scan(points)
+        return self._scans[frame.cloud_path]
 
 
 def twist_by_scans(
     frame: Frame,
     beside: Sequence[tuple[Frame, float]],
-    scans: Callable[[Frame], PreparedScan] = scan_of,
+    steps: ScanSteps | None = None,
 ) -> Array:
     """(6,) mean twist between a frame's scan and those before and after, by registration.
 
@@ -177,7 +162,7 @@ def twist_by_scans(
         frame: whose twist is wanted.
         beside: the frames before and after in the recording, or one of them, and by how much later
             they are [s].
-        scans: as :func:`scan_of`, which may keep what it has prepared.
+        steps: those that are known; none.
 
     Raises:
         DatasetError: if there is none, scans do not fit, or the speed is beyond that of a vehicle.
@@ -187,10 +172,9 @@ def twist_by_scans(
             f"{frame.cloud_path}: has no neighbouring scan, which its motion is found from; give "
             "two frames or more, or leave --interval-s out"
         )
-    own = scans(frame)
+    steps = steps or ScanSteps()
     twists = [
-        twist_between(np.eye(4), register(own, scans(one), frame.cloud_path), later_s)
-        for one, later_s in beside
+        twist_between(np.eye(4), steps.between(frame, one), later_s) for one, later_s in beside
     ]
     twist = np.asarray(np.mean(twists, axis=0))
     if (speed_m_s := np.linalg.norm(twist[3:])) > _MOST_M_S:
@@ -230,7 +214,7 @@ def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
     if motion is None:
         return Frame(*files)
     found = ScanMotion.of_entry(motion)
-    return MovingFrame(*files, find_motion=lambda: found)
+    return Frame(*files, find_motion=lambda: found)
 
 
 def load_entry_cloud(entry: Mapping[str, Any]) -> NDArray[np.float32]:

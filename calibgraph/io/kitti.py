@@ -91,15 +91,20 @@ class NumberLines:
         """The finite numbers of a line, in this shape."""
         if key not in self:
             raise FileError(self.path, f"line {key!r} is missing")
-        count = math.prod(shape)
         try:
             found = np.array(self._words[key], dtype=np.float64)
         except ValueError:
             found = np.empty(0)
-        if len(found) != count or not np.isfinite(found).all():
-            text = f"line {key!r} has {len(found)} numbers, expected {count} finite ones"
-            raise FileError(self.path, text)
-        return found.reshape(shape)
+        return matrix_of_line(self.path, key, found, shape)
+
+
+def matrix_of_line(path: Path, key: str, numbers: Array, shape: tuple[int, ...]) -> Array:
+    """The numbers of a line in this shape; as many as it holds, and finite."""
+    count = math.prod(shape)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        text = f"line {key!r} has {len(numbers)} numbers, expected {count} finite ones"
+        raise FileError(path, text)
+    return numbers.reshape(shape)
 
 
 def first_image_size(folder: Path) -> tuple[int, int]:

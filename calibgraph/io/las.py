@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibgraph.errors import CalibrationError, FileError
+from calibgraph.errors import FileError, needs_extra
 from calibgraph.io.point_fields import RawCloud, make_cloud
 
 _CHUNK = 1_000_000
@@ -22,12 +22,8 @@ def read_las(path: Path) -> RawCloud:
         CalibrationError: if laspy is missing.
         FileError: if the file is damaged, or ends before its points.
     """
-    try:
+    with needs_extra("las", f"{path}: reading {path.suffix} needs laspy"):
         import laspy
-    except ImportError as error:
-        raise CalibrationError(
-            f"{path}: reading {path.suffix} needs laspy: pip install 'calibgraph[las]' ({error})"
-        ) from error
     _require_header(path)
     try:
         with laspy.open(path) as file:

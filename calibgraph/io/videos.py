@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.errors import CalibrationError, FileError
+from calibgraph.errors import FileError, needs_extra
 from calibgraph.files import read_text
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov")
@@ -88,11 +88,8 @@ def _read_times(video: Path, _changed_ns: int) -> tuple[int, ...]:
 
 @contextmanager
 def _opened(video: Path) -> Iterator[Any]:
-    try:
+    with needs_extra("video", f"{video}: reading videos needs PyAV"):
         import av
-    except ImportError as error:
-        message = f"{video}: reading videos needs PyAV: pip install 'calibgraph[video]' ({error})"
-        raise CalibrationError(message) from error
     try:
         with av.open(str(video)) as container:
             yield container

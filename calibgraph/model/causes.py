@@ -49,6 +49,12 @@ CAUSES: dict[str, Cause] = {
             "range_rotation": _FROM_RESULT, "range_translation": _FROM_RESULT,
         },
     ),
+    "search": Cause(
+        "too few frames to find a camera in",
+        "Record at least 5 frames, 10 s apart; if the camera is not found in them either, correct "
+        "the guess, and see with doctor whether images and clouds belong together.",
+        {"search_in_few_frames": ""},
+    ),
     "time": Cause(
         "images and clouds of different times",
         "Pair each image with the cloud of its own instant: correct the time stamps or the offset.",
@@ -89,6 +95,7 @@ CAUSES: dict[str, Cause] = {
     "agreement": Cause(
         "image and cloud that agree too little", _STRUCTURE,
         {"z_score": "Check the guess, the intrinsics, and that images and clouds belong together.",
+         "chance": "",
          "displaced_z_score": "", "frames_best": "", "rematch_rotation": "",
          "rematch_translation": "", "matching again": "", "last_round_rotation": _FROM_RESULT,
          "last_round_translation": _FROM_RESULT},

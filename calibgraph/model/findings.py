@@ -10,8 +10,8 @@ from typing import Any
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.error_components import UNKNOWN, error_components
 
-_PER_CAMERA = ("z_score", "start_dependence", "memorization", "failed_share", "found", "missed")
-_Z_SCORES = ("z_score", "found", "missed")
+_FINITE = ("z_score", "found", "missed", "chance")
+_PER_CAMERA = (*_FINITE, "start_dependence", "memorization", "failed_share")
 _FORMER_KEYS = {"contrast": "z_score", "recall": "memorization"}
 STAGE1, _SOURCES = "stage1", ("pnp", "rig")
 _NUMBERS = {
@@ -41,6 +41,8 @@ class MatcherFindings:
         failed_share: share of the frames without matches (0 to 1).
         found: z-score at the pose where the search found the camera.
         missed: best z-score of the search where it did not find the camera: the camera fails.
+        chance: probability that a search with nothing to find ends at as high a z-score; of a
+            search in one to three frames alone, which measures it (0 to 1).
         stage1: ``rig`` if the matches of a single frame determine no pose, else ``pnp``.
         range_rotation_deg, range_translation_m: how far from the guess it searches, per axis; None
             if unknown.
@@ -63,6 +65,7 @@ class MatcherFindings:
     failed_share: Mapping[str, float] = field(default_factory=dict)
     found: Mapping[str, float] = field(default_factory=dict)
     missed: Mapping[str, float] = field(default_factory=dict)
+    chance: Mapping[str, float] = field(default_factory=dict)
     stage1: str = "pnp"
     range_rotation_deg: float | None = None
     range_translation_m: float | None = None
@@ -153,7 +156,7 @@ def _by_camera(metadata: Mapping[str, Any], key: str) -> dict[str, float]:
                 f"metadata {key!r} must map camera names to numbers, found {values!r}",
                 camera=camera,
             )
-        if key in _Z_SCORES and not math.isfinite(_to_float(value)):
+        if key in _FINITE and not math.isfinite(_to_float(value)):
             raise CorrespondenceError(
                 f"metadata {key!r} must be finite, found {_to_float(value)!r}", camera=camera
             )

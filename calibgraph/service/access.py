@@ -13,7 +13,7 @@ from fastapi.security import HTTPBearer
 from fastapi.security.http import HTTPAuthorizationCredentials
 from pydantic import BaseModel, ConfigDict, StringConstraints
 
-from calibgraph.files import checked_model, read_yaml, write_yaml
+from calibgraph.files import checked_model, load_model, write_yaml
 from calibgraph.service.problems import Problem
 
 Scope = Literal["read", "submit", "admin"]
@@ -66,7 +66,7 @@ class Caller:
 
 def load_tokens(path: Path) -> tuple[Token, ...]:
     """The tokens of a file."""
-    return checked_model(TokenFile, read_yaml(path), path).tokens
+    return load_model(TokenFile, path).tokens
 
 
 def add_token(path: Path, tenant: str, scope: Scope) -> str:

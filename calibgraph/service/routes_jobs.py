@@ -145,7 +145,7 @@ def _submit_route(kind: JobKind) -> Callable[..., Awaitable[Response]]:
     async def route(
         request: Request, state: State, caller: Submitter, idempotency_key: IdempotencyKey = None
     ) -> Response:
-        record, _ = await submit(state, request, caller, kind, key=idempotency_key)
+        record = await submit(state, request, caller, kind, key=idempotency_key)
         answer = job_answer(record, state.runner.step(record.id))
         headers = {"Location": f"/v1/jobs/{record.id}"}
         return JSONResponse(answer.model_dump(mode="json"), 202, headers)
@@ -169,8 +169,13 @@ def find_job(state: Service, caller: Reader, id: str) -> JobRecord:
     """The job of an id."""
     record = state.jobs.get(id, caller)
     if record is None:
-        raise Problem(404, "no such job; finished jobs are removed after some time")
+        raise no_such_job()
     return record
+
+
+def no_such_job() -> Problem:
+    """The answer for an id that is not known, or no more."""
+    return Problem(404, "no such job; finished jobs are removed after some time")
 
 
 @router.get("/jobs", responses=documented(422))

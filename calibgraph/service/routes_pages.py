@@ -121,7 +121,7 @@ async def new_job(kind: JobKind, request: Request, state: State, caller: Visitor
     try:
         if not caller.may("submit"):
             raise Problem(403, f"this needs a token of scope submit, found {caller.scope}")
-        record, _ = await submit(state, request, caller, kind, key=None)
+        record = await submit(state, request, caller, kind, key=None)
     except (Problem, CalibrationError) as error:
         status = error.status if isinstance(error, Problem) else 422
         return _page(request, "new.html.j2", status, problem=str(error), kind=kind)

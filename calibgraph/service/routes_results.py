@@ -1,8 +1,9 @@
 """Routes of results: the summary, the report, the files, other programs' formats."""
 
+import io
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +16,7 @@ from calibgraph.model.result_files import CALIBRATION_FILE, REPORT_FILE
 from calibgraph.service.access import Reader
 from calibgraph.service.problems import Problem, documented
 from calibgraph.service.requests import FILES, RESULT, SUMMARY
-from calibgraph.service.routes_jobs import JobId, find_job
+from calibgraph.service.routes_jobs import JobId, find_job, no_such_job
 from calibgraph.service.state import Service, State
 
 router = APIRouter(prefix="/v1/jobs/{id}")
@@ -29,7 +30,7 @@ REPORT_POLICY = (
 _SUFFIXES = {
     "kalibr": ".yaml", "ros1": ".txt", "ros2": ".txt", "ros2-launch": ".launch.xml",
     "tf2": ".yaml", "urdf": ".urdf", "autoware": ".yaml", "nuscenes": ".json", "koide": ".json",
-    "opencv": ".yaml", "npz": ".npz", "json": ".json",
+    "camera_info": ".zip", "opencv": ".yaml", "npz": ".npz", "json": ".json",
 }  # fmt: skip
 
 
@@ -52,7 +53,7 @@ def result(id: JobId, state: State, caller: Reader) -> Response:
     try:
         return Response(path.read_bytes(), media_type="application/json")  # a few kilobytes
     except FileNotFoundError:
-        raise _expired() from None
+        raise no_such_job() from None
 
 
 @router.get(
@@ -90,7 +91,8 @@ def report(id: JobId, state: State, caller: Reader) -> Response:
     path = _result_folder(state, caller, id) / FILES / REPORT_FILE
     if not path.exists():
         raise Problem(404, "no report was asked for")
-    return _file(path, "text/html", {"Content-Security-Policy": REPORT_POLICY})
+    policy = {"Content-Security-Policy": REPORT_POLICY}
+    return FileResponse(path, media_type="text/html", headers=policy)
 
 
 @router.get(
@@ -119,19 +121,18 @@ def export(
         written = export_calibration(
             folder, Path(temporary) / name, format, even_if_failed=even_if_failed
         )
-        content = written[0].read_bytes()
+        content = _zipped(written) if suffix == ".zip" else written[0].read_bytes()
     return Response(content, media_type="application/octet-stream", headers=_attachment(name))
+
+
+def _zipped(files: Sequence[Path]) -> bytes:
+    """Files of a few kilobytes as an archive."""
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w") as archive:
+        for file in files:
+            archive.write(file, file.name)
+    return held.getvalue()
 
 
 def _attachment(name: str) -> dict[str, str]:
     return {"Content-Disposition": f'attachment; filename="{name}"'}
-
-
-def _expired() -> Problem:
-    return Problem(404, "no such job; finished jobs are removed after some time")
-
-
-def _file(path: Path, media_type: str, headers: dict[str, str] | None = None) -> Response:
-    if not path.exists():  # it has expired meanwhile
-        raise _expired()
-    return FileResponse(path, media_type=media_type, headers=headers)

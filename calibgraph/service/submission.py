@@ -48,11 +48,11 @@ _RETRY_AFTER_S = 5
 
 async def submit(
     service: Service, request: Request, caller: Caller, kind: JobKind, *, key: str | None
-) -> tuple[JobRecord, bool]:
+) -> JobRecord:
     """Take in a job, of JSON with URIs or a form with files; it is durable when this returns.
 
     Returns:
-        The job, and whether it was known before.
+        The job; that of the first request with the key if there was one.
 
     Raises:
         Problem: if the request is malformed or too large, or there is no room.
@@ -166,12 +166,12 @@ def _free_name(name: str, taken: set[str]) -> str:
 
 def _keep(
     service: Service, arriving: Path, tenant: str, job: Job, *, digest: str, key: str | None
-) -> tuple[JobRecord, bool]:
+) -> JobRecord:
     """Put the input in its place, then the job into the table."""
     (arriving / LOG).touch()
     known = service.jobs.known(tenant, key, digest)
     if known is not None:
-        return known, True
+        return known
     _require_place_in_queue(service, tenant)
     sync_tree(arriving)
     folder = service.folder.of_job(arriving.name)
@@ -183,9 +183,9 @@ def _keep(
         raise
     if record.id != folder.name:  # another request with the key was faster
         shutil.rmtree(folder, ignore_errors=True)
-        return record, True
-    service.runner.wake()
-    return record, False
+    else:
+        service.runner.wake()
+    return record
 
 
 def parse_json(body: bytes) -> Any:

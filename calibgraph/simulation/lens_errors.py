@@ -5,7 +5,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from calibgraph.arrays import Array
-from calibgraph.model.config import LensPart
 from calibgraph.model.rig import Camera, Intrinsics, Rig
 from calibgraph.simulation.cameras import pixel_directions
 
@@ -30,31 +29,6 @@ def draw_lens_errors(rig: Rig, size: float, rng: np.random.Generator) -> Rig:
     return rig.model_copy(
         update={"cameras": {n: _as_stated(c, size, rng) for n, c in rig.cameras.items()}}
     )
-
-
-def put_lens_error(rig: Rig, part: LensPart, error: float) -> Rig:
-    """The rig with one part of all lenses wrong, and the same extrinsics.
-
-    Args:
-        rig: its lenses are the truth.
-        part: which.
-        error: relative, of ``focal`` and ``aspect``; of cx [px], of ``centre``; of k1.
-    """
-    cameras = {}
-    for name, camera in rig.cameras.items():
-        k, distortion = camera.intrinsics_px, [*camera.distortion] or [0.0] * 4
-        update: dict[str, object] = {}
-        if part == "distortion":
-            distortion[_RADIAL[camera.model]] += error
-            update["distortion"] = tuple(distortion)
-        wrong = {
-            "focal": {"fx": k.fx * (1 + error), "fy": k.fy * (1 + error)},
-            "aspect": {"fx": k.fx * (1 + error)},
-            "centre": {"cx": k.cx + error},
-        }
-        update["intrinsics_px"] = k.model_copy(update=wrong.get(part, {}))
-        cameras[name] = camera.model_copy(update=update)
-    return rig.model_copy(update={"cameras": cameras})
 
 
 def _as_stated(camera: Camera, size: float, rng: np.random.Generator) -> Camera:

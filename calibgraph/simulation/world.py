@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import needs_extra
 from calibgraph.simulation.mesh import Mesh
 from calibgraph.simulation.paints import paint_one
 from factors.compiled import compiled
@@ -155,13 +155,12 @@ def _to_rays(origins: Floats, directions: Floats) -> Any:
 
 
 def _open3d() -> Any:
-    try:
+    with needs_extra(
+        "simulation",
+        "simulating sensors needs open3d, and on Debian or Ubuntu apt-get install libusb-1.0-0 "
+        "libgl1 libgomp1 libx11-6",
+    ):
         import open3d
-    except ImportError as error:
-        raise CalibrationError(
-            f"simulating sensors needs open3d: pip install 'calibgraph[simulation]', on Debian or "
-            f"Ubuntu also apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6 ({error})"
-        ) from error
     return open3d
 
 

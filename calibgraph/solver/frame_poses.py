@@ -1,6 +1,5 @@
 """Robust poses of many frames of one camera at once: Levenberg-Marquardt over stacked sums."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +8,6 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import retract_all
 from factors import ProjectionBlock
-from factors.block_arrays import contiguous
-from factors.compiled import compiled
 
 Runs = NDArray[np.int64]
 """(f, 2): the first correspondence of each frame, and the one behind its last."""
@@ -18,7 +15,7 @@ Runs = NDArray[np.int64]
 _MAX_STEPS = 50  # with a start in the right basin, 4 to 8 are enough
 _DAMPING, _MAX_DAMPING = 1e-5, 1e6  # relative to the diagonal
 _MIN_DAMPING = 1e-12  # with less, frames that leave a direction free would be singular
-_ROUNDING = 1e-16  # least square of a root's diagonal, which damping keeps well above it
+_LEAST_SIZE = np.finfo(np.float64).tiny
 _SMALL_STEP = 1e-10  # rad, m: below what residuals of 1e-6 px resolve
 FINE, COARSE = 1e-10, 1e-3
 """Relative decrease of the cost at which a fit stops: at the optimum; as a start for another."""
@@ -83,34 +80,8 @@ def solve_damped(hessians: Array, gradients: Array, dampings: Array | float) -> 
         gradients: (f, 6).
         dampings: of each, or of all: what is added to the diagonal, relative to it; above 1e-15.
     """
-    steps = np.empty(gradients.shape)
-    each = contiguous(np.atleast_1d(np.asarray(dampings, dtype=np.float64)))
-    _fill_steps(contiguous(hessians), contiguous(gradients), each, steps)
-    return steps
-
-
-@compiled()
-def _fill_steps(hessians, gradients, dampings, steps):  # type: ignore[no-untyped-def]
-    """Fill in the steps of :func:`solve_damped`, by Cholesky's root in units of a unit diagonal."""
-    n = gradients.shape[1]
-    units, root = np.empty(n), np.empty((n, n))
-    for f in range(len(steps)):
-        step, damping = steps[f], dampings[min(f, len(dampings) - 1)]
-        for i in range(n):
-            size = hessians[f, i, i]
-            units[i] = 1.0 / math.sqrt(size) if size > 0.0 else 0.0
-            step[i] = units[i] * gradients[f, i]
-            for j in range(i + 1):
-                rest = 1.0 + damping if i == j else hessians[f, i, j] * units[i] * units[j]
-                for m in range(j):
-                    rest -= root[i, m] * root[j, m]
-                root[i, j] = math.sqrt(max(rest, _ROUNDING)) if i == j else rest / root[j, j]
-                if j < i:
-                    step[i] -= root[i, j] * step[j]
-            step[i] /= root[i, i]
-        for i in range(n - 1, -1, -1):
-            for j in range(i + 1, n):
-                step[i] -= root[j, i] * step[j]
-            step[i] /= root[i, i]
-        for i in range(n):
-            step[i] *= -units[i]
+    sizes = np.einsum("fii->fi", hessians)
+    units = np.where(sizes > 0, np.maximum(sizes, _LEAST_SIZE) ** -0.5, 0.0)
+    scaled = hessians * units[:, :, None] * units[:, None, :]
+    np.einsum("fii->fi", scaled)[...] = 1.0 + np.reshape(dampings, (-1, 1))
+    return np.asarray(-units * np.linalg.solve(scaled, (units * gradients)[:, :, None])[:, :, 0])

@@ -9,9 +9,8 @@ deviations by the residuals of the matches that have them.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,15 +62,6 @@ class WeighedFrames:
     outlier_frames: Mapping[str, int]
 
 
-@dataclass(frozen=True, eq=False)
-class WeighedCamera:
-    """One camera's part of :class:`WeighedFrames`."""
-
-    block: CameraBlock
-    T_camera_lidar: Array
-    outlier_frames: int
-
-
 def weigh_all_frames(
     table: Correspondences,
     blocks: Mapping[str, CameraBlock],
@@ -95,10 +85,10 @@ def weigh_all_frames(
         terms: of the objective.
     """
     uses_correspondences = terms in ("full", "reprojection")
-    if not (config.learnt_weights and config.stage1 == "pnp" and uses_correspondences):
+    if not (config.learnt_weights and config.stage1 == "pnp" and uses_correspondences and blocks):
         return WeighedFrames(blocks, dict(start), {})
 
-    def weigh(name: str) -> WeighedCamera:
+    def weigh(name: str) -> tuple[CameraBlock, Array, int]:
         return weigh_frames(
             blocks[name],
             table.of_camera(name).confidence.astype(np.float64),
@@ -106,14 +96,11 @@ def weigh_all_frames(
             stage1[name].by_frame if name in stage1 else {},
         )
 
-    weighed = dict(zip(blocks, map_on_cores(weigh, [*blocks]), strict=True))
+    kept, centers, outliers = zip(*map_on_cores(weigh, [*blocks]), strict=True)
     return WeighedFrames(
-        blocks={name: camera.block for name, camera in weighed.items()},
-        T_camera_lidar={
-            **start,
-            **{name: camera.T_camera_lidar for name, camera in weighed.items()},
-        },
-        outlier_frames={name: camera.outlier_frames for name, camera in weighed.items()},
+        blocks=dict(zip(blocks, kept, strict=True)),
+        T_camera_lidar={**start, **dict(zip(blocks, centers, strict=True))},
+        outlier_frames=dict(zip(blocks, outliers, strict=True)),
     )
 
 
@@ -122,7 +109,7 @@ def weigh_frames(
     confidence: Array,
     T_camera_lidar: Array,
     by_frame: Mapping[int, Array],
-) -> WeighedCamera:
+) -> tuple[CameraBlock, Array, int]:
     """Weigh the correspondences of one camera by the residuals of its frames and confidences.
 
     Args:
@@ -130,10 +117,14 @@ def weigh_frames(
         confidence: (n,) of its correspondences.
         T_camera_lidar: (4, 4) where to start; it may be that of a wrong majority of frames.
         by_frame: (4, 4) T_camera_lidar of single frames, by PnP.
+
+    Returns:
+        The correspondences without those of outlier frames; (4, 4) T_camera_lidar where the frames
+        are densest; the number of outlier frames.
     """
     edges = block.frame_edges
     if len(edges) - 1 < MIN_FRAMES_TO_WEIGH:
-        return WeighedCamera(block, T_camera_lidar, 0)
+        return block, T_camera_lidar, 0
     numbers = block.frame[edges[:-1]]
     starts = np.array([by_frame.get(number, T_camera_lidar) for number in numbers.tolist()])
     frames = fit_each_frame(block, starts)
@@ -143,7 +134,7 @@ def weigh_frames(
     each = np.repeat(weights, np.diff(edges))
     counted = each > 0
     kept = block.select(counted).with_weights(each[counted] / sigmas[counted] ** 2)
-    return WeighedCamera(kept, T_consensus, int(np.count_nonzero(weights == 0)))
+    return kept, T_consensus, int(np.count_nonzero(weights == 0))
 
 
 def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
@@ -197,14 +188,7 @@ def _reach(shift: Array, least: float, *, widened: bool) -> float:
     return _REACH * max(min(robust_spread(np.sqrt(shift)), _MAX_WIDENING * nearest), least)
 
 
-class _Candidates(Protocol):
-    """A block, of which only this is asked."""
-
-    def best_candidate(self, candidates: Sequence[Array], scale_px: float) -> int:
-        """Which of some T_camera_lidar has the least loss."""
-
-
-def densest_start(block: _Candidates, frames: FrameFits, T_camera_lidar: Array) -> Array:
+def densest_start(block: CameraBlock, frames: FrameFits, T_camera_lidar: Array) -> Array:
     """The (4, 4) T_camera_lidar of least loss over all frames: a frame's own, or the given one."""
     step = -(-len(frames.T_camera_lidar) // _MAX_CANDIDATES)
     candidates: list[Array] = [T_camera_lidar, *frames.T_camera_lidar[::step]]

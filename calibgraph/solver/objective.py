@@ -19,7 +19,7 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, pair_graph
-from calibgraph.solver.optimizer import RELATIVE_TOLERANCE, Optimum, optimize
+from calibgraph.solver.optimizer import Optimum, optimize
 from calibgraph.solver.residual_scale import ResidualScale
 
 Transforms = dict[str, Array]
@@ -27,7 +27,6 @@ Transforms = dict[str, Array]
 Scales = dict[str, ResidualScale]
 USING_CORRESPONDENCES: tuple[Terms, ...] = ("full", "reprojection")
 
-_COARSE_TOLERANCE = 1e-3  # relative change of the error
 _MAX_RESCALINGS = 10  # mostly 3 are enough
 _CONVERGED = 0.01  # relative change of the spread: far below its own uncertainty
 _NARROWING, _NARROWINGS = 1 / 1.5, 16  # in all from 600 px, half an image, to 1 px
@@ -45,7 +44,6 @@ class Objective:
         terms: which terms of Eq. 5 are used.
         gated: after the gate, per camera all correspondences, and the (4, 4) T_camera_lidar and the
             scale that it was drawn at; before it, empty.
-        relative_tolerance: of Levenberg-Marquardt.
         pairs: what cameras see in common, each term with its sigma.
         lenses: those that the error model estimates; here they are where the rig has them.
     """
@@ -56,7 +54,6 @@ class Objective:
     config: Config
     terms: Terms
     gated: Mapping[str, tuple[CameraBlock, Array, ResidualScale]] = field(default_factory=dict)
-    relative_tolerance: float = RELATIVE_TOLERANCE
     pairs: tuple[PairTerm, ...] = ()
     lenses: Mapping[str, LensVariable] = field(default_factory=dict)
 
@@ -95,18 +92,6 @@ class Objective:
             name: block.at(T).gate_hessian(scale) for name, (block, T, scale) in self.gated.items()
         }
 
-    def coarse(self, matches: int) -> Objective:
-        """With at most so many correspondences of each camera, and less exact minima.
-
-        For a start: the spread of so many is known to some percent, and so is the minimum.
-        """
-        blocks = {name: block.select_evenly(matches) for name, block in self.blocks.items()}
-        return self.with_blocks(blocks).with_tolerance(_COARSE_TOLERANCE)
-
-    def with_tolerance(self, relative_tolerance: float) -> Objective:
-        """The same objective, with less exact minima."""
-        return self._with(relative_tolerance=relative_tolerance)
-
     def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:
         """The same objective with other (fewer) correspondences, and the pairs of their frames."""
         if not self.pairs:
@@ -137,12 +122,7 @@ class Objective:
         """The minimum by Levenberg-Marquardt, with the residuals' scales held constant."""
         if self.terms == "stage1":
             return Optimum(start, math.nan, 0, True)
-        return optimize(
-            self.graph(scales),
-            self.cameras,
-            start,
-            relative_tolerance=self.relative_tolerance,
-        )
+        return optimize(self.graph(scales), self.cameras, start)
 
     def minimize_with_scale(self, start: Transforms) -> tuple[Transforms, Scales]:
         """Pass 1. With `auto` scales: minimize and re-measure the spread until it is constant.

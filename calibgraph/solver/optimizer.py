@@ -46,8 +46,6 @@ def optimize(
     graph: gtsam.NonlinearFactorGraph,
     cameras: Sequence[str],
     T_camera_lidar: Mapping[str, Array],
-    *,
-    relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> Optimum:
     """Minimize a graph by Levenberg-Marquardt.
 
@@ -55,10 +53,9 @@ def optimize(
         graph: over the variables of the cameras.
         cameras: their names, in the order of the variables.
         T_camera_lidar: (4, 4) per camera, the start.
-        relative_tolerance: relative change of the error at which it stops.
     """
     start = to_values(cameras, T_camera_lidar)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, _parameters(relative_tolerance))
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, _parameters())
     values = optimizer.optimize()
     found = {name: to_T_camera_lidar(values.atPose3(pose_key(cameras, name))) for name in cameras}
     iterations = int(optimizer.iterations())
@@ -66,10 +63,10 @@ def optimize(
 
 
 @cache
-def _parameters(relative_tolerance: float) -> gtsam.LevenbergMarquardtParams:
+def _parameters() -> gtsam.LevenbergMarquardtParams:
     """Of Levenberg-Marquardt, which copies them."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(MAX_ITERATIONS)
-    parameters.setRelativeErrorTol(relative_tolerance)
+    parameters.setRelativeErrorTol(RELATIVE_TOLERANCE)
     parameters.setAbsoluteErrorTol(0.0)
     return parameters

@@ -12,7 +12,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
-from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.lens_estimate import LensEstimate, with_sigmas
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
@@ -85,11 +85,12 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
     covariance, few = window.covariance(keys), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
     verdicts, lens = {}, _lens_estimates(window)
+    apart = estimates_of_halves(state, halves)
     for camera, name in enumerate(state.names):
         own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
-        apart = estimates_of_halves(state, halves, camera)
+        known = lens.get(name, ())
         verdicts[name] = _verdict(
-            state, sums, camera, covariance, conflicts=own, halves=apart, lens=lens.get(name, ())
+            state, sums, camera, covariance, conflicts=own, halves=apart.get(camera), lens=known
         )
     return Assessment(estimates, covariance, verdicts, window, lens)
 
@@ -218,7 +219,7 @@ def to_calibration(state: State, assessment: Assessment) -> Calibration:
     newest = replace(state, offsets=assessment.offsets(state))
     rig = rig_at(newest, assessment.T_lidar_camera)
     return Calibration(
-        rig=rig,
+        rig=with_sigmas(rig, assessment.lens),
         initial_rig=state.rig,
         covariance=covariance_by_camera(assessment, state.names),
         joint_covariance=known,

@@ -9,7 +9,6 @@ A constant motion straight ahead is equivalent to a camera that is mounted furth
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 
@@ -18,15 +17,14 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.io.frame import Frame, scan_of, seconds_between, twist_by_scans
+from calibgraph.io.frame import Frame, ScanSteps, seconds_between, twist_by_scans
 from calibgraph.io.kept_frames import KeptFrame
-from calibgraph.io.motion import PreparedScan
 from calibgraph.matching.run import with_motion
 from calibgraph.model.clock import at_pixels, clock_of
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.model.verdict import Check
+from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.solver.camera_twist import free_fields_px
 from calibgraph.solver.linear_fit import block_of, fit_camera
 from calibgraph.trust.evidence import Checks, Evidence
@@ -57,7 +55,8 @@ def offset_checks(evidence: Evidence) -> Checks:
     table, rig = solution.correspondences, solution.solved_rig
     if table.twist_per_s is None or not {*CLOCK}.isdisjoint(solution.config.estimate):
         return {}
-    return _check_cameras(rig, table, evidence.findings, by=RESIDUALS)
+    fits = _fit_cameras(rig, table, evidence.findings)
+    return {n: [check_offset(fit, RESIDUALS, solution.config.tolerance)] for n, fit in fits}
 
 
 def image_offset_checks(evidence: RunEvidence) -> Checks:
@@ -81,26 +80,29 @@ def image_offset_checks(evidence: RunEvidence) -> Checks:
     )
     matcher.release()
     table = with_motion(table, moved).with_places(run.correspondences.places)
-    checks = _check_cameras(rig, table, run.correspondences.findings, by=IMAGES)
+    fits = _fit_cameras(rig, table, run.correspondences.findings)
+    checks = {n: [check_offset(fit, IMAGES, config.tolerance)] for n, fit in fits}
     if registered and seconds_between(*moved.frames[:2]) is None:
         taken = f"; successive clouds are taken to be {INTERVAL_S:g} s apart"
         checks = {n: [replace(c, text=c.text + taken) for c in of] for n, of in checks.items()}
     return evidence.grade_by_images(checks)
 
 
-def _check_cameras(
-    rig: Rig, table: Correspondences, findings: MatcherFindings, *, by: str
-) -> Checks:
-    fits = {
-        name: fit_offset(camera, table.of_camera(name), findings.place_variance)
+def _fit_cameras(
+    rig: Rig, table: Correspondences, findings: MatcherFindings
+) -> list[tuple[str, LensParameter]]:
+    fits = (
+        (name, fit_offset(camera, table.of_camera(name), findings.place_variance))
         for name, camera in rig.cameras.items()
-    }
-    return {name: [check_offset(fit, by)] for name, fit in fits.items() if fit is not None}
+    )
+    return [(name, fit) for name, fit in fits if fit is not None]
 
 
-def check_offset(found: LensParameter, by: str) -> Check:
+def check_offset(
+    found: LensParameter, by: str, tolerance: tuple[float, float] = TOLERANCE
+) -> Check:
     """The check of an offset; of one that is not determined, it tells how much depends on it."""
-    check, size = check_parameter(found, by), float(found.units[0] * found.size)
+    check, size = check_parameter(found, by, tolerance), float(found.units[0] * found.size)
     if found.sigmas[0] < limit("lens_wrong"):
         return check
     text = "the time of the images is not determined by these data, and taken for right"
@@ -142,36 +144,27 @@ def _without_times(rig: Rig) -> Rig:
 
 def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
     """Some frames with their motion, None of too few; whether scans show that of any of them."""
-    frames, registered, scans = [], False, dict[int, PreparedScan]()
-
-    def kept_scan(frame: Frame) -> PreparedScan:
-        if frame.index not in scans:
-            scans[frame.index] = scan_of(frame)
-        return scans[frame.index]
-
+    frames, registered, steps = [], False, ScanSteps()
     for frame in spread_out(dataset.frames, MAX_FRAMES):
         twist = frame.twist_per_s
         if twist is not None:
             frames.append(frame)
         elif (
-            isinstance(frame, KeptFrame)
-            and (found := _register(dataset, frame, kept_scan)) is not None
+            isinstance(frame, KeptFrame) and (found := _register(dataset, frame, steps)) is not None
         ):
             frames.append(replace(frame, twist=found))
             registered = True
     return dataset.only(frames) if len(frames) >= MIN_FRAMES else None, registered
 
 
-def _register(
-    dataset: Dataset, frame: Frame, scans: Callable[[Frame], PreparedScan]
-) -> Array | None:
+def _register(dataset: Dataset, frame: Frame, steps: ScanSteps) -> Array | None:
     """(6,) the twist by both neighbours, if they are as far away as of one drive."""
     near = [dataset.neighbour(frame, sign) for sign in (-1, 1)]
     known = [(other, _later_s(frame, other)) for other in near if other is not None]
     if len(known) < len(near) or not all(later_s for _, later_s in known):
         return None
     try:
-        before, after = (twist_by_scans(frame, [one], scans) for one in known)
+        before, after = (twist_by_scans(frame, [one], steps) for one in known)
     except DatasetError:  # they do not fit
         return None
     jerk = np.linalg.norm(after[3:] - before[3:])

@@ -53,45 +53,49 @@ def compare_with_guess(guess: Array, result: Array, findings: MatcherFindings) -
 
 
 def swap_checks(evidence: Evidence) -> Checks:
-    """Whether a camera and another ended where the other's guess is."""
-    guesses, results = evidence.guess.T_camera_lidar, evidence.solution.T_camera_lidar
-    distances = distances_between(guesses, results)
-    return {name: compare_with_other_guesses(name, distances) for name in results}
-
-
-def distances_between(
-    guesses: Mapping[str, Array], results: Mapping[str, Array]
-) -> dict[tuple[str, str], float]:
-    """Between each guess and each result, (4, 4) T_camera_lidar, by the names of both cameras."""
-    return {(one, two): _distance(guesses[one], results[two]) for one in results for two in results}
+    """Whether a camera ended where another one's guess is; of those that have been found."""
+    guesses, missed = evidence.guess.T_camera_lidar, evidence.findings.missed
+    results = {n: T for n, T in evidence.solution.T_camera_lidar.items() if n not in missed}
+    return {name: compare_with_other_guesses(name, guesses, results) for name in results}
 
 
 def compare_with_other_guesses(
-    camera: str, distances: Mapping[tuple[str, str], float]
+    camera: str, guesses: Mapping[str, Array], results: Mapping[str, Array]
 ) -> list[Check]:
     """The distance of two cameras to each other's guess over that to their own, at the least.
+
+    With Gaussian errors of the guesses, of unknown size, the likelihood ratio of a swap is the
+    12th power of own over other: there are six numbers a camera. If the other camera has no result,
+    it is the 6th, so that the square root of the distances' ratio stands for as much.
+
+    Args:
+        camera: its name.
+        guesses: (4, 4) T_camera_lidar of all cameras.
+        results: the same of those that have one.
 
     Returns:
         One check; none for a single camera.
     """
-    slack = limit("swap_slack")
-    ratios = {
-        other: (slack + distances[other, camera] + distances[camera, other])
-        / (slack + distances[camera, camera] + distances[other, other])
-        for other, _ in distances
-        if other != camera
-    }
-    if not ratios:
+
+    def ratio(other: str) -> float:
+        swapped = {camera: other, other: camera}
+        pairs = [(swapped[name], name) for name in swapped if name in results]
+        own = sum(_squared_distance(guesses[name], results[name]) for _, name in pairs)
+        crossed = sum(_squared_distance(guesses[one], results[two]) for one, two in pairs)
+        return float((crossed / own) ** (len(pairs) / 4))
+
+    others = [name for name in guesses if name != camera]
+    if not others:
         return []
-    other = min(ratios, key=lambda name: ratios[name])
+    other = min(others, key=ratio)
     name = f"distance of this camera and {other} to each other's guess over that to their own"
-    return [threshold("swapped_cameras").check(ratios[other], name=name)]
+    return [threshold("swapped_cameras").check(ratio(other), name=name)]
 
 
-def _distance(one: Array, two: Array) -> float:
-    """Between two T_camera_lidar: of the camera's centre [m], and the angle [rad], together."""
+def _squared_distance(one: Array, two: Array) -> float:
+    """Between two T_camera_lidar: centres [m] and angle [rad], with the usual error of a result."""
     degrees, centimetres = pose_difference(one, two)
-    return float(np.radians(degrees)) + centimetres / 100
+    return float(np.radians(degrees) ** 2 + (centimetres / 100) ** 2 + limit("swap_slack") ** 2)
 
 
 def point_distance_checks(evidence: Evidence) -> Checks:

@@ -43,19 +43,34 @@ def check_findings(
             where the error bar holds it.
         tolerance: of the user [deg, cm].
     """
-    z_score = findings.z_score.get(camera)
     shared = None if shared_sigmas is None else np.repeat(shared_sigmas, 3)
     return [
         *_search_checks(findings, camera),
         *_share_checks(findings, camera),
         *check_sigmas("error that the matcher's frames share", shared, tolerance),
-        *([] if z_score is None else [threshold("z_score").check(z_score)]),
+        *_agreement_checks(findings, camera),
     ]
+
+
+def _agreement_checks(findings: MatcherFindings, camera: str) -> list[Check]:
+    """Whether image and cloud agree better than by chance, which some searches measure."""
+    z_score, chance = findings.z_score.get(camera), findings.chance.get(camera)
+    if chance is not None:  # the check of the search has it where the camera was missed
+        return [] if camera in findings.missed else [threshold("chance").check(chance)]
+    return [] if z_score is None else [threshold("z_score").check(z_score)]
 
 
 def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:
     """Whether the matcher's global search found the camera, if it searched."""
     missed, found = findings.missed.get(camera), findings.found.get(camera)
+    chance = findings.chance.get(camera)
+    if missed is not None and chance is not None:
+        text = (
+            f"not found: where image and cloud agree best (z-score {missed:.1f}), a search with "
+            f"nothing to find would agree as well with a probability of {chance:.2g}. One to three "
+            "frames often show too little: give more frames, from more places, or a nearer guess"
+        )
+        return [Check("search", "FAIL", text, missed, kind="search_in_few_frames")]
     if missed is not None:
         text = (
             "no extrinsic within the matcher's range explains the images (best z-score "

@@ -1,10 +1,10 @@
 """The probability that a result is off by more than the tolerance, from which verdicts are cut.
 
 Three ways to be off. Grossly, in a way that checks notice: a logistic model of how bad each check
-is, which can only grow as a check gets worse. By a wrong lens: checks whose value is a probability.
-And by the error bar itself, if it is wide beside the tolerance. The weights are fitted by
-``benchmarks.accuracy.probability``, on results that were made wrong on purpose and right ones, and
-kept in ``probability.json`` with how they were got.
+is, which can only grow as a check gets worse. By a wrong lens, or by a pose that a search found by
+chance: checks whose value is a probability. And by the error bar itself, if it is wide beside the
+tolerance. The weights are fitted by ``benchmarks.accuracy.probability``, on results that were made
+wrong on purpose and right ones, and kept in ``probability.json`` with how they were got.
 """
 
 from __future__ import annotations
@@ -20,11 +20,21 @@ import numpy as np
 from scipy.special import expit, gammaincc
 
 from calibgraph.arrays import Array
-from calibgraph.model.verdict import COMMON_ERROR, PASS_BELOW, Check, ErrorProbability, Verdict
+from calibgraph.model.verdict import (
+    ABOUT_THE_DATA,
+    COMMON_ERROR,
+    PASS_BELOW,
+    Check,
+    ErrorProbability,
+    Verdict,
+)
 from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
 
 TABLES, STRUCTURE = "tables", "structure"
 """The models: of correspondences from any source; of runs of the matcher."""
+
+CHANCE = "chance"
+"""Kind of the check whose value is the probability that a search finds as much by chance."""
 
 _DIRECTIONS = 400  # over which the error bar is integrated: to 1e-3 of a probability's logarithm
 
@@ -61,19 +71,22 @@ def probability_of_checks(checks: Sequence[Check], model: str) -> float:
     if any(value > 1.0 for kind, value in worst.items() if kind not in fitted["weights"]):
         grossly = max(grossly, PASS_BELOW)  # no case had it: what it says is not known
     values = [(k, check.status, check.value) for k, check in zip(kinds, checks, strict=True)]
-    return 1.0 - (1.0 - grossly) * (1.0 - probability_of_lens(values))
+    by_chance = max((value or 0.0 for kind, _, value in values if kind == CHANCE), default=0.0)
+    return 1.0 - (1.0 - grossly) * (1.0 - probability_of_lens(values)) * (1.0 - by_chance)
 
 
 def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
     """The worst of (kind, severity) pairs per kind of check.
 
-    Checks of the lens are left out, as is the check of the stated error, no sign of an error.
+    Checks of the lens are left out, as is the check of the stated error, no sign of an error; and,
+    if it is known how much is found by chance, all that count data: few are no sign either.
     """
     worst: dict[str, float] = {}
     for kind, severity in checks:
-        if kind not in LENS_KINDS and kind != COMMON_ERROR:
-            worst[kind] = max(severity, worst.get(kind, 0.0))
-    return worst
+        worst[kind] = max(severity, worst.get(kind, 0.0))
+    left_out = {*LENS_KINDS, COMMON_ERROR, CHANCE}
+    left_out |= ABOUT_THE_DATA if CHANCE in worst else frozenset()
+    return {kind: severity for kind, severity in worst.items() if kind not in left_out}
 
 
 def contributions(

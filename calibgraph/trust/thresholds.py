@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
 
-from calibgraph.model.threshold import Threshold, in_unit, is_reachable
-from calibgraph.model.verdict import PASS_BELOW, TOLERANCE
+from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE
+from calibgraph.model.threshold import Threshold, in_unit, is_reachable, ratio_of
+from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.lens import MATCH_SHARE
 
@@ -49,10 +50,12 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "Can the translation of the guess be in metres?", "Vehicles are shorter.",
               "is the translation of T_camera_lidar in millimetres?"),
     Threshold("swapped_cameras", "distance of two cameras to each other's guess over that to "
-              "their own", "at least", 0.7, 0.5, "", "Are the images of two cameras swapped?",
-              "Of 1000 guesses each of KITTI's pair, within 2 to 20 deg and 0.2 to 1.5 m, up to "
-              "0.2 % are under 0.7 and none under 0.5; with swapped images 99 and 79 % of those "
-              "within 2 deg, 0.2 m.", "are their images swapped, or their extrinsics in the rig?"),
+              "their own", "at least", 0.7, 0.6, "", "Are the images of two cameras swapped?",
+              "Likelihood ratios of 72 and 460 for a swap. Of 20,000 drawn guesses each of cameras "
+              "54 cm apart, within 2 to 20 deg and 0.2 to 1.5 m, up to 0.7 % are under 0.7 and "
+              "0.15 % under 0.6; with swapped images 100 and 99 % of those within 2 deg, 0.2 m, "
+              "and 90 and 78 % within 5 deg, 0.3 m.",
+              "are their images swapped, or their extrinsics in the rig?"),
     Threshold("point_distance", "median distance of the points", "at most", 200.0, 1000.0, "m",
               "Can the points be in metres?", "LiDARs do not measure farther.",
               "are the clouds in millimetres?"),
@@ -112,6 +115,10 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "image and cloud hardly agree better than by chance; check the guess (p_camera = "
               "T_camera_lidar * p_lidar: its direction, axes and units), the intrinsics, and that "
               "images and clouds belong together"),
+    Threshold("chance", "probability that a search finds as much by chance", "at most",
+              FALSE_ACCEPTANCE, FAIL_ABOVE, "share",
+              "Do images and clouds of one to three frames agree better than by chance?",
+              "The search accepts no more; the verdict's own cut. In place of `z_score`."),
     # the frames
     Threshold("competing_solution", "matches of a competing solution over those of this one",
               "at most", 0.25, 0.5, "share",
@@ -143,7 +150,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
     # the lens, from the residuals and the images
     Threshold("lens", "probability of a wrong one", "at most", 0.005, 0.2, "share",
               "Is focal length, principal point, distortion, fx / fy, skew or time of the images "
-              "wrong, so that the camera is off by more than 0.5 deg or 10 cm?",
+              "wrong, so that the camera is off by more than the tolerance?",
               "The verdict's own cuts. By the posterior of a free lens or clock, once from the "
               "residuals and once from the images, and by `lens_wrong` etc.",
               "check the intrinsics, the image size, and that images are not undistorted twice, "
@@ -203,12 +210,21 @@ THRESHOLDS: tuple[Threshold, ...] = (
 
 @dataclass(frozen=True)
 class Limit:
-    """A number that decides whether a check counts, or that it is compared with."""
+    """A number that decides whether a check counts, or that it is compared with.
+
+    Attributes:
+        key: by which checks look it up.
+        value: the number.
+        unit: of it.
+        meaning: what it decides.
+        of_tolerance: whether it grows with a tolerance above the default.
+    """
 
     key: str
     value: float
     unit: str
     meaning: str
+    of_tolerance: bool = False
 
 
 # fmt: off
@@ -226,10 +242,11 @@ LIMITS: tuple[Limit, ...] = (
           "against displaced extrinsics: at a wrong extrinsic it cannot be measured. KITTI 00 and "
           "the sample: wrong lenses left 3.2 and more."),
     Limit("competing_rotation", 0.3, "deg", "A competing solution this near, and as near as the "
-          "next row, is the same solution."),
-    Limit("competing_translation", 10.0, "cm", "See the row above."),
-    Limit("swap_slack", 0.1, "m + rad", "Added to both distances of swapped cameras: the usual "
-          "error of a result is no evidence of a swap."),
+          "next row, is the same solution: nearer ones differ in the matches at the gate alone.",
+          of_tolerance=True),
+    Limit("competing_translation", 10.0, "cm", "See the row above.", of_tolerance=True),
+    Limit("swap_slack", 0.05, "m, rad", "Added in quadrature to the distances of swapped cameras: "
+          "the usual error of a result is no evidence of a swap."),
     Limit("convention_rotation", 30.0, "deg", "A convention error explains a guess if, undone, it "
           "is this near to the result, and as near as the next row."),
     Limit("convention_translation", 2.5, "m", "See the row above."),
@@ -248,9 +265,10 @@ def threshold(key: str, tolerance: tuple[float, float] = TOLERANCE) -> Threshold
     return _ROWS[key].at(tolerance)
 
 
-def limit(key: str) -> float:
-    """The value of a limit."""
-    return _LIMITS[key].value
+def limit(key: str, tolerance: tuple[float, float] = TOLERANCE) -> float:
+    """The value of a limit, for a tolerance [deg, cm]."""
+    row = _LIMITS[key]
+    return row.value * (max(ratio_of(row.unit, tolerance), 1.0) if row.of_tolerance else 1.0)
 
 
 def thresholds_markdown() -> str:
@@ -261,14 +279,20 @@ def thresholds_markdown() -> str:
         *(_line(row) for row in THRESHOLDS),
         "",
         "\\* At the default tolerance of "
-        f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. The limit of "
-        "FAIL grows with the tolerance, and does not fall below this value.",
+        f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. A limit "
+        "of FAIL, or in the table below, grows with the tolerance, and does not fall below this "
+        "value.",
         "",
         "| key | limit | meaning |",
         "|---|---|---|",
-        *(f"| `{row.key}` | {in_unit(row.value, row.unit)} | {row.meaning} |" for row in LIMITS),
+        *(_limit_line(row) for row in LIMITS),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _limit_line(row: Limit) -> str:
+    scaled = " \\*" if row.of_tolerance else ""
+    return f"| `{row.key}` | {in_unit(row.value, row.unit)}{scaled} | {row.meaning} |"
 
 
 def _line(row: Threshold) -> str:

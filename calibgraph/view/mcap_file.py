@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import needs_extra
 from calibgraph.files import write_atomically
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
@@ -62,7 +62,9 @@ class _Messages:
     """
 
     def __init__(self) -> None:
-        try:
+        with needs_extra(
+            "view", "--mcap needs mcap-protobuf-support and foxglove-schemas-protobuf"
+        ):
             from foxglove_schemas_protobuf import (
                 CameraCalibration_pb2,
                 CompressedImage_pb2,
@@ -74,11 +76,6 @@ class _Messages:
                 PointsAnnotation_pb2,
             )
             from mcap_protobuf.writer import Writer
-        except ImportError as error:
-            raise CalibrationError(
-                "--mcap needs mcap-protobuf-support and foxglove-schemas-protobuf: "
-                f"pip install 'calibgraph[view]' ({error})"
-            ) from error
         self._Writer = Writer
         self._Cloud: Any = PointCloud_pb2.PointCloud
         self._Image: Any = CompressedImage_pb2.CompressedImage

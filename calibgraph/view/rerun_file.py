@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import needs_extra
 from calibgraph.files import cannot_write, write_atomically
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
@@ -51,12 +51,8 @@ def write_rerun(result: Calibration, path: Path | str, *, progress: Progress = n
 
 
 def _import_rerun() -> Any:
-    try:
+    with needs_extra("view", "--rerun needs rerun-sdk"):
         import rerun
-    except ImportError as error:
-        raise CalibrationError(
-            f"--rerun needs rerun-sdk: pip install 'calibgraph[view]' ({error})"
-        ) from error
     return rerun
 
 

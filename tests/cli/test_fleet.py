@@ -10,9 +10,9 @@ from calibgraph.fleet.child import Child
 from calibgraph.fleet.execute import execute
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.task import Outcome, Task
-from calibgraph.simulation.fleet_rows import write_fleet
 from tests.cli.conftest import error_line
 from tests.conftest import Call
+from tests.draws.fleets import write_fleet
 
 
 def run_here(_: Child, task: Task) -> Outcome:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ast
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -16,11 +14,15 @@ import pytest
 from numba import prange
 
 from factors.compiled import compiled
+from factors.kernel_source import source_files
 from tests.conftest import ROOT
 
 MAIN = """
 from factors.compiled import compiled
-from kernels.helper import twice, OFFSET
+from kernels.constants import HALF
+from kernels.helper import twice
+from kernels.other import NAME
+OFFSET = 2 * HALF
 
 @compiled()
 def kernel(x):
@@ -28,12 +30,23 @@ def kernel(x):
 """
 HELPER = """
 from factors.compiled import compiled
-OFFSET = {offset}
 
 @compiled()
 def twice(x):
     return {factor} * x
 """
+CHAIN = {  # what the kernels of main use is in all but last
+    "__init__": "",
+    "main": "from factors.compiled import compiled\nfrom kernels.a import A\n"
+    "from kernels.last import LAST\n@compiled()\ndef kernel(x):\n    return A * x\nL = LAST",
+    "a": "import kernels.b as other\nTWO = 2\ndef scale():\n    return TWO * other.B\nA = scale()",
+    "b": "try:\n    from .c import C\nexcept ImportError:\n    C = 1\n(B, _) = (C, 0)",
+    "c": "from kernels import d\nclass K:\n    value = d.D\nC = K.value",
+    "d": "from kernels.e import E\nD = [0]\nD[0] = E",
+    "e": "from kernels.f import *\nE = F",
+    "f": "F = 3",
+    "last": "LAST = 5",
+}
 CALL = "from kernels.main import kernel\nprint(kernel(3.0), sum(kernel.stats.cache_hits.values()))"
 LOSS = (
     "import numpy as np; from factors.loss import loss_and_weight as kernel\n"
@@ -98,7 +111,7 @@ def test_a_second_process_finds_the_kernels_of_a_lens(tmp_path: Path) -> None:
 def test_the_users_cache_folder_is_the_default(tmp_path: Path) -> None:
     found = [run(LOSS, XDG_CACHE_HOME=str(tmp_path), HOME=str(tmp_path)) for _ in range(2)]
     assert found == [(f"{HUBER} 0", ""), (f"{HUBER} 1", "")]
-    assert [*(tmp_path / "calibgraph").glob("factors-*/*/loss.loss_and_weight-*.nbi")]
+    assert [*(tmp_path / "calibgraph").glob("factors.loss-*/*/loss.loss_and_weight-*.nbi")]
 
 
 @pytest.mark.parametrize(
@@ -127,21 +140,45 @@ def test_a_file_in_the_place_of_the_folder_is_reported_in_one_line(tmp_path: Pat
     assert err.startswith(NOT_KEPT) and err.count("\n") == 1
 
 
-def test_a_change_of_a_callee_or_a_constant_is_noticed(tmp_path: Path) -> None:
-    """Both are in another file than the kernel, whose own file stays the same."""
+def test_a_change_of_a_callee_or_a_constant_is_noticed_and_one_elsewhere_is_not(
+    tmp_path: Path,
+) -> None:
+    """None is in the kernel's own file, which stays the same."""
     folder, cache = tmp_path / "kernels", str(tmp_path / "cache")
     folder.mkdir()
     (folder / "__init__.py").write_text("")
     (folder / "main.py").write_text(MAIN)
-    for factor, offset, hits in ((2.0, 1.0, 0), (2.0, 5.0, 0), (7.0, 5.0, 0), (2.0, 1.0, 1)):
-        (folder / "helper.py").write_text(HELPER.format(factor=factor, offset=offset))
+    cases = ((2, 1, "a", 0), (2, 5, "a", 0), (7, 5, "a", 0), (7, 5, "b", 1), (2, 1, "c", 1))
+    for factor, offset, name, hits in cases:  # the last is the first: its code is kept too
+        (folder / "helper.py").write_text(HELPER.format(factor=float(factor)))
+        (folder / "constants.py").write_text(f"HALF = {offset / 2}")
+        (folder / "other.py").write_text(f"NAME = {name!r}")
         shutil.rmtree(folder / "__pycache__", ignore_errors=True)  # Python compares times
         found = run(CALL, path=tmp_path, NUMBA_CACHE_DIR=cache)
-        assert found == (f"{factor * 3.0 + offset} {hits}", "")  # the first version is kept too
+        assert found == (f"{factor * 3.0 + offset} {hits}", "")
+
+
+def test_what_kernels_use_is_followed_through_all_kinds_of_definitions_and_imports(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "kernels").mkdir()
+    for name, text in CHAIN.items():
+        (tmp_path / "kernels" / f"{name}.py").write_text(text)
+    code = (
+        "import kernels.main; from factors.kernel_source import source_files\n"
+        "print(*sorted(file.stem for file in source_files('kernels.main')))"
+    )
+    assert run(code, path=tmp_path)[0] == "a b c d e f main"
+
+
+def test_the_sums_depend_on_kernels_and_on_the_layout_of_their_tiles_alone() -> None:
+    found = {file.stem for file in source_files("factors.kernel")}
+    assert found >= {"kernel", "kernel_sums", "lens_kernels", "loss", "tile"}
+    assert not found & {"__init__", "block", "lens", "compiled", "projection"}
 
 
 def test_code_that_no_process_has_used_for_a_week_is_removed(tmp_path: Path) -> None:
-    old, recent = tmp_path / "factors-old", tmp_path / "factors-recent"
+    old, recent = tmp_path / "factors.loss-old", tmp_path / "factors.loss-recent"
     old.mkdir()
     recent.mkdir()
     os.utime(old, (0, 0))
@@ -206,38 +243,3 @@ def totals(shared: bool) -> Any:
         return found
 
     return total
-
-
-def test_kernels_use_kernels_and_constants_of_their_own_folder_and_of_factors_alone() -> None:
-    """The cache compares the files of these two folders."""
-    files = [*ROOT.glob("factors/*.py"), *ROOT.glob("calibgraph/**/*.py")]
-    kernels = [file for file in files if re.search(r"^ *@compiled\(", file.read_text(), re.M)]
-    assert len(kernels) > 10
-    for file in kernels:
-        folder = ".".join(file.parent.relative_to(ROOT).parts)
-        for used in _names_in_kernels(ast.parse(file.read_text())):
-            assert used.startswith((f"{folder}.", "factors.", "numba.", "typing.")), used
-
-
-def _names_in_kernels(module: ast.Module) -> set[str]:
-    """What the kernels of a module use of other modules."""
-    imported = {
-        alias.asname or alias.name: f"{node.module}.{alias.name}"
-        for node in ast.walk(module)
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    kernels = [
-        node
-        for node in ast.walk(module)
-        if isinstance(node, ast.FunctionDef)
-        and any("compiled(" in ast.unparse(decorator) for decorator in node.decorator_list)
-    ]
-    names = {
-        node.id
-        for kernel in kernels
-        for statement in kernel.body
-        for node in ast.walk(statement)
-        if isinstance(node, ast.Name)
-    }
-    return {imported[name] for name in names if name in imported}

@@ -17,15 +17,13 @@ from factors import (
     PairBlock,
     ProjectionBlock,
     SurfaceBlock,
-    epipolar_factor,
     pair_block_factor,
-    pair_projection_factor,
     pair_run_sums,
     pair_sums,
-    surface_factor,
     unproject,
 )
 from tests.conftest import FORWARD, KANNALA, RADTAN5
+from tests.factors.pair_factors import epipolar_factor, pair_projection_factor, surface_factor
 
 A, B = 3, 8
 K = {"fx": 718.0, "fy": 710.0, "cx": 607.0, "cy": 185.0}

@@ -7,7 +7,7 @@ import pytest
 
 from calibgraph.fleet.model import FleetModel, fit_fleet
 from calibgraph.fleet.observations import observe
-from calibgraph.simulation.fleet_rows import Fleet, simulate_fleet
+from tests.draws.fleets import Fleet, simulate_fleet
 
 
 @dataclass(frozen=True)

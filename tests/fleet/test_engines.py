@@ -20,7 +20,7 @@ from calibgraph.fleet.manifest import load_manifest
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import run_fleet
 from calibgraph.fleet.task import Limits, Outcome, Task, release
-from calibgraph.simulation.fleet_rows import write_fleet
+from tests.draws.fleets import write_fleet
 from tests.fleet.killing import kill_at_random
 
 JOBS, MANY = 12, 100

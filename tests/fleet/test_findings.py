@@ -10,7 +10,7 @@ from calibgraph.fleet.findings import Finding, find_changes, moved_lidars
 from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
 from calibgraph.model.geometry import retract_all
-from calibgraph.simulation.fleet_rows import CAMERAS, simulate_fleet
+from tests.draws.fleets import CAMERAS, simulate_fleet
 from tests.fleet.conftest import Fitted
 
 

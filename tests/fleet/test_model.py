@@ -11,7 +11,7 @@ from calibgraph.fleet.deviations import Centers, measured_batches, solve_centers
 from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import newest_rows, observe
 from calibgraph.model.geometry import retract_all, to_T_lidar_camera, twists_between
-from calibgraph.simulation.fleet_rows import SPREAD, Fleet, errors_of, simulate_fleet
+from tests.draws.fleets import SPREAD, Fleet, errors_of, simulate_fleet
 from tests.fleet.conftest import Fitted
 
 

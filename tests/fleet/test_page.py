@@ -16,8 +16,8 @@ from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
 from calibgraph.fleet.page import STATES, assess_status, changed_poses, write_fleet_report
 from calibgraph.model.geometry import retract_all
-from calibgraph.simulation.fleet_rows import simulate_fleet
 from tests.conftest import Call
+from tests.draws.fleets import simulate_fleet
 from tests.report.browsing import browser, render
 
 HOSTILE = "</script><b>x"

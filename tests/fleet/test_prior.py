@@ -13,8 +13,8 @@ from calibgraph.fleet.model import FleetModel, fit_fleet
 from calibgraph.fleet.model_files import expected_pose, prior_rig, write_fleet_model
 from calibgraph.fleet.observations import observe
 from calibgraph.model.geometry import relative_transform, twists_between
-from calibgraph.simulation.fleet_rows import CAMERAS, Fleet, simulate_fleet
 from calibgraph.simulation.rigs import rig_of
+from tests.draws.fleets import CAMERAS, Fleet, simulate_fleet
 
 
 @pytest.fixture(scope="module")

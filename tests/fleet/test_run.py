@@ -17,7 +17,7 @@ from calibgraph.fleet.engines import ProcessEngine
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import Summary, run_fleet
 from calibgraph.fleet.task import RETRIES, Limits, Outcome, Task
-from calibgraph.simulation.fleet_rows import write_fleet
+from tests.draws.fleets import write_fleet
 
 POISON = Path(__file__).parent / "poison"
 GOOD, ILL, BROKEN = "car-00001", ("segfault", "hungry", "endless", "bug"), "broken"
@@ -109,6 +109,7 @@ def test_rows_are_what_solve_gives(fleet: Fleet) -> None:
         row = fleet.rows[GOOD, camera]
         assert row["verdict"] == result.camera_verdicts[camera].status
         assert row["cannot_tell"] == result.camera_verdicts[camera].cannot_tell
+        assert row["of"] == "alignment"
         doubt = result.camera_verdicts[camera].error_probability
         assert doubt is not None
         assert row["probability_off"] == pytest.approx(doubt.probability, rel=1e-3)

@@ -12,7 +12,7 @@ from calibgraph import FileError
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import run_fleet
 from calibgraph.fleet.uris import fetch, fingerprint, in_arrow, join, read_bytes
-from calibgraph.simulation.fleet_rows import write_fleet
+from tests.draws.fleets import write_fleet
 
 
 @pytest.fixture

@@ -16,9 +16,9 @@ from calibgraph.matching.protocol import Start, to_full_matcher
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.progress import Progress, no_progress
 from calibgraph.rounds import match_in_rounds
-from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
 from factors import Clock
 from tests.conftest import SAMPLE
+from tests.draws.clocks import draw_twists, put_clock_error
 
 
 class Minimal:
@@ -136,13 +136,35 @@ def test_a_repeated_round_names_what_is_estimated(truth: Rig) -> None:
             return put_clock_error(found, truth, twists, Clock(0.1))
 
     told: list[str] = []
-    match_in_rounds(
+    run = match_in_rounds(
         calibgraph.load_dataset(SAMPLE, truth),
         matcher=Late(),
         config=Config(estimate=("offset",)),
         progress=lambda what, *_: told.append(what),
     )
     assert told[:2] == ["matching", "matching (offset: repeat 1, at most 4)"]
+    assert not run.warnings
+
+
+def test_a_clock_that_does_not_settle_is_warned_of(truth: Rig) -> None:
+    """Every match is of another offset: four repeats, then a line."""
+    offsets_s = [0.0, 0.05, 0.1, 0.15, 0.2, 0.25]
+
+    class Restless(Minimal):
+        knows_motion = True
+
+        def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN202
+            twists = draw_twists(len(dataset.frames), np.random.default_rng(0))
+            return put_clock_error(simulate(dataset, truth), truth, twists, Clock(offsets_s.pop(0)))
+
+    run = match_in_rounds(
+        calibgraph.load_dataset(SAMPLE, truth),
+        matcher=Restless(),
+        config=Config(estimate=("offset",)),
+        progress=no_progress,
+    )
+    assert len(run.rounds) == 5
+    assert run.warnings[-1].startswith("offset: after 4 repeats of the matching still changes by")
 
 
 def test_a_minimal_matcher_calibrates(truth: Rig) -> None:
@@ -196,6 +218,7 @@ FINDINGS = MatcherFindings(
     failed_share={"left": 0.25},
     found={"left": 18.0},
     missed={"right": 3.0},
+    chance={"left": 1e-5, "right": 0.7},
     range_rotation_deg=20.0,
     range_translation_m=1.5,
     systematic_rotation_rad=0.001,
@@ -208,6 +231,7 @@ METADATA = {
     "failed_share": {"left": 0.25},
     "found": {"left": 18.0},
     "missed": {"right": 3.0},
+    "chance": {"left": 1e-5, "right": 0.7},
     "range_rotation_deg": 20.0,
     "range_translation_m": 1.5,
     "systematic_rotation_rad": 0.001,

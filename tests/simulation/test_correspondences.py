@@ -7,10 +7,10 @@ import pytest
 
 import calibgraph
 from calibgraph import Correspondences, MatcherErrors, Rig, simulate_correspondences
-from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.simulation.matcher_errors import PoseSpread
 from calibgraph.simulation.rigs import RIG_NAMES, rig_of
 from calibgraph.solver.joint import solve_joint
+from tests.draws.drives import simulate_drive
 
 
 def residuals(rig: Rig, table: Correspondences, name: str) -> np.ndarray:

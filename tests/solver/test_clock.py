@@ -20,11 +20,11 @@ from calibgraph import (
 )
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import twist_between
-from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
-from calibgraph.simulation.lens_errors import put_lens_error
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from factors import Clock
+from tests.draws.clocks import draw_twists, put_clock_error
+from tests.draws.lenses import put_lens_error
 from tests.solver.test_lens import FIVE_SIGMAS, simulated, squared_errors
 
 STRAIGHT = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])

@@ -13,8 +13,8 @@ import calibgraph
 from calibgraph import Config, MatcherErrors, Rig, simulate_correspondences
 from calibgraph.model.geometry import relative_covariance
 from calibgraph.model.rig import IntrinsicsSigma
-from calibgraph.simulation.place_draws import draw_places
 from calibgraph.solver.joint import solve_joint
+from tests.draws.places import draw_places
 
 pytestmark = pytest.mark.statistics
 

@@ -10,10 +10,10 @@ import pytest
 from calibgraph import MatcherErrors, Rig, concatenate, simulate_correspondences
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.simulation.place_draws import displaced
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.variance_components import VarianceRatios
+from tests.draws.places import displaced
 
 EXACT = MatcherErrors(noise_px=0.3, outlier_share=0.0)
 STATED = {"place_rotation_rad": 1e-3, "place_translation_m": 0.01, "camera_share": 0.0}

@@ -9,10 +9,10 @@ import numpy as np
 
 from calibgraph import Config, Correspondences, IncrementalCalibrator, MatcherErrors, Rig, Update
 from calibgraph.model.geometry import twist_between
-from calibgraph.simulation.clock_errors import put_clock_error
-from calibgraph.simulation.correspondences import simulate_drive
 from calibgraph.simulation.rigs import rig_of
 from factors import Clock
+from tests.draws.clocks import put_clock_error
+from tests.draws.drives import simulate_drive
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.1)
 OFFSET = Config(estimate=("offset",))

@@ -15,7 +15,7 @@ from calibgraph import (
     Rig,
     Update,
 )
-from calibgraph.simulation.correspondences import simulate_drive
+from tests.draws.drives import simulate_drive
 
 Array = np.ndarray
 

@@ -44,9 +44,7 @@ def test_an_unknown_offset_counts_as_far_as_motions_differ() -> None:
     state = State.initial(rig_of("kitti"), OFFSET)
     A = 1e4 * np.random.default_rng(0).normal(size=(6, 20))
     hessian, frames = A @ A.T, np.array(50.0)
-    poses = replace(
-        Sums.zeros(), hessian=hessian, reweighted=hessian, scatter=hessian, frames=frames
-    )
+    poses = Sums.zeros().change(hessian=hessian, reweighted=hessian, scatter=hessian, frames=frames)
     before, turn = with_offset(poses, STRAIGHT), np.array([0, 0, 0.2, 0, 0, 0])
     walk = state.config.tracking.walk_time_offset_s**2 * frames
     for motion, variance in ((STRAIGHT, walk), (STRAIGHT + turn, walk + 0.05**2)):

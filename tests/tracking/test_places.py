@@ -29,7 +29,6 @@ from calibgraph.model.geometry import (
     twist_between,
 )
 from calibgraph.model.rig import IntrinsicsSigma
-from calibgraph.simulation.place_draws import Drawn, draw_places, tied
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.elimination import fit_latent_poses, start_values
 from calibgraph.solver.joint import solve_joint
@@ -48,6 +47,7 @@ from calibgraph.tracking.streams import Refused, StreamFrame
 from calibgraph.tracking.window import Window
 from calibgraph.trust.evidence import Evidence
 from tests.conftest import stereo_relative_pose
+from tests.draws.places import Drawn, draw_places, tied
 from tests.tracking.drives import drive, pair_of, track_draw
 from tests.tracking.test_place_sums import part
 
@@ -205,7 +205,7 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     rig = pair_of()
     tracker = IncrementalCalibrator(rig, Config(of="mount"))
     tracker.update(states(drive(rig, 1)[0], scan_motion_m=0.2))
-    sums = PlaceSums.empty(2).add({"a": replace(part("a", 0)["a"], gradient=np.zeros((2, 6)))})
+    sums = PlaceSums.empty(2).add({"a": part("a", 0)["a"].change(gradient=np.zeros((2, 6)))})
     spread = np.array([2.0 * np.eye(6), 3.0 * np.eye(6)])
     seen = FrameSpread(spread, np.ones(2))
     shifts = 0.1 * np.random.default_rng(0).normal(size=(2, 6, 3))

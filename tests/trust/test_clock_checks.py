@@ -13,14 +13,13 @@ import pytest
 from calibgraph import Config, Correspondences, Rig, solve
 from calibgraph.io.bags import MESSAGE_SUFFIX
 from calibgraph.io.dataset import Dataset
-from calibgraph.io.frame import Frame, MovingFrame
+from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.io.motion import ScanMotion
 from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.verdict import Check
 from calibgraph.progress import Stopwatch
-from calibgraph.simulation.clock_errors import draw_twists, put_clock_error
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.clock_checks import (
     _with_known_motion,
@@ -31,6 +30,7 @@ from calibgraph.trust.clock_checks import (
 from calibgraph.trust.lens_parameter import RESIDUALS, LensParameter
 from calibgraph.trust.run_evidence import RunEvidence
 from factors import Clock
+from tests.draws.clocks import draw_twists, put_clock_error
 from tests.solver.test_lens import FIVE_SIGMAS, simulated
 
 STRAIGHT = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
@@ -53,7 +53,7 @@ def test_an_offset_is_recovered_within_its_sigma(offset_s: float) -> None:
     (seconds,), (sigma,) = found.units * found.values, found.units * found.sigmas
     assert abs(seconds - offset_s) < FIVE_SIGMAS * sigma
     assert sigma < 0.002
-    assert (found.probability > 0.5) == (offset_s != 0.0)
+    assert (found.probability() > 0.5) == (offset_s != 0.0)
     assert f"ms {'earlier' if seconds < 0 else 'later'}" in found.describe()
 
 
@@ -62,7 +62,7 @@ def test_at_rest_and_straight_ahead_nothing_is_known_of_it(twists: np.ndarray) -
     """Less than the 40 ms of an offset that is wrong, so it raises no doubt, and that is told."""
     found = fit(0.05, twists)
     assert 0.002 * found.sigmas[0] > 0.04
-    assert found.probability < 1e-3
+    assert found.probability() < 1e-3
     check = check_offset(found, RESIDUALS)
     assert check.status == "PASS"
     assert "not determined by these data, and taken for right" in check.text
@@ -129,7 +129,7 @@ def run_of(
 def moving_frames(twists: np.ndarray) -> list[Frame]:
     motions = [ScanMotion(tuple(twist.tolist()), 0.0) for twist in twists]
     return [
-        MovingFrame(n, str(n), Path(f"{n}.pcd"), {}, find_motion=lambda found=found: found)
+        Frame(n, str(n), Path(f"{n}.pcd"), {}, find_motion=lambda found=found: found)
         for n, found in enumerate(motions)
     ]
 

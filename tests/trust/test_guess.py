@@ -3,6 +3,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 import calibgraph
 from calibgraph import MatcherErrors, Rig, solve
@@ -10,7 +11,6 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.trust.guess import (
     compare_with_guess,
     compare_with_other_guesses,
-    distances_between,
 )
 from tests.trust.conftest import named, simulated
 
@@ -35,18 +35,48 @@ def test_swapped_cameras_are_named(pair: Rig) -> None:
     swapped = dict(zip(right, reversed(right.values()), strict=True))
     guess = calibgraph.perturb(pair, rotation_deg=2, translation_m=0.2, seed=3).T_camera_lidar
     for name in right:
-        (check,) = compare_with_other_guesses(name, distances_between(guess, right))
+        (check,) = compare_with_other_guesses(name, guess, right)
         assert check.status == "PASS"
-        (check,) = compare_with_other_guesses(name, distances_between(guess, swapped))
+        (check,) = compare_with_other_guesses(name, guess, swapped)
         assert check.status != "PASS" and "are their images swapped" in check.text
     # Lenses of one housing, and results that are off by more than these are apart.
     near = {"left": np.eye(4), "right": np.eye(4)}
     near["right"][0, 3] = 0.02
     for results in (near, dict(zip(near, reversed(near.values()), strict=True))):
-        (check,) = compare_with_other_guesses("left", distances_between(near, results))
+        (check,) = compare_with_other_guesses("left", near, results)
         assert check.status == "PASS"
-    alone = distances_between({"left": guess["left"]}, {"left": right["left"]})
-    assert compare_with_other_guesses("left", alone) == []
+    alone = {"left": guess["left"]}, {"left": right["left"]}
+    assert compare_with_other_guesses("left", *alone) == []
+
+
+def test_beside_a_lost_camera_the_found_one_is_compared_alone(pair: Rig) -> None:
+    guess = calibgraph.perturb(pair, rotation_deg=1, translation_m=0.1, seed=3).T_camera_lidar
+    right = pair.T_camera_lidar["left"]
+    (check,) = compare_with_other_guesses("left", guess, {"left": right})
+    assert check.status == "PASS"
+    (check,) = compare_with_other_guesses("left", guess, {"left": pair.T_camera_lidar["right"]})
+    assert check.status != "PASS" and "right" in check.name
+
+
+@pytest.mark.parametrize(
+    ("degrees", "metres", "false_fails", "named"),
+    [(2.0, 0.2, 0.002, 0.9), (10.0, 0.5, 0.01, 0.1), (20.0, 1.5, 0.01, 0.0)],
+)
+def test_a_swap_is_named_as_far_as_the_guesses_can_show_it(
+    pair: Rig, degrees: float, metres: float, false_fails: float, named: float
+) -> None:
+    right = pair.T_camera_lidar
+    swapped = dict(zip(right, reversed(right.values()), strict=True))
+    statuses: dict[bool, list[str]] = {True: [], False: []}
+    for seed in range(300):
+        drawn = calibgraph.perturb(
+            pair, rotation_deg=degrees, translation_m=metres, seed=seed, uniform=True
+        )
+        for is_swapped, results in ((False, right), (True, swapped)):
+            (check,) = compare_with_other_guesses("left", drawn.T_camera_lidar, results)
+            statuses[is_swapped].append(check.status)
+    assert statuses[False].count("FAIL") <= false_fails * 300
+    assert statuses[True].count("FAIL") >= named * 300
 
 
 def test_points_in_millimetres_fail(pair: Rig) -> None:

@@ -92,6 +92,23 @@ def test_a_camera_without_structure_gets_a_warning(
     assert "structure in both image and cloud" in checks[0].text
 
 
+def test_a_camera_that_was_not_found_has_no_pose_to_check(
+    dataset: Dataset, truth: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured: list[str] = []
+
+    def measure(_: Dataset, rig: Rig, **__: object) -> dict[str, ImageEvidence]:
+        measured.extend(rig.cameras)
+        return dict.fromkeys(rig.cameras, ImageEvidence(0))
+
+    monkeypatch.setattr(image_checks, "measure_image_evidence", measure)
+    missed = EMPTY.with_metadata({"missed": {NAME: 5.0}})
+    others = truth.cameras.keys() - {NAME}
+    assert check_images(dataset, truth, missed).keys() == {*measured} == others
+    alone = Rig(cameras={NAME: truth.cameras[NAME]})
+    assert check_images(dataset, alone, missed) == {}
+
+
 def test_frames_are_named_by_number_and_file() -> None:
     found = ImageEvidence(100, displaced_z_score=5.0, frames_best=0.5, frames_lost=(3, 5))
     (check,) = (c for c in evidence_checks(found, NAMES) if c.value == 0.5)

@@ -14,7 +14,7 @@ import pytest
 
 import calibgraph
 from calibgraph import Camera, Dataset, Rig
-from calibgraph.io.frame import DrivenFrame
+from calibgraph.io.frame import Frame
 from calibgraph.model.places import Places
 from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
 from calibgraph.trust import lens_evidence
@@ -114,7 +114,7 @@ def test_the_lens_is_applied_to_points_where_they_are_when_they_are_seen(
     late = truth.model_copy(update={"time_offset_s": 0.05})
     data, twist = calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: late})), np.arange(6.0)
     files = [(f.index, f.name, f.cloud_path, f.image_paths) for f in data.frames[:2]]
-    moving = tuple(DrivenFrame(*each, find_twist=lambda: twist) for each in files)
+    moving = tuple(Frame(*each, find_twist=lambda: twist) for each in files)
     with ThreadPoolExecutor(2) as pool:
         scorer = FrameScorer(replace(data, frames=moving), moving, pool)
         images = scorer.load_images(NAME, late)
@@ -129,7 +129,7 @@ def test_the_lens_is_applied_to_points_where_they_are_when_they_are_seen(
 def test_frames_of_one_content_are_one_frame_which_shows_no_significance(truth: Camera) -> None:
     camera = change_lens(truth, FOCAL, 0.03)
     found = measure(camera, stop=tuple(range(6)))
-    assert all(math.isnan(each.sigma) and each.probability == 0.0 for each in found)
+    assert all(math.isnan(each.sigma) and each.probability() == 0.0 for each in found)
     assert CALIBRATED * abs(found[0].values[0]) > 0.01  # noqa: PLR2004
 
 

@@ -71,3 +71,39 @@ def test_an_error_that_is_in_the_error_bar_is_not_listed_as_zero(pair: Rig) -> N
     with_error = replace(table, metadata={"systematic_rotation_rad": 0.001})
     verdict = calibgraph.solve(pair, with_error).camera_verdicts["left"]
     assert not [check.name for check in verdict.checks if "frames share" in check.name]
+
+
+def test_a_search_that_measured_chance_is_judged_by_that_and_by_nothing_else(pair: Rig) -> None:
+    """In one frame, which all checks that count data are about."""
+    table = calibgraph.simulate_correspondences(pair, frames=1, matches=200)
+    low = {"z_score": {"left": 3.0, "right": 3.0}}
+    found = {"found": {"left": 12.0, "right": 12.0}, "chance": {"left": 2e-4, "right": 1e-6}}
+    blamed = calibgraph.solve(pair, replace(table, metadata=STATED | low)).camera_verdicts
+    assert blamed["left"].status == "FAIL"
+    verdicts = calibgraph.solve(pair, replace(table, metadata=STATED | low | found)).camera_verdicts
+    assert verdicts["left"].status == verdicts["right"].status == "WARN"
+    assert verdicts["left"].cannot_tell
+    kinds = {check.kind for check in verdicts["left"].checks}
+    assert "chance" in kinds and "z_score" not in kinds
+    by_checks = [verdicts[name].error_probability.by_checks for name in ("left", "right")]  # type: ignore[union-attr]
+    assert by_checks[0] - by_checks[1] == pytest.approx(2e-4, rel=0.02)
+
+
+def test_a_camera_that_few_frames_do_not_show_fails_for_that_reason(pair: Rig) -> None:
+    """Neither swapped images nor pairing are blamed; the other camera keeps its verdict."""
+    swapped = dict(zip(pair.cameras, reversed(pair.T_camera_lidar.values()), strict=True))
+    table = calibgraph.simulate_correspondences(pair, frames=1, matches=200)
+    metadata = STATED | {
+        "z_score": {"left": 3.0, "right": 9.0},
+        "found": {"right": 12.0},
+        "missed": {"left": 8.0},
+        "chance": {"left": 0.3, "right": 1e-5},
+    }
+    guess = pair.moved_to({"left": swapped["left"]})  # the result of the left is at the other's
+    result = calibgraph.solve(guess, replace(table, metadata=metadata))
+    first = result.summary.reasons[0]
+    assert first.cameras == ("left",) and first.text.startswith("not found: ")
+    assert "with a probability of 0.3" in first.text
+    assert result.summary.actions[0].startswith("Record at least 5 frames")
+    assert not [text for text in result.verdict.reasons if "swapped" in text]
+    assert result.camera_verdicts["right"].status == "WARN"

@@ -94,10 +94,7 @@ def _pixels(message: Any, channels: int, kind: str, where: str) -> NDArray[Any]:
     step = max(message.step, width * item)
     data = np.ascontiguousarray(message.data)
     if not height * width or len(data) < step * (height - 1) + width * item:
-        raise DatasetError(
-            f"{where}: has {len(data)} bytes for {message.width}x{height} px, encoding "
-            f"{message.encoding!r}; record it again"
-        )
+        raise _incomplete(message, where)
     rows = np.lib.stride_tricks.as_strided(data, (height, width * item), (step, 1), writeable=False)
     pixels = np.ascontiguousarray(rows).view(kind)
     return pixels if channels == 1 else pixels.reshape(height, -1, channels)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
-from calibgraph.io.point_fields import find_intensity
+from calibgraph.io.point_fields import find_intensity, make_cloud
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _TIMES = ("t", "time", "timestamp", "offset_time", "time_offset")  # Ouster, Velodyne, Hesai, Livox
@@ -72,11 +72,9 @@ def _seconds_after(stamp: Any, times: NDArray[Any], where: str) -> NDArray[np.fl
 def _all_points(message: Any, where: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """(n, 4) all points, and (n,) which are returns."""
     points = _structured(message, where)
-    cloud = np.full((len(points), 4), np.nan, dtype=np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, or is a signalling NaN
-        for column, name in enumerate(points.dtype.names or ()):
-            cloud[:, column] = points[name]
-        xyz = cloud[:, :3]
+    cloud = make_cloud(*(points[name] for name in points.dtype.names or ()))
+    xyz = cloud[:, :3]
+    with np.errstate(invalid="ignore"):  # a signalling NaN
         returned: NDArray[np.bool_] = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)
     return cloud, returned
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calibgraph.io.bags.messages import CLOUDS, Bag, Message
 from calibgraph.io.bags.options import Stamps
 from calibgraph.io.bags.point_clouds import has_points
+from calibgraph.io.bags.transforms import stamp_ns_of
 
 _S = 1_000_000_000
 
@@ -37,8 +38,7 @@ class TopicStamps:
 
     def add(self, message: Message, bag: Bag, stamps: Stamps) -> None:
         """Count the message in, or why it is left out."""
-        header = message.content.header.stamp
-        stamp_ns = _to_ns(header) if stamps == "header" else message.record_ns
+        stamp_ns = stamp_ns_of(message.content) if stamps == "header" else message.record_ns
         if stamp_ns in self._seen:
             self.repeated += 1
             return
@@ -52,11 +52,6 @@ class TopicStamps:
         self.paths.append(path)
         self.record_ns.append(message.record_ns)
         self.stamp_ns.append(stamp_ns)
-
-
-def _to_ns(stamp: object) -> int:
-    """Nanoseconds of a ROS time."""
-    return int(stamp.sec) * _S + int(stamp.nanosec)  # type: ignore[attr-defined]
 
 
 def read_stamps(

@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePath
 
-from calibgraph.errors import CalibrationError, FileError, in_words
+from calibgraph.errors import CalibrationError, FileError, in_words, needs_extra
 from calibgraph.files import read_yaml
 from calibgraph.io.bags.recording import Recording, topics_by_name
 
@@ -34,14 +34,9 @@ def open_recording(path: Path) -> Recording:
         Exception: what the libraries raise for a damaged bag.
     """
     _require_closed(path)
-    try:
+    with needs_extra("ros", f"{path}: reading ROS bags needs rosbags and mcap"):
         from calibgraph.io.bags.mcap_files import McapFile
         from calibgraph.io.bags.rosbags_files import RosbagsFile
-    except ImportError as error:
-        raise CalibrationError(
-            f"{path}: reading ROS bags needs rosbags and mcap: pip install 'calibgraph[ros]' "
-            f"({error})"
-        ) from error
     if path.is_dir():
         files = _files_of(path)
         return BagFolder(files) if files else RosbagsFile(path)

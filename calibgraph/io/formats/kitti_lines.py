@@ -22,6 +22,7 @@ from calibgraph.errors import FileError
 from calibgraph.files import read_text
 from calibgraph.io.formats.part import ONLY_CAMERA, FrameLink, Part
 from calibgraph.io.formats.rig_export import frame_id
+from calibgraph.io.kitti import matrix_of_line
 from calibgraph.io.lenses import CameraLens, intrinsics_of_matrix
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import rigid_transform
@@ -124,13 +125,7 @@ def _row(text: str) -> list[float]:
 
 
 def _matrix(lines: dict[str, list[float]], key: str, shape: tuple[int, int], path: Path) -> Array:
-    found = np.array(lines.get(key, []))
-    if found.size != shape[0] * shape[1] or not np.isfinite(found).all():
-        raise FileError(
-            path, f"line {key!r} has {found.size} numbers, expected {shape[0] * shape[1]} finite "
-            "ones"
-        )  # fmt: skip
-    return found.reshape(shape)
+    return matrix_of_line(path, key, np.array(lines.get(key, [])), shape)
 
 
 def _rigid(row: list[float], path: Path, what: str) -> Array:

@@ -1,14 +1,13 @@
 """The learned matcher CMRNext: its network, weights, matcher and training. Needs torch."""
 
-try:
-    import torch as _torch  # noqa: F401
-except ModuleNotFoundError as error:
-    from calibgraph.errors import CalibrationError
+from calibgraph.errors import needs_extra
 
-    raise CalibrationError(
-        "the matcher cmrnext needs torch, which is not installed: pip install 'calibgraph[learned]'"
-        " (without a GPU: pip install torch --index-url https://download.pytorch.org/whl/cpu first)"
-    ) from error
+with needs_extra(
+    "learned",
+    "the matcher cmrnext needs torch (without a GPU, first pip install torch --index-url "
+    "https://download.pytorch.org/whl/cpu)",
+):
+    import torch as _torch  # noqa: F401
 
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint, load_checkpoint
 from calibgraph.matching.cmrnext.matcher import CmrNextMatcher

@@ -63,6 +63,11 @@ def least_z_score(tries: float, chance: Chance = SEARCH) -> float:
     return chance.raised + chance.scale * math.log(tries / FALSE_ACCEPTANCE)
 
 
+def probability_by_chance(z_score: float, tries: float, chance: Chance = SEARCH) -> float:
+    """The probability that a search with nothing to find ends at this z-score or a higher one."""
+    return min(1.0, tries * math.exp((chance.raised - z_score) / chance.scale))
+
+
 def are_accepted(z_scores: Iterable[float], tries: float) -> bool:
     """Whether poses of several cameras, one of each, are accepted together."""
     excess = sum(max(0.0, z_score - SEARCH.raised) for z_score in z_scores)

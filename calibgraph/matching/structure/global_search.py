@@ -12,9 +12,9 @@ taken.
 
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from calibgraph.matching.structure.acceptance import least_z_score
+from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE, least_z_score
 from calibgraph.matching.structure.bodies import Body, lead, place_member, rigid_bodies
 from calibgraph.matching.structure.box_search import CANDIDATES
 from calibgraph.matching.structure.pose_refinement import CameraFrames, Candidate
@@ -43,11 +43,14 @@ class Located:
         z_score: agreement of image and cloud there, in standard deviations of chance agreement; of
             the whole body.
         accepted: whether that is far better than by chance.
+        chance: the probability that a search with nothing to find ends as high; in few frames
+            alone, where an accepted camera is at its pose by the fine levels.
     """
 
     camera: Camera
     z_score: float
     accepted: bool
+    chance: float | None = None
 
 
 def locate_cameras(
@@ -108,16 +111,13 @@ class Locator:
 
     def _consider(self, name: str, candidate: Candidate, tries: float) -> bool:
         """Keep a candidate if it is the best of its body, and locate the body if it is accepted."""
+        looked_at = self._search.second_look(candidate, tries)
         if name not in self.best or candidate.z_score > self.best[name].z_score:
-            self.best[name] = candidate
-        if not self._is_accepted(candidate, tries):
+            self.best[name] = replace(candidate, chance=looked_at.chance)
+        if not _is_accepted(looked_at, tries):
             return False
-        self.located[name] = candidate
+        self.located[name] = looked_at
         return True
-
-    def _is_accepted(self, candidate: Candidate, tries: float) -> bool:
-        enough = candidate.z_score >= least_z_score(tries)
-        return enough or self._search.stands_second_look(candidate, tries)
 
     def _propose(self) -> bool:
         """Let the best located body that has not proposed yet propose poses for all others."""
@@ -188,7 +188,7 @@ class Locator:
             near = self._near[name]
             enough = near.z_score >= least_z_score(ALONE)  # no second look: tunnels are alike
             if enough and _is_same_pose(near.body, self.best[name].body):
-                self.located[name] = near
+                self.located[name] = self._search.second_look(near, ALONE)
                 return True
         return False
 
@@ -232,10 +232,16 @@ class Locator:
     def _result(self) -> dict[str, Located]:
         found = {name: self.located.get(name, self.best[name]) for name in self._bodies}
         return {
-            member: Located(camera, found[name].z_score, name in self.located)
+            member: Located(camera, found[name].z_score, name in self.located, found[name].chance)
             for name in self._bodies
             for member, camera in found[name].body.items()
         }
+
+
+def _is_accepted(candidate: Candidate, tries: float) -> bool:
+    if candidate.chance is not None:
+        return candidate.chance <= FALSE_ACCEPTANCE
+    return candidate.z_score >= least_z_score(tries)
 
 
 def _distinct(bodies: Iterable[Body]) -> list[Body]:

@@ -44,7 +44,8 @@ from factors import displace
 _TRACKING_ROUNDS = (2, 4)
 _ROUND_AFTER_SEARCH = 3
 """The round that follows a search, if it is confident of all cameras. With a sparse LiDAR, poses of
-lower z-scores were 2 degrees off, and the first rounds corrected them."""
+lower z-scores were 2 degrees off, and the first rounds corrected them. In few frames the search
+itself ends at the fine levels, and coarse rounds would lose what it has found."""
 
 FRAME_WINDOWS = 6_000  # bounds the time of a single frame
 SHARING_FRAMES = 20
@@ -202,7 +203,8 @@ class StructureMatcher:
         ):  # a search at the lens and clock of the rig ends where these are made up for
             return 0
         confident = all(c.accepted and c.z_score >= CONFIDENT for c in candidates.values())
-        return min(_ROUND_AFTER_SEARCH, self.rounds - 1) if confident else 0
+        looked_at = any(c.accepted and c.chance is not None for c in candidates.values())
+        return min(_ROUND_AFTER_SEARCH, self.rounds - 1) if confident or looked_at else 0
 
     def _submit_scores(
         self, cache: FrameCache, frames: Sequence[Frame], rig: Rig, level: Level, *, cores: Executor
@@ -279,6 +281,7 @@ def _search_findings(
     return MatcherFindings(
         found={n: c.z_score for n, c in candidates.items() if c.accepted},
         missed={n: max(0.0, c.z_score) for n, c in candidates.items() if not c.accepted},
+        chance={n: c.chance for n, c in candidates.items() if c.chance is not None},
         range_rotation_deg=search_range.rotation_deg,
         range_translation_m=search_range.translation_m,
     )

@@ -62,11 +62,19 @@ class CameraFrames:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A candidate pose of a body."""
+    """A candidate pose of a body.
+
+    Attributes:
+        body: at that pose.
+        z_score: of the last level of a refinement.
+        stands_out: whether displaced poses agree far less.
+        chance: the probability that a search with nothing to find ends as high; None if unknown.
+    """
 
     body: Body
     z_score: float
     stands_out: bool = False
+    chance: float | None = None
 
     @property
     def is_beyond_doubt(self) -> bool:

@@ -8,7 +8,11 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibgraph.matching.structure.acceptance import least_z_score, second_look_chance
+from calibgraph.matching.structure.acceptance import (
+    FALSE_ACCEPTANCE,
+    probability_by_chance,
+    second_look_chance,
+)
 from calibgraph.matching.structure.bodies import Body, lead, place, place_member, rigid_bodies
 from calibgraph.matching.structure.box_search import BodyMaps, Box, search_box
 from calibgraph.matching.structure.common_features import CommonFeatures
@@ -137,15 +141,22 @@ class PoseSearch:
             if self.out_of_time():
                 return
 
-    def stands_second_look(self, candidate: Candidate, tries: float) -> bool:
-        """Whether the fine levels, too, agree with a candidate far better than by chance.
+    def second_look(self, candidate: Candidate, tries: float) -> Candidate:
+        """In few frames, the candidate at the fine levels, and how probable it is by chance.
 
-        In few frames right poses are too near to chance for the last level of the search alone.
+        There right poses are too near to chance for the last level of the search alone. With more
+        frames, the candidate itself.
         """
-        if not self._few or candidate.z_score < FEW_PROMISING:
-            return False
-        chance = second_look_chance(self._mirrored_evidence, len(ROLLS_RAD))
-        return self._evidence(candidate) >= least_z_score(tries, chance)
+        if not self._few:
+            return candidate
+        chance = probability_by_chance(candidate.z_score, tries)
+        if chance > FALSE_ACCEPTANCE and candidate.z_score < FEW_PROMISING:
+            return replace(candidate, chance=chance)
+        fine = look_again(self._frames, candidate.body)
+        if chance > FALSE_ACCEPTANCE:
+            mirrored = second_look_chance(self._mirrored_evidence, len(ROLLS_RAD))
+            chance = probability_by_chance(candidate.z_score + fine.z_score, tries, mirrored)
+        return replace(candidate, body=fine.body, chance=chance)
 
     def _evidence(self, candidate: Candidate) -> float:
         return candidate.z_score + look_again(self._frames, candidate.body).z_score

@@ -140,5 +140,5 @@ def _rounded(values: Array) -> list[float]:
 
 def _gelu(values: Array) -> Array:
     """The Gaussian error linear unit, by its approximation with a hyperbolic tangent."""
-    inner = math.sqrt(2 / math.pi) * (values + 0.044715 * values**3)
+    inner = math.sqrt(2 / math.pi) * values * (1.0 + 0.044715 * values * values)
     return np.asarray(0.5 * values * (1.0 + np.tanh(inner)))

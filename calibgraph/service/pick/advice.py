@@ -6,8 +6,8 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.rig import Camera
-from calibgraph.service.pick.joint import pixel_jacobians
 from calibgraph.service.pick.session import PICK_SIGMA_PX
+from calibgraph.solver.camera_twist import project_with_jacobian
 
 TOLERABLE: Array = np.repeat([np.radians(0.15), 0.05], 3)
 """Errors of rotation [rad] and translation [m] that weigh alike: 0.15 deg, 5 cm."""
@@ -71,7 +71,7 @@ def _share_left(camera: Camera, covariance: Array, scale: float, points_m: Array
     """(n,) standard deviation along the weakest direction with one more pair, over that without."""
     values, vectors = np.linalg.eigh(covariance / np.outer(TOLERABLE, TOLERABLE))
     weak = vectors[:, -1] * np.sqrt(values[-1])  # C' w = lambda w, in tolerable units
-    J = pixel_jacobians(camera, points_m) * TOLERABLE / (scale * PICK_SIGMA_PX)
+    J = project_with_jacobian(camera, points_m)[1] * TOLERABLE / (scale * PICK_SIGMA_PX)
     scaled = covariance / np.outer(TOLERABLE, TOLERABLE)
     # w^T (C - C J^T (I + J C J^T)^-1 J C) w over w^T C w, for the unit eigenvector of C.
     along = J @ weak

@@ -18,16 +18,17 @@ from calibgraph.model.config import Config
 from calibgraph.model.geometry import pose_rows
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.service.pick.session import Pair, pixels_of, points_of, sigmas_of
-from calibgraph.solver.curvature import pose_hessian
+from calibgraph.solver.camera_twist import project_with_jacobian
+from calibgraph.solver.curvature import invert_or_none, pose_hessian
 from calibgraph.solver.optimizer import optimize
-from factors import ProjectionBlock, unit_diagonal
+from factors import ProjectionBlock
 
 PSEUDO_RESIDUALS = 8.0
 """Residuals of the stated sigma that are added to the measured ones: those of four pairs, so that
 the error bar rests on the statement while there are fewer than that, and on the residuals later."""
 
 _POSE = 6
-_FREE = 1e-9  # smallest eigenvalue of a unit-diagonal Hessian: below, a direction is free
+_FREE = 1e-9  # smallest over largest eigenvalue of a unit-diagonal Hessian: below, one is free
 _SCALINGS = 3  # the scale only moves the solution where relative poses take part
 
 
@@ -77,7 +78,7 @@ def solve_pairs(rig: Rig, pairs: Mapping[str, Sequence[Pair]]) -> JointSolve:
         )
         scale = float(np.sqrt((PSEUDO_RESIDUALS + squares) / (PSEUDO_RESIDUALS + max(freedom, 0))))
     hessian = pose_hessian(_graph(rig, pairs, scale), list(rig.cameras), rig.T_camera_lidar)
-    return JointSolve(rig, _inverse(hessian), scale, freedom)
+    return JointSolve(rig, invert_or_none(hessian, least=_FREE), scale, freedom)
 
 
 def _graph(
@@ -99,32 +100,12 @@ def _block(camera: Camera, pairs: Sequence[Pair], scale: float) -> ProjectionBlo
     )
 
 
-def _inverse(hessian: Array) -> Array | None:
-    """The inverse of a Hessian; None if a direction is free."""
-    scaled, units = unit_diagonal(hessian)
-    values, vectors = np.linalg.eigh(scaled)
-    if values[0] < _FREE:
-        return None
-    inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
-    return inverse
-
-
 def whitened_residuals(camera: Camera, pairs: Sequence[Pair]) -> Array:
     """(n, 2) projection less pixel, over the stated sigma."""
     T = camera.T_camera_lidar
     projected, _ = camera.lens.project(points_of(pairs) @ T[:3, :3].T + T[:3, 3])
     residuals: Array = (projected - pixels_of(pairs)) / sigmas_of(pairs)[:, None]
     return residuals
-
-
-def pixel_jacobians(camera: Camera, points_lidar_m: Array) -> Array:
-    """(n, 2, 6) derivatives of pixels by xi in T_camera_lidar = exp(xi) T [px/rad, px/m]."""
-    T = camera.T_camera_lidar
-    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    _, by_point = camera.lens.project_with_jacobian(points)
-    # exp(xi) p = p + w x p + v: by w it is -[p]x, by v the identity.
-    by_rotation = np.cross(points[:, None, :], by_point)
-    return np.concatenate([by_rotation, by_point], axis=2)
 
 
 FALSE_ALARMS = 0.01
@@ -163,7 +144,7 @@ def influences(
 def _of_camera(solve: JointSolve, name: str, pairs: Sequence[Pair], count: int) -> list[Influence]:
     camera, sigmas = solve.rig.cameras[name], sigmas_of(pairs)
     residuals = whitened_residuals(camera, pairs)
-    jacobians = pixel_jacobians(camera, points_of(pairs)) / sigmas[:, None, None]
+    jacobians = project_with_jacobian(camera, points_of(pairs))[1] / sigmas[:, None, None]
     covariance = solve.covariance_of(name)
     return [
         _influence(

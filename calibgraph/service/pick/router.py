@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import cv2
 import uvicorn
-from fastapi import APIRouter, FastAPI, Query, Response
+from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
 from fastapi.responses import FileResponse, RedirectResponse
 from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel, ConfigDict, Field
@@ -65,128 +65,145 @@ class PairChange(_Body):
     used: bool | None = None
 
 
-def pick_router(workspace: Workspace) -> APIRouter:
-    """The routes of a session."""
-    router = APIRouter(responses=documented(404, 409, 422))
-    _add_page(router)
-    _add_data(router, workspace)
-    _add_changes(router, workspace)
-    return router
+router = APIRouter(responses=documented(404, 409, 422))
 
 
-def _add_page(router: APIRouter) -> None:
-    @router.get("/", include_in_schema=False)
-    def home() -> Response:
-        return RedirectResponse("/pick")
-
-    @router.get("/pick", include_in_schema=False)
-    def page() -> Response:
-        return FileResponse(STATIC_PAGE, media_type="text/html")
+async def _workspace(request: Request) -> Workspace:
+    workspace: Workspace = request.app.state.workspace
+    return workspace
 
 
-def _add_data(router: APIRouter, workspace: Workspace) -> None:
-    @router.get("/v1/pick/session")
-    def session(caller: Reader) -> SessionAnswer:
-        """The frames, the cameras and the pairs."""
-        return session_answer(workspace)
-
-    @router.get("/v1/pick/estimate")
-    def estimate(
-        caller: Reader, frame: int | None = None, camera: str | None = None
-    ) -> EstimateAnswer:
-        """What the pairs determine; with a frame and a camera, where to pick next."""
-        revision, found = workspace.session.revision, workspace.estimate()
-        given = frame is not None and camera is not None
-        advice = workspace.advice(frame or 0, camera or "") if given else None
-        return estimate_answer(revision, found, advice)
-
-    @router.get("/v1/pick/frames/{frame}/images/{camera}", response_class=Response)
-    def image(caller: Reader, frame: int, camera: str) -> Response:
-        """The image as recorded, PNG."""
-        _, data = cv2.imencode(".png", workspace.image(frame, camera))
-        return Response(data.tobytes(), media_type="image/png")
-
-    @router.get("/v1/pick/frames/{frame}/cloud", response_class=Response)
-    def cloud(caller: Reader, frame: int) -> Response:
-        """The cloud: x y z [m] and intensity of each point, float32, little-endian."""
-        data = workspace.cloud(frame).astype("<f4").tobytes()
-        return Response(data, media_type="application/octet-stream")
-
-    @router.get("/v1/pick/frames/{frame}/visible/{camera}", response_class=Response)
-    def visible(caller: Reader, frame: int, camera: str, pose: Pose = "guess") -> Response:
-        """The points in view that nothing hides: count, rows, columns, lines, distances."""
-        seen = workspace.visible(frame, camera, estimated=pose == "estimate")
-        return Response(seen.to_bytes(), media_type="application/octet-stream")
-
-    @router.get("/v1/pick/frames/{frame}/corner/{camera}")
-    def corner(
-        caller: Reader,
-        frame: int,
-        camera: str,
-        *,
-        u: Annotated[float, Query(ge=-1e5, le=1e5)],
-        v: Annotated[float, Query(ge=-1e5, le=1e5)],
-    ) -> CornerAnswer:
-        """The corner near a pixel."""
-        found = workspace.corner(frame, camera, (u, v))
-        pixel = None if found is None else (float(found[0]), float(found[1]))
-        return CornerAnswer(pixel_px=pixel)
+Work = Annotated[Workspace, Depends(_workspace)]
+"""A parameter of routes: the session with its dataset."""
 
 
-def _add_changes(router: APIRouter, workspace: Workspace) -> None:
-    def changed(revision: int, change: Change) -> SessionAnswer:
-        try:
-            workspace.change(revision, change)
-        except StaleError:
-            raise Problem(
-                409, "the session was changed in another window; reload the page"
-            ) from None
-        return session_answer(workspace)
+@router.get("/", include_in_schema=False)
+def home() -> Response:
+    """To the page."""
+    return RedirectResponse("/pick")
 
-    @router.post("/v1/pick/pairs", status_code=201)
-    def add(caller: Submitter, body: NewPair) -> SessionAnswer:
-        """Add a pair."""
-        pair = _pair(workspace, body)
-        return changed(body.revision, lambda session: _with(session, [*session.pairs, pair]))
 
-    @router.patch("/v1/pick/pairs/{place}")
-    def alter(caller: Submitter, place: Place, body: PairChange) -> SessionAnswer:
-        """Move a pair's pixel, or leave it out of the estimate."""
-        update = body.model_dump(exclude={"revision"}, exclude_none=True)
+@router.get("/pick", include_in_schema=False)
+def page() -> Response:
+    """The page."""
+    return FileResponse(STATIC_PAGE, media_type="text/html")
 
-        def change(session: Session) -> Session:
-            pairs = _pairs_with(session, place)
-            pairs[place] = pairs[place].model_copy(update=update)
-            return session.with_pairs(pairs)
 
-        return changed(body.revision, change)
+@router.get("/v1/pick/session")
+def session(caller: Reader, workspace: Work) -> SessionAnswer:
+    """The frames, the cameras and the pairs."""
+    return session_answer(workspace)
 
-    @router.post("/v1/pick/pairs/{place}/remove")
-    def remove(caller: Submitter, place: Place, body: Revision) -> SessionAnswer:
-        """Remove a pair."""
 
-        def change(session: Session) -> Session:
-            pairs = _pairs_with(session, place)
-            return session.with_pairs([*pairs[:place], *pairs[place + 1 :]])
+@router.get("/v1/pick/estimate")
+def estimate(
+    caller: Reader, workspace: Work, frame: int | None = None, camera: str | None = None
+) -> EstimateAnswer:
+    """What the pairs determine; with a frame and a camera, where to pick next."""
+    revision, found = workspace.session.revision, workspace.estimate()
+    given = frame is not None and camera is not None
+    advice = workspace.advice(frame or 0, camera or "") if given else None
+    return estimate_answer(revision, found, advice)
 
-        return changed(body.revision, change)
 
-    @router.post("/v1/pick/undo")
-    def undo(caller: Submitter, body: Revision) -> SessionAnswer:
-        """Take the last change back."""
-        return changed(body.revision, Session.undone)
+@router.get("/v1/pick/frames/{frame}/images/{camera}", response_class=Response)
+def image(caller: Reader, workspace: Work, frame: int, camera: str) -> Response:
+    """The image as recorded, PNG."""
+    _, data = cv2.imencode(".png", workspace.image(frame, camera))
+    return Response(data.tobytes(), media_type="image/png")
 
-    @router.post("/v1/pick/redo")
-    def redo(caller: Submitter, body: Revision) -> SessionAnswer:
-        """Make an undone change again."""
-        return changed(body.revision, Session.redone)
 
-    @router.post("/v1/pick/reference")
-    def write(caller: Submitter) -> WrittenAnswer:
-        """Write reference.yaml, and the pairs as a table of correspondences."""
-        paths = workspace.write()
-        cameras = list(reference_rig(workspace.estimate()).cameras)
-        return WrittenAnswer(files=[path.name for path in paths], cameras=cameras)
+@router.get("/v1/pick/frames/{frame}/cloud", response_class=Response)
+def cloud(caller: Reader, workspace: Work, frame: int) -> Response:
+    """The cloud: x y z [m] and intensity of each point, float32, little-endian."""
+    data = workspace.cloud(frame).astype("<f4").tobytes()
+    return Response(data, media_type="application/octet-stream")
+
+
+@router.get("/v1/pick/frames/{frame}/visible/{camera}", response_class=Response)
+def visible(
+    caller: Reader, workspace: Work, frame: int, camera: str, *, pose: Pose = "guess"
+) -> Response:
+    """The points in view that nothing hides: count, rows, columns, lines, distances."""
+    seen = workspace.visible(frame, camera, estimated=pose == "estimate")
+    return Response(seen.to_bytes(), media_type="application/octet-stream")
+
+
+@router.get("/v1/pick/frames/{frame}/corner/{camera}")
+def corner(
+    caller: Reader,
+    workspace: Work,
+    frame: int,
+    camera: str,
+    *,
+    u: Annotated[float, Query(ge=-1e5, le=1e5)],
+    v: Annotated[float, Query(ge=-1e5, le=1e5)],
+) -> CornerAnswer:
+    """The corner near a pixel."""
+    found = workspace.corner(frame, camera, (u, v))
+    pixel = None if found is None else (float(found[0]), float(found[1]))
+    return CornerAnswer(pixel_px=pixel)
+
+
+def _changed(workspace: Workspace, revision: int, change: Change) -> SessionAnswer:
+    try:
+        workspace.change(revision, change)
+    except StaleError:
+        raise Problem(409, "the session was changed in another window; reload the page") from None
+    return session_answer(workspace)
+
+
+@router.post("/v1/pick/pairs", status_code=201)
+def add(caller: Submitter, workspace: Work, body: NewPair) -> SessionAnswer:
+    """Add a pair."""
+    pair = _pair(workspace, body)
+    return _changed(
+        workspace, body.revision, lambda session: _with(session, [*session.pairs, pair])
+    )
+
+
+@router.patch("/v1/pick/pairs/{place}")
+def alter(caller: Submitter, workspace: Work, place: Place, body: PairChange) -> SessionAnswer:
+    """Move a pair's pixel, or leave it out of the estimate."""
+    update = body.model_dump(exclude={"revision"}, exclude_none=True)
+
+    def change(session: Session) -> Session:
+        pairs = _pairs_with(session, place)
+        pairs[place] = pairs[place].model_copy(update=update)
+        return session.with_pairs(pairs)
+
+    return _changed(workspace, body.revision, change)
+
+
+@router.post("/v1/pick/pairs/{place}/remove")
+def remove(caller: Submitter, workspace: Work, place: Place, body: Revision) -> SessionAnswer:
+    """Remove a pair."""
+
+    def change(session: Session) -> Session:
+        pairs = _pairs_with(session, place)
+        return session.with_pairs([*pairs[:place], *pairs[place + 1 :]])
+
+    return _changed(workspace, body.revision, change)
+
+
+@router.post("/v1/pick/undo")
+def undo(caller: Submitter, workspace: Work, body: Revision) -> SessionAnswer:
+    """Take the last change back."""
+    return _changed(workspace, body.revision, Session.undone)
+
+
+@router.post("/v1/pick/redo")
+def redo(caller: Submitter, workspace: Work, body: Revision) -> SessionAnswer:
+    """Make an undone change again."""
+    return _changed(workspace, body.revision, Session.redone)
+
+
+@router.post("/v1/pick/reference")
+def write(caller: Submitter, workspace: Work) -> WrittenAnswer:
+    """Write reference.yaml, and the pairs as a table of correspondences."""
+    paths = workspace.write()
+    cameras = list(reference_rig(workspace.estimate()).cameras)
+    return WrittenAnswer(files=[path.name for path in paths], cameras=cameras)
 
 
 def _pair(workspace: Workspace, body: NewPair) -> Pair:
@@ -219,7 +236,8 @@ def create_pick_app(workspace: Workspace) -> FastAPI:
     app.add_middleware(RequestGuard, hosts=LOCAL_NAMES, observe=Metrics().observe_request)
     app.mount("/static", StaticFiles(directory=STATIC_FOLDER), name="static")
     add_problem_handlers(app)
-    app.include_router(pick_router(workspace))
+    app.state.workspace = workspace
+    app.include_router(router)
     return app
 
 

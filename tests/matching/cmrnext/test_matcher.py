@@ -207,5 +207,6 @@ def test_networks_are_for_evaluation(weights: Path) -> None:
     model = matcher.networks[0].model
     assert isinstance(model, CmrNext) and not model.training
     assert isinstance(
-        model(torch.zeros(1, 3, 128, 128), torch.zeros(1, 25, 128, 128), iterations=1), Flow
+        model(*(torch.zeros(1, n, 128, 128, device=matcher.device) for n in (3, 25)), iterations=1),
+        Flow,
     )

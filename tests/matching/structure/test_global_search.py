@@ -292,25 +292,45 @@ def test_no_pose_is_tried_after_the_time_limit(one: Rig, monkeypatch: pytest.Mon
 
 
 class FewFrames(MadeUp):
-    """All poses are of one evidence."""
+    """One to three frames, with that evidence in mirrored images."""
 
-    evidence, _mirrored_evidence = 0.0, 12.0
-
-    def _evidence(self, _: Candidate) -> float:
-        return self.evidence
+    _mirrored_evidence = 12.0
 
 
 @pytest.mark.parametrize(
     ("few", "above", "accepted"), [(True, 0.1, True), (True, -0.1, False), (False, 0.1, False)]
 )
 def test_in_few_frames_the_fine_levels_can_accept_a_pose(
-    one: Rig, few: bool, above: float, accepted: bool
+    one: Rig, monkeypatch: pytest.MonkeyPatch, few: bool, above: float, accepted: bool
 ) -> None:
+    """The camera is then where they put it, and the probability by chance is known."""
     elsewhere = off(one.T_camera_lidar["left"])
     search = FewFrames(one, [(elsewhere, MANY - 4)], {"left": [elsewhere]})
     search._few = few
-    search.evidence = least_z_score(TRIES[1], second_look_chance(12.0, 3)) + above
-    assert locate(search)["left"].accepted == accepted
+    at_fine = least_z_score(TRIES[1], second_look_chance(12.0, 3)) + above - (MANY - 4)
+
+    def look_again(_: Any, body: Body) -> Candidate:
+        return Candidate(place(body, off(lead(body).T_camera_lidar, 0.1)), at_fine)
+
+    monkeypatch.setattr(pose_search, "look_again", look_again)
+    found = locate(search)["left"]
+    assert found.accepted == accepted
+    if few:
+        assert found.chance is not None
+        assert (found.chance <= acceptance.FALSE_ACCEPTANCE) == accepted
+    else:
+        assert found.chance is None
+    if accepted:
+        np.testing.assert_allclose(found.camera.T_camera_lidar, off(elsewhere, 0.1), atol=1e-9)
+
+
+def test_the_probability_by_chance_of_an_accepted_pose_is_the_share_that_may_be_wrong() -> None:
+    for chance in (acceptance.SEARCH, second_look_chance(12.0, 3)):
+        for tries in (0.1, 3.0, 9.0):
+            least = least_z_score(tries, chance)
+            by_chance = acceptance.probability_by_chance(least, tries, chance)
+            assert by_chance == pytest.approx(acceptance.FALSE_ACCEPTANCE)
+    assert acceptance.probability_by_chance(-math.inf, 3.0) == 1.0
 
 
 @pytest.mark.parametrize(("frames", "approached", "refined"), [(1, 5, 10), (3, 5, 10), (4, 5, 2)])

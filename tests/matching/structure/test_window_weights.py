@@ -144,6 +144,23 @@ def test_weights_make_the_truth_stand_out_more_among_leaves(tmp_path: Path) -> N
     assert weighed > 1.05 * plain > 5.0
 
 
+def test_another_scale_of_the_intensity_changes_no_score() -> None:
+    """They are ranks: of a sensor that counts to 255, or takes the root, all is the same."""
+    dataset = calibgraph.load_dataset(SAMPLE)
+    (name, camera), frame = next(iter(dataset.rig.cameras.items())), dataset.frames[0]
+    gray, cloud = frame.load_gray(name, camera), frame.load_cloud()
+    scaled = cloud.copy()
+    scaled[:, 3] = 3.0 + 255.0 * cloud[:, 3]
+    one, other = (
+        score_frame(
+            gray, PreparedCloud.from_points(points), camera, LEVELS[3], frame=0, max_windows=500
+        )
+        for points in (cloud, scaled)
+    )
+    assert len(one.weights) > 10
+    np.testing.assert_array_equal(one.grids, other.grids)
+
+
 def test_weights_stay_within_0_and_1() -> None:
     layer = np.full((1, 1), 50.0), np.zeros(1)
     network = WindowNetwork(np.zeros(1), np.ones(1), (layer,))

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, describe, read_yaml, write_yaml
+from calibgraph.files import describe, write_yaml
 from calibgraph.matching.cmrnext.architecture import FULL_WIDTH, Architecture
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint
 from calibgraph.matching.cmrnext.training.samples import SampleSettings
@@ -107,15 +107,6 @@ class TrainSettings(BaseModel):
     def save(self, path: Path) -> None:
         """Write all settings as YAML."""
         write_yaml(path, self.model_dump(), first_line=yaml_mark("train"))
-
-
-def load_settings(path: Path | str) -> TrainSettings:
-    """Read settings from YAML; those that the file lacks have their defaults.
-
-    Raises:
-        FileError: if the file is missing, has an unknown key or a wrong value.
-    """
-    return checked_model(TrainSettings, read_yaml(Path(path)), path)
 
 
 def to_config(settings: TrainSettings, validation: Validation) -> dict[str, Any]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from calibgraph.files import checked_model, read_yaml
 from calibgraph.model.config import Seed
 
 Count = Annotated[int, Field(ge=1, le=10**6)]
@@ -34,12 +32,3 @@ class WindowSettings(BaseModel):
     """Standard deviation of noise on the features, in theirs."""
     seed: Seed = 0
     """Seed of everything random."""
-
-
-def load_window_settings(path: Path | str) -> WindowSettings:
-    """Read settings from YAML; those that the file lacks have their defaults.
-
-    Raises:
-        FileError: if the file is missing, has an unknown key or a wrong value.
-    """
-    return checked_model(WindowSettings, read_yaml(Path(path)), path)

@@ -8,9 +8,8 @@ import pytest
 import yaml
 
 from calibgraph import FileError
-from calibgraph.files import commented_defaults
+from calibgraph.files import commented_defaults, load_model
 from calibgraph.matching.cmrnext import TrainSettings
-from calibgraph.matching.cmrnext.training.settings import load_settings
 from tests.matching.cmrnext.training.tiny import TINY
 
 
@@ -41,9 +40,9 @@ def test_settings_survive_a_file(tmp_path: Path) -> None:
     path = tmp_path / "settings.yaml"
     for settings in (TINY, TrainSettings(crop_px=None)):
         settings.save(path)
-        assert load_settings(path) == settings
+        assert load_model(TrainSettings, path) == settings
     path.write_text("steps: 7\ncrop_px: [320, 960]\nlearning_rate: 1e-3\n")
-    assert load_settings(path) == TrainSettings(steps=7, learning_rate=1e-3)
+    assert load_model(TrainSettings, path) == TrainSettings(steps=7, learning_rate=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -62,7 +61,7 @@ def test_wrong_files_are_refused_in_one_line(tmp_path: Path, text: str, message:
     path = tmp_path / "settings.yaml"
     path.write_text(text)
     with pytest.raises(FileError, match=message) as caught:
-        load_settings(path)
+        load_model(TrainSettings, path)
     assert "\n" not in str(caught.value)
 
 

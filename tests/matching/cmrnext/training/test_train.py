@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from calibgraph import CalibrationError, Dataset, DatasetError, FileError
+from calibgraph.files import load_model
 from calibgraph.io.dataset import spread_out
-from calibgraph.matching.cmrnext import load_checkpoint, train
+from calibgraph.matching.cmrnext import TrainSettings, load_checkpoint, train
 from calibgraph.matching.cmrnext.training.run import one_cycle
-from calibgraph.matching.cmrnext.training.settings import load_settings
 from calibgraph.matching.cmrnext.training.validation import MAX_SCENES
 from tests.matching.cmrnext.builders import nll_content, saved
 from tests.matching.cmrnext.training.tiny import TINY, scene
@@ -51,7 +51,7 @@ def test_the_checkpoint_holds_the_range_of_training(
     assert checkpoint.range_deg_m == (1.0, 0.1)
     assert checkpoint.architecture == settings.architecture
     assert checkpoint.config["half_resolution"] is True
-    assert load_settings(tmp_path / "net.settings.yaml") == settings
+    assert load_model(TrainSettings, tmp_path / "net.settings.yaml") == settings
     assert checkpoint.config["systematic_rotation_rad"] == validation.systematic_rotation_rad
     assert 0.3 < validation.start_deg < np.sqrt(3)
     assert 1.0 < validation.zero_px < 30.0  # 1 deg is 10 px

@@ -10,7 +10,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from calibgraph import Correspondences, Dataset, DatasetError  # noqa: E402
-from calibgraph.io.frame import DrivenFrame  # noqa: E402
+from calibgraph.io.frame import Frame  # noqa: E402
 from calibgraph.matching.structure.frame_cache import FrameCache  # noqa: E402
 from calibgraph.matching.structure.peaks import find_local_peaks  # noqa: E402
 from calibgraph.matching.structure.shift_scores import score_frame  # noqa: E402
@@ -99,7 +99,7 @@ def test_points_are_where_they_are_when_their_pixels_are_taken(
     name, camera = next(iter(trusted.rig.cameras.items()))
     camera = camera.model_copy(update={"time_offset_s": clock[0], "readout_s": clock[1]})
     files = given.index, given.name, given.cloud_path, given.image_paths
-    frame, cache = DrivenFrame(*files, find_twist=lambda: twist), FrameCache()
+    frame, cache = Frame(*files, find_twist=lambda: twist), FrameCache()
     found = camera_windows([frame], name, camera, per_frame=800, cache=cache)
     scores = score_frame(
         cache.image(frame, name, camera), cache.cloud(frame), camera, LEVEL,

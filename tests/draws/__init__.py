@@ -1,0 +1,1 @@
+"""Worlds with a known truth, drawn for tests and benchmarks."""
