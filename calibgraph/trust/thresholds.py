@@ -25,16 +25,7 @@ _CHOSEN = "A choice; no data recorded."
 _RECORDED = "KITTI 00 and the sample"
 
 _WRONG_SIGMAS, _WRONG_SHARE = 20.0, 0.01
-
-
-def _rarer_than_pass(share: float) -> float:
-    """Prior sigmas beyond which less than ``PASS_BELOW`` of all parameters err.
-
-    Args:
-        share: of them that are wrong, with errors of ``_WRONG_SIGMAS``.
-    """
-    return _WRONG_SIGMAS * NormalDist().inv_cdf(1 - PASS_BELOW / share / 2)
-
+_BEYOND = [NormalDist().inv_cdf(1 - PASS_BELOW / share / 2) for share in (_WRONG_SHARE, 1)]
 
 # fmt: off
 THRESHOLDS: tuple[Threshold, ...] = (
@@ -159,8 +150,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "at most", 15.0, math.inf, "cm", "How much depends on the focal length?", _COUNTED,
               "verify the intrinsics, or give matches at more distances",
               of_tolerance=True),
-    Threshold("lens_prior", "distance from the rig", "at most", _rarer_than_pass(_WRONG_SHARE),
-              _rarer_than_pass(1.0), "prior sigmas",
+    Threshold("lens_prior", "distance from the rig", "at most",
+              _WRONG_SIGMAS * _BEYOND[0], _WRONG_SIGMAS * _BEYOND[1], "prior sigmas",
               "How far did an estimated parameter of lens or clock move from what the rig states?",
               "By `lens_wrong` and `lens_wrong_share`, 0.5 % of all parameters err by more than "
               "the first, and 0.5 % of the wrong ones by more than the second.",
