@@ -23,7 +23,6 @@ from calibgraph.solver.lens import MATCH_SHARE
 _COUNTED = "`benchmarks/accuracy/verdicts.py`: chosen on its set tune, counted on its set count."
 _CHOSEN = "A choice; no data recorded."
 _RECORDED = "KITTI 00 and the sample"
-
 _WRONG_SIGMAS, _WRONG_SHARE = 20.0, 0.01
 _BEYOND = [NormalDist().inv_cdf(1 - PASS_BELOW / share / 2) for share in (_WRONG_SHARE, 1)]
 
