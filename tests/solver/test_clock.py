@@ -65,6 +65,27 @@ def test_late_images_are_found(offset_s: float, readout_s: float, part: str) -> 
     assert max(squared_errors(found, truth)) < chi2.isf(1e-6, 6)
 
 
+@pytest.mark.parametrize(
+    ("sigma_s", "status"), [(0.004, "PASS"), (0.0025, "WARN"), (0.0005, "FAIL")]
+)
+def test_an_offset_beyond_what_the_rig_allows_is_no_pass(sigma_s: float, status: str) -> None:
+    """50 ms late: 12.5, 20 and 100 prior sigmas, with limits at 13.5 and 56.1."""
+    truth, table = late(0.05, 0.0)
+    rig = with_times(truth, time_offset_sigma_s=sigma_s)
+    result = solve(rig, table, Config(estimate="offset", common_deg=0.0))
+    for name, verdict in result.camera_verdicts.items():
+        (check,) = [one for one in verdict.checks if one.kind == "time_prior"]
+        assert check.status == verdict.status == status
+        assert check.value == pytest.approx(0.05 / sigma_s, rel=0.05)
+        if status != "PASS":
+            (one,) = result.lens[name]
+            assert check.text.startswith("offset: distance from the rig")
+            assert one.change in check.text and "before 0" in one.change
+    if status != "PASS":
+        (reason,) = result.summary.reasons
+        assert reason.cause == "time" and "correct the named time in the rig" in reason.action
+
+
 def test_a_known_clock_is_as_good_as_none() -> None:
     """Points at the times of the pixels, and points of late images with the times in the rig."""
     truth, table = late(0.04, 0.02)
