@@ -261,7 +261,8 @@ def thresholds_markdown() -> str:
         "",
         "\\* At the default tolerance of "
         f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. A limit of "
-        "FAIL, or in the table below, grows with the tolerance, and does not fall below this value.",
+        "FAIL, or in the table below, grows with the tolerance, and does not fall below this "
+        "value.",
         "",
         "| key | limit | meaning |",
         "|---|---|---|",
