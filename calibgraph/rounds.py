@@ -200,11 +200,12 @@ def _solve(
             return solve_joint(*matched, config, terms, camera_matches=matches)
         with suppress(CorrespondenceError):
             return solve_without_failing(*matched, config, terms)
-        intended = likely_intended_guess(dataset, guess)
-        if intended is None:
+        cause = likely_intended_guess(dataset, guess)
+        if cause is None and error.camera in matched[1].findings.missed:
+            cause = "the search has not found this camera: give more frames, or a nearer guess"
+        if cause is None:
             raise
-        hint = f"{error}; {intended}"
-        raise CorrespondenceError(hint, camera=error.camera) from error
+        raise CorrespondenceError(f"{error}; {cause}", camera=error.camera) from error
 
 
 def rematch(run: MatchingRun, progress: Progress, out_of_time: Callable[[], bool]) -> MatchingRun:

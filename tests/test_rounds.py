@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Config, CorrespondenceError, perturb, simulate_correspondences
+from calibgraph import Config, CorrespondenceError, perturb, rounds, simulate_correspondences
 from calibgraph.model.geometry import pose_difference
 from calibgraph.solver.joint import solve_joint, solve_without_failing
 from tests.conftest import SAMPLE
@@ -56,3 +56,19 @@ def test_a_camera_whose_matches_do_not_agree_is_held_and_the_others_are_solved()
     for name in ("front_left", "front_right"):
         T = solution.T_camera_lidar[name]
         assert pose_difference(T, truth.cameras[name].T_camera_lidar)[0] < 0.1
+
+
+def test_a_lone_camera_without_enough_matches_was_perhaps_not_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Then that is the reason, and not the gate."""
+    monkeypatch.setattr(rounds, "likely_intended_guess", lambda *_: None)
+    truth = calibgraph.load_rig(SAMPLE / "reference.yaml")
+    rig = calibgraph.Rig(cameras={"left": truth.cameras["left"]})
+    data = calibgraph.load_dataset(SAMPLE, rig).select("0")
+    few = simulate_correspondences(rig, frames=1, matches=5)
+    for missed, reason in (({"left": 7.0}, "the search has not found this camera"), ({}, "")):
+        table = few.with_metadata({**few.metadata, "missed": missed})
+        with pytest.raises(CorrespondenceError, match=f"correspondences.*{reason}") as error:
+            calibgraph.calibrate(data, rig, table)
+        assert bool(missed) == ("not found" in str(error.value))
