@@ -60,6 +60,11 @@ class LensEstimate:
         return left or self.sigma < share * self.prior_sigma
 
     @property
+    def prior_sigmas(self) -> float:
+        """How many standard deviations of the prior the estimate lies from what the rig states."""
+        return abs(self.value - self.prior) / self.prior_sigma
+
+    @property
     def printed(self) -> tuple[str, str, str, str]:
         """Value, sigma, prior and its sigma in ``printed_unit``, to two digits of the sigma."""
         scale = 1e3 if self.unit == "s" else 1.0
@@ -81,6 +86,14 @@ class LensEstimate:
         new, sigma, old, _ = self.printed
         unit = f" {self.printed_unit}" if self.unit else ""
         return f"{self.name} {new} +- {sigma}{unit}, before {old}{unit}"
+
+    @property
+    def trade_off(self) -> str:
+        """Which change of the pose may be a change of it, in words; empty if none."""
+        if self.correlation <= _NONE:
+            return ""
+        pair = f"{self.name} with {self.direction} {self.correlation:.2f}"
+        return f"part of it may be the other, by their correlation: {pair}"
 
     def describe(self) -> str:
         """Whether the data determine it, and what it cannot be told from."""

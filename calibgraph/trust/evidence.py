@@ -289,6 +289,7 @@ class Evidence:
             held=held,
             scatter_only=not self.findings.states_common_error,
             tolerance=solution.config.tolerance,
+            lens=solution.lens.get(camera, ()),
         )
 
 

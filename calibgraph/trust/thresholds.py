@@ -12,16 +12,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from statistics import NormalDist
 
 from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE
 from calibgraph.model.threshold import Threshold, in_unit, is_reachable, ratio_of
-from calibgraph.model.verdict import FAIL_ABOVE, TOLERANCE
+from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.lens import MATCH_SHARE
 
 _COUNTED = "`benchmarks/accuracy/verdicts.py`: chosen on its set tune, counted on its set count."
 _CHOSEN = "A choice; no data recorded."
 _RECORDED = "KITTI 00 and the sample"
+_WRONG_SIGMAS, _WRONG_SHARE = 20.0, 0.01
+_BEYOND = [NormalDist().inv_cdf(1 - PASS_BELOW / share / 2) for share in (_WRONG_SHARE, 1)]
 
 # fmt: off
 THRESHOLDS: tuple[Threshold, ...] = (
@@ -146,6 +149,12 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "at most", 15.0, math.inf, "cm", "How much depends on the focal length?", _COUNTED,
               "verify the intrinsics, or give matches at more distances",
               of_tolerance=True),
+    Threshold("lens_prior", "distance from the rig", "at most",
+              _WRONG_SIGMAS * _BEYOND[0], _WRONG_SIGMAS * _BEYOND[1], "prior sigmas",
+              "How far did an estimated parameter of lens or clock move from what the rig states?",
+              "By `lens_wrong` and `lens_wrong_share`, 0.5 % of all parameters err by more than "
+              "the first, and 0.5 % of the wrong ones by more than the second.",
+              "correct the rig, or state how well it is known"),
     # the rounds of matching
     Threshold("last_round_rotation", "change in the last round of matching", "at most", 0.1, 0.4,
               "deg", "Have the rounds of matching converged?", _COUNTED,
@@ -212,11 +221,11 @@ class Limit:
 LIMITS: tuple[Limit, ...] = (
     Limit("pull_sigmas", 4.0, "sigma",
           "A pull within this of what a camera's own solution leaves open is zero."),
-    Limit("lens_wrong", 20.0, "sigma", "The error of a wrong lens parameter, in standard "
+    Limit("lens_wrong", _WRONG_SIGMAS, "sigma", "The error of a wrong lens parameter, in standard "
           "deviations of a calibrated one: 0.2 % of the focal length, fx / fy and the skew, "
           "0.002 focal lengths of the principal point, 0.002 of k1, 2 ms of the time of "
           "an image, or as the rig states."),
-    Limit("lens_wrong_share", 0.01, "share", "So many are taken for wrong."),
+    Limit("lens_wrong_share", _WRONG_SHARE, "share", "So many are taken for wrong."),
     Limit("lens_match_share", MATCH_SHARE, "share", "So much of a match's variance is taken to be "
           "shared by all: less cannot be told from a wrong lens."),
     Limit("lens_z_score", 3.0, "", "The lens is checked by the images only above this z-score "
@@ -260,8 +269,9 @@ def thresholds_markdown() -> str:
         *(_line(row) for row in THRESHOLDS),
         "",
         "\\* At the default tolerance of "
-        f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. A limit of "
-        "FAIL, or in the table below, grows with the tolerance, and does not fall below this value.",
+        f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. A limit "
+        "of FAIL, or in the table below, grows with the tolerance, and does not fall below this "
+        "value.",
         "",
         "| key | limit | meaning |",
         "|---|---|---|",

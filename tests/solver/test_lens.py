@@ -88,6 +88,18 @@ def test_a_wrong_lens_is_found(drawn: tuple[Rig, Correspondences], part: str, er
     assert max(squared_errors(found, truth)) < chi2.isf(1e-6, 6)
 
 
+def test_a_lens_beyond_what_the_rig_allows_is_no_pass(drawn: tuple[Rig, Correspondences]) -> None:
+    """4 % of a focal length that is stated to 0.1 %."""
+    rig, table = drawn
+    wrong = put_lens_error(rig, "focal", 0.04)
+    focal_px = 0.001 * wrong.cameras["image_2"].intrinsics_px.fx
+    for known, status in ((wrong, "PASS"), (known_to(wrong, focal_px), "WARN")):
+        result = solve(known, table, Config(estimate="focal", common_deg=0.0))
+        for verdict in result.camera_verdicts.values():
+            (check,) = [one for one in verdict.checks if one.kind == "lens_prior"]
+            assert check.status == verdict.status == status
+
+
 def test_a_lens_that_is_known_exactly_changes_nothing(drawn: tuple[Rig, Correspondences]) -> None:
     """Its excess displaces pose and lens together, so that nothing of it is left."""
     truth, table = drawn
