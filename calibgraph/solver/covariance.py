@@ -98,10 +98,9 @@ def frame_gradients(at: FittedObjective) -> Array:
     of_pairs = [pair.frame for pair in pairs]
     numbers = np.unique(np.concatenate([np.empty(0, np.int64), *own.values(), *of_pairs]))
     gradients = np.zeros((len(numbers), 6 * len(cameras)))
-    for name, block in blocks.items():
+    for name in blocks:
         rows = np.searchsorted(numbers, own[name])
-        of_frames = block.frame_gradients(at.pose(name), at.scales[name])
-        gradients[rows, pose_rows(cameras.index(name))] = of_frames
+        gradients[rows, pose_rows(cameras.index(name))] = at.frame_gradients[name]
     for pair in pairs:
         rows = np.searchsorted(numbers, np.unique(pair.frame))
         columns = rows_of_pair(cameras, pair)

@@ -9,11 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.graph.objective import relative_pose_graph
-from calibgraph.model.geometry import pose_rows, retract_all, to_T_camera_lidar
-from calibgraph.parallel import map_on_cores
+from calibgraph.model.geometry import retract_all, to_T_camera_lidar
 from calibgraph.solver.camera_pairs import PairTerm
-from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.optimizer import to_values
 from factors import ProjectionBlock, unit_diagonal
 
@@ -69,26 +66,6 @@ def invert_or_none(hessian: Array, *, least: float = _SINGULAR) -> Array | None:
     return inverse
 
 
-def curvature_at(at: FittedObjective, robust_hessians: Mapping[str, Array]) -> Curvature:
-    """The curvature of an objective's terms, the gate's own among them.
-
-    Args:
-        at: the minimum.
-        robust_hessians: per camera, (6, 6) of its correspondences there.
-    """
-    inliers, cameras, T_camera_lidar = at.objective, at.cameras, at.T_camera_lidar
-    gates = inliers.gate_hessian
-    own = np.zeros((6 * len(cameras), 6 * len(cameras)))
-    for name, hessian in robust_hessians.items():
-        rows = pose_rows(cameras.index(name))
-        own[rows, rows] = convex_hessian(hessian + gates.get(name, 0.0), hessian)
-    measured = relative_pose_graph(cameras, inliers.rig.relative_poses)
-    whole = own + pose_hessian(inliers.pose_graph, cameras, T_camera_lidar)
-    add_pair_hessians(whole, inliers.pairs, T_camera_lidar)
-    whole += unknown([name in at.held for name in cameras])
-    return Curvature(own, pose_hessian(measured, cameras, T_camera_lidar), whole)
-
-
 def convex_hessian(hessian: Array, otherwise: Array) -> Array:
     """The Hessian if it is positive definite; few matches near the gate may spoil it."""
     return hessian if _is_positive_definite(hessian) else otherwise
@@ -105,15 +82,6 @@ def _is_positive_definite(hessian: Array) -> bool:
 def unknown(chosen: Sequence[bool]) -> Array:
     """(6 N, 6 N) diagonal, 1 for the chosen cameras."""
     return np.diag(np.repeat(np.array(chosen, dtype=np.float64), 6))
-
-
-def robust_hessians(at: FittedObjective) -> dict[str, Array]:
-    """Per camera with correspondences, its :func:`robust_hessian`; empty if no term uses them."""
-    if not at.objective.uses_correspondences:
-        return {}
-    blocks = at.projections
-    hessians = map_on_cores(robust_hessian, [*blocks.values()], [at.pose(n) for n in blocks])
-    return dict(zip(blocks, hessians, strict=True))
 
 
 def add_pair_hessians(

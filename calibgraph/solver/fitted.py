@@ -7,8 +7,20 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
+import numpy as np
 
-from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.arrays import Array
+from calibgraph.graph.objective import relative_pose_graph
+from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
+from calibgraph.parallel import map_on_cores
+from calibgraph.solver.curvature import (
+    Curvature,
+    add_pair_hessians,
+    convex_hessian,
+    pose_hessian,
+    robust_hessian,
+    unknown,
+)
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from factors import ProjectionBlock
 
@@ -42,6 +54,35 @@ class FittedObjective:
     def projections(self) -> Mapping[str, ProjectionBlock]:
         """Per camera with correspondences, these with their scale."""
         return {n: b.with_scale(self.scales[n]) for n, b in self.objective.blocks.items()}
+
+    @cached_property
+    def robust_hessians(self) -> Mapping[str, Array]:
+        """Per camera with correspondences, their (6, 6) `robust_hessian`; empty without terms."""
+        if not self.objective.uses_correspondences:
+            return {}
+        blocks = self.projections
+        hessians = map_on_cores(robust_hessian, [*blocks.values()], [self.pose(n) for n in blocks])
+        return dict(zip(blocks, hessians, strict=True))
+
+    @cached_property
+    def frame_gradients(self) -> Mapping[str, Array]:
+        """Per camera with correspondences, (f, 6) gradients of half the cost of its frames."""
+        blocks = self.objective.blocks
+        return {n: b.frame_gradients(self.pose(n), self.scales[n]) for n, b in blocks.items()}
+
+    @cached_property
+    def curvature(self) -> Curvature:
+        """The curvature of all terms, the gate's own among them."""
+        inliers, cameras, T_camera_lidar = self.objective, self.cameras, self.T_camera_lidar
+        own = np.zeros((6 * len(cameras), 6 * len(cameras)))
+        for name, hessian in self.robust_hessians.items():
+            rows = pose_rows(cameras.index(name))
+            own[rows, rows] = convex_hessian(hessian + inliers.gate_hessian.get(name, 0.0), hessian)
+        measured = relative_pose_graph(cameras, inliers.rig.relative_poses)
+        whole = own + pose_hessian(inliers.pose_graph, cameras, T_camera_lidar)
+        add_pair_hessians(whole, inliers.pairs, T_camera_lidar)
+        whole += unknown([name in self.held for name in cameras])
+        return Curvature(own, pose_hessian(measured, cameras, T_camera_lidar), whole)
 
     def data_only(self) -> FittedObjective:
         """The correspondences alone, at their minimum near here."""

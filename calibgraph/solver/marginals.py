@@ -6,7 +6,6 @@ model: there it is the sandwich, by the scatter between frames.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -22,7 +21,7 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
-from calibgraph.solver.curvature import Curvature, curvature_at, robust_hessians
+from calibgraph.solver.curvature import Curvature
 from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
 from calibgraph.solver.error_shares import (
@@ -99,7 +98,7 @@ class Marginals:
             return None if self.errors is None else self.errors.fit.covariance
         if self.scatter is None:
             return None
-        shared = self.shared_variance_ratio * self._shared(self.at.objective, self.curvature)
+        shared = self.shared_variance_ratio * self._shared(self.at.objective, self.at.curvature)
         return (
             self.scatter + shared + error_between(self.at.T_camera_lidar, self.at.objective.pairs)
         )
@@ -122,19 +121,9 @@ class Marginals:
         return None if found is None else found.with_shared_ratio(self.shared_variance_ratio)
 
     @cached_property
-    def curvature(self) -> Curvature:
-        """The curvature of all terms at the solution."""
-        return curvature_at(self.at, self.robust_hessians)
-
-    @cached_property
     def scatter(self) -> Array | None:
         """(6 N, 6 N) covariance by the scatter between frames, or None."""
-        return cluster_robust_covariance(self.at, self.curvature)
-
-    @cached_property
-    def robust_hessians(self) -> Mapping[str, Array]:
-        """Per camera, (6, 6) of the inliers at the solution; empty if the terms do not use them."""
-        return robust_hessians(self.at)
+        return cluster_robust_covariance(self.at, self.at.curvature)
 
     @cached_property
     def data_sigmas(self) -> Array | None:
@@ -173,7 +162,7 @@ class Marginals:
         inliers, T_camera_lidar = self.at.objective, self.at.T_camera_lidar
         no_places = replace(self.findings, place_variance=0.0)
         every, common = (
-            self.shared_variance_ratio * np.diag(self._shared(inliers, self.curvature, findings))
+            self.shared_variance_ratio * np.diag(self._shared(inliers, self.at.curvature, findings))
             for findings in (self.findings, no_places)
         )
         between = np.diag(error_between(T_camera_lidar, inliers.pairs))
@@ -237,11 +226,10 @@ class Marginals:
         free = self.at.data_only()
         if self.at.objective.config.preset == "auto":
             return JointPoses(free.T_camera_lidar, None)
-        curvature = curvature_at(free, robust_hessians(free))
-        scatter = cluster_robust_covariance(free, curvature)
+        scatter = cluster_robust_covariance(free, free.curvature)
         if scatter is None:
             return JointPoses(free.T_camera_lidar, None)
-        shared = self._shared(free.objective, curvature)
+        shared = self._shared(free.objective, free.curvature)
         between = error_between(free.T_camera_lidar, free.objective.pairs)
         return JointPoses(free.T_camera_lidar, scatter + (shared + between))
 

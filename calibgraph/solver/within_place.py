@@ -21,7 +21,7 @@ from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.model.error_components import error_components
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.curvature import convex_hessian, robust_hessian
+from calibgraph.solver.curvature import convex_hessian
 from calibgraph.solver.fitted import FittedObjective
 from factors import pose_sigmas
 
@@ -79,12 +79,12 @@ def within_place(at: FittedObjective, name: str, placed: BlockByPlace) -> Within
         name: of the camera.
         placed: its matches.
     """
-    block, pose, scale = at.objective.blocks[name], at.pose(name), at.scales[name]
+    block = at.objective.blocks[name]
     hessians = placed.sums(np.tile(at.T_camera_lidar[name], (len(placed.frames), 1, 1))).hessian
     root = np.linalg.cholesky(hessians.sum(axis=0) + WEAK)
-    robust = robust_hessian(at.projections[name], pose)
+    robust = at.robust_hessians[name]
     true = convex_hessian(robust + at.objective.gate_hessian.get(name, 0.0), robust) + WEAK
-    scatter = frame_scatter(block, block.frame_gradients(pose, scale), placed, true)
+    scatter = frame_scatter(block, at.frame_gradients[name], placed, true)
     frames = placed.frames.astype(np.float64)
     covariance, efficiency = relative_covariance(scatter, root, true)
     return WithinPlace(

@@ -219,7 +219,7 @@ class Evidence:
         """Per camera, which share of its result comes from priors and relative poses."""
         errors = self.solution.marginals.errors
         if errors is None:
-            return prior_shares(self.solution, self.solution.marginals.robust_hessians)
+            return prior_shares(self.solution, self.solution.fitted.robust_hessians)
         return shares_of_marginal(self.solution, errors.fit.of_mount.covariance)
 
     @cached_property

@@ -28,7 +28,6 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.solver.camera_pairs import MIN_PAIR_MATCHES, PairTerm, pair_graph, pair_terms
 from calibgraph.solver.covariance import cluster_robust_covariance
-from calibgraph.solver.curvature import curvature_at, robust_hessians
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.optimizer import optimize
 from calibgraph.solver.solution import Solution
@@ -186,7 +185,7 @@ def test_frame_gradients_add_up_and_frames_are_clusters(rig: Rig) -> None:
     covariances = []
     for inliers in (solution.inliers, solution.without_pairs().inliers):
         at = replace(solution.fitted, objective=inliers)
-        covariances.append(cluster_robust_covariance(at, curvature_at(at, robust_hessians(at))))
+        covariances.append(cluster_robust_covariance(at, at.curvature))
     a, b = list(rig.cameras)[:2]
     T_b_a = relative_transform(T[b], T[a])
     relative = [relative_covariance(c, 0, 1, T_b_a) for c in covariances]
