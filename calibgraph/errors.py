@@ -97,7 +97,11 @@ class CorrespondenceError(CalibrationError):
     def after(self, rows: int) -> CorrespondenceError:
         """The same error in a table with this number of rows before these."""
         row = None if self.row is None else rows + self.row
-        return CorrespondenceError(self._message, camera=self.camera, frame=self.frame, row=row)
+        return type(self)(self._message, camera=self.camera, frame=self.frame, row=row)
+
+
+class MotionError(CorrespondenceError):
+    """A motion that no vehicle has: it is of another unit or order, also where it is slower."""
 
 
 class DatasetError(CalibrationError):

@@ -4,9 +4,9 @@
     python -m benchmarks.accuracy.audit --summary out/audit.jsonl
 
 Recordings with KITTI's calibration, and rendered streets with a LiDAR that errs: two frames of each
-of three streets. What is deployed is right (the reference, the truth, or the result of another
-recording of that rig); or one camera, or the LiDAR, is displaced along one axis: by sizes in
-degrees and centimetres, and by multiples of the smallest change that the audit of the right rig
+of three streets. What is deployed is right (the reference, the true alignment, or the result of
+another recording of that rig); or one camera, or the LiDAR, is displaced along one axis: by sizes
+in degrees and centimetres, and by multiples of the smallest change that the audit of the right rig
 states. Data, cameras and signs change from case to case.
 
 An axis is significant, as the audit itself decides it, where its deviation is beyond what one of

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.accuracy.alignment import ALIGNMENT, aligned_rig, mean_poses
 from benchmarks.accuracy.error_bars import RIGS
 from benchmarks.accuracy.scenes import GUESS_DEG, GUESS_M, Folders
 from calibgraph import (
@@ -46,11 +47,15 @@ class Sources:
     scenes: Path
 
     def load(self, name: str) -> tuple[Dataset, Rig]:
-        """Data by name, and the true rig; a scene is rendered if it is not there yet."""
+        """Data by name, and the right rig; a scene is rendered if it is not there yet.
+
+        Of a scene cameras are at their alignments: where their LiDAR, which errs, sees them.
+        """
         if not name.startswith("scene_"):
             return Folders(self.recordings, None).load(name)
         streets = self.render(int(name.removeprefix("scene_")))
-        return load_dataset(streets), load_rig(streets[0] / "reference.yaml")
+        aligned = mean_poses([load_rig(street / ALIGNMENT).T_camera_lidar for street in streets])
+        return load_dataset(streets), load_rig(streets[0] / "reference.yaml").moved_to(aligned)
 
     def render(self, number: int) -> list[Path]:
         """Folders of the streets through which one sensor drove, each a place of its own."""
@@ -59,13 +64,16 @@ class Sources:
         errors = draw_scan_errors(beams, SENSOR_ERRORS, rng)
         for street in range(STREETS):
             folders.append(self.scenes / f"scene_{number}" / f"street_{street}")
-            if (folders[-1] / "rig.yaml").exists():
+            if (folders[-1] / ALIGNMENT).exists():
                 continue
             shutil.rmtree(folders[-1], ignore_errors=True)
             simulate_street(
                 folders[-1], make_rig(), beams=beams, frames=FRAMES, step_m=STEP_M,
                 seed=_SEED + STREETS * number + street, sensor_errors=errors, vary_layout=True,
             )  # fmt: skip
+            truth = load_rig(folders[-1] / "reference.yaml")
+            aligned = aligned_rig(truth, truth, folders[-1], beams, errors)
+            aligned.save(folders[-1] / ALIGNMENT)
         return folders
 
     def result(self, name: str) -> Rig:

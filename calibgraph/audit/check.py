@@ -15,7 +15,7 @@ from calibgraph.audit.judgement import (
 from calibgraph.audit.matching import Matching, match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
 from calibgraph.audit.significance import Tolerance
-from calibgraph.errors import CorrespondenceError
+from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import load_model
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.frame import hash_source
@@ -23,7 +23,7 @@ from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
-from calibgraph.model.config import Config
+from calibgraph.model.config import Config, Reported
 from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Status
@@ -71,7 +71,7 @@ def check(
     no part, since they may be as outdated as the extrinsics.
 
     Args:
-        rig: the deployed calibration.
+        rig: the deployed calibration, of alignments.
         dataset: a recent recording: a dataset, its folder, a KITTI odometry sequence, or several.
         tolerance_deg: largest deviation about an axis of a camera that is OK.
         tolerance_cm: largest deviation along an axis of a camera that is OK.
@@ -188,11 +188,16 @@ class _Verdict(BaseModel):
     status: Status
 
 
+class _Config(BaseModel):
+    of: Reported = "alignment"
+
+
 class _Result(BaseModel):
     """What is used here of the file of a result."""
 
     inputs: dict[str, str] = {}
     verdict: _Verdict | None = None
+    config: _Config = _Config()
 
 
 @dataclass(frozen=True)
@@ -214,12 +219,17 @@ def provenance(rig: Path, data: Dataset) -> Provenance:
     Only clouds with the name of one of its inputs are read.
 
     Raises:
-        FileError: if the result is malformed, or a cloud cannot be read.
+        FileError: if the result is malformed, or of mounts; or a cloud cannot be read.
     """
     path = rig / CALIBRATION_FILE if rig.is_dir() else rig
     if not is_calibration_file(path):
         return Provenance()
     result = load_model(_Result, path)
+    if result.config.of != "alignment":
+        raise FileError(
+            path, f"has poses of the {result.config.of}, and check compares alignments; give the "
+            "alignment, by `calibgraph solve` of its table with --of alignment",
+        )  # fmt: skip
     names = {Path(source).name for source in result.inputs}
     clouds = (frame.cloud_path for frame in data.frames if frame.cloud_path.name in names)
     same = any(hash_source(cloud) in result.inputs.values() for cloud in clouds)

@@ -192,6 +192,11 @@ def _require_same_rig(
             f"{name}: has the cameras {', '.join(b)}, {first} has {', '.join(a)}; give results of "
             "one rig"
         )
+    if two.config.of != one.config.of:
+        raise CalibrationError(
+            f"{name}: has poses of the {two.config.of}, {first} of the {one.config.of}, which are "
+            "different quantities; solve one of them again with the other's --of"
+        )
     for camera, other in b.items():
         parts = {"T_camera_lidar", *IMAGE_TIMES}
         parts |= {"intrinsics_px", "distortion"} if own_lenses else set()

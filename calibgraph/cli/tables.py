@@ -17,6 +17,7 @@ from calibgraph.cli.terminal import print_plain
 from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.geometry import degrees_and_centimetres
 from calibgraph.model.metrics import Evaluation, PoseError, pose_error
+from calibgraph.model.places import describe_places
 from calibgraph.model.summary import Summary
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
         f"{config.tolerance_deg:g} deg or {config.tolerance_cm:g} cm; moved: from the "
         "guess; median: error of all matches, in pixels; inliers, matches: within the gate"
     )
+    if result.places:
+        print_plain(console, describe_places(result.places))
     console.print(error_bar_table(result))
     console.print(
         f"one standard deviation of the {config.of}: scatter between frames, and the error that "

@@ -107,6 +107,7 @@ def _results(result: Calibration) -> tuple[CameraResult, ...]:
             else verdict.error_probability.probability,
             reasons=tuple(reason.text for reason in result.summary_of(name).reasons),
             actions=result.summary_of(name).actions,
+            of=result.config.of,
             T_camera_lidar=tuple(result.T_camera_lidar[name].ravel().tolist()),
             covariance=None if (c := covariance[name]) is None else tuple(c.ravel().tolist()),
         )

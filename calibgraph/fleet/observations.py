@@ -62,7 +62,7 @@ def observe(rows: pa.Table) -> Observations:
         rows: as of ``read_rows``; columns of numbers beyond its own become covariates.
 
     Raises:
-        CalibrationError: if a column is missing.
+        CalibrationError: if a column is missing, or some poses are alignments and some mounts.
     """
     missing = [name for name in ("vehicle", "camera", "status", "T_camera_lidar", "covariance")
                if name not in rows.column_names]  # fmt: skip
@@ -71,6 +71,7 @@ def observe(rows: pa.Table) -> Observations:
             f"the fleet's table has no column {missing[0]!r}, found "
             f"{', '.join(rows.column_names)}; give the folder that calibgraph fleet wrote"
         )
+    require_one_quantity(rows)
     T, placed = _fixed_size(rows, "T_camera_lidar", 16)
     covariance, bounded = _fixed_size(rows, "covariance", 36)
     done = (words(rows, "status") == "done") & (words(rows, "verdict") != "FAIL")
@@ -84,6 +85,26 @@ def observe(rows: pa.Table) -> Observations:
         day=days(rows),
         covariates=_covariates(rows),
     )
+
+
+def require_one_quantity(*tables: pa.Table) -> None:
+    """Check that the poses of all rows are alignments, or all mounts.
+
+    Raises:
+        CalibrationError: naming a vehicle of each.
+    """
+    found: dict[str, str] = {}
+    for rows in tables:
+        done = words(rows, "status") == "done"
+        of, first = np.unique(words(rows, "of")[done] == "mount", return_index=True)
+        names = words(rows, "vehicle")[done][first].tolist()
+        found |= zip(np.where(of, "mount", "alignment").tolist(), names, strict=True)
+    if len(found) > 1:
+        raise CalibrationError(
+            f"the rows of vehicle {found['mount']!r} are of mounts, those of "
+            f"{found['alignment']!r} of alignments, which are different quantities; calibrate all "
+            "with one `of` in their settings"
+        )
 
 
 def newest_rows(rows: pa.Table, *, days_ago: float = 0.0) -> pa.Table:

@@ -15,7 +15,14 @@ from calibgraph.arrays import Array
 from calibgraph.files import write_text
 from calibgraph.fleet.findings import find_changes, moved_lidars
 from calibgraph.fleet.model import FALSE_DISCOVERIES, FleetModel, fit_fleet
-from calibgraph.fleet.observations import Observations, Words, newest_rows, observe, words
+from calibgraph.fleet.observations import (
+    Observations,
+    Words,
+    newest_rows,
+    observe,
+    require_one_quantity,
+    words,
+)
 from calibgraph.model.geometry import twists_between
 from calibgraph.report.kit import load_template
 
@@ -49,6 +56,7 @@ def assess_status(rows: pa.Table, fleet: FleetModel, before: pa.Table | None = N
     """Where every row stands."""
     changed = np.zeros(len(rows), dtype=np.bool_)
     if before is not None and len(before):
+        require_one_quantity(rows, before)
         changed = changed_poses(fleet.observations, observe(before))
     status, verdict = words(rows, "status"), words(rows, "verdict")
     done, measured = status == "done", fleet.observations.measured

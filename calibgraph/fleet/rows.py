@@ -39,6 +39,7 @@ SCHEMA = pa.schema(
         ("actions", pa.list_(pa.string())),
         ("T_camera_lidar", pa.list_(pa.float64(), 16)),
         ("covariance", pa.list_(pa.float64(), 36)),
+        ("of", pa.string()),
         ("error_kind", pa.string()),
         ("error", pa.string()),
         ("seconds", pa.float64()),
@@ -49,8 +50,9 @@ SCHEMA = pa.schema(
     metadata={"format": FLEET_FORMAT},
 )
 """probability_off: by more than the tolerance. T_camera_lidar: (4, 4) by rows, null when failed;
-covariance: (6, 6) of xi in T_camera_lidar = exp(xi) estimate, null without an error bar. A vehicle
-that failed before its cameras were known has one row with an empty camera."""
+covariance: (6, 6) of xi in T_camera_lidar = exp(xi) estimate, null without an error bar; of:
+alignment or mount, null in rows of earlier versions, which are alignments. A vehicle that failed
+before its cameras were known has one row with an empty camera."""
 
 
 def read_rows(uri: str, storage_options: Mapping[str, Any] | None = None) -> pa.Table:

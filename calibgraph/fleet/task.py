@@ -6,6 +6,7 @@ from typing import Literal
 
 from calibgraph.errors import CalibrationError
 from calibgraph.fleet.manifest import Job
+from calibgraph.model.config import Reported
 from calibgraph.model.versions import version_of
 
 ErrorKind = Literal[
@@ -73,6 +74,7 @@ class CameraResult:
     T_camera_lidar: tuple[float, ...]
     covariance: tuple[float, ...] | None
     actions: tuple[str, ...] = ()
+    of: Reported = "alignment"
 
 
 @dataclass(frozen=True)

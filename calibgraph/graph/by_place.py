@@ -137,14 +137,14 @@ class LateQuadraticByPlace:
         T_lidar_camera: as there.
         offsets: (p,) at the minima, in the units of the variable.
         information: (p, 7, 7) of poses and offset there.
-        key: of the variable.
+        keys: (p,) of its variables.
     """
 
     places: Numbers
     T_lidar_camera: Sequence[gtsam.Pose3]
     offsets: Array
     information: Array
-    key: int
+    keys: Sequence[int]
 
     def with_variance(self, factor: float) -> LateQuadraticByPlace:
         """Multiply the variance of the matches."""
@@ -155,9 +155,9 @@ class LateQuadraticByPlace:
 
         Args:
             T_camera_cloud: (p, 4, 4), one pose per place.
-            values: (1,) the offset.
+            values: (p, 1) the offsets.
         """
-        return [self._sums(row, T, values) for row, T in enumerate(T_camera_cloud)]
+        return [self._sums(row, T, values[row]) for row, T in enumerate(T_camera_cloud)]
 
     def _sums(self, row: int, T_camera_cloud: Array, values: Array) -> BlockSums:
         step = self.T_lidar_camera[row].localCoordinates(to_T_lidar_camera(T_camera_cloud))
@@ -167,9 +167,10 @@ class LateQuadraticByPlace:
 
     def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
         """The quadratic of one place: a factor on its cloud, its camera and the time offset."""
-        rows = map(int, np.flatnonzero(self.places == place))
-        keys = cloud, matched, self.key
-        return [free_lens_sums_factor(keys, partial(self._sums, row), 1) for row in rows]
+        return [
+            free_lens_sums_factor((cloud, matched, self.keys[row]), partial(self._sums, row), 1)
+            for row in map(int, np.flatnonzero(self.places == place))
+        ]
 
 
 @dataclass(frozen=True, eq=False)

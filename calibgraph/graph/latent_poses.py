@@ -75,8 +75,9 @@ class LatentPoseModel:
         components: of the errors.
         of: the poses that are reported.
         lenses: those that are estimated, by the numbers of their cameras.
-        lens_errors: where mounts are reported, by the numbers of cameras, (6, 6) covariance of
-            ``b_c`` about ``x_c``: of the pose that follows what is not estimated of the lens.
+        lens_errors: by the numbers of cameras, (6, 6) covariance of ``b_c``, which is then
+            reported, about the mount or alignment: of the pose that follows what is not estimated
+            of lens and clock.
     """
 
     cameras: tuple[str, ...]
@@ -110,11 +111,13 @@ class LatentPoseModel:
     @cached_property
     def reported_keys(self) -> list[int]:
         """Keys of the poses that are reported, in the order of the cameras."""
-        key, differing = (aligned_key, [*self.aligned])
-        if self.of == "mount":
-            key, differing = body_key, [*self.lens_errors]
         numbers = range(len(self.cameras))
-        return [key(n) if n in differing else camera_key(n) for n in numbers]
+        return [body_key(n) if n in self.lens_errors else self.fitted_key(n) for n in numbers]
+
+    def fitted_key(self, number: int) -> int:
+        """Key of the mount or the alignment of a camera, as the lens of the rig has it."""
+        is_aligned = self.of == "alignment" and number in self.aligned
+        return aligned_key(number) if is_aligned else camera_key(number)
 
     @cached_property
     def matched(self) -> list[int]:
@@ -175,12 +178,13 @@ class LatentPoseModel:
         Mounts before the distortion: in this order no exact tie is left to a weak variable.
         """
         distortion = [DISTORTION] if self.is_distorted else []
+        walks = [key for term in self.lenses.values() for key, _ in term.walk]
         lenses = [key(number) for key in (seen_lens_key, lens_key) for number in self.lenses]
         shown = [*map(matched_key, self.matched), *map(paired_key, self.paired)]
         bodies = map(body_key, self.lens_errors)
         poses = [*self.camera_keys, *map(aligned_key, self.aligned), *bodies]
         others = [key for key in poses if key not in self.reported_keys]
-        return [CLOUD, *shown, *others, *lenses, *distortion, *self.reported_keys]
+        return [CLOUD, *shown, *others, *walks, *lenses, *distortion, *self.reported_keys]
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
@@ -239,7 +243,7 @@ def _shared_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
             shifts = term.shifts(number, is_distorted=model.is_distorted)
             graph.add(displaced_between_factor(*edge, shifts, noise))
     for number, covariance in model.lens_errors.items():
-        edge = camera_key(number), body_key(number)
+        edge = model.fitted_key(number), body_key(number)
         graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), _noise(covariance)))
     for number in model.paired:
         edge = camera_key(number), paired_key(number)

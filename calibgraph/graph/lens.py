@@ -3,7 +3,8 @@
     prior    l_c at the lens of the rig, each parameter with a Cauchy loss
     matcher  l_c to s_c, the lens as the matches show it, displaced by the scan distortion and by
              their errors; these displace m_c, the pose as they show it, too
-    data     correspondences of camera c at place p, on o_p, a_cp and s_c
+    walk     e_cp to the next one in time, the last to s_c, of a lens that walks
+    data     correspondences of camera c at place p, on o_p, a_cp and s_c, or e_cp
 
 A parameter of l_c is in standard deviations of its prior. The prior has heavy tails: data that are
 sure of a wrong lens leave it, and data that are not stay with it.
@@ -64,6 +65,7 @@ TANGENTIAL_SHARE = 0.1
 _CALIBRATED = 0.002
 _TAIL_SIGMAS = 2.0  # where the Cauchy loss of a prior bends
 _PLAIN = 2  # radial coefficients that are set free in a rig without distortion
+_STILL = 1e-4  # of a walk in no time: two places that were left together
 _EXACT = 1e-3  # prior standard deviations: less would lose digits
 
 
@@ -176,6 +178,7 @@ class LensTerm:
             no scan distortion: of the pose that fits best where the lens is wrong by as much.
         earlier: value and standard deviation of a single parameter, in its unit, by data that are
             in no other factor; None if there are none.
+        walk: keys of ``e_cp`` in the order of time, each with the variance of the walk to the next.
     """
 
     variable: LensVariable
@@ -183,6 +186,7 @@ class LensTerm:
     by_distortion: Array
     compensating: Array
     earlier: tuple[float, float] | None = None
+    walk: Sequence[tuple[int, float]] = ()
 
     def shifts(self, number: int, *, is_distorted: bool) -> dict[int, Array]:
         """By key, the (6, ...) displacements of m_c by l_c, s_c and the scan distortion."""
@@ -208,6 +212,17 @@ def lens_graph(lenses: Mapping[int, LensTerm], *, is_distorted: bool) -> gtsam.N
             keys, matrices = [*keys, DISTORTION], [*matrices, -term.by_distortion]
         noise = gtsam.noiseModel.Gaussian.Covariance(term.excess + _EXACT**2 * unit)
         graph.add(linear_factor(keys, matrices, noise))
+        graph.push_back(walk_graph(number, term.walk))
+    return graph
+
+
+def walk_graph(number: int, walk: Sequence[tuple[int, float]]) -> gtsam.NonlinearFactorGraph:
+    """The walk of one parameter of a lens over the places that were left, to the present."""
+    graph = gtsam.NonlinearFactorGraph()
+    following = [*(key for key, _ in walk[1:]), seen_lens_key(number)]
+    for (key, variance), other in zip(walk, following, strict=False):
+        noise = gtsam.noiseModel.Isotropic.Variance(1, variance + _STILL**2)
+        graph.add(gtsam.BetweenFactorVector(key, other, np.zeros(1), noise))
     return graph
 
 
@@ -216,7 +231,8 @@ def start_lenses(lenses: Mapping[int, LensTerm]) -> gtsam.Values:
     values = gtsam.Values()
     for number, term in lenses.items():
         values.insert(lens_key(number), term.variable.values)
-        values.insert(seen_lens_key(number), term.variable.values)
+        for key in (seen_lens_key(number), *(key for key, _ in term.walk)):
+            values.insert(key, term.variable.values)
     return values
 
 

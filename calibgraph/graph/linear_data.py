@@ -80,8 +80,13 @@ class LinearData:
         values: gtsam.Values,
         T_camera_cloud: Array,
     ) -> None:
-        """The same with a free lens, on o_p^-1 a_cp and s_c."""
-        sums = block.sums(T_camera_cloud, values.atVector(block.key))
+        """The same with a free lens, on o_p^-1 a_cp and s_c, or e_cp."""
+        if isinstance(block, LateQuadraticByPlace):
+            lenses = block.keys
+            sums = block.sums(T_camera_cloud, np.array([*map(values.atVector, lenses)]))
+        else:
+            lenses = [block.key] * len(keys)
+            sums = block.sums(T_camera_cloud, values.atVector(block.key))
         by_cloud = -adjoints(T_camera_cloud)
         for number, (place, key) in enumerate(zip(block.places, keys, strict=True)):
             one, size = sums[number], len(sums[number].gradient)
@@ -93,7 +98,7 @@ class LinearData:
             self.cost += float(one.cost)
             self.graph.push_back(
                 gtsam.HessianFactor(
-                    cloud_at_key(int(place)), key, block.key,
+                    cloud_at_key(int(place)), key, lenses[number],
                     hessian[cloud, cloud], hessian[cloud, pose], hessian[cloud, lens], pull[cloud],
                     hessian[pose, pose], hessian[pose, lens], pull[pose],
                     hessian[lens, lens], pull[lens], float(one.cost),

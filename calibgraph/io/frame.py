@@ -84,6 +84,11 @@ class Frame:
             return self.find_twist()
         return None if self.motion is None else np.array(self.motion.twist_per_s)
 
+    @property
+    def T_world_lidar(self) -> Array | None:
+        """(4, 4) of the LiDAR in a frame fixed to the ground; None if no poses are given."""
+        return None if self.motion is None else self.motion.T_world_lidar
+
     def load_cloud(self) -> NDArray[np.float32]:
         """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`."""
         return load_cloud(self.cloud_path, self.motion)

@@ -8,7 +8,7 @@ leaves 1 cm.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +34,12 @@ class ScanMotion:
     Attributes:
         twist_per_s: rotation [rad/s] and translation [m/s] along the LiDAR's axes.
         to_s: the instant, in seconds after the stamp of the scan.
+        T_world_lidar: (4, 4) at the stamp, if poses of the drive are given; not kept in results.
     """
 
     twist_per_s: tuple[float, ...]
     to_s: float
+    T_world_lidar: Array | None = field(default=None, compare=False, repr=False)
 
     def correct(self, points_m: NDArray[np.floating], times_s: Array) -> Array:
         """(n, 3) where points, taken at times [s] after the stamp, would be seen at the instant."""

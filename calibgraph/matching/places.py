@@ -1,8 +1,9 @@
 """The places of a recording: frames that are near each other show the same objects, and err alike.
 
-The motion from one frame to the next follows from features of a camera's images that both see,
-with depths from the cloud: robust PnP, in metres, without odometry; or from the two clouds. Who
-returns to a place, in any direction, is recognised by the cloud of the place's first frame.
+The motion from one frame to the next follows from poses of the LiDAR, if they are given, or from
+its twists over a short time; else from features of a camera's images that both see, with depths
+from the cloud: robust PnP, in metres; or from the two clouds. Who returns to a place, in any
+direction, is recognised by the cloud of the place's first frame.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
-from calibgraph.io.frame import Frame
+from calibgraph.io.frame import Frame, seconds_between
 from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
 from calibgraph.matching.camera_pairs.relative_pose import relative_pose
 from calibgraph.matching.camera_pairs.surfaces import planes_at
@@ -30,6 +32,10 @@ PLACE_M = 20.0
 """Radius [m] of a place about its first frame: a camera that looks
 ahead matches objects at 10 to 50 m."""
 
+MOST_S = 1.0
+"""Longest time over which twists are integrated: from the mean of those at both ends the distance
+differs by up to a t^2 / 4, which is 0.75 m at 3 m/s^2."""
+
 Motion = NDArray[np.float64] | None
 """(4, 4) T_later_earlier of the LiDAR; None where the two frames have too little in common."""
 
@@ -37,7 +43,8 @@ Motion = NDArray[np.float64] | None
 def find_places(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -> list[list[int]]:
     """The numbers of the frames of each place, in the order of the frames.
 
-    Where features do not show the motion, as beyond some 5 m, the clouds may. A frame farther than
+    Where no pose or twist is known and features do not show the motion, as beyond some 5 m, the
+    clouds may. A frame farther than
     PLACE_M from the first of its place, or of another recording, or after an unknown motion, is
     compared with the first frames of all places. It is of the most similar one within PLACE_M, else
     of a new one. If neither images nor clouds show the motion, unlike clouds are evidence of
@@ -110,6 +117,20 @@ class PlaceWalk:
             del self._known[next(iter(self._known))]
 
 
+def _given_motion(before: Frame, now: Frame) -> Motion:
+    """The motion by the poses of both frames, or by their twists if they are close in time."""
+    one, two = before.T_world_lidar, now.T_world_lidar
+    if one is not None and two is not None:
+        return invert(two) @ one
+    seconds = seconds_between(before, now)
+    if seconds is None or abs(seconds) > MOST_S:
+        return None
+    twists = before.twist_per_s, now.twist_per_s
+    if twists[0] is None or twists[1] is None:
+        return None
+    return np.asarray(gtsam.Pose3.Expmap(-seconds * (twists[0] + twists[1]) / 2).matrix())
+
+
 def _motion_by_clouds(before: Frame, now: Frame) -> Motion:
     earlier, later = _upright_cloud(before), _upright_cloud(now)
     found = earlier and later and align_with_any(later, [earlier])
@@ -160,7 +181,9 @@ class PlaceFinder:
         """
         seen, before = _SeenFrame(frame, {}), self._before
         self._before = seen
-        step = None if before is None else self._step(before, seen)
+        step = None if before is None else _given_motion(before.frame, frame)
+        if before is not None and step is None:
+            step = self._step(before, seen)
         return self._walk.first_of_place(frame, step)
 
     def _step(self, before: _SeenFrame, now: _SeenFrame) -> Motion:
@@ -210,10 +233,11 @@ def _motion(
     lens: Camera,
     seed: int,
 ) -> Motion:
-    """Matches of the earlier frame's features that have depth to the later frame's pixels."""
-    (frame, before), (_, after) = both
-    if before is None or after is None:
-        return None
+    """As given, else by the earlier frame's features that have depth and the later one's pixels."""
+    (frame, before), (later, after) = both
+    given = _given_motion(frame, later)
+    if given is not None or before is None or after is None:
+        return given
     rows = match_features(before, after)
     rays = before.rays[rows[:, 0]]
     cloud = frame.load_cloud()[:, :3].astype(np.float64)

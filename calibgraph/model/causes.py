@@ -60,7 +60,9 @@ CAUSES: dict[str, Cause] = {
         "Pair each image with the cloud of its own instant: correct the time stamps or the offset.",
         {"own_clouds": "", "clouds of another time": "", "repeated frames": "",
          **dict.fromkeys(("time_offset", "lens_time_offset"), "Correct the time stamps, or "
-                         "estimate the time of the images: --estimate offset.")},
+                         "estimate the time of the images: --estimate offset."),
+         "time_prior": "Check that the stamps of images and clouds, and the motion, are right. "
+         "Then correct the named time in the rig, or state its sigma."},
     ),
     "lens": Cause(
         "the intrinsics",
@@ -73,6 +75,8 @@ CAUSES: dict[str, Cause] = {
                f"estimate the lens: --estimate {part}."
                for by in ("lens_", "") for name, part in _ESTIMATED_AS.items()},
             "lens_skew": "", "skew": "",
+            "lens_prior": "Check that the lens belongs to these images; then correct the named "
+            "value in the rig, or state intrinsics_sigma_px and distortion_sigma.",
             "focal_sensitivity": "Verify the focal length: here the position depends on it.",
         },
     ),
@@ -126,8 +130,9 @@ CAUSES: dict[str, Cause] = {
          "difference between even and odd frames": "Record at least 5 frames, 10 s apart.",
          "repeated_frames": "Take frames while the vehicle drives.",
          "image evidence": _STRUCTURE,
-         "common_error": "State the error that all frames share, --common-deg and --common-cm (0 "
-         "if none), or systematic_rotation_rad and systematic_translation_m in the metadata.",
+         "common_error": "State the error that all frames share (0 if none): common_deg and "
+         "common_cm in the config (of solve also as options), or systematic_rotation_rad and "
+         "systematic_translation_m in the metadata.",
          "start": "Keep driving: the camera starts after enough frames with matches.",
          "blind frames": "Check that the camera delivers images and sees what the LiDAR sees."},
     ),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CorrespondenceError
+from calibgraph.errors import CorrespondenceError, MotionError
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import KEYS, Places
 from calibgraph.model.table_columns import (
@@ -22,7 +22,9 @@ from calibgraph.model.table_columns import (
     OPTIONAL_WHOLE,
     TABLE_FORMAT,
     TWIST,
+    TWIST_RULE,
     as_confidence,
+    beyond_vehicles,
     rows_where,
     write_table,
 )
@@ -30,9 +32,6 @@ from calibgraph.model.table_columns import (
 if TYPE_CHECKING:
     import pyarrow as pa
 
-
-MAX_TWIST = 6.0, 100.0  # rad/s and m/s: beyond those of a vehicle; swapped ones are seen
-_TWIST_RULE = "be under 6 rad/s, then under 100 m/s (rotation first, in radians)"
 MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
 _MAX_WHOLE = 2**63 - 1
 MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
@@ -237,8 +236,8 @@ class Correspondences:
             good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
             self._require(good, what, values, f"be finite and below {MAX_COORDINATE:g}")
         if (twist := self.twist_per_s) is not None:
-            good = (np.linalg.norm(twist.reshape(-1, 2, 3), axis=2) < MAX_TWIST).all(axis=1)
-            self._require(good, "twist", twist, _TWIST_RULE)
+            self._require(np.isfinite(twist).all(axis=1), "twist", twist, "be finite")
+            self._require(~beyond_vehicles(twist), "twist", twist, TWIST_RULE)
         c = self.confidence
         self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
         if self.point_index is not None:
@@ -258,7 +257,8 @@ class Correspondences:
             row = int(np.flatnonzero(~good)[0])
             camera, frame = self.cameras[self.camera_index[row]], int(self.frame[row])
             text = f"{what} must {rule}, found {found[row].tolist()}; drop or correct the row"
-            raise CorrespondenceError(text, camera=camera, frame=frame, row=row)
+            error = MotionError if rule is TWIST_RULE else CorrespondenceError
+            raise error(text, camera=camera, frame=frame, row=row)
 
 
 _WIDTHS = {

@@ -130,7 +130,7 @@ def left_out(config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool
     if is_mount:
         lens += ", beyond what the rig states or a calibration with a target leaves"
     stated = motion_known and all(each.time_offset_sigma_s for each in rig.cameras.values())
-    times = "offset" in config.estimate or (is_mount and stated)
+    times = "offset" in config.estimate or (config.preset == "auto" and stated)
     others = [] if times else ["of the time of the images"]
     others += [] if rig.relative_poses else ["of the clouds' scale"]
     joint = ", and " if is_mount or len(others) > 1 else " and "

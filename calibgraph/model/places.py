@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ PLACES = "places"
 STATIONARY = "stationary"
 _STATIONARY_BEFORE = "same_place"
 """The key of older tables."""
+_MOST_DESCRIBED = 8
 KEYS = (PLACES, STATIONARY, _STATIONARY_BEFORE)
 
 
@@ -76,6 +78,11 @@ class Places:
         edges = np.flatnonzero(np.diff(place[order])) + 1
         return [part for part in np.split(frame[order], edges) if len(part)]
 
+    def of_frames(self, frame: Numbers) -> Groups:
+        """The places of (n,) frame numbers; empty if nobody looked for them."""
+        parts = [] if self.places is None else self.split(np.unique(frame))
+        return as_groups([part.tolist() for part in parts])
+
     def frames_per_place(self, frame: Numbers) -> float:
         """Number of (f,) frames that share the error of a place, averaged over frames."""
         counts = [len(place) for place in self.split(frame)]
@@ -93,6 +100,20 @@ NOWHERE = Places()
 def as_groups(groups: Sequence[Sequence[int]]) -> Groups:
     """Lists of frame numbers as groups."""
     return tuple(tuple(group) for group in groups)
+
+
+def describe_places(groups: Groups) -> str:
+    """How many places, and the frames of the first of them, in a line."""
+    named = "; ".join(map(_describe_numbers, groups[:_MOST_DESCRIBED]))
+    more = f"; and {len(groups) - _MOST_DESCRIBED} more" if groups[_MOST_DESCRIBED:] else ""
+    return f"{len(groups)} place{'s' if len(groups) > 1 else ''}: frames {named}{more}"
+
+
+def _describe_numbers(group: Sequence[int]) -> str:
+    """Ascending numbers in short, as in 0-4, 7."""
+    runs = groupby(enumerate(group), key=lambda item: item[1] - item[0])
+    numbers = ([number for _, number in run] for _, run in runs)
+    return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in numbers)
 
 
 def _groups(metadata: Mapping[str, Any], key: str) -> Groups:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import write_atomically
 
@@ -19,12 +20,21 @@ TABLE_FORMAT = "calibgraph-correspondences/1"
 COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
 INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
 TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_m_s", "vy_m_s", "vz_m_s")
+MAX_TWIST = 6.0, 100.0  # rad/s and m/s: beyond those of a vehicle; swapped ones are seen
+TWIST_RULE = "be under 6 rad/s, then under 100 m/s (rotation first, in radians)"
 
 OPTIONAL_WHOLE = ("stamp_ns", "point_index")
 _WHOLE = ("frame", *OPTIONAL_WHOLE)
 _REQUIRED = ("camera", "frame", *COORDINATES)
 _COLUMNS = (*_REQUIRED, "confidence", *OPTIONAL_WHOLE, *INFORMATION, *TWIST)
 _TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
+
+
+def beyond_vehicles(twist_per_s: Array) -> NDArray[np.bool_]:
+    """(n,) whether (n, 6) motions are those of no vehicle."""
+    lengths = np.linalg.norm(twist_per_s.reshape(-1, 2, 3), axis=2)
+    beyond: NDArray[np.bool_] = (lengths >= MAX_TWIST).any(axis=1)
+    return beyond
 
 
 def write_table(arrow: pa.Table, path: Path) -> None:

@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import numpy as np
-
 from calibgraph.model.verdict import TOLERANCE, Check, Status, grade
 
 Direction = Literal["at most", "at least"]
@@ -51,9 +49,8 @@ class Threshold:
         """
         if not self.of_tolerance:
             return self
-        ratio = dict(zip(("deg", "cm"), np.divide(tolerance, TOLERANCE), strict=True))[self.unit]
-        fail = self.fail * max(float(ratio), 1.0)
-        return replace(self, warn=self.warn * float(ratio), fail=fail)
+        ratio = ratio_of(self.unit, tolerance)
+        return replace(self, warn=self.warn * ratio, fail=self.fail * max(ratio, 1.0))
 
     def grade(self, value: float) -> Status:
         """PASS, WARN or FAIL of a value; NaN fails."""
@@ -75,6 +72,11 @@ class Threshold:
         """A check whose sentence, and perhaps status, depend on more than the value."""
         limits = (self.warn, self.fail, self.unit)
         return Check(name or self.name, status, text, value, *limits, kind=self.key)
+
+
+def ratio_of(unit: str, tolerance: tuple[float, float]) -> float:
+    """A tolerance [deg, cm] over the default one: that of the rotation or of the distance."""
+    return tolerance[("deg", "cm").index(unit)] / TOLERANCE[("deg", "cm").index(unit)]
 
 
 def is_reachable(limit: float, unit: str, direction: Direction) -> bool:

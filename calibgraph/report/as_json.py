@@ -35,6 +35,9 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
                 {**vars(one), "is_determined": one.is_determined}
                 for one in result.lens.get(name, ())
             ],
+            "lens_covariance": (
+                result.joint_of_lens(name) if name in result.lens_covariance else None
+            ),
         }
     return {
         "verdict": result.verdict.status,
@@ -43,6 +46,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
         "reasons": list(result.verdict.reasons),
         "summary": result.summary.to_mapping(),
         "warnings": list(result.warnings),
+        "places": [list(place) for place in result.places],
         "cameras": cameras,
         "pairs": {name: _sigmas(result, name) for name in result.pair_covariance},
         "timings_s": result.timings_s,

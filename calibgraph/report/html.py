@@ -10,6 +10,7 @@ from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
     CAMERA_MATCHES_FILE,
     CORRESPONDENCES_FILE,
@@ -62,6 +63,7 @@ def report_html(result: Calibration) -> str:
         cameras=cameras,
         summary=summary,
         recording=recording_name(result),
+        places=describe_places(result.places) if result.places else "",
         actions=summary.actions or ("Deploy it: see below.",),
         export_command=_export_command(result),
         export_formats=EXPORT_FORMATS,

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.service.tracker_request import ARROW, FramesTaken, TrackerRequest
+from calibgraph.errors import FileError
+from calibgraph.service.tracker_request import ARROW, FramesTaken, Refusal, TrackerRequest
 
 if TYPE_CHECKING:
     from calibgraph.tracking.durable import DurableCalibrator
@@ -105,19 +105,25 @@ class _Taken:
     refused: list[str] = field(default_factory=list)
 
 
-def take_frames(tracker: OpenTracker, request: TrackerRequest) -> FramesTaken:
+def take_frames(tracker: OpenTracker, request: TrackerRequest) -> FramesTaken | Refusal:
     """Take in the frames of a request; they are on disk before their updates are answered.
 
-    Whatever ends a long request, the frames of its earlier writes are known then.
+    Whatever ends a long request, the frames of its earlier writes are known then. One with a motion
+    that no vehicle has is refused whole: its slower frames look right, and are not.
 
     Raises:
         OSError: if they cannot be written; then abandon the tracker, and open it anew.
     """
     from calibgraph.tracking.frame_group import in_groups
+    from calibgraph.tracking.streams import Refused
     from calibgraph.tracking.update import json_lines
 
     taken = _Taken()
-    groups = in_groups(_items(request, taken.refused), min(_TOGETHER, _WRITE_FRAMES))
+    items = [*_items(request, taken.refused)]
+    for item in items:
+        if isinstance(item, Refused) and item.by_motion:
+            return Refusal(422, f"{item.message}; none of these frames was taken in")
+    groups = in_groups(items, min(_TOGETHER, _WRITE_FRAMES))
     while _take_by_one_write(tracker, groups, taken):
         pass
     lines = ", ".join(json_lines(taken.updates))
@@ -155,8 +161,8 @@ def _take(calibrator: DurableCalibrator, group: list[StreamFrame] | Refused, tak
     new = [one for one in group if last is None or one.frame > last]
     taken.known += len(group) - len(new)
     for found in update_all(calibrator, new):
-        if isinstance(found, CorrespondenceError):
-            taken.refused.append(str(found))
+        if isinstance(found, Refused):
+            taken.refused.append(found.message)
         else:
             taken.updates += found
 

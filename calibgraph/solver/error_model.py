@@ -250,8 +250,7 @@ def error_model(
     )
     graph = join(inliers.pose_graph, held_graph(cameras, at.T_camera_lidar, at.held))
     features = pairs_by_place(pairs, places)
-    of = inliers.config.of
-    errors = lens_errors(at) if of == "mount" else {}
+    of, errors = inliers.config.of, lens_errors(at)
     return LatentPoseModel(
         cameras, blocks, features, graph, components, of, lenses=lenses, lens_errors=errors
     )

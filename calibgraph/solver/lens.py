@@ -74,7 +74,11 @@ def lens_term(
     scatter = _frame_scatter(FreeLensBlock(placed.block, lens.free), placed, at)
     counts = len(placed.block), len(placed.count_of_frame)
     of_poses = within.at_place(findings.place_variance)[placed.places]
-    return lens_term_of(lens, (hessians, scatter, of_poses), counts, within, findings=findings)
+    in_graph = np.linalg.inv(
+        information_in_graph(hessians, of_poses, within.least, lens).sum(axis=0)
+    )
+    shown = hessians.sum(axis=0), scatter, in_graph
+    return lens_term_of(lens, shown, counts, within, findings=findings)
 
 
 def lens_term_of(
@@ -89,35 +93,37 @@ def lens_term_of(
 
     Args:
         lens: of the camera.
-        shown: (p, 6 + k, 6 + k) Hessians of independent matches at each place; (6 + k, 6 + k) sum
-            of the outer products of the gradients of frames; (p, 6, 6) covariance of a_cp about
-            m_c.
+        shown: (6 + k, 6 + k) Hessian of independent matches; sum of the outer products of the
+            gradients of frames; covariance of m_c and s_c by the matches and the poses of places.
         counts: of matches and of frames.
         within: what its matches of one place share.
         findings: the matcher's error.
     """
-    hessians, scatter, of_poses = shown
-    hessian = hessians.sum(axis=0) + weak_information(lens)
+    hessian, scatter, in_graph = shown
+    hessian = hessian + weak_information(lens)
     covariance = np.linalg.inv(hessian)
     scatter = _allow_for_few_frames(scatter, hessian, *counts)
     of_matches = MATCH_SHARE * counts[0] if any(findings.systematic_sigmas) else 0.0
     shared = within.efficiency * max(findings.place_variance * within.alike, of_matches)
     whole = within.efficiency**2 * (covariance @ scatter @ covariance) + shared * covariance
-    excess = _positive((whole - _in_graph(hessians, of_poses, within.least, lens))[6:, 6:])
+    excess = _positive((whole - in_graph)[6:, 6:])
     compensating = np.asarray(-np.linalg.solve(hessian[:6, :6], hessian[:6, 6:]))
     return LensTerm(lens, excess, np.zeros((len(excess), 0)), compensating)
 
 
 def lens_errors(at: FittedObjective) -> dict[int, Array]:
-    """Per number of a camera, (6, 6) covariance of its mount by what is not estimated of its lens.
+    """Per number of a camera, (6, 6) covariance of its pose by what is not estimated of its lens.
 
     Of the pose that fits the matches of a lens which errs as that of a calibrated camera, or as the
-    rig states, and of a clock whose errors the rig states; in the tangent of T_lidar_camera.
+    rig states, and of a clock whose errors the rig states; in the tangent of T_lidar_camera. An
+    alignment makes up for a lens alike in every recording, but for a clock by the speed.
     """
-    found = {}
+    found, is_mount = {}, at.objective.config.of == "mount"
     for name, block in at.projections.items():
         camera = at.objective.rig.cameras[name]
-        lens = LensVariable.of(camera, _uncertain_parts(camera), LensSigmas.calibrated(camera))
+        clock = _stated_clock(camera) if is_mount or block.motion is not None else []
+        parts = [*(_uncertain_lens(camera) if is_mount else ()), *clock]
+        lens = LensVariable.of(camera, parts, LensSigmas.calibrated(camera))
         estimated = at.objective.lenses[name].free.parameters if name in at.objective.lenses else ()
         names = enumerate(lens.free.parameters, start=6)
         rows = [row for row, parameter in names if parameter not in estimated]
@@ -128,18 +134,24 @@ def lens_errors(at: FittedObjective) -> dict[int, Array]:
     return found
 
 
-def _uncertain_parts(camera: Camera) -> list[LensPart]:
-    """Of a panorama the format determines the lens; of clocks nothing is usual."""
+def _uncertain_lens(camera: Camera) -> tuple[LensPart, ...]:
+    """Of a panorama the format determines the lens."""
+    return () if camera.model == "equirectangular" else _LENS
+
+
+def _stated_clock(camera: Camera) -> list[LensPart]:
+    """Of clocks nothing is usual."""
     stated: dict[LensPart, float | None] = {
         "offset": camera.time_offset_sigma_s,
         "readout": camera.readout_sigma_s,
     }
-    lens = () if camera.model == "equirectangular" else _LENS
-    return [*lens, *(part for part, sigma in stated.items() if sigma)]
+    return [part for part, sigma in stated.items() if sigma]
 
 
-def _in_graph(hessians: Array, of_poses: Array, least: float, lens: LensVariable) -> Array:
-    """(6 + k, 6 + k) covariance of m_c and s_c by the matches and the poses of places.
+def information_in_graph(
+    hessians: Array, of_poses: Array, least: float, lens: LensVariable
+) -> Array:
+    """(p, 6 + k, 6 + k) of m_c and s_c by the matches and the pose of each place.
 
     Args:
         hessians: (p, 6 + k, 6 + k) of independent matches at each place.
@@ -149,7 +161,7 @@ def _in_graph(hessians: Array, of_poses: Array, least: float, lens: LensVariable
     """
     own = np.linalg.inv(hessians / least + weak_information(lens))
     own[:, :6, :6] += of_poses
-    return np.asarray(np.linalg.inv(np.linalg.inv(own).sum(axis=0)))
+    return np.asarray(np.linalg.inv(own))
 
 
 def weak_information(lens: LensVariable | None) -> Array:
@@ -224,6 +236,21 @@ def lens_estimates(fit: LatentPoseFit) -> dict[str, tuple[LensEstimate, ...]]:
     return found
 
 
+def lens_covariances(fit: LatentPoseFit) -> dict[str, Array]:
+    """Per camera whose lens is free, the (6 + k, 6 + k) joint marginal of pose, lens and clock.
+
+    Of xi in T_camera_lidar = exp(xi) estimate, then of the parameters in the order and the units of
+    :func:`lens_estimates`.
+    """
+    model, found = fit.linear.model, {}
+    for number, term in model.lenses.items():
+        joint = fit.linear.covariance_of([model.reported_keys[number], lens_key(number)])
+        units = [_unit(term.variable, row) for row in range(len(term.variable.free))]
+        scale = np.array([-1.0] * 6 + units)  # of T_lidar_camera the tangent is -xi
+        found[model.cameras[number]] = joint * np.outer(scale, scale)
+    return found
+
+
 def estimates_of(lens: LensVariable, values: Array, covariance: Array) -> tuple[LensEstimate, ...]:
     """The parameters of a lens, by its (k,) values and their (k + 6, k + 6) joint with the pose."""
     sigmas = np.sqrt(np.diag(covariance))
@@ -236,9 +263,8 @@ def _estimate(
     lens: LensVariable, row: int, values: Array, marginal: tuple[Array, Array]
 ) -> LensEstimate:
     """One parameter, with standard deviation and correlation with the pose of its camera."""
-    name, step = lens.free.parameters[row], lens.free.sigmas[row]
+    name, unit = lens.free.parameters[row], _unit(lens, row)
     before, after = (_in_its_unit(lens, name, v) for v in (np.zeros(len(values)), values))
-    unit = step * (before if name in (FOCAL, ASPECT) else 1.0)
     sigmas, correlation = marginal
     most = int(np.argmax(correlation[row]))
     return LensEstimate(
@@ -251,6 +277,13 @@ def _estimate(
         direction=_DIRECTIONS[most],
         correlation=float(correlation[row, most]),
     )
+
+
+def _unit(lens: LensVariable, row: int) -> float:
+    """The prior standard deviation of a parameter, in its unit."""
+    name, step = lens.free.parameters[row], lens.free.sigmas[row]
+    of_rig = _in_its_unit(lens, name, np.zeros(len(lens.free)))
+    return step * of_rig if name in (FOCAL, ASPECT) else step
 
 
 def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:

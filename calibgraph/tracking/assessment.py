@@ -12,7 +12,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
-from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.lens_estimate import LensEstimate, with_sigmas
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
@@ -84,13 +84,15 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
         estimates = window.T_lidar_camera(keys)
     covariance, few = window.covariance(keys), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
-    verdicts, apart = {}, estimates_of_halves(state, halves)
+    verdicts, lens = {}, _lens_estimates(window)
+    apart = estimates_of_halves(state, halves)
     for camera, name in enumerate(state.names):
         own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
+        known = lens.get(name, ())
         verdicts[name] = _verdict(
-            state, sums, camera, covariance, conflicts=own, halves=apart.get(camera)
+            state, sums, camera, covariance, conflicts=own, halves=apart.get(camera), lens=known
         )
-    return Assessment(estimates, covariance, verdicts, window, _lens_estimates(window))
+    return Assessment(estimates, covariance, verdicts, window, lens)
 
 
 def _lens_estimates(window: Window) -> dict[str, tuple[LensEstimate, ...]]:
@@ -111,6 +113,7 @@ def _verdict(
     *,
     conflicts: tuple[Conflict, ...],
     halves: tuple[Array, Array] | None,
+    lens: tuple[LensEstimate, ...],
 ) -> Verdict:
     name, one = state.names[camera], state.cameras[camera]
     if not one.started:
@@ -131,8 +134,9 @@ def _verdict(
         terms="full",
         scatter_only=not state.findings.states_common_error,
         tolerance=state.config.tolerance,
+        lens=lens,
     )
-    return Verdict((*check_estimate(estimate), *_recent_checks(state, one)))
+    return Verdict((*check_estimate(estimate), *_recent_checks(state, one, lens)))
 
 
 def _start_check(state: State, one: CameraState) -> Verdict:
@@ -146,7 +150,7 @@ def _start_check(state: State, one: CameraState) -> Verdict:
     )
 
 
-def _recent_checks(state: State, one: CameraState) -> list[Check]:
+def _recent_checks(state: State, one: CameraState, lens: tuple[LensEstimate, ...]) -> list[Check]:
     """Checks of a camera's last frames."""
     checks = []
     if one.absent >= state.config.tracking.blind_frames:
@@ -154,6 +158,7 @@ def _recent_checks(state: State, one: CameraState) -> list[Check]:
         checks.append(Check("blind frames", "WARN", text, one.absent))
     if one.summary.walk:
         text = "drifts: the estimate follows, over fewer frames"
+        text += "".join(f"; {each.trade_off}" for each in lens if each.trade_off)
         checks.append(Check("drift", "WARN", text))
     agreements = [good for _, good in one.agreements]
     if agreements:
@@ -214,7 +219,7 @@ def to_calibration(state: State, assessment: Assessment) -> Calibration:
     newest = replace(state, offsets=assessment.offsets(state))
     rig = rig_at(newest, assessment.T_lidar_camera)
     return Calibration(
-        rig=rig,
+        rig=with_sigmas(rig, assessment.lens),
         initial_rig=state.rig,
         covariance=covariance_by_camera(assessment, state.names),
         joint_covariance=known,

@@ -32,6 +32,7 @@ from calibgraph.tracking.contradictions import (
 )
 from calibgraph.tracking.epoch_sums import split_halves, sum_closed_epochs
 from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.offset_walk import add_epoch, times_of, times_with, to_present
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
@@ -80,13 +81,17 @@ class ClosedPlaces:
         if state.offsets is None:
             sums, earlier = state.places.add(sums_by_place(frames)), state.places
         else:  # a match of an earlier epoch is of another offset
-            sums, earlier, frames = *2 * (_walked_sums(state),), []
+            sums, earlier, frames = *2 * (_sums_in_time(state),), []
         for camera in state.drifting:
             sums, earlier = sums.without(camera), earlier.without(camera)
         seen = FrameSpread.of(state, sums)
         rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
-        data = PlaceData.of(state, quadratics_of(state, earlier), frames, rows)
-        model = place_model(state, sums, seen, data)
+        data, times = (
+            PlaceData.of(state, quadratics_of(state, earlier), frames, rows),
+            times_of(state),
+        )
+        data = data.at_own_times(times)
+        model = place_model(state, sums, seen, data, times=times)
         values = _start(state, model, data.names)
         if state.optimum is None:
             fit, dropped = fit_without_contradictions(state, sums, model, values)
@@ -98,7 +103,7 @@ class ClosedPlaces:
 
     def fitted(self, state: State) -> ClosedPlaces:
         """At the optimum for the variance ratios of the state."""
-        model = place_model(state, self.sums, self.seen, self.data)
+        model = place_model(state, self.sums, self.seen, self.data, times=times_of(state))
         values = self.fit.linear.values
         fit, dropped = fit_without_contradictions(state, self.sums, model, values)
         return ClosedPlaces(state, self.sums, self.seen, self.data, fit, dropped)
@@ -168,14 +173,17 @@ class ClosedPlaces:
         """
         frames = state.epochs[-1].frames
         opened = (*frames, *state.live_frames[-1:])
-        every = self.sums.add(sums_by_place(frames))
+        touched = {frame.place for frame in opened}
+        every = self._at_present(self.sums, touched).add(sums_by_place(frames))
         for camera in state.drifting:  # its sums are as if of the present place
             own = self.all_sums(state)[camera]
             every = every.with_camera_at(state.live_frames[-1].place, camera, own)
         earlier = self.quadratics | quadratics_of(state, every, state.drifting)
         seen = self.seen if self.is_settled else FrameSpread.of(state, every)
         if state.config.preset == "auto":
-            kept, rows = self._split(every, {f.place for f in opened})
+            kept, rows = self._split(every, touched)
+            lasts = {every.names[row] for row in rows} - touched
+            every, touched = self._at_present(every, lasts), touched | lasts
             if state.offsets is not None:
                 earlier, frames = quadratics_of(state, every, places=rows), ()
         else:  # the weights of a preset of the paper
@@ -183,7 +191,8 @@ class ClosedPlaces:
             earlier = quadratics_of(state, every)
             frames, kept, rows = (), (), [0] if every.frames.any() else []
         data = PlaceData.of(state, earlier, frames, {every.names[row]: row for row in rows})
-        model = place_model(state, every, seen, data)
+        times = times_with(times_of(self.state), touched)
+        model = place_model(state, every, seen, data, times=times)
         conflicts = Conflicts()
         if state.rig.relative_poses:
             start = _start(state, model, data.names)
@@ -196,11 +205,17 @@ class ClosedPlaces:
             window = Window(model, data.names, _start(state, model, data.names))
         return window, conflicts
 
+    def _at_present(self, sums: PlaceSums, names: set[str]) -> PlaceSums:
+        """Sums whose time offsets at some places are those of the open epoch."""
+        if self.state.offsets is None:
+            return sums
+        return to_present(self.state, sums, times_of(self.state), names)
+
     def _summary(self, kept: Rows) -> gtsam.NonlinearFactorGraph:
         """One factor that stands for some of the places."""
         if (kept, None) not in self._pose_graphs:
-            chosen = [self.marginals[place] for place in kept]
-            self._pose_graphs[kept, None] = summary_factor(chosen, self.fit.linear.values)
+            marginals = self.marginals if kept else ()
+            self._pose_graphs[kept, None] = summary_factor(marginals, self.fit, kept)
         return self._pose_graphs[kept, None]
 
     def _pose_graph(self, kept: Rows, dropped: Rows) -> gtsam.NonlinearFactorGraph:
@@ -226,12 +241,13 @@ class ClosedPlaces:
         return kept, sorted(rows)
 
 
-def _walked_sums(state: State) -> PlaceSums:
-    """The sums of closed epochs, each before the walk of the time offsets that comes after it."""
-    sums = state.places
+def _sums_in_time(state: State) -> PlaceSums:
+    """The sums of closed epochs, each place at the time offset that it was left with."""
+    assert state.offsets is not None
+    sums, times = state.places, state.offsets.times
     for epoch in state.epochs[:-1]:
-        sums = sums.add(sums_by_place(epoch.frames))
-        sums = state.after_offset_walk(sums, len(epoch.frames))
+        parts, frames = sums_by_place(epoch.frames), len(epoch.frames)
+        sums, times = add_epoch(state, sums, times, parts=parts, frames=frames)
     return sums
 
 

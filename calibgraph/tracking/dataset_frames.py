@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calibgraph.errors import CalibrationError, CorrespondenceError
+from calibgraph.errors import CalibrationError, CorrespondenceError, MotionError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.matching.places import PlaceFinder
@@ -87,7 +87,8 @@ class DatasetDrive:
                 if index != rounds[-1]:
                     rig = _refined(rig, table, self.config.changed(estimate=()))
         except (CalibrationError, OSError) as error:
-            return Refused(f"frame {frame.name} ({frame.index}): {error}")
+            message = f"frame {frame.name} ({frame.index}): {error}"
+            return Refused(message, by_motion=isinstance(error, MotionError))
         return StreamFrame(frame.index, table)
 
 

@@ -25,10 +25,10 @@ def sum_all_epochs(state: State, before: int | None = None) -> Sums:
 
 
 def sums_before_epochs(state: State) -> Iterator[Sums]:
-    """(n,) over the frames before each live epoch, of the poses alone."""
+    """(n,) over the frames before each live epoch, with the time offsets that are estimated."""
     sums = Sums.stack([one.summary.selected for one in state.cameras])
     for epoch in state.epochs:
-        yield state.of_poses(sums)
+        yield sums
         sums = _after_epoch(state, sums + epoch.sums, epoch)
 
 

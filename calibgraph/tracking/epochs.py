@@ -18,6 +18,7 @@ from calibgraph.tracking.events import Event
 from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, inliers_of
 from calibgraph.tracking.offset_search import explaining_offsets, follow
+from calibgraph.tracking.offset_walk import add_epoch, bounded
 from calibgraph.tracking.offsets import Offsets, delayed
 from calibgraph.tracking.place_sums import sums_by_place
 from calibgraph.tracking.regate import regate
@@ -76,6 +77,7 @@ def _with_references(
     """The state with its sums about other references, but those of live frames."""
     steps = np.array([*map(step_between, state.references, references)])
     if offsets is not None and state.offsets is not None:
+        offsets = replace(offsets, times=state.offsets.times)
         later_s = offsets.values_s - state.offsets.values_s
         steps = np.column_stack([steps, later_s])
         state = _with_points_at(replace(state, offsets=offsets), later_s)
@@ -87,13 +89,7 @@ def _with_references(
     if drift is not None:
         drift = replace(drift, anchors=drift.anchors.shift_reference(steps))
     places = state.places.shift_reference(steps)
-    return replace(
-        state,
-        cameras=cameras,
-        references=references,
-        places=places,
-        drift=drift,
-    )
+    return replace(state, cameras=cameras, references=references, places=places, drift=drift)
 
 
 def at_explaining_offsets(
@@ -152,13 +148,9 @@ def _summarize_oldest(state: State) -> State:
         variance = state.walk_variance(STRENGTHS, len(epoch.frames))
         summary = summary.propagate(variance, state.overconfidence(camera))
         state = state.with_camera(camera, replace(one, summary=summary))
-    state = replace(
-        state,
-        epochs=tuple(younger),
-        distortion=tuple(map(add, state.distortion, epoch.distortion)),
-    )
-    state = _with_places(state, sums_by_place(_at_places(state, epoch)), drifted)
-    return replace(state, places=state.after_offset_walk(state.places, len(epoch.frames)))
+    distortion = tuple(map(add, state.distortion, epoch.distortion))
+    state = replace(state, epochs=tuple(younger), distortion=distortion)
+    return _with_places(state, epoch, drifted)
 
 
 def _at_places(state: State, epoch: Epoch) -> list[LiveFrame]:
@@ -188,7 +180,7 @@ def _ungated(state: State, epoch: Epoch, camera: int) -> Sums:
     return sums_of_matches(raw, scale, pose, state.references[camera])
 
 
-def _with_places(state: State, parts: Mapping[str, Sums], drifted: Sequence[bool]) -> State:
+def _with_places(state: State, epoch: Epoch, drifted: Sequence[bool]) -> State:
     """The state with an epoch's sums added to those of its places.
 
     Of a camera that drifts there are only the sums that are discounted by its walk. When the drift
@@ -196,16 +188,23 @@ def _with_places(state: State, parts: Mapping[str, Sums], drifted: Sequence[bool
 
     Args:
         state: with the epoch summarized.
-        parts: sums of the epoch, per place.
+        epoch: the epoch.
         drifted: per camera, whether it drifted before the epoch was summarized.
     """
-    places = state.places.add(parts).bounded()
+    parts, offsets = sums_by_place(_at_places(state, epoch)), state.offsets
+    if offsets is None:
+        places = state.places.add(parts).bounded()
+    else:
+        frames = len(epoch.frames)
+        summed = add_epoch(state, state.places, offsets.times, parts=parts, frames=frames)
+        places, times = bounded(state, *summed)
+        offsets = replace(offsets, times=times)
     for camera, (one, before) in enumerate(zip(state.cameras, drifted, strict=True)):
         if one.summary.walk:
             places = places.without(camera)
         elif before and parts:
             places = places.with_camera_at([*parts][-1], camera, one.summary.selected)
-    return replace(state, places=places)
+    return replace(state, places=places, offsets=offsets)
 
 
 def _update_evidence(state: State, camera: int, epoch: Epoch, by_places: Array) -> CameraState:
@@ -218,6 +217,7 @@ def _update_evidence(state: State, camera: int, epoch: Epoch, by_places: Array) 
     noise = state.frame_noise(camera)
     if noise is None or alone is None or not sums.frames:
         return one
+    alone = alone + state.score_by_offset(camera, epoch.sums[camera]) / sums.frames
     groups = tuple(group.add(score, int(sums.frames), alone) for group in one.groups)
     rows = pose_rows(camera)
     if state.offsets is not None:

@@ -39,7 +39,7 @@ class Calibrator(Protocol):
 
 def update_all(
     calibrator: Calibrator, frames: Sequence[StreamFrame]
-) -> Iterator[list[Update] | CorrespondenceError]:
+) -> Iterator[list[Update] | Refused]:
     """Take in frames, together where nothing is unusual; what became of them, in their order.
 
     Args:
@@ -58,7 +58,7 @@ def update_all(
                 updates = [calibrator.update(one.table, frame=one.frame)]
             except CorrespondenceError as error:
                 taken += 1
-                yield error
+                yield Refused(one.why_not(error))
                 continue
         taken += len(updates)
         yield updates

@@ -7,7 +7,8 @@ were at the present offset, so that all else sees an image and a cloud of one ti
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -47,12 +48,14 @@ class Offsets:
             those of newer estimates, frames of one twist would seem to show the offset.
         earlier: (n, 3) what the frames before the last move of each camera show: value [s],
             variance [s^2], and the number of updates then. A move of a mount leaves the clock.
+        times: of the places that are kept apart, see ``calibgraph.tracking.offset_walk``.
     """
 
     values_s: Array
     sigmas_s: Array
     adjoints: Array
     earlier: Array
+    times: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
     def initial(rig: Rig) -> Offsets:

@@ -53,7 +53,8 @@ class Optimum:
         for place, camera in model.matched_places:
             matched[names[place]][camera] = values.atPose3(matched_at_key(place, camera))
         lenses = {key(number) for key in (lens_key, seen_lens_key) for number in model.lenses}
-        vectors = {DISTORTION, *lenses}
+        walks = (key for term in model.lenses.values() for key, _ in term.walk)
+        vectors = {DISTORTION, *lenses, *walks}
         return Optimum(
             {key: values.atPose3(key) for key in model.shared_keys if key not in vectors},
             values.atVector(DISTORTION) if model.is_distorted else None,

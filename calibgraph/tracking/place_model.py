@@ -37,7 +37,14 @@ from calibgraph.solver.within_place import (
     split_excess,
 )
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
-from calibgraph.tracking.offset_terms import offset_term
+from calibgraph.tracking.offset_terms import offset_term, walk_in_graph, with_shared_errors
+from calibgraph.tracking.offset_walk import (
+    Times,
+    at_own_times,
+    in_order_of_time,
+    walk_of,
+    walks_at,
+)
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.quadratics import Data, Quadratics, by_place
 from calibgraph.tracking.state import State
@@ -144,9 +151,19 @@ class PlaceData:
                 cameras[camera] = quadratic
         return PlaceData([*places], np.array([*places.values()], dtype=np.int64), cameras)
 
+    def at_own_times(self, times: Times) -> PlaceData:
+        """The same of closed places, each at the time offset of its own time."""
+        cameras = {
+            camera: at_own_times(camera, own, self.names, times)
+            if isinstance(own, LateQuadraticByPlace)
+            else own
+            for camera, own in self.cameras.items()
+        }
+        return replace(self, cameras=cameras)
+
 
 def place_model(
-    state: State, sums: PlaceSums, seen: FrameSpread, data: PlaceData
+    state: State, sums: PlaceSums, seen: FrameSpread, data: PlaceData, *, times: Times
 ) -> LatentPoseModel:
     """The graph of some places, without any prior of a camera.
 
@@ -155,17 +172,24 @@ def place_model(
         sums: of all frames.
         seen: by the frames of each camera.
         data: the matches of the places.
+        times: of the time offsets of all places.
     """
     chosen, names = data.rows, state.names
     blocks, shown, lenses = {}, {}, {}
     for camera, matches in data.cameras.items():
         within = seen.within(sums, camera, chosen)
-        if state.offsets is not None:
+        held: Data = matches
+        if isinstance(matches, LateQuadraticByPlace):
             rows = np.flatnonzero(sums.frames[:, camera])
-            own = seen.within(sums, camera, rows)
-            at_places = sums.rows[rows, camera]
-            lenses[camera] = offset_term(state, camera, at_places, own)
-        blocks[names[camera]] = matches.with_variance(within.least)
+            order, frames = in_order_of_time(times, [sums.names[row] for row in rows])
+            own = seen.within(sums, camera, rows[order])
+            term = offset_term(state, camera, sums.rows[rows[order], camera], own, frames=frames)
+            walk = walk_of(camera, matches, data.names, times, step=walk_in_graph(state, camera))
+            lenses[camera] = replace(term, walk=walk)
+            of_poses = within.at_place(state.findings.place_variance)[matches.places]
+            shared = with_shared_errors(matches.information, of_poses, within.least)
+            held = replace(matches, information=shared)
+        blocks[names[camera]] = held.with_variance(within.least)
         shown[names[camera]] = within, _distortion(state, camera, len(chosen))
     components = variance_components(state.findings, names, shown, places=len(chosen))
     alike = np.where(sums.frames[chosen] > 0, sums.places[chosen], np.inf).min(axis=1)
@@ -201,12 +225,17 @@ def marginals_of_places(fit: LatentPoseFit) -> list[gtsam.GaussianFactorGraph]:
 
 
 def summary_factor(
-    marginals: Sequence[gtsam.GaussianFactorGraph], values: gtsam.Values
+    marginals: Sequence[gtsam.GaussianFactorGraph], fit: LatentPoseFit, kept: Sequence[int]
 ) -> gtsam.NonlinearFactorGraph:
-    """One factor that stands for places: their marginals, linearized at ``values``."""
-    graph = gtsam.NonlinearFactorGraph()
-    if marginals:
-        factor, at = gtsam.HessianFactor(join_linear(*marginals)), gtsam.Values()
+    """One factor that stands for some places of a fit: their marginals, linearized there."""
+    graph, values = gtsam.NonlinearFactorGraph(), fit.linear.values
+    if kept:
+        joined = join_linear(*(marginals[place] for place in kept))
+        walks, offsets = walks_at(fit.linear.model.lenses, kept)
+        if offsets:
+            joined = join_linear(joined, walks.linearize(values))
+            joined = joined.eliminatePartialSequential(to_ordering(offsets))[1]
+        factor, at = gtsam.HessianFactor(joined), gtsam.Values()
         for key in list(factor.keys()):
             is_vector = gtsam.symbolChr(key) == gtsam.symbolChr(seen_lens_key(0))
             at.insert(key, values.atVector(key) if is_vector else values.atPose3(key))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from calibgraph.errors import CorrespondenceError
+from calibgraph.errors import MotionError
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.frame_group import in_groups, update_all
 from calibgraph.tracking.history import History
@@ -13,6 +13,10 @@ from calibgraph.tracking.streams import Item, Refused, StreamFrame
 from calibgraph.tracking.update import Update, json_lines
 
 Notify = Callable[[str], None]
+
+MOTION_FRAMES = 100
+"""Once in so many frames, a motion that no vehicle has is an outlier of the odometry: its frame is
+left out. Earlier or oftener, its unit or order is wrong, and slower frames are wrong unseen."""
 
 
 @dataclass
@@ -30,6 +34,7 @@ class Run:
         updates: frames taken in.
         refused: input that was not a frame, or a frame that was left out.
         skipped: frames at the beginning that an earlier run had taken in already.
+        sound: how many updates have come since a motion that no vehicle has.
     """
 
     calibrator: DurableCalibrator
@@ -40,6 +45,7 @@ class Run:
     updates: int = 0
     refused: int = 0
     skipped: int = 0
+    sound: int = 0
 
     def follow(self, items: Iterable[Item], *, every: int, stop: Callable[[], bool]) -> None:
         """Update with each frame until there are no more, or ``stop()``.
@@ -48,13 +54,17 @@ class Run:
             items: the frames.
             every: take every so-many-th frame.
             stop: called after each frame, or frames that come together.
+
+        Raises:
+            MotionError: if several of ``MOTION_FRAMES`` have a motion that no vehicle has, or one
+                of the first.
         """
         known = self.calibrator.tracker.frame if self.calibrator.resumed else None
         try:
             self._report(self.calibrator.last_repeated)  # their lines may not have been printed
             for some in in_groups(_every(items, every), self.together):
                 if isinstance(some, Refused):
-                    self._refuse(some.message)
+                    self._refuse(some.message, by_motion=some.by_motion)
                 else:
                     self._take(some, known)
                 if stop():  # before waiting for the next one, or matching it
@@ -80,13 +90,19 @@ class Run:
             self.skipped += len(old)
             frames = frames[len(old) :]
         for found in update_all(self.calibrator, frames):
-            if isinstance(found, CorrespondenceError):
-                self._refuse(str(found))
+            if isinstance(found, Refused):
+                self._refuse(found.message)
             else:
                 self.updates += len(found)
+                self.sound += len(found)
                 self._report(found)
 
-    def _refuse(self, message: str) -> None:
+    def _refuse(self, message: str, *, by_motion: bool = False) -> None:
+        if by_motion and self.sound < MOTION_FRAMES:
+            raise MotionError(
+                f"{message}; correct the motion of all frames, and take another --out"
+            )
+        self.sound = 0 if by_motion else self.sound
         self.refused += 1
         self.notify(f"left out: {message}")
 

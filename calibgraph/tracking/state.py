@@ -23,7 +23,7 @@ from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import NO_DISTORTION, Epoch, LiveFrame
 from calibgraph.tracking.noise import inflation, widening
-from calibgraph.tracking.offset_sums import after_offset_walk, without_offset
+from calibgraph.tracking.offset_sums import without_offset
 from calibgraph.tracking.offsets import Offsets, require_offset_alone
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
@@ -197,25 +197,18 @@ class State:
             return variance
         return np.insert(variance, 6, tracking.walk_time_offset_s**2 * frames, axis=1)
 
-    def after_offset_walk(self, sums: PlaceSums, frames: int) -> PlaceSums:
-        """The sums at all places after the walk of the time offsets over so many frames.
-
-        Walks of places that are left are taken for independent, and wider by their number: together
-        they then say no more of the present offset than one of them.
-        """
-        if self.offsets is None:
-            return sums
-        left = len(sums.names) - 1
-        counts = np.append(np.full(left, max(left, 1.0)), 1.0)
-        variance = counts[:, None, None] * self.walk_variance(np.zeros(1), frames)
-        rows = after_offset_walk(sums.rows, variance, self.all_overconfidence)
-        return replace(sums, rows=rows)
-
     def of_poses(self, sums: Sums) -> Sums:
         """(n,) sums of the poses alone: the offsets are as uncertain as their estimates."""
         if self.offsets is None:
             return sums
         return without_offset(sums, self.offsets.sigmas_s**-2, self.all_overconfidence)
+
+    def score_by_offset(self, camera: int, sums: Sums) -> Array:
+        """(6, 6) covariance of the score of frames by the offset of their camera, by (7,) sums."""
+        if self.offsets is None:
+            return np.zeros((6, 6))
+        follows = sums.hessian[:6, 6] * self.offsets.sigmas_s[camera]
+        return np.outer(follows, follows)
 
     def of_pose(self, camera: int, sums: Sums) -> Sums:
         """The same of (...) sums of one camera."""

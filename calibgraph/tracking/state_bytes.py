@@ -10,6 +10,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import fields
+from itertools import takewhile
 from typing import Annotated, Any, Literal
 
 import gtsam
@@ -43,7 +44,7 @@ from factors import Lens, ProjectionBlock
 
 Kind = Literal["state", "input", "history"]
 
-_VERSION = 9
+_VERSION = 10
 """Earlier ones held other sums, or were of another encoding."""
 
 _DIGEST = hashlib.sha256().digest_size
@@ -84,9 +85,10 @@ def decode(data: bytes, kind: Kind) -> Any:
     """
     mark = _mark(kind)
     if not data.startswith(mark):
-        found = data[: len(mark)].split(b"\n")[0].decode("ascii", "replace")
+        found = data[: len(mark)].decode("ascii", "replace")
+        text = "".join(takewhile(str.isprintable, found.partition("\ufffd")[0]))
         expected = f"expected {mark[:-1].decode()!r}"
-        raise StateError(f"is no tracker's {kind}: it begins with {found!r}, {expected}")
+        raise StateError(f"is no tracker's {kind}: it begins with {text!r}, {expected}")
     start = len(mark) + _DIGEST
     digest, body = data[len(mark) : start], data[start:]
     if hashlib.sha256(body).digest() != digest:

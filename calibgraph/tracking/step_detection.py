@@ -15,6 +15,7 @@ from calibgraph.tracking.cause import alarm_limit, squared_sigmas
 from calibgraph.tracking.epoch_sums import sums_before_epochs
 from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import Epoch, OutlierFrame
+from calibgraph.tracking.offset_terms import score_after
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.state import State
 from calibgraph.tracking.steps import shift_since
@@ -129,12 +130,12 @@ def detect_small_step(state: State) -> DetectedStep | None:
     for epoch, before, after in zip(state.epochs[1:], befores, afterwards[1:], strict=True):
         if not epoch.frames:
             continue
-        since, later = epoch.frames[0].number, state.of_poses(after)
+        since = epoch.frames[0].number
         for camera, camera_state in enumerate(state.cameras):
-            if not camera_state.started or _shift_excess(state, camera, before, later) <= best:
+            if not camera_state.started or _shift_excess(state, camera, before, after) <= best:
                 continue  # by what places share it is less still
             by_places = shift_since(state, since)
-            excess = _shift_excess(state, camera, before, later, by_places=by_places)
+            excess = _shift_excess(state, camera, before, after, by_places=by_places)
             if excess > best:
                 best, detected = excess, DetectedStep(since, frozenset([camera]))
     return detected
@@ -173,16 +174,17 @@ def _shift_excess(
     known_scatter = state.cameras[camera].groups[0].count >= _LEAST_EPOCHS
     if frames < _BEFORE or not known_scatter or not after.frames[camera]:
         return 0.0
-    step = before.step(camera)
+    step = before.pose.step(camera)
     if step is None:
         return 0.0
-    hessian, rows = after.hessian[camera], pose_rows(camera)
-    by_frames = before.scatter[camera] * (after.frames[camera] / (frames - 1))
-    if state.offsets is not None:  # both sides know the offset differently
-        by_frames = after.scatter[camera]
-    by_frames = by_frames + hessian @ before.covariance(camera) @ hessian
-    covariance = by_frames * state.inflation(camera)
+    hessian, rows = after.hessian[camera, :6, :6], pose_rows(camera)
+    if state.offsets is None:
+        by_frames = before.scatter[camera] * (after.frames[camera] / (frames - 1))
+        by_frames = by_frames + hessian @ before.covariance(camera) @ hessian
+        covariance = by_frames * state.inflation(camera)
+        score = after.gradient[camera] + hessian @ step
+    else:
+        score, covariance = score_after(state, camera, before[camera], after[camera])
     if by_places is not None:
         covariance = covariance + hessian @ by_places[rows, rows] @ hessian
-    score = after.gradient[camera] + hessian @ step
     return squared_sigmas(score, covariance) / alarm_limit(frames) - 1.0

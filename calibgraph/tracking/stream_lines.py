@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import from_json
 
-from calibgraph.errors import CorrespondenceError
+from calibgraph.errors import CorrespondenceError, MotionError
 from calibgraph.files import describe
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.findings import MatcherFindings
@@ -190,11 +190,11 @@ def _parse(line: bytes, where: str, header: Mapping[str, Any]) -> Item | dict[st
             metadata = HeaderLine.model_validate(content).metadata
             MatcherFindings.from_metadata(metadata)
             return metadata
-        return FrameLine.model_validate(content).to_frame(header)
+        return replace(FrameLine.model_validate(content).to_frame(header), where=where)
     except ValidationError as error:
         return refused(where, describe(error))
     except CorrespondenceError as error:
-        return refused(where, str(error))
+        return refused(where, str(error), by_motion=isinstance(error, MotionError))
     except ValueError as error:
         return refused(where, f"is not JSON ({error}); send one frame a line, as JSON")
 

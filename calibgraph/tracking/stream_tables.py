@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.errors import CorrespondenceError, FileError, MotionError
 from calibgraph.files import require_file
 from calibgraph.io.correspondence_tables import (
     arrow_reads,
@@ -19,7 +20,7 @@ from calibgraph.io.correspondence_tables import (
     require_rows,
 )
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.table_columns import check_schema
+from calibgraph.model.table_columns import TWIST, TWIST_RULE, beyond_vehicles, check_schema
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -32,25 +33,37 @@ class StreamFrame:
     Attributes:
         frame: its number.
         table: rows of this frame alone; there may be none.
+        where: the part of its source that it is from, for messages.
     """
 
     frame: int
     table: Correspondences
+    where: str = ""
+
+    def why_not(self, error: CorrespondenceError) -> str:
+        """The message of an error of this frame, with where the frame is from."""
+        return f"{self.where}: {error}" if self.where else str(error)
 
 
 @dataclass(frozen=True)
 class Refused:
-    """Input that is not a frame, as a message of one line."""
+    """Input that is not a frame.
+
+    Attributes:
+        message: of one line.
+        by_motion: whether it is a frame with a motion that no vehicle has.
+    """
 
     message: str
+    by_motion: bool = False
 
 
 Item = StreamFrame | Refused
 
 
-def refused(where: Path | str, what: str) -> Refused:
+def refused(where: Path | str, what: str, *, by_motion: bool = False) -> Refused:
     """The message for wrong input: where it is, and what is wrong."""
-    return Refused(str(FileError(where, what)))
+    return Refused(str(FileError(where, what)), by_motion)
 
 
 def frames_of_table(path: Path) -> Iterator[Item]:
@@ -64,6 +77,44 @@ def frames_of_table(path: Path) -> Iterator[Item]:
     """
     for table in _parts_of_file(require_file(path)):
         yield from frames_in(table, str(path), ascending=True)
+
+
+def require_plausible_motion(path: Path) -> None:
+    """Check the motion in all rows of a table: its slower frames look right where it is wrong.
+
+    What else is wrong, or cannot be read, is reported where its frame comes.
+
+    Raises:
+        FileError: with the first row of a motion that no vehicle has.
+    """
+    rows = 0
+    for part in _motion_parts(path):
+        twist = np.stack([part[name].to_numpy().astype(np.float64) for name in TWIST], axis=1)
+        beyond = np.flatnonzero(beyond_vehicles(twist))
+        if len(beyond):
+            row = int(beyond[0])
+            camera, frame = part["camera"][row].as_py(), part["frame"][row].as_py()
+            rule = f"twist must {TWIST_RULE}, found {twist[row].tolist()}"
+            text = f"{rule}; correct the columns {TWIST[0]} to {TWIST[-1]}"
+            error = MotionError(text, camera=camera, frame=frame, row=rows + row)
+            raise FileError(path, str(error))
+        rows += len(part)
+
+
+def _motion_parts(path: Path) -> Iterator[pa.Table]:
+    """The columns of the motion, where a file has them, as far as they can be read."""
+    columns = ["camera", "frame", *TWIST]
+    with suppress(FileError, CorrespondenceError), arrow_reads(path):
+        if path.suffix == ".csv":
+            table = read_arrow(path)
+            check_schema(table.schema)
+            yield from [table] if TWIST[0] in table.column_names else []
+            return
+        with open_parquet(path) as file:
+            check_schema(file.schema_arrow)
+            if TWIST[0] in file.schema_arrow.names:
+                for group in range(file.metadata.num_row_groups):
+                    yield file.read_row_group(group, columns=columns)
 
 
 def _parts_of_file(path: Path) -> Iterator[pa.Table]:
@@ -152,9 +203,10 @@ def _frame_or_refused(rows: pa.Table, where: str) -> Item:
     """One frame from all its rows."""
     number = rows["frame"][0].as_py()
     try:
-        return StreamFrame(number, from_arrow(rows))
+        return StreamFrame(number, from_arrow(rows), f"{where}, frame {number}")
     except CorrespondenceError as error:
-        return refused(where, f"frame {number} is left out; among its rows, {error}")
+        found = f"frame {number} is left out; among its rows, {error}"
+        return refused(where, found, by_motion=isinstance(error, MotionError))
 
 
 def frames_of_batches(file: Any, where: str) -> Iterator[Item]:

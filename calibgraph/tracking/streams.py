@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from calibgraph.errors import FileError
+from calibgraph.io.bags.storage import is_bag
 from calibgraph.tracking.stream_lines import frames_of_lines
 from calibgraph.tracking.stream_tables import (
     Item,
@@ -22,6 +23,7 @@ from calibgraph.tracking.stream_tables import (
     StreamFrame,
     frames_of_batches,
     frames_of_table,
+    require_plausible_motion,
 )
 
 __all__ = ["Item", "Refused", "StreamFrame", "frames_of"]
@@ -38,6 +40,7 @@ MAX_READ_BYTES = 256 * 2**20
 _CHUNK_BYTES = 2**16
 _STANDARD_INPUT = "standard input"
 _ARROW_STREAM = b"\xff\xff\xff\xff"
+_DATASET = "to track a dataset, say what matches its frames: --matcher structure"
 _FILES_NOT_STREAMS = {b"PAR1": "a Parquet file", b"ARROW1": "an Arrow file"}
 
 
@@ -58,7 +61,8 @@ def frames_of(
         stdin: what "-" reads; standard input if None.
 
     Raises:
-        FileError: at once, if there is no such source, or a file is to be followed.
+        FileError: at once, if there is no such source, a file is to be followed, or a file has a
+            motion that no vehicle has.
     """
     if str(source) == "-":
         if stdin is None and sys.stdin is None:
@@ -70,11 +74,19 @@ def frames_of(
     except (OSError, ValueError) as error:
         raise FileError(path, f"cannot be read ({error}); check the path") from error
     if stat.S_ISDIR(mode):
+        tables = [one for one in sorted(path.iterdir()) if _is_table_name(one)]
+        if not (tables or follow):
+            raise FileError(path, f"holds no table of correspondences; {_DATASET}")
+        for table in tables if not follow else ():
+            require_plausible_motion(table)
         return _until(stop, frames_of_folder(path, follow=follow, stop=stop))
     if not stat.S_ISREG(mode):
         raise FileError(path, "is neither a file nor a folder; pipe it in and give '-'")
     if follow:
         raise FileError(path, "is a file, and only a folder can be followed; give its folder")
+    if is_bag(path):
+        raise FileError(path, f"is no table of correspondences; {_DATASET}")
+    require_plausible_motion(path)
     return _until(stop, frames_of_table(path))
 
 

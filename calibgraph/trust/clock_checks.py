@@ -24,7 +24,7 @@ from calibgraph.model.clock import at_pixels, clock_of
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.model.verdict import Check
+from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.solver.camera_twist import free_fields_px
 from calibgraph.solver.linear_fit import block_of, fit_camera
 from calibgraph.trust.evidence import Checks, Evidence
@@ -55,7 +55,8 @@ def offset_checks(evidence: Evidence) -> Checks:
     table, rig = solution.correspondences, solution.solved_rig
     if table.twist_per_s is None or not {*CLOCK}.isdisjoint(solution.config.estimate):
         return {}
-    return _check_cameras(rig, table, evidence.findings, by=RESIDUALS)
+    fits = _fit_cameras(rig, table, evidence.findings)
+    return {n: [check_offset(fit, RESIDUALS, solution.config.tolerance)] for n, fit in fits}
 
 
 def image_offset_checks(evidence: RunEvidence) -> Checks:
@@ -79,26 +80,29 @@ def image_offset_checks(evidence: RunEvidence) -> Checks:
     )
     matcher.release()
     table = with_motion(table, moved).with_places(run.correspondences.places)
-    checks = _check_cameras(rig, table, run.correspondences.findings, by=IMAGES)
+    fits = _fit_cameras(rig, table, run.correspondences.findings)
+    checks = {n: [check_offset(fit, IMAGES, config.tolerance)] for n, fit in fits}
     if registered and seconds_between(*moved.frames[:2]) is None:
         taken = f"; successive clouds are taken to be {INTERVAL_S:g} s apart"
         checks = {n: [replace(c, text=c.text + taken) for c in of] for n, of in checks.items()}
     return evidence.grade_by_images(checks)
 
 
-def _check_cameras(
-    rig: Rig, table: Correspondences, findings: MatcherFindings, *, by: str
-) -> Checks:
-    fits = {
-        name: fit_offset(camera, table.of_camera(name), findings.place_variance)
+def _fit_cameras(
+    rig: Rig, table: Correspondences, findings: MatcherFindings
+) -> list[tuple[str, LensParameter]]:
+    fits = (
+        (name, fit_offset(camera, table.of_camera(name), findings.place_variance))
         for name, camera in rig.cameras.items()
-    }
-    return {name: [check_offset(fit, by)] for name, fit in fits.items() if fit is not None}
+    )
+    return [(name, fit) for name, fit in fits if fit is not None]
 
 
-def check_offset(found: LensParameter, by: str) -> Check:
+def check_offset(
+    found: LensParameter, by: str, tolerance: tuple[float, float] = TOLERANCE
+) -> Check:
     """The check of an offset; of one that is not determined, it tells how much depends on it."""
-    check, size = check_parameter(found, by), float(found.units[0] * found.size)
+    check, size = check_parameter(found, by, tolerance), float(found.units[0] * found.size)
     if found.sigmas[0] < limit("lens_wrong"):
         return check
     text = "the time of the images is not determined by these data, and taken for right"

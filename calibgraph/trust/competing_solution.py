@@ -24,7 +24,7 @@ def competing_solution_checks(evidence: Evidence) -> Checks:
 
 def check_competing_solution(solution: Solution, camera: str) -> Check:
     """Ratio of the matches that agree on another extrinsic alone to those on this one alone."""
-    row = threshold("competing_solution")
+    row, tolerance = threshold("competing_solution"), solution.config.tolerance
     block, gate_px = _of_all_frames(solution, camera), solution.scales[camera].gate_px
     ours = block.within_gate(solution.T_camera_lidar[camera], gate_px)
     left_out = block.block.select(~ours)
@@ -38,7 +38,8 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
         return row.describe(0.0, "PASS", f"{row.name}: none")
     theirs = block.within_gate(T, gate_px)
     degrees, centimetres = pose_difference(T, solution.T_camera_lidar[camera])
-    same = degrees < limit("competing_rotation") and centimetres < limit("competing_translation")
+    same = degrees < limit("competing_rotation", tolerance)
+    same = same and centimetres < limit("competing_translation", tolerance)
     only_theirs, only_ours = int((theirs & ~ours).sum()), int((ours & ~theirs).sum())
     share = 0.0 if same else only_theirs / max(only_ours, 1)
     advice = f"the other is {degrees:.2g} deg, {centimetres:.2g} cm away; which one is right?"

@@ -9,6 +9,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.config import Terms
+from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import TOLERANCE
 from calibgraph.solver.conflicts import Conflict
@@ -35,6 +36,7 @@ class Estimate:
         held: whether nothing determines it.
         scatter_only: whether it is unknown how large the error is that all frames share.
         tolerance: of the user: rotation [deg] and distance [cm].
+        lens: the parameters of lens and clock that were estimated.
     """
 
     camera: Camera
@@ -51,6 +53,7 @@ class Estimate:
     held: bool = False
     scatter_only: bool = False
     tolerance: tuple[float, float] = TOLERANCE
+    lens: tuple[LensEstimate, ...] = ()
 
     @property
     def sigmas(self) -> Array | None:

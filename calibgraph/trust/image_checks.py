@@ -9,7 +9,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import Check
+from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.progress import Progress
 from calibgraph.trust.evidence import Checks
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
@@ -29,10 +29,15 @@ def image_checks(evidence: RunEvidence) -> Checks:
     run = evidence.run
     if run.out_of_time:
         return {}
-    rig, seed = run.solution.without_pairs().solved_rig, run.solution.config.seed
+    rig, config = run.solution.without_pairs().solved_rig, run.solution.config
     try:
         checks = check_images(
-            run.dataset, rig, run.correspondences, seed=seed, progress=evidence.progress
+            run.dataset,
+            rig,
+            run.correspondences,
+            tolerance=config.tolerance,
+            seed=config.seed,
+            progress=evidence.progress,
         )
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
         text = f"the images could not be checked: {error}"
@@ -45,6 +50,7 @@ def check_images(
     rig: Rig,
     table: Correspondences,
     *,
+    tolerance: tuple[float, float] = TOLERANCE,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> dict[str, tuple[Check, ...]]:
@@ -69,7 +75,7 @@ def check_images(
     placed = {n for n, found in evidence.items() if row.grade(found.displaced_z_score) != "FAIL"}
     of_placed = {name: checks for name, checks in of_time.items() if name in placed}
     return {
-        name: (*evidence_checks(found, names), *of_time[name])
+        name: (*evidence_checks(found, names, tolerance), *of_time[name])
         + _clouds_checks(of_time[name], of_placed)
         for name, found in evidence.items()
     }
@@ -89,7 +95,9 @@ def _clouds_checks(
     )
 
 
-def evidence_checks(found: ImageEvidence, names: Mapping[int, str]) -> tuple[Check, ...]:
+def evidence_checks(
+    found: ImageEvidence, names: Mapping[int, str], tolerance: tuple[float, float] = TOLERANCE
+) -> tuple[Check, ...]:
     """The checks of one camera's extrinsic and lens by the image evidence."""
     if math.isnan(found.displaced_z_score):
         text = (
@@ -102,7 +110,8 @@ def evidence_checks(found: ImageEvidence, names: Mapping[int, str]) -> tuple[Che
     mispaired = found.frames_best <= threshold("frames_best").fail
     if found.displaced_z_score < limit("lens_z_score") or mispaired:
         return displaced, frames  # at a wrong extrinsic the lens cannot be measured
-    return displaced, frames, *_lens_checks(found)
+    lens = (check_parameter(each, IMAGES, tolerance) for each in found.lens)
+    return displaced, frames, *lens
 
 
 def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
@@ -113,11 +122,6 @@ def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
         "belong together?"
     )
     return threshold("frames_best").check(found.frames_best, advice=advice)
-
-
-def _lens_checks(found: ImageEvidence) -> tuple[Check, ...]:
-    """Whether another lens fits the images better."""
-    return tuple(check_parameter(each, IMAGES) for each in found.lens)
 
 
 def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:

@@ -62,7 +62,7 @@ def _check_camera(evidence: Evidence, name: str) -> list[Check]:
         LensParameter.of(each, units_of(camera, *numbers), fit.free(*numbers))
         for each, numbers in _NUMBERS.items()
     )
-    checks = [check_parameter(each, RESIDUALS) for each in found]
+    checks = [check_parameter(each, RESIDUALS, solution.config.tolerance) for each in found]
     # A focal length that is wrong by one percent is easily overlooked.
     percents = 100 * lens_variable(camera).free.sigmas[Free.FOCAL]
     moved_m = float(np.linalg.norm(fit.free(Free.FOCAL).compensating[3:, 0])) / percents

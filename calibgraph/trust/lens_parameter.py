@@ -139,9 +139,8 @@ class LensParameter:
         along = self.values / max(self.size, np.finfo(float).tiny)
         return max(float(np.linalg.norm(along * self.sigmas)), np.finfo(float).tiny)
 
-    @property
-    def probability(self) -> float:
-        """That the parameter is wrong and displaces the camera by more than users tolerate.
+    def probability(self, tolerance: tuple[float, float] = TOLERANCE) -> float:
+        """That the parameter is wrong and displaces the camera beyond a tolerance [deg, cm].
 
         What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
         wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. An
@@ -150,7 +149,7 @@ class LensParameter:
         """
         if not math.isfinite(self.sigma):  # not determined
             return 0.0
-        moves = max(moved / most for moved, most in zip(self.moved, TOLERANCE, strict=True))
+        moves = max(moved / most for moved, most in zip(self.moved, tolerance, strict=True))
         tolerated = self.size / moves if moves else math.inf
         spreads, share = np.array([1.0, limit("lens_wrong")]), limit("lens_wrong_share")
         total = np.hypot(self.sigma, spreads)
@@ -219,14 +218,17 @@ def _with_sigma(value: float, sigma: float) -> str:
     return f"{value:.{decimals}f} +- {sigma:.{decimals}f}"
 
 
-def check_parameter(found: LensParameter, by: str) -> Check:
+def check_parameter(
+    found: LensParameter, by: str, tolerance: tuple[float, float] = TOLERANCE
+) -> Check:
     """Whether a lens parameter is wrong: the value of the check is the probability.
 
     Args:
         found: its estimate.
         by: RESIDUALS or IMAGES.
+        tolerance: of the user [deg, cm].
     """
-    row, probability, (deg, cm) = threshold("lens"), found.probability, found.moved
+    row, probability, (deg, cm) = threshold("lens"), found.probability(tolerance), found.moved
     status, (part, *_) = row.grade(probability), _WORDS[found.name]
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
     if status != "PASS":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import threshold
+from factors.free_lens import CLOCK
 
 
 def estimate_checks(evidence: Evidence) -> Checks:
@@ -133,6 +135,18 @@ def count_checks(estimate: Estimate) -> list[Check]:
     ]
 
 
+def lens_prior_checks(estimate: Estimate) -> list[Check]:
+    """How far each estimated parameter of lens and clock lies from what the rig states."""
+    row, checks = threshold("lens_prior"), []
+    for one in estimate.lens:
+        name = f"{one.name}: {row.name}"
+        kind = "time_prior" if one.name in CLOCK else row.key
+        check = replace(row.check(one.prior_sigmas, name=name), kind=kind)
+        text = check.text if check.status == "PASS" else f"{check.text} ({one.change})"
+        checks.append(replace(check, text=text))
+    return checks
+
+
 def convergence_checks(estimate: Estimate) -> list[Check]:
     """Whether the optimizer stopped by its tolerance."""
     if estimate.converged:
@@ -147,6 +161,7 @@ ESTIMATE_CHECKS: tuple[Callable[[Estimate], list[Check]], ...] = (
     pull_checks,
     halves_checks,
     count_checks,
+    lens_prior_checks,
     convergence_checks,
 )
 """Checks that a batch solve and the tracker share."""

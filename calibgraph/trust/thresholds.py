@@ -12,16 +12,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from statistics import NormalDist
 
 from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE
-from calibgraph.model.threshold import Threshold, in_unit, is_reachable
-from calibgraph.model.verdict import FAIL_ABOVE, TOLERANCE
+from calibgraph.model.threshold import Threshold, in_unit, is_reachable, ratio_of
+from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.lens import MATCH_SHARE
 
 _COUNTED = "`benchmarks/accuracy/verdicts.py`: chosen on its set tune, counted on its set count."
 _CHOSEN = "A choice; no data recorded."
 _RECORDED = "KITTI 00 and the sample"
+_WRONG_SIGMAS, _WRONG_SHARE = 20.0, 0.01
+_BEYOND = [NormalDist().inv_cdf(1 - PASS_BELOW / share / 2) for share in (_WRONG_SHARE, 1)]
 
 # fmt: off
 THRESHOLDS: tuple[Threshold, ...] = (
@@ -137,7 +140,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
     # the lens, from the residuals and the images
     Threshold("lens", "probability of a wrong one", "at most", 0.005, 0.2, "share",
               "Is focal length, principal point, distortion, fx / fy, skew or time of the images "
-              "wrong, so that the camera is off by more than 0.5 deg or 10 cm?",
+              "wrong, so that the camera is off by more than the tolerance?",
               "The verdict's own cuts. By the posterior of a free lens or clock, once from the "
               "residuals and once from the images, and by `lens_wrong` etc.",
               "check the intrinsics, the image size, and that images are not undistorted twice, "
@@ -146,6 +149,12 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "at most", 15.0, math.inf, "cm", "How much depends on the focal length?", _COUNTED,
               "verify the intrinsics, or give matches at more distances",
               of_tolerance=True),
+    Threshold("lens_prior", "distance from the rig", "at most",
+              _WRONG_SIGMAS * _BEYOND[0], _WRONG_SIGMAS * _BEYOND[1], "prior sigmas",
+              "How far did an estimated parameter of lens or clock move from what the rig states?",
+              "By `lens_wrong` and `lens_wrong_share`, 0.5 % of all parameters err by more than "
+              "the first, and 0.5 % of the wrong ones by more than the second.",
+              "correct the rig, or state how well it is known"),
     # the rounds of matching
     Threshold("last_round_rotation", "change in the last round of matching", "at most", 0.1, 0.4,
               "deg", "Have the rounds of matching converged?", _COUNTED,
@@ -191,31 +200,41 @@ THRESHOLDS: tuple[Threshold, ...] = (
 
 @dataclass(frozen=True)
 class Limit:
-    """A number that decides whether a check counts, or that it is compared with."""
+    """A number that decides whether a check counts, or that it is compared with.
+
+    Attributes:
+        key: by which checks look it up.
+        value: the number.
+        unit: of it.
+        meaning: what it decides.
+        of_tolerance: whether it grows with a tolerance above the default.
+    """
 
     key: str
     value: float
     unit: str
     meaning: str
+    of_tolerance: bool = False
 
 
 # fmt: off
 LIMITS: tuple[Limit, ...] = (
     Limit("pull_sigmas", 4.0, "sigma",
           "A pull within this of what a camera's own solution leaves open is zero."),
-    Limit("lens_wrong", 20.0, "sigma", "The error of a wrong lens parameter, in standard "
+    Limit("lens_wrong", _WRONG_SIGMAS, "sigma", "The error of a wrong lens parameter, in standard "
           "deviations of a calibrated one: 0.2 % of the focal length, fx / fy and the skew, "
           "0.002 focal lengths of the principal point, 0.002 of k1, 2 ms of the time of "
           "an image, or as the rig states."),
-    Limit("lens_wrong_share", 0.01, "share", "So many are taken for wrong."),
+    Limit("lens_wrong_share", _WRONG_SHARE, "share", "So many are taken for wrong."),
     Limit("lens_match_share", MATCH_SHARE, "share", "So much of a match's variance is taken to be "
           "shared by all: less cannot be told from a wrong lens."),
     Limit("lens_z_score", 3.0, "", "The lens is checked by the images only above this z-score "
           "against displaced extrinsics: at a wrong extrinsic it cannot be measured. KITTI 00 and "
           "the sample: wrong lenses left 3.2 and more."),
     Limit("competing_rotation", 0.3, "deg", "A competing solution this near, and as near as the "
-          "next row, is the same solution."),
-    Limit("competing_translation", 10.0, "cm", "See the row above."),
+          "next row, is the same solution: nearer ones differ in the matches at the gate alone.",
+          of_tolerance=True),
+    Limit("competing_translation", 10.0, "cm", "See the row above.", of_tolerance=True),
     Limit("swap_slack", 0.05, "m, rad", "Added in quadrature to the distances of swapped cameras: "
           "the usual error of a result is no evidence of a swap."),
     Limit("convention_rotation", 30.0, "deg", "A convention error explains a guess if, undone, it "
@@ -236,9 +255,10 @@ def threshold(key: str, tolerance: tuple[float, float] = TOLERANCE) -> Threshold
     return _ROWS[key].at(tolerance)
 
 
-def limit(key: str) -> float:
-    """The value of a limit."""
-    return _LIMITS[key].value
+def limit(key: str, tolerance: tuple[float, float] = TOLERANCE) -> float:
+    """The value of a limit, for a tolerance [deg, cm]."""
+    row = _LIMITS[key]
+    return row.value * (max(ratio_of(row.unit, tolerance), 1.0) if row.of_tolerance else 1.0)
 
 
 def thresholds_markdown() -> str:
@@ -249,14 +269,20 @@ def thresholds_markdown() -> str:
         *(_line(row) for row in THRESHOLDS),
         "",
         "\\* At the default tolerance of "
-        f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. The limit of "
-        "FAIL grows with the tolerance, and does not fall below this value.",
+        f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. A limit "
+        "of FAIL, or in the table below, grows with the tolerance, and does not fall below this "
+        "value.",
         "",
         "| key | limit | meaning |",
         "|---|---|---|",
-        *(f"| `{row.key}` | {in_unit(row.value, row.unit)} | {row.meaning} |" for row in LIMITS),
+        *(_limit_line(row) for row in LIMITS),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _limit_line(row: Limit) -> str:
+    scaled = " \\*" if row.of_tolerance else ""
+    return f"| `{row.key}` | {in_unit(row.value, row.unit)}{scaled} | {row.meaning} |"
 
 
 def _line(row: Threshold) -> str:

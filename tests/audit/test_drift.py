@@ -176,6 +176,13 @@ def test_results_of_other_rigs_are_refused_in_one_line() -> None:
     assert calibgraph.drift(given, own_lenses=True).status == "OK"
 
 
+def test_a_mount_is_not_compared_with_alignments() -> None:
+    given = results(0, count=3)
+    given["1"] = replace(given["1"], config=given["1"].config.model_copy(update={"of": "mount"}))
+    with pytest.raises(CalibrationError, match="1: has poses of the mount, 0 of the alignment"):
+        calibgraph.drift(given)
+
+
 def test_a_copy_and_a_single_result_are_refused() -> None:
     one = draw(np.random.default_rng(12))
     with pytest.raises(CalibrationError, match="result 2: is the same result as result 1"):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from calibgraph import load_dataset, load_rig
+import pytest
+
+from calibgraph import CalibrationError, load_dataset, load_rig
 from calibgraph.audit.check import provenance
 from tests.conftest import SAMPLE, CommandRun
 
@@ -29,3 +31,13 @@ def test_the_recording_of_a_result_is_known_by_its_content_wherever_it_lies(
 def test_a_rig_names_no_recording() -> None:
     rig = load_rig(SAMPLE / "rig.yaml")
     assert not provenance(SAMPLE / "rig.yaml", load_dataset(SAMPLE, rig)).same_recording
+
+
+def test_a_result_of_mounts_is_refused(calibrated_sample: CommandRun, tmp_path: Path) -> None:
+    text = (calibrated_sample.folder / "calibration.yaml").read_text("utf-8")
+    assert "of: alignment" in text
+    deployed = tmp_path / "calibration.yaml"
+    deployed.write_text(text.replace("of: alignment", "of: mount"), "utf-8")
+    data = load_dataset(SAMPLE, load_rig(SAMPLE / "rig.yaml"))
+    with pytest.raises(CalibrationError, match=r"poses of the mount.*--of alignment"):
+        provenance(deployed, data)

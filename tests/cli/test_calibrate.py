@@ -17,6 +17,7 @@ from calibgraph import (
     load_rig,
     simulate_correspondences,
 )
+from calibgraph.model.places import Places
 from tests.cli.conftest import save_problem
 from tests.conftest import SAMPLE, Call, CommandRun, make_camera, run_command
 
@@ -98,13 +99,31 @@ def test_json_is_on_stdout_and_complete(problem: Path, call: Call) -> None:
     assert stderr == ""
     summary = json.loads(stdout)
     keys = {"verdict", "probability_off", "reasons", "cameras", "pairs", "timings_s", "files"}
-    assert set(summary) == {*keys, "cannot_tell", "summary", "warnings"}
+    assert set(summary) == {*keys, "cannot_tell", "summary", "warnings", "places"}
     assert summary["verdict"] == "PASS"
     assert summary["cannot_tell"] is False
     each = [camera["probability_off"] for camera in summary["cameras"].values()]
     assert 0 < summary["probability_off"] == max(each) < 0.005
     assert np.array(summary["cameras"]["left"]["T_camera_lidar"]).shape == (4, 4)
     assert len(summary["cameras"]["left"]["rotation_sigma_deg"]) == 3
+
+
+def test_places_are_in_the_file_in_json_on_the_terminal_and_in_the_report(
+    tmp_path: Path, pair: Rig, call: Call
+) -> None:
+    table = simulate_correspondences(pair, frames=8, matches=100)
+    places = Places(places=((0, 1, 2, 5), (3, 4, 6, 7)))
+    table.with_places(places).save(tmp_path / "table.parquet")
+    pair.save(tmp_path / "rig.yaml")
+    out = tmp_path / "result"
+    arguments = "solve", tmp_path / "rig.yaml", tmp_path / "table.parquet", "--out", out
+    _, _, text = call(*arguments)
+    line = "2 places: frames 0-2, 5; 3-4, 6-7"
+    assert line in text
+    assert line in (out / "report.html").read_text("utf-8")
+    assert load_calibration(out).places == places.places
+    _, stdout, _ = call(*arguments, "--json")
+    assert json.loads(stdout)["places"] == [[0, 1, 2, 5], [3, 4, 6, 7]]
 
 
 def test_a_failed_calibration_exits_1_and_its_files_are_marked(problem: Path, call: Call) -> None:

@@ -64,3 +64,13 @@ def test_columns_of_the_manifest_are_understood() -> None:
 def test_wrong_tables_are_one_line(rows: pa.Table, message: str) -> None:
     with pytest.raises(CalibrationError, match=message):
         observe(rows)
+
+
+def test_mounts_are_not_mixed_with_alignments() -> None:
+    """Rows of earlier versions, without the column, are alignments; a failed row is neither."""
+    mounts, alignments = rows_of(of=["mount", "mount", None]), rows_of()
+    assert observe(mounts).measured.any()
+    with pytest.raises(CalibrationError, match="vehicle 'a' are of mounts, those of 'a' of align"):
+        assess_status(mounts, fit_fleet(observe(mounts)), before=alignments)
+    with pytest.raises(CalibrationError, match="one `of` in their settings"):
+        observe(rows_of(of=["mount", None, None]))

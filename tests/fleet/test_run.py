@@ -109,6 +109,7 @@ def test_rows_are_what_solve_gives(fleet: Fleet) -> None:
         row = fleet.rows[GOOD, camera]
         assert row["verdict"] == result.camera_verdicts[camera].status
         assert row["cannot_tell"] == result.camera_verdicts[camera].cannot_tell
+        assert row["of"] == "alignment"
         doubt = result.camera_verdicts[camera].error_probability
         assert doubt is not None
         assert row["probability_off"] == pytest.approx(doubt.probability, rel=1e-3)

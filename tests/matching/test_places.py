@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import calibgraph
 from calibgraph import Dataset, Rig
 from calibgraph.io.frame import Frame
+from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching import places
 from calibgraph.matching.places import Motion, PlaceFinder, PlaceWalk, find_places, motions
 from calibgraph.simulation.recording import Drive
@@ -197,6 +198,20 @@ def test_even_and_odd_frames_of_a_recording_are_at_one_place(
     data = replace(whole, frames=tuple(frames))
     found = find_places(data, "image_2", whole.rig.cameras["image_2"])
     assert found == [list(range(10)), [10, 11, 12]]
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_shuffled_recording_has_the_same_places(realdata: Path, seed: int) -> None:
+    """25 frames of KITTI 00; at three places it is twice, 0.4, 0.6 and 19 m apart."""
+    data = keep_frames(calibgraph.load_dataset(realdata / "kitti_places"))
+    lens = data.rig.cameras["image_2"]
+    order = np.random.default_rng(seed).permutation(len(data.frames))
+    shuffled = data.only([data.frames[number] for number in order])
+    expected = find_places(data, "image_2", lens)
+    assert [place for place in expected if len(place) > 1] == [[0, 24], [2, 13], [3, 19]]
+    found = find_places(shuffled, "image_2", lens)
+    assert sorted(sorted(place) for place in found) == expected
 
 
 @pytest.mark.realdata

@@ -103,6 +103,20 @@ def test_a_kill_in_a_long_request_leaves_its_earlier_writes_and_a_short_repetiti
         assert len(resumed.repeated) <= 2 + 2 * 2
 
 
+def test_a_request_with_a_motion_of_no_vehicle_is_refused_whole(
+    trackers: _Trackers, tmp_path: Path, tables: list[Correspondences]
+) -> None:
+    lines = [json.loads(line) for line in as_lines(tables[:3]).splitlines()]
+    for line, ahead in zip(lines, (1.0, 8.0, 9.0), strict=True):  # its columns are swapped
+        line["twist_per_s"] = [ahead, 0.0, 0.0, 0.0, 0.0, 0.1]
+    body = "\n".join(map(json.dumps, lines)).encode()
+    answer = trackers.answer(TrackerRequest("frames", str(tmp_path / "car"), body))
+    assert isinstance(answer, Refusal) and answer.status == 422
+    assert answer.detail.startswith("frames, line 2: row 0 (camera 'left', frame 1): twist must be")
+    assert answer.detail.endswith("; none of these frames was taken in")
+    assert len(updates_in(send(trackers, tmp_path / "car", tables[:3]))) == 3
+
+
 def test_an_error_keeps_the_frames_before_it_with_plot_and_events(
     trackers: _Trackers,
     tables: list[Correspondences],

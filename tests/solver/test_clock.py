@@ -19,12 +19,14 @@ from calibgraph import (
     solve,
 )
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.error_sources import LENSES
 from calibgraph.model.geometry import twist_between
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from factors import Clock
 from tests.draws.clocks import draw_twists, put_clock_error
 from tests.draws.lenses import put_lens_error
+from tests.solver.test_elimination import STATED
 from tests.solver.test_lens import FIVE_SIGMAS, simulated, squared_errors
 
 STRAIGHT = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
@@ -63,6 +65,27 @@ def test_late_images_are_found(offset_s: float, readout_s: float, part: str) -> 
     assert max(squared_errors(found, truth)) < chi2.isf(1e-6, 6)
 
 
+@pytest.mark.parametrize(
+    ("sigma_s", "status"), [(0.004, "PASS"), (0.0025, "WARN"), (0.0005, "FAIL")]
+)
+def test_an_offset_beyond_what_the_rig_allows_is_no_pass(sigma_s: float, status: str) -> None:
+    """50 ms late: 12.5, 20 and 100 prior sigmas, with limits at 13.5 and 56.1."""
+    truth, table = late(0.05, 0.0)
+    rig = with_times(truth, time_offset_sigma_s=sigma_s)
+    result = solve(rig, table, Config(estimate="offset", common_deg=0.0))
+    for name, verdict in result.camera_verdicts.items():
+        (check,) = [one for one in verdict.checks if one.kind == "time_prior"]
+        assert check.status == verdict.status == status
+        assert check.value == pytest.approx(0.05 / sigma_s, rel=0.05)
+        if status != "PASS":
+            (one,) = result.lens[name]
+            assert check.text.startswith("offset: distance from the rig")
+            assert one.change in check.text and "before 0" in one.change
+    if status != "PASS":
+        (reason,) = result.summary.reasons
+        assert reason.cause == "time" and "correct the named time in the rig" in reason.action
+
+
 def test_a_known_clock_is_as_good_as_none() -> None:
     """Points at the times of the pixels, and points of late images with the times in the rig."""
     truth, table = late(0.04, 0.02)
@@ -74,15 +97,37 @@ def test_a_known_clock_is_as_good_as_none() -> None:
         assert np.abs(twist).max() < 1e-6  # exact but for the digits of the displacement
 
 
-def test_a_stated_error_of_the_clock_is_one_of_a_mount_and_no_other() -> None:
-    """10 ms at 10 m/s, which is 10 cm along the drive."""
+def test_a_stated_error_of_the_clock_is_one_of_the_pose() -> None:
+    """10 ms at 10 m/s, which is 10 cm along the drive; at an unknown motion it is not."""
     truth, table = late(0.0, 0.0, twists=np.tile(STRAIGHT, (30, 1)))
     doubted = with_times(truth, time_offset_sigma_s=0.01)
-    for of, added_m in (("mount", 0.1), ("alignment", 0.0)):
-        known, unknown = (solve_joint(rig, table, Config(of=of)) for rig in (truth, doubted))
+    still = replace(table, twist_per_s=None)
+    for of, matches, added_m in (
+        ("mount", table, 0.1), ("alignment", table, 0.1), ("alignment", still, 0.0)
+    ):  # fmt: skip
+        known, unknown = (solve_joint(rig, matches, Config(of=of)) for rig in (truth, doubted))
         assert known.covariance is not None and unknown.covariance is not None
         added = np.diag(unknown.covariance - known.covariance).reshape(-1, 2, 3).sum(axis=2)
         np.testing.assert_allclose(np.sqrt(np.abs(added[:, 1])), added_m, rtol=0.02, atol=1e-6)
+        for name, T in known.T_camera_lidar.items():
+            assert np.abs(twist_between(unknown.T_camera_lidar[name], T)).max() < 1e-6
+
+
+def test_an_alignment_of_a_distorted_scan_has_the_error_of_the_clock_too() -> None:
+    """There the alignment is a variable of its own; shares name the source."""
+    truth, table = late(0.0, 0.0, twists=np.tile(STRAIGHT, (30, 1)))
+    stated = table.with_findings(replace(table.findings, **STATED))
+    doubted = with_times(truth, time_offset_sigma_s=0.01)
+    known, unknown = (solve(rig, stated) for rig in (truth, doubted))
+    for name, before in known.covariance.items():
+        after = unknown.covariance[name]
+        assert before is not None and after is not None
+        assert np.sqrt(after[5, 5] - before[5, 5]) == pytest.approx(0.1, rel=0.05)
+        assert LENSES not in known.error_sources[name].translation
+        assert unknown.error_sources[name].translation[LENSES] > 0.5
+    assert unknown.pair_covariance.keys() == known.pair_covariance.keys()
+    for pair, before in known.pair_covariance.items():
+        np.testing.assert_allclose(unknown.pair_covariance[pair], before, rtol=1e-6, atol=1e-12)
 
 
 def test_the_sentence_names_the_time_only_where_it_is_not_included() -> None:
@@ -96,7 +141,10 @@ def test_the_sentence_names_the_time_only_where_it_is_not_included() -> None:
     assert solve(truth, table, mount).not_included == with_time
     assert solve(doubted, still, mount).not_included == with_time
     alignment = f"{usual}, of the time of the images, and of the clouds' scale are not included"
-    assert solve(doubted, table).not_included == alignment
+    assert solve(truth, table).not_included == alignment
+    assert solve(doubted, still).not_included == alignment
+    included = f"{usual} and of the clouds' scale are not included"
+    assert solve(doubted, table).not_included == included
     estimated = solve(truth, table, Config(estimate=("offset",)))
     assert estimated.not_included == f"{usual} and of the clouds' scale are not included"
 
@@ -180,5 +228,19 @@ def test_errors_are_as_large_as_the_error_bar_says(offset_s: float, readout_s: f
     for seed in range(draws):
         truth, table = late(offset_s, readout_s, seed)
         squared += squared_errors(solve_joint(truth, table, Config(estimate="clock")), truth)
+    scatter = 3 * np.sqrt(2 / 6 / draws)
+    assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter
+
+
+@pytest.mark.statistics
+def test_alignments_err_as_their_error_bar_says_with_the_stated_error_of_a_clock() -> None:
+    """Mean NEES over 6: 0.8 to 1.25, give or take three standard deviations of its draws."""
+    squared, draws, sigma_s = [], 40, 0.01
+    for seed in range(draws):
+        offset_s = sigma_s * np.random.default_rng([seed, 1]).standard_normal()
+        truth, table = late(offset_s, 0.0, seed, np.tile(STRAIGHT, (30, 1)))
+        squared += squared_errors(
+            solve_joint(with_times(truth, time_offset_sigma_s=sigma_s), table), truth
+        )
     scatter = 3 * np.sqrt(2 / 6 / draws)
     assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter

@@ -43,7 +43,7 @@ def test_a_table_that_states_none_is_no_pass(pair: Rig, metadata: dict[str, Any]
     (reason,) = result.summary.reasons
     assert reason.text.startswith("cannot tell: scatter only: ")
     assert reason.cameras == ("left", "right")
-    assert any("--common-deg" in action for action in result.summary.actions)
+    assert any("common_deg and common_cm" in action for action in result.summary.actions)
 
 
 def test_it_changes_no_probability_and_no_pose(pair: Rig) -> None:

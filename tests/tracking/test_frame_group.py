@@ -148,7 +148,7 @@ def test_frames_that_stand_out_are_taken_in_by_themselves() -> None:
             refused.append(str(error))
     results = [*update_all(IncrementalCalibrator(guess_of(rig)), frames)]
     found = [update for group in results if isinstance(group, list) for update in group]
-    assert [str(one) for one in results if isinstance(one, CorrespondenceError)] == refused
+    assert [one.message for one in results if isinstance(one, Refused)] == refused
     assert len(refused) == 2
     assert [(u.frame, u.left_out, {*u.used}) for u in found] == [
         (u.frame, u.left_out, {*u.used}) for u in expected

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calibgraph import Config
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.camera_block import camera_blocks
+from calibgraph.tracking.assessment import _recent_checks
 from calibgraph.tracking.live_frames import OutlierFrame
+from calibgraph.tracking.offset_sums import with_offset
+from calibgraph.tracking.offset_terms import score_after
+from calibgraph.tracking.state import State
+from calibgraph.tracking.sums import Sums
 from tests.tracking.drives import moved_later
-from tests.tracking.late_drives import STRAIGHT, late, town, track
+from tests.tracking.late_drives import OFFSET, STRAIGHT, late, town, track
 from tests.tracking.steps import moved, step_of
 
 
@@ -26,6 +34,26 @@ def test_a_small_move_is_found_although_the_offset_is_estimated() -> None:
     (event,) = [e for update in updates for e in update.events if e.kind != "started"]
     assert (event.kind, event.camera) == ("moved", "image_2")
     assert abs(event.frame - 100) <= 5
+
+
+def test_an_unknown_offset_counts_as_far_as_motions_differ() -> None:
+    """Frames of one motion tell a move from an earlier pose as with a known offset, whatever it is.
+
+    Of others, an offset of 50 ms displaces the score by as much as their motions differ.
+    """
+    state = State.initial(rig_of("kitti"), OFFSET)
+    A = 1e4 * np.random.default_rng(0).normal(size=(6, 20))
+    hessian, frames = A @ A.T, np.array(50.0)
+    poses = Sums.zeros().change(hessian=hessian, reweighted=hessian, scatter=hessian, frames=frames)
+    before, turn = with_offset(poses, STRAIGHT), np.array([0, 0, 0.2, 0, 0, 0])
+    walk = state.config.tracking.walk_time_offset_s**2 * frames
+    for motion, variance in ((STRAIGHT, walk), (STRAIGHT + turn, walk + 0.05**2)):
+        moved = np.outer(turn, turn) * 0.05**2 if variance > walk else np.zeros((6, 6))
+        along = np.outer(motion, motion) * walk
+        expected = 2 * hessian + hessian @ (moved + along) @ hessian
+        score, covariance = score_after(state, 0, before, with_offset(poses, motion))
+        assert np.array_equal(score, np.zeros(6))
+        assert np.abs(covariance - expected).max() < 0.01 * expected.max()  # by weak priors
 
 
 def test_after_a_move_the_offset_is_what_it_was() -> None:
@@ -61,6 +89,20 @@ def test_frames_of_a_camera_that_has_moved_do_not_show_its_offset() -> None:
     (size,) = [event.size for event in events if event.kind == "moved"]
     assert size is not None
     assert size.translation_sigma_cm == pytest.approx(2**0.5 * 36, rel=0.1)
+
+
+def test_a_drift_names_what_may_be_the_clock() -> None:
+    """A mount that turns, and a clock that drifts, are told apart as well as they correlate."""
+    state = State.initial(rig_of("kitti"), OFFSET)
+    one = replace(state.cameras[0], summary=replace(state.cameras[0].summary, walk=3))
+    offset = LensEstimate("offset", "s", 0.02, 0.001, 0.0, 0.05, "yaw", 0.874)
+    (check,) = _recent_checks(state, one, (offset,))
+    assert check.status == "WARN"
+    assert check.text.endswith(
+        "part of it may be the other, by their correlation: offset with yaw 0.87"
+    )
+    (check,) = _recent_checks(state, one, (replace(offset, correlation=0.0),))
+    assert check.text == "drifts: the estimate follows, over fewer frames"
 
 
 def test_a_frame_that_is_set_aside_keeps_its_errors_at_another_offset() -> None:

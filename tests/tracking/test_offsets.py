@@ -233,7 +233,7 @@ def test_the_quadratic_of_a_late_camera_is_its_factors() -> None:
     A = rng.normal(size=(7, 20))
     pose = gtsam.Pose3.Expmap(rng.normal(size=6))
     place, value = np.array([0]), rng.normal(size=1)
-    late_one = LateQuadraticByPlace(place, [pose], value, (A @ A.T)[None], seen_lens_key(0))
+    late_one = LateQuadraticByPlace(place, [pose], value, (A @ A.T)[None], [seen_lens_key(0)])
     keys = cloud_at_key(0), matched_at_key(0, 0), seen_lens_key(0)
     values = gtsam.Values()
     values.insert(keys[0], gtsam.Pose3())

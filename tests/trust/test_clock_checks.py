@@ -53,7 +53,7 @@ def test_an_offset_is_recovered_within_its_sigma(offset_s: float) -> None:
     (seconds,), (sigma,) = found.units * found.values, found.units * found.sigmas
     assert abs(seconds - offset_s) < FIVE_SIGMAS * sigma
     assert sigma < 0.002
-    assert (found.probability > 0.5) == (offset_s != 0.0)
+    assert (found.probability() > 0.5) == (offset_s != 0.0)
     assert f"ms {'earlier' if seconds < 0 else 'later'}" in found.describe()
 
 
@@ -62,7 +62,7 @@ def test_at_rest_and_straight_ahead_nothing_is_known_of_it(twists: np.ndarray) -
     """Less than the 40 ms of an offset that is wrong, so it raises no doubt, and that is told."""
     found = fit(0.05, twists)
     assert 0.002 * found.sigmas[0] > 0.04
-    assert found.probability < 1e-3
+    assert found.probability() < 1e-3
     check = check_offset(found, RESIDUALS)
     assert check.status == "PASS"
     assert "not determined by these data, and taken for right" in check.text

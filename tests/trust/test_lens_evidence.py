@@ -129,7 +129,7 @@ def test_the_lens_is_applied_to_points_where_they_are_when_they_are_seen(
 def test_frames_of_one_content_are_one_frame_which_shows_no_significance(truth: Camera) -> None:
     camera = change_lens(truth, FOCAL, 0.03)
     found = measure(camera, stop=tuple(range(6)))
-    assert all(math.isnan(each.sigma) and each.probability == 0.0 for each in found)
+    assert all(math.isnan(each.sigma) and each.probability() == 0.0 for each in found)
     assert CALIBRATED * abs(found[0].values[0]) > 0.01  # noqa: PLR2004
 
 

@@ -25,22 +25,30 @@ def estimate(name: str, size: float, sigma: float, moved_cm: float) -> LensParam
 
 
 def test_a_parameter_of_which_the_residuals_say_nothing_raises_no_doubt() -> None:
-    assert estimate("focal length", 0.5, 1.0, 500.0).probability == pytest.approx(0.0, abs=1e-3)
-    assert estimate("focal length", 0.0, 1e-4, 0.0).probability == 0.0
+    assert estimate("focal length", 0.5, 1.0, 500.0).probability() == pytest.approx(0.0, abs=1e-3)
+    assert estimate("focal length", 0.0, 1e-4, 0.0).probability() == 0.0
     for sigma in (math.nan, math.inf, 1e100):
         found = estimate("focal length", 0.01, sigma, 50.0)
-        assert found.probability == pytest.approx(0.0, abs=1e-12)
+        assert found.probability() == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_small_change_counts_by_how_far_it_moves_the_camera() -> None:
     near, far = (estimate("focal length", 0.005, 1e-4, moved_cm) for moved_cm in (2.0, 30.0))
-    assert near.probability < 1e-6
-    assert far.probability > 0.5  # noqa: PLR2004
+    assert near.probability() < 1e-6
+    assert far.probability() > 0.5  # noqa: PLR2004
+
+
+def test_the_tolerance_of_the_user_decides_how_far_is_wrong() -> None:
+    found = estimate("focal length", 0.017, 0.002, 8.0)
+    by_tolerance = [found.probability((0.5, cm)) for cm in (2.0, 10.0, 30.0)]
+    assert by_tolerance[0] > 0.9 and 0.2 > by_tolerance[1] > by_tolerance[2]
+    assert found.probability() == by_tolerance[1]
+    assert check_parameter(found, IMAGES, (0.5, 2.0)).value == by_tolerance[0]
 
 
 def test_the_probability_grows_with_the_significance() -> None:
     found = [
-        estimate("distortion", 0.03, 0.03 / sigmas, 30.0).probability for sigmas in (1, 3, 5, 9)
+        estimate("distortion", 0.03, 0.03 / sigmas, 30.0).probability() for sigmas in (1, 3, 5, 9)
     ]
     assert found == sorted(found) and found[0] < 0.01 and found[-1] > 0.9  # noqa: PLR2004
 
@@ -75,13 +83,13 @@ def test_an_unobservable_other_parameter_leaves_an_estimate_as_it_is() -> None:
 
 
 def test_a_shape_that_no_lens_has_counts_though_it_hardly_moves_the_camera() -> None:
-    assert estimate("skew", 0.03, 0.002, 0.1).probability > 0.9  # noqa: PLR2004
-    assert estimate("focal length", 0.03, 0.002, 0.1).probability < 1e-6  # noqa: PLR2004
+    assert estimate("skew", 0.03, 0.002, 0.1).probability() > 0.9  # noqa: PLR2004
+    assert estimate("focal length", 0.03, 0.002, 0.1).probability() < 1e-6  # noqa: PLR2004
 
 
 def test_a_parameter_that_moves_the_camera_beyond_any_length_is_wrong() -> None:
-    assert estimate("focal length", 1.0, 1e-3, 1e10).probability > 0.9  # noqa: PLR2004
-    assert estimate("focal length", 1e100, 1e-3, 1e10).probability > 0.9  # noqa: PLR2004
+    assert estimate("focal length", 1.0, 1e-3, 1e10).probability() > 0.9  # noqa: PLR2004
+    assert estimate("focal length", 1e100, 1e-3, 1e10).probability() > 0.9  # noqa: PLR2004
 
 
 def test_a_single_frame_leaves_the_significance_unknown() -> None:

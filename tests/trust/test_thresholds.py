@@ -9,7 +9,7 @@ import pytest
 
 from calibgraph import Config, Rig, solve
 from calibgraph.model.threshold import Threshold
-from calibgraph.trust.thresholds import LIMITS, THRESHOLDS, thresholds_markdown
+from calibgraph.trust.thresholds import LIMITS, THRESHOLDS, limit, thresholds_markdown
 from tests.conftest import ROOT
 from tests.trust.conftest import simulated
 
@@ -60,8 +60,14 @@ def test_the_markdown_has_all_rows() -> None:
         assert line.count("|") == 7
         assert row.question in line and row.name in line and row.reason in line
         assert f"{row.direction} " in line
-    for limit in LIMITS:
-        assert sum(line.startswith(f"| `{limit.key}` ") for line in lines) == 1
+    for each in LIMITS:
+        assert sum(line.startswith(f"| `{each.key}` ") for line in lines) == 1
     assert "| at most 35% | above 90% |" in thresholds_markdown()
     assert "| at least 4 | below 2.5 |" in thresholds_markdown()
     assert "| at least 50 | never |" in thresholds_markdown()
+
+
+def test_a_limit_grows_with_the_tolerance_and_is_exact_at_the_default() -> None:
+    assert [limit("competing_rotation", (deg, 10.0)) for deg in (0.1, 0.5, 1.0)] == [0.3, 0.3, 0.6]
+    assert limit("competing_translation", (0.1, 30.0)) == pytest.approx(30.0)
+    assert limit("swap_slack", (5.0, 100.0)) == limit("swap_slack")

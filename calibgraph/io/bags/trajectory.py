@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -95,9 +95,11 @@ class _ByPoses:
     trajectory: _Trajectory
 
     def __call__(self, frame: BagFrame) -> ScanMotion:
-        middle_s = (frame.stamp_ns - self.trajectory.start_ns) / 1e9 + frame.to_s / 2
+        stamp_s = (frame.stamp_ns - self.trajectory.start_ns) / 1e9
+        middle_s = stamp_s + frame.to_s / 2
         before, after = (self.trajectory.at(middle_s + t) for t in (-_HALF_S, _HALF_S))
-        return _motion(twist_between(before, after, 2 * _HALF_S), frame)
+        found = _motion(twist_between(before, after, 2 * _HALF_S), frame)
+        return replace(found, T_world_lidar=self.trajectory.at(stamp_s))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from calibgraph import BagOptions, DatasetError, calibrate, evaluate, load_datas
 from calibgraph.io.bags.point_clouds import timed_points_of
 from calibgraph.io.frame import load_entry_cloud
 from calibgraph.io.motion import ScanMotion
+from calibgraph.matching import places
 from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.model.geometry import invert
 from calibgraph.trust.inputs import find_doubts
@@ -87,6 +88,32 @@ def test_a_cache_tells_corrected_clouds_from_those_as_recorded(
 def test_the_note_states_the_correction(bag: tuple[Path, list[np.ndarray]]) -> None:
     notes = load_dataset(bag[0], bag=BagOptions(motion="tf")).notes
     assert notes[-1].endswith("clouds are corrected for motion by tf, with the t")
+
+
+@pytest.mark.parametrize(("motion", "limit_m"), [("odometry", 2e-4), ("scans", 0.1)])
+def test_poses_or_twists_give_the_motion_between_frames(
+    bag: tuple[Path, list[np.ndarray]],
+    monkeypatch: pytest.MonkeyPatch,
+    motion: Any,
+    limit_m: float,
+) -> None:
+    """No feature is looked for; scans give twists alone, which hold for a short time.
+
+    Of poses, the limit is that of their interpolation; of scans, a tenth of the step.
+    """
+    data = load_dataset(bag[0], bag=BagOptions(motion=motion))
+    monkeypatch.setattr(places, "_detect", lambda *_, **__: None)
+    name, lens = next(iter(RIG.cameras.items()))
+    period_s = PERIOD_NS / 1e9
+    for number, step in enumerate(places.motions(data, name, lens)):
+        assert step is not None
+        now, before = T_world_lidar((number + 1) * period_s), T_world_lidar(number * period_s)
+        expected = invert(now) @ before
+        assert np.linalg.norm(expected[:3, 3]) > 0.9
+        assert np.linalg.norm(step[:3, 3] - expected[:3, 3]) < limit_m
+    monkeypatch.setattr(places, "MOST_S", 0.5 * period_s)
+    found = places.motions(data, name, lens)
+    assert [step is None for step in found] == [motion == "scans"] * len(found)
 
 
 def test_times_that_are_all_equal_are_named_if_motion_is_to_be_corrected(
