@@ -82,6 +82,12 @@ def common_error_checks(estimate: Estimate) -> list[Check]:
     return [Check("common error", "WARN", text, kind=COMMON_ERROR)]
 
 
+def flat_evidence_checks(evidence: Evidence) -> Checks:
+    """Whether the images leave a pose more open than the matches, where images are known."""
+    row = threshold("flat_evidence")
+    return {name: [row.check(evidence.widening(name))] for name in evidence.posteriors}
+
+
 def relative_pose_checks(estimate: Estimate) -> list[Check]:
     """Whether the rig's relative poses agree with the correspondences."""
     return [_check_relative_pose(conflict) for conflict in estimate.conflicts]

@@ -27,6 +27,7 @@ from calibgraph.trust.pose_posterior import (
     measure_posteriors,
     widen,
 )
+from calibgraph.trust.probability import TABLES, judge
 from tests.trust.conftest import SAMPLE, simulated
 
 Array = NDArray[np.float64]
@@ -189,6 +190,28 @@ def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: 
     assert found.error_probability.by_error_bar > 0.9
     assert found.error_probability.by_checks < 0.01
     assert found.status == "WARN" and found.cannot_tell
+    (check,) = (each for each in found.checks if each.kind == "flat_evidence")
+    assert check.status == "WARN" and check.value is not None and check.value > 3
+
+
+@pytest.mark.parametrize(("wider", "status"), [(2.0, "PASS"), (4.0, "WARN")])
+def test_a_wider_surface_is_a_finding_that_changes_no_verdict(
+    pair: Rig, wider: float, status: str
+) -> None:
+    """The check states how much wider; the verdict is the one without it."""
+    solution = solve_joint(pair, simulated(pair, frames=20))
+    covariance = Evidence(solution, pair).covariance_of("left")
+    assert covariance is not None
+    evidence = Evidence(solution, pair, lambda *_: {"left": certain(wider**2 * covariance)})
+    found = to_calibration(evidence, assess(evidence)).camera_verdicts["left"]
+    (check,) = (each for each in found.checks if each.kind == "flat_evidence")
+    assert check.status == status
+    assert check.value == pytest.approx(wider)
+    others = tuple(each for each in found.checks if each is not check)
+    assert found.error_probability is not None
+    without = judge(others, found.error_probability.by_error_bar, TOLERANCE, TABLES)
+    assert (without.status, without.cannot_tell) == (found.status, found.cannot_tell)
+    assert without.error_probability == found.error_probability
 
 
 def test_where_the_images_are_flat_other_scenes_are_advised_and_not_more_of_the_same() -> None:
