@@ -19,6 +19,7 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pair_covariances
+from calibgraph.model.lens_estimate import with_sigmas
 from calibgraph.model.rig import Rig
 from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import Progress, Stopwatch, no_progress
@@ -141,7 +142,7 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         for name in cameras
     }
     result = Calibration(
-        rig=solution.solved_rig,
+        rig=with_sigmas(solution.solved_rig, solution.lens),
         initial_rig=evidence.guess,
         covariance={name: evidence.covariance_of(name) for name in cameras},
         joint_covariance=evidence.joint_covariance,
@@ -159,6 +160,7 @@ def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> C
         prior_share=evidence.prior_shares,
         error_sources=evidence.error_sources,
         lens=solution.lens,
+        lens_covariance=evidence.lens_covariance,
         bootstrap=evidence.bootstrap,
         places=solution.correspondences.places.of_frames(solution.correspondences.frame),
         correspondences=solution.correspondences,

@@ -34,7 +34,7 @@ from calibgraph.matching.run import (
 from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
-from calibgraph.model.lens_estimate import LensEstimate, change_of_lens
+from calibgraph.model.lens_estimate import LensEstimate, change_of_lens, unsettled
 from calibgraph.model.perturbation import perturb
 from calibgraph.model.places import Places, as_groups
 from calibgraph.model.rig import Rig
@@ -54,7 +54,6 @@ _BETTER = 1.03
 """Ratio of z-scores from which the end of a displaced start replaces the first end. On KITTI, ends
 8 to 12 cm off had 8 to 16 % lower z-scores than those at 3 cm; equally good ends differ by a few
 percent."""
-
 
 _STANDS, _REPEATS = 0.5, 4
 """Change of a lens or clock, in standard deviations, from which the last round is repeated; how
@@ -102,10 +101,12 @@ def match_in_rounds(
         _log.info("round %d: %s", index, round_in_words(rounds[-1]))
         moved, lens = change_of_lens(lens, solution.lens), solution.lens
         estimate = solution.solved_rig
-        if indices[-1] == index and moved > _STANDS and len(indices) < full.rounds + _REPEATS:
+        if index == full.rounds - 1 and moved > _STANDS and repeat < _REPEATS:
             indices.append(index)  # with the new lens
         if out_of_time():
             break
+    if moved > _STANDS and repeat == _REPEATS:
+        warnings = (*warnings, unsettled(config.estimate, moved, repeat))
     missed = full.rounds - 1 - index
     run = MatchingRun(
         data, full, guess, table, solution, tuple(rounds), watch, missed, warnings=warnings

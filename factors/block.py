@@ -146,19 +146,26 @@ class ProjectionBlock(RobustBlock):
         """(p, 6) b of the whole block at each of (p, 4, 4) poses."""
         return unpack_sums(self._sums_at_each(T_camera_lidar, GRADIENT)).gradient
 
+    def run_gradients_at_each(self, T_camera_lidar: Array, runs: NDArray[np.int64]) -> Array:
+        """(r, p, 6) b of each of (r, 2) runs at each of (p, 4, 4) poses."""
+        return unpack_sums(self._run_sums_at_each(T_camera_lidar, runs, GRADIENT)).gradient
+
     def costs_at_each(self, T_camera_lidar: Array) -> Array:
         """(p,) c of the whole block at each of (p, 4, 4) poses."""
         return unpack_sums(self._sums_at_each(T_camera_lidar, COST)).cost
 
     def _sums_at_each(self, T_camera_lidar: Array, wanted: int) -> Array:
         """(p, 28) sums of the whole block at (p, 4, 4) poses; each chunk at all of them in turn."""
-        chunks, count = len(self._chunks), len(T_camera_lidar)
-        poses, runs = (
-            np.tile(T_camera_lidar, (chunks, 1, 1)),
-            np.repeat(self._chunks, count, axis=0),
-        )
-        sums = self._run_sums(poses, runs, None, wanted)
-        return np.asarray(sums.reshape(chunks, count, 28).sum(axis=0))
+        sums = self._run_sums_at_each(T_camera_lidar, self._chunks, wanted)
+        return np.asarray(sums.sum(axis=0))
+
+    def _run_sums_at_each(
+        self, T_camera_lidar: Array, runs: NDArray[np.int64], wanted: int
+    ) -> Array:
+        """(r, p, 28) sums of each run at each pose."""
+        count = len(T_camera_lidar)
+        poses, each = np.tile(T_camera_lidar, (len(runs), 1, 1)), np.repeat(runs, count, axis=0)
+        return self._run_sums(poses, each, None, wanted).reshape(len(runs), count, 28)
 
     def frame_sums(self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike) -> BlockSums:
         """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked."""

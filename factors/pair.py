@@ -93,7 +93,11 @@ def _error_and_jacobian(
     """(13,) error and (13, 12) Jacobian, or (7,) and (7, 12)."""
     if isinstance(block, SurfaceBlock):
         return square_root(block.sums(T_lidar_a, T_lidar_b))
-    error, jacobian = square_root(block.sums(T_lidar_a.between(T_lidar_b)))
+    T_a_b = T_lidar_a.between(T_lidar_b)
+    if isinstance(block, ProjectionBlock):
+        error, jacobian = block.error_and_jacobian(T_a_b)
+    else:
+        error, jacobian = square_root(block.sums(T_a_b))
     return error, jacobian @ pair_chain(T_lidar_a, T_lidar_b)
 
 

@@ -4,6 +4,7 @@
 
 The weights of ``benchmarks.accuracy.probability`` are fitted to the first files without one kind of
 check, kind by kind. A row is by how much the likelihood of the others, kept out, is then lower.
+Checks that no kept-out case has, since they were deleted, take no part.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks.accuracy import ledger
-from benchmarks.accuracy.probability import (
+from benchmarks.accuracy.probability import fit
+from benchmarks.accuracy.verdict_samples import (
     AMBIGUOUS,
-    SHARE_OFF,
     Sample,
     drop,
-    fit,
     probabilities,
     samples_of,
+    shares,
 )
 from benchmarks.tables import Table, add_record_option
 from calibgraph.trust.probability import STRUCTURE, TABLES
@@ -58,11 +59,13 @@ def additions(
     name: str, tuned: Sequence[Sample], kept_out: Sequence[Sample], *, jobs: int
 ) -> Table:
     """Per kind of check, what the kept-out likelihood loses where it is left out of the fit."""
-    kinds = sorted({kind for sample in tuned for kind in sample.severities})
+    fitted, kinds = ({k for s in of for k in s.severities} for of in (tuned, kept_out))
+    tuned = [drop(sample, fitted - kinds) for sample in tuned]
+    kinds &= fitted
     whole = log_likelihood(fit(tuned), kept_out)
     with ProcessPoolExecutor(jobs) as pool:
-        lost = [*pool.map(partial(_without, tuned, kept_out), kinds)]
-    rows = sorted(((whole - found, kind) for found, kind in zip(lost, kinds, strict=True)))
+        lost = [*pool.map(partial(_without, tuned, kept_out), sorted(kinds))]
+    rows = sorted(((whole - found, kind) for found, kind in zip(lost, sorted(kinds), strict=True)))
     return Table(
         f"{name}, kept out: log likelihood {whole:.4f} a result, and what a kind of check adds",
         ("kind of check", "adds, 1e-4"), tuple((kind, f"{1e4 * gain:.1f}") for gain, kind in rows),
@@ -77,9 +80,8 @@ def _without(tuned: Sequence[Sample], kept_out: Sequence[Sample], kind: str) -> 
 def log_likelihood(model: dict[str, Any], samples: Sequence[Sample]) -> float:
     """Mean of the logarithm of what was foretold, with one result in ten off."""
     p, off = probabilities(model, samples), np.array([sample.off for sample in samples])
-    count = np.where(off, SHARE_OFF / off.mean(), (1 - SHARE_OFF) / (1 - off.mean()))
     p = np.clip(np.where(off, p, 1 - p), 1e-6, 1.0)
-    return float(np.average(np.log(p), weights=count))
+    return float(np.average(np.log(p), weights=shares(samples)))
 
 
 if __name__ == "__main__":

@@ -1,13 +1,11 @@
 """Lenses that are wrong, before and after they are estimated with the extrinsics.
 
-    python -m benchmarks.accuracy.lens [--draws 30] [--data FOLDER ...]
+    python -m benchmarks.accuracy.lens [--draws 30]
 
 Simulated tables of two cameras like KITTI's, 30 frames of 100 matches, with errors that the matches
 of a frame share. NEES is the squared error of a camera's pose in the metric of its covariance; its
-mean over 6 should be 1. ``z^2`` is the mean square of the lens' errors in their sigmas. With
-``--data``, recordings in folders whose rig is the reference: their lenses are spoilt, they are
-calibrated from starts 1 degree and 10 cm off with and without the estimate, and the errors are
-against the reference.
+mean over 6 should be 1. ``z^2`` is the mean square of the lens' errors in their sigmas. Recordings:
+``benchmarks.accuracy.lens_cases``.
 """
 
 from __future__ import annotations
@@ -16,22 +14,16 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import (
-    Calibration,
     Config,
     Correspondences,
     MatcherErrors,
     Rig,
-    calibrate,
-    evaluate,
-    load_dataset,
-    perturb,
     simulate_correspondences,
 )
 from calibgraph.graph.lens import LensVariable
@@ -52,13 +44,9 @@ CASES = (
 )  # fmt: skip
 """Part that is estimated; its error: of the focal length (share), of cx [px], of k1."""
 
-SPOILT = (("focal", 0.017), ("centre", 10.0), ("distortion", 0.03), ("focal", 0.0))
 COLUMNS = (
     "part", "error", "before [deg]", "[cm]", "after [deg]", "[cm]", "NEES / 6", "lens off",
     "sigma", "z^2",
-)  # fmt: skip
-RECORDED = (
-    "recording", "part", "error", "estimated", "verdict", "error [deg]", "[cm]", "lens off", "sigma"
 )  # fmt: skip
 
 
@@ -122,9 +110,7 @@ def nees_of(found: Solution, errors: list[Array]) -> list[float]:
     return [float(e @ np.linalg.solve(own, e)) for e, own in zip(errors, blocks, strict=True)]
 
 
-def _lens_errors(
-    found: Solution | Calibration, truth: Rig, part: str
-) -> Iterator[tuple[float, float]]:
+def _lens_errors(found: Solution, truth: Rig, part: str) -> Iterator[tuple[float, float]]:
     """Error and sigma of the parameter that was spoilt, of all with ``lens``."""
     for name, parameters in found.lens.items():
         camera = truth.cameras[name]
@@ -141,17 +127,11 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--draws", type=int, default=30)
-    parser.add_argument("--data", nargs="*", type=Path, default=[], help="recordings")
     add_record_option(parser)
     options = parser.parse_args()
-    tables = []
-    if options.draws:
-        rows = tuple(row_of(part, error, options.draws) for part, error in CASES)
-        tables.append(Table(f"{options.draws} draws, medians of 2 cameras", COLUMNS, rows))
-    if options.data:
-        recorded = tuple(row for folder in options.data for row in rows_of(folder))
-        tables.append(Table("Recordings, the worst camera", RECORDED, recorded))
-    publish("accuracy.lens", tables, record=options.record)
+    rows = tuple(row_of(part, error, options.draws) for part, error in CASES)
+    table = Table(f"{options.draws} draws, medians of 2 cameras", COLUMNS, rows)
+    publish("accuracy.lens", [table], record=options.record)
 
 
 def row_of(part: str, error: float, draws: int) -> tuple[str, ...]:
@@ -173,27 +153,6 @@ def sizes_of(found: list[Drawn], when: str) -> tuple[str, str]:
         np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors, 2, axis=1)
     )
     return f"{np.degrees(turned):.3f}", f"{100 * moved:.2f}"
-
-
-def rows_of(folder: Path) -> Iterator[tuple[str, ...]]:
-    """A recording with every spoilt lens, fixed and estimated."""
-    data = load_dataset(folder)
-    for part, error in SPOILT:
-        wrong = put_lens_error(data.rig, part, error)
-        guess = perturb(wrong, rotation_deg=1.0, translation_m=0.1, seed=1)
-        for estimate in ((), (part,)):
-            result = calibrate(data, guess, config=Config(estimate=estimate))
-            errors = evaluate(result.rig, data.rig).cameras.values()
-            worst = max(
-                _lens_errors(result, data.rig, part), key=lambda pair: abs(pair[0]), default=None
-            )
-            yield (
-                folder.name, part, f"{error:g}", "yes" if estimate else "no",
-                result.verdict.status,
-                f"{max(one.rotation_error_deg for one in errors):.3f}",
-                f"{max(one.translation_error_cm for one in errors):.1f}",
-                *(("-", "-") if worst is None else (f"{value:.3g}" for value in worst)),
-            )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -3,17 +3,19 @@
     python -m benchmarks.accuracy.search --data 00,00+01 --within 20/1.5,2/0.2
     python -m benchmarks.accuracy.search --kinds dark,half_beams --starts 3 --out out/spoilt.jsonl
     python -m benchmarks.accuracy.search --kinds one_frame,two_frames --within 10/0.5 --starts 6
-    python -m benchmarks.accuracy.search --summary out/search.jsonl
+    python -m benchmarks.accuracy.search --summary out/search.jsonl --cameras
 
 Guesses are drawn uniformly per axis, independently per camera. A run is a success if every camera
 ends within 0.5 deg and 15 cm of the reference. A wrong PASS or WARN is a camera farther off than
-that with this verdict.
+that with this verdict. ``--cameras`` adds a row per camera, with its error bar and the squared
+error over the variance of each axis (1 is expected).
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -30,6 +32,7 @@ from benchmarks.tables import ROOT, Table, add_record_option
 from calibgraph import Camera, Dataset, Frame, calibrate, evaluate, perturb
 
 SUCCESS_DEG, SUCCESS_CM = 0.5, 15.0
+STATUSES = ("PASS", "WARN", "FAIL")
 BEAM_DEG = 0.4  # about the spacing of 64 beams over 26 degrees
 
 
@@ -45,7 +48,8 @@ def main() -> None:
     ]
     work = partial(run_case, folders=Folders(arguments.realdata, None))
     records = ledger.records_of(arguments, cases, work)
-    ledger.publish_cases("accuracy.search", [report(records)], records, record=arguments.record)
+    tables = [report(records), *([per_camera(records)] if arguments.cameras else [])]
+    ledger.publish_cases("accuracy.search", tables, records, record=arguments.record)
     for record in records:
         print(record.get("crash", ""), end="")
 
@@ -65,6 +69,7 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "search.jsonl")
     parser.add_argument("--summary", type=Path, help="print the table of a file, run nothing")
+    parser.add_argument("--cameras", action="store_true", help="a row per camera, too")
     add_record_option(parser)
     return parser.parse_args()
 
@@ -79,8 +84,10 @@ def run_case(case: Key, folders: Folders) -> Record:
         scene = Scene(case.data, data, truth, folders, Path(folder), case.seed)
         result = calibrate(KINDS[case.kind](scene), guess)
     pairs = evaluate(result.rig, truth).pairs
+    table = result.correspondences
     return {
         **ledger.to_record(result, truth),
+        "places": None if table is None else len(table.places.split(np.unique(table.frames))),
         "rig": result.verdict.status,
         "pairs": {
             name: [pair.rotation_error_deg, pair.translation_error_cm]
@@ -191,9 +198,56 @@ def cells(name: tuple[str, str, str], records: list[Record]) -> tuple[str, ...]:
         *name, str(len(records)), str(successes), f"{degrees:.3f}", f"{centimetres:.2f}",
         "; ".join(f"{deg:.3f}, {cm:.2f}" for deg, cm in each), f"{pairs[0]:.3f}",
         f"{pairs[1]:.2f}", *(str(wrong.count(status)) for status in ("PASS", "WARN")),
-        *(str(statuses.count(status)) for status in ("PASS", "WARN", "FAIL")),
+        *(str(statuses.count(status)) for status in STATUSES),
         str(len(records) - len(done)), f"{np.median(seconds):.1f}", f"{max(seconds):.1f}",
     )  # fmt: skip
+
+
+CAMERA_COLUMNS = (
+    "within [deg/m]", "kind", "data", "camera", "places", "starts", "refused",
+    "median [deg]", "[cm]", "sigma [deg]", "[cm]", "squared error over variance: rotation x, y, z",
+    "translation x, y, z", "in the covariance, over 6",
+    *(f"{which}: {status}" for which in ("found", "not found") for status in STATUSES),
+)  # fmt: skip
+
+
+def per_camera(records: list[Record]) -> Table:
+    """A row per range, kind, data and camera; sigmas are of the worst axis, of results not FAIL."""
+    groups: dict[tuple[str, ...], list[Record]] = {}
+    for record in records:
+        for name, camera in record.get("cameras", {}).items():
+            case = (record["level"], record["kind"], record["data"], name)
+            groups.setdefault(case, []).append({"places": record.get("places"), **camera})
+    refused = Counter((r["level"], r["kind"], r["data"]) for r in records if "refusal" in r)
+    rows = [camera_cells(name, groups[name], refused[name[:3]]) for name in groups]
+    return Table("Each camera", CAMERA_COLUMNS, tuple(rows))
+
+
+def camera_cells(name: tuple[str, ...], cameras: list[Record], refused: int) -> tuple[str, ...]:
+    """The row of a camera over all starts."""
+    places = "/".join(sorted({str(c["places"]) for c in cameras if c["places"] is not None}))
+    with_bar = [c for c in cameras if c["sigma_deg"] is not None and c["status"] != "FAIL"]
+    errors = (f"{error:.2f}" for error in _median_errors(cameras))
+    sigmas = (_median([max(c[key]) for c in with_bar]) for key in ("sigma_deg", "sigma_cm"))
+    ratios = (
+        ", ".join(_mean([(c[f"xi_{u}"][i] / c[f"sigma_{u}"][i]) ** 2 for c in with_bar])
+                  for i in range(3 if with_bar else 0))
+        for u in ("deg", "cm")
+    )  # fmt: skip
+    verdicts = Counter((_is_right(c), c["status"]) for c in cameras)
+    return (
+        *name, places, str(len(cameras) + refused), str(refused), *errors, *sigmas, *ratios,
+        _mean([c["normalised_squared"] for c in with_bar]),
+        *(str(verdicts[found, status]) for found in (True, False) for status in STATUSES),
+    )  # fmt: skip
+
+
+def _median(values: list[float]) -> str:
+    return f"{np.median(values):.2f}" if values else ""
+
+
+def _mean(values: list[float]) -> str:
+    return f"{np.mean(values):.1f}" if values else ""
 
 
 def _is_right(camera: Record) -> bool:

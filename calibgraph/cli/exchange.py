@@ -108,7 +108,9 @@ def export(
             help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="File to write.")],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="File to write; of camera_info a folder.")
+    ],
     camera: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME", help="Only this camera; may be repeated. (default: all)"),

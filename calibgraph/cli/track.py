@@ -68,7 +68,7 @@ def track(
 
     Each line on standard output is one update: estimates, covariances, verdicts, and events (what
     moved, since when, how far). It is printed once the update is on disk: after a crash or kill -9
-    the same command resumes there, and may print the last line again. SIGTERM and Ctrl-C finish
+    the same command resumes there, and may print the last lines again. SIGTERM and Ctrl-C finish
     the current update first.
 
     Frames of one place (within some 20 m) share errors: name it in each line ("place") or list the

@@ -80,8 +80,10 @@ class BlockByPlace:
 
     def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
         """The correspondences of one place, lossless, on the variables of these keys."""
-        rows = np.arange(self.edges[place], self.edges[place + 1])
-        return [pair_block_factor(cloud, matched, self.block.select(rows))] if len(rows) else []
+        first, end = self.edges[place : place + 2].tolist()
+        whole = end - first == len(self.block)
+        block = self.block if whole else self.block.select(np.arange(first, end))
+        return [pair_block_factor(cloud, matched, block)] if first < end else []
 
 
 @dataclass(frozen=True, eq=False)

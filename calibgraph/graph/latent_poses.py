@@ -20,7 +20,7 @@ poses of a camera are equal, and the graph is that of Eq. 5 of the paper.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -116,7 +116,7 @@ class LatentPoseModel:
         numbers = range(len(self.cameras))
         return [key(n) if n in differing else camera_key(n) for n in numbers]
 
-    @property
+    @cached_property
     def matched(self) -> list[int]:
         """Numbers of the cameras that have correspondences."""
         return [number for number, name in enumerate(self.cameras) if name in self.blocks]
@@ -127,17 +127,20 @@ class LatentPoseModel:
         names = {name for pair in self.pairs for name in (pair.a, pair.b)}
         return [number for number, name in enumerate(self.cameras) if name in names]
 
-    @property
+    @cached_property
     def is_distorted(self) -> bool:
         """Whether the scan distortion is a variable."""
         parts = self.components
         return bool(parts.distortion_jacobian.any() or parts.pair_distortion_jacobian.any())
 
-    def matched_places(self) -> Iterator[tuple[int, int]]:
+    @cached_property
+    def matched_places(self) -> list[tuple[int, int]]:
         """Place and camera of every ``a_cp``."""
-        for number in self.matched:
-            for place in self.blocks[self.cameras[number]].places:
-                yield int(place), number
+        return [
+            (place, number)
+            for number in self.matched
+            for place in self.blocks[self.cameras[number]].places.tolist()
+        ]
 
     @cached_property
     def shared_graph(self) -> gtsam.NonlinearFactorGraph:
@@ -162,7 +165,7 @@ class LatentPoseModel:
     @property
     def place_keys(self) -> list[int]:
         """Keys of ``a_cp`` and ``o_p``."""
-        matched = [matched_at_key(place, camera) for place, camera in self.matched_places()]
+        matched = [matched_at_key(place, camera) for place, camera in self.matched_places]
         return [*matched, *map(cloud_at_key, range(self.places))]
 
     @property
@@ -199,7 +202,7 @@ def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
     A summary of earlier correspondences is another factor of its camera and place.
     """
     graph = gtsam.NonlinearFactorGraph()
-    for place, camera in model.matched_places():
+    for place, camera in model.matched_places:
         keys = cloud_at_key(place), matched_at_key(place, camera)
         for factor in model.blocks[model.cameras[camera]].factors(place, *keys):
             graph.add(factor)
@@ -274,7 +277,7 @@ def _place_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
     for place, covariance in enumerate(clouds):
         noise = _robust(covariance, parts.robust_scale)
         graph.add(gtsam.BetweenFactorPose3(CLOUD, cloud_at_key(place), no_motion, noise))
-    for place, camera in model.matched_places():
+    for place, camera in model.matched_places:
         noise = _robust(parts.at_place[place, camera], parts.robust_scale)
         keys = matched_key(camera), matched_at_key(place, camera)
         graph.add(gtsam.BetweenFactorPose3(*keys, no_motion, noise))

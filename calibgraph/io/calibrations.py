@@ -16,7 +16,7 @@ from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.error_sources import ErrorSources
-from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.lens_estimate import LensEstimate, joint_parameters
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
     CALIBRATION_FORMAT,
@@ -55,6 +55,7 @@ def load_calibration(path: Path | str) -> Calibration:
             k: Verdict(v.checks, v.error_probability) for k, v in parts.camera_verdicts.items()
         },
         bootstrap=parts.bootstrap_covariance,
+        lens_covariance={name: of.covariance for name, of in parts.lens_covariance.items()},
         frames=tuple(frame.model_dump(exclude_none=True) for frame in parts.frames_used),
         correspondences=_table(path, CORRESPONDENCES_FILE, content, load_correspondences),
         camera_matches=_table(path, CAMERA_MATCHES_FILE, content, load_camera_matches),
@@ -78,10 +79,16 @@ def _square(value: Any) -> Array:
 
 
 def _covariance(value: Any) -> Array:
-    """The covariance of one or more poses: symmetric, and of no negative variance."""
-    found = _square(value)
+    """The covariance of one or more poses."""
+    found = _positive(value)
     if len(found) % _POSE:
         raise ValueError(f"expected 6 rows for each pose, found {found.shape}")
+    return found
+
+
+def _positive(value: Any) -> Array:
+    """A covariance: symmetric, and of no negative variance."""
+    found = _square(value)
     variances = np.diag(found)
     units = np.sqrt(np.where(variances > 0, variances, 1.0))
     correlations = found / np.outer(units, units)
@@ -103,6 +110,7 @@ def _covariance_of_one(value: Any) -> Array:
 Matrix4 = Annotated[Any, BeforeValidator(rigid_transform)]
 Covariance = Annotated[Any, BeforeValidator(_covariance_of_one)]
 JointCovariance = Annotated[Any, BeforeValidator(_covariance)]
+LensCovariance = Annotated[Any, BeforeValidator(_positive)]
 
 
 class _Motion(BaseModel):
@@ -116,6 +124,11 @@ class _FrameEntry(BaseModel):
     cloud: str
     images: dict[str, str]
     motion: _Motion | None = None
+
+
+class _JointOfLens(BaseModel):
+    parameters: tuple[str, ...]
+    covariance: LensCovariance
 
 
 class _Checks(BaseModel):
@@ -151,6 +164,7 @@ class _Parts(BaseModel):
     prior_share: dict[str, float]
     error_sources: dict[str, ErrorSources] = {}
     lens: dict[str, tuple[LensEstimate, ...]] = {}
+    lens_covariance: dict[str, _JointOfLens] = {}
     inputs: dict[str, str]
     versions: dict[str, str]
     date: str = ""
@@ -178,6 +192,11 @@ def _require_consistent(
     right |= {part: names >= {*getattr(found, part)} for part in _OF_SOME_CAMERAS}
     right["initial_rig"] = names == {*found.initial_rig.cameras}
     right["joint_covariance"] = joint is None or len(joint) == _POSE * len(names)
+    right["lens_covariance"] = all(
+        [*of.parameters] == joint_parameters(found.lens.get(name, ()))
+        and len(of.covariance) == len(of.parameters)
+        for name, of in parts.lens_covariance.items()
+    )
     for part in (part for part, is_right in right.items() if not is_right):
         raise FileError(path, f"its {part} are not of the cameras of its rig; write it again")
 

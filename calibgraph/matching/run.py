@@ -52,7 +52,7 @@ class MatchingRun:
         watch: seconds per stage.
         missed_rounds: number of rounds that the time limit cut off.
         out_of_time: whether the time limit has passed.
-        warnings: about the dataset and its guess.
+        warnings: about the dataset and its guess; about a lens or clock that did not settle.
         rematch: the test from a displaced start; None if it was not made.
     """
 

@@ -19,7 +19,7 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.error_sources import ErrorSources, left_out
-from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.lens_estimate import LensEstimate, joint_parameters
 from calibgraph.model.places import Groups
 from calibgraph.model.rig import Rig
 from calibgraph.model.summary import Summary, summarize
@@ -62,7 +62,8 @@ class Calibration:
     """A calibrated rig.
 
     Attributes:
-        rig: the rig with the estimated extrinsics.
+        rig: the rig with the estimated extrinsics; of lenses and clocks that were estimated, with
+            these and their standard deviations.
         initial_rig: the rig that the solve started from.
         covariance: clustered by frames, plus the error that all frames share by the matcher's
             findings: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
@@ -81,13 +82,15 @@ class Calibration:
         prior_share: per camera, the share of its result that comes from priors, not data (0-1).
         error_sources: per camera with an error bar, the shares of its sources.
         lens: per camera whose lens was estimated, its parameters; the lens itself is the rig's.
+        lens_covariance: per camera of ``lens``, (6 + k, 6 + k) of xi and of its parameters in their
+            order and units, as ``joint_parameters(lens[name])`` names them.
         bootstrap: of ``solve(..., bootstrap=N)``: per camera, (6, 6) scatter of N solutions from
             frames drawn with replacement, like ``covariance``, as a check of it.
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
             ``images``, a file per camera.
         places: frame numbers of each place; empty if nobody looked for places, and of ``track``.
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
-        warnings: of ``calibrate``: about the dataset and its guess, found before the search.
+        warnings: of ``calibrate``: about the dataset, its guess, and a lens that did not settle.
         correspondences: of ``solve``, those that the preprocessing kept; of ``calibrate``, those of
             its last round.
         camera_matches: what cameras see in common, with the surfaces that were used; None if it was
@@ -114,6 +117,7 @@ class Calibration:
     prior_share: dict[str, float] = field(default_factory=dict)
     error_sources: dict[str, ErrorSources] = field(default_factory=dict)
     lens: dict[str, tuple[LensEstimate, ...]] = field(default_factory=dict)
+    lens_covariance: dict[str, Array] = field(default_factory=dict)
     bootstrap: dict[str, Array] = field(default_factory=dict)
     frames: tuple[dict[str, Any], ...] = ()
     places: Groups = ()
@@ -202,6 +206,11 @@ class Calibration:
         """The standard deviations of :meth:`sigmas` where they hold, else None."""
         return self.sigmas(name) if self.error_bar_holds(name) else None
 
+    def joint_of_lens(self, name: str) -> dict[str, Any]:
+        """The joint covariance of a camera's pose and lens, with the names of its rows."""
+        rows = joint_parameters(self.lens[name])
+        return {"parameters": rows, "covariance": self.lens_covariance[name].tolist()}
+
     def with_inputs(self, inputs: Mapping[str, str]) -> Calibration:
         """The same result with the SHA-256 of its input files, by path."""
         return replace(self, inputs=dict(inputs))
@@ -268,6 +277,7 @@ class Calibration:
             "pair_covariance_of": PAIR_TANGENT_SENTENCE,
             "pair_covariance": self.pair_covariance,
             "lens": {name: [vars(one) for one in of] for name, of in self.lens.items()},
+            "lens_covariance": {name: self.joint_of_lens(name) for name in self.lens_covariance},
             "bootstrap_covariance": self.bootstrap,
             "residuals": {name: vars(value) for name, value in self.residuals.items()},
             "counts": self.counts,

@@ -35,6 +35,9 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
                 {**vars(one), "is_determined": one.is_determined}
                 for one in result.lens.get(name, ())
             ],
+            "lens_covariance": (
+                result.joint_of_lens(name) if name in result.lens_covariance else None
+            ),
         }
     return {
         "verdict": result.verdict.status,

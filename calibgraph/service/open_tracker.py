@@ -17,13 +17,14 @@ from calibgraph.service.tracker_request import ARROW, FramesTaken, TrackerReques
 if TYPE_CHECKING:
     from calibgraph.tracking.durable import DurableCalibrator
     from calibgraph.tracking.history import History
-    from calibgraph.tracking.streams import Item
+    from calibgraph.tracking.streams import Item, Refused, StreamFrame
     from calibgraph.tracking.update import Update
 
 HISTORY = "history.state"
 _EVENTS = "events.jsonl"
 _SAVE_EVERY = 50  # updates: after a kill, the plot lacks fewer, and those of a write
 _MOST_EVENTS = 200
+_TOGETHER = 10  # frames that are read before they are taken in: an epoch's
 _WRITE_FRAMES, _WRITE_S = 50, 1.0  # of one write: a kill costs no more, and snapshots follow
 
 
@@ -112,24 +113,27 @@ def take_frames(tracker: OpenTracker, request: TrackerRequest) -> FramesTaken:
     Raises:
         OSError: if they cannot be written; then abandon the tracker, and open it anew.
     """
-    from calibgraph.tracking.update import json_line
+    from calibgraph.tracking.frame_group import in_groups
+    from calibgraph.tracking.update import json_lines
 
     taken = _Taken()
-    items = _items(request, taken.refused)
-    while _take_by_one_write(tracker, items, taken):
+    groups = in_groups(_items(request, taken.refused), min(_TOGETHER, _WRITE_FRAMES))
+    while _take_by_one_write(tracker, groups, taken):
         pass
-    lines = ", ".join(map(json_line, taken.updates))
+    lines = ", ".join(json_lines(taken.updates))
     rest = json.dumps({"known": taken.known, "refused": taken.refused}).removeprefix("{")
     return FramesTaken(len(taken.updates), f'{{"updates": [{lines}], {rest}')
 
 
-def _take_by_one_write(tracker: OpenTracker, items: Iterator[Item], taken: _Taken) -> bool:
+def _take_by_one_write(
+    tracker: OpenTracker, groups: Iterator[list[StreamFrame] | Refused], taken: _Taken
+) -> bool:
     """Take in some frames, and note those that are on disk; whether there may be more."""
     before, end = len(taken.updates), time.monotonic() + _WRITE_S
     try:
         with tracker.calibrator.in_one_write():
-            for item in items:
-                _take(tracker.calibrator, item, taken)
+            for group in groups:
+                _take(tracker.calibrator, group, taken)
                 if len(taken.updates) - before >= _WRITE_FRAMES or time.monotonic() >= end:
                     return True
         return False
@@ -140,19 +144,21 @@ def _take_by_one_write(tracker: OpenTracker, items: Iterator[Item], taken: _Take
         tracker.note(taken.updates[before:])
 
 
-def _take(calibrator: DurableCalibrator, item: Item, taken: _Taken) -> None:
+def _take(calibrator: DurableCalibrator, group: list[StreamFrame] | Refused, taken: _Taken) -> None:
+    from calibgraph.tracking.frame_group import update_all
     from calibgraph.tracking.streams import Refused
 
+    if isinstance(group, Refused):
+        taken.refused.append(group.message)
+        return
     last = calibrator.tracker.frame
-    if isinstance(item, Refused):
-        taken.refused.append(item.message)
-    elif last is not None and item.frame <= last:
-        taken.known += 1
-    else:
-        try:
-            taken.updates.append(calibrator.update(item.table, frame=item.frame))
-        except CorrespondenceError as error:
-            taken.refused.append(str(error))
+    new = [one for one in group if last is None or one.frame > last]
+    taken.known += len(group) - len(new)
+    for found in update_all(calibrator, new):
+        if isinstance(found, CorrespondenceError):
+            taken.refused.append(str(found))
+        else:
+            taken.updates += found
 
 
 def _items(request: TrackerRequest, refused: list[str]) -> Iterator[Item]:

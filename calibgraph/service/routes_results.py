@@ -1,8 +1,9 @@
 """Routes of results: the summary, the report, the files, other programs' formats."""
 
+import io
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,7 +30,7 @@ REPORT_POLICY = (
 _SUFFIXES = {
     "kalibr": ".yaml", "ros1": ".txt", "ros2": ".txt", "ros2-launch": ".launch.xml",
     "tf2": ".yaml", "urdf": ".urdf", "autoware": ".yaml", "nuscenes": ".json", "koide": ".json",
-    "opencv": ".yaml", "npz": ".npz", "json": ".json",
+    "camera_info": ".zip", "opencv": ".yaml", "npz": ".npz", "json": ".json",
 }  # fmt: skip
 
 
@@ -120,8 +121,17 @@ def export(
         written = export_calibration(
             folder, Path(temporary) / name, format, even_if_failed=even_if_failed
         )
-        content = written[0].read_bytes()
+        content = _zipped(written) if suffix == ".zip" else written[0].read_bytes()
     return Response(content, media_type="application/octet-stream", headers=_attachment(name))
+
+
+def _zipped(files: Sequence[Path]) -> bytes:
+    """Files of a few kilobytes as an archive."""
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w") as archive:
+        for file in files:
+            archive.write(file, file.name)
+    return held.getvalue()
 
 
 def _attachment(name: str) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import json
 import shutil
@@ -157,6 +158,7 @@ def main() -> None:
     from calibgraph.tracking.preload import warm_up_tracker
 
     warm_up_tracker()
+    gc.freeze()  # what is loaded by now stays: each full collection would visit it
     trackers, pool = _Trackers(), ThreadPoolExecutor(_THREADS)
 
     def answer(requests: list[TrackerRequest], note: Note) -> None:

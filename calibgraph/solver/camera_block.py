@@ -242,11 +242,19 @@ class BlockResiduals:
         return np.asarray(self.projectable & (self.errors_px <= scale.gate_px))
 
     def gate_hessian(self, scale: ResidualScale) -> Array:
-        """(6, 6) what the gate's moving with the extrinsic adds to the Hessian of the inliers.
+        """(6, 6) of all matches, see :meth:`gate_hessians`."""
+        return np.asarray(self.gate_hessians(scale, np.array([0, len(self.errors_px)]))[0])
+
+    def gate_hessians(self, scale: ResidualScale, edges: NDArray[np.int64]) -> Array:
+        """(r, 6, 6) what the gate's moving with the extrinsic adds to the Hessian of the inliers.
 
         A step of the extrinsic takes matches over the edge of the gate, out on one side and in on
         the other, and their gradients with them. The term is some percent of the Hessian, and
         negative. It is measured on the matches near the edge, on both sides of it.
+
+        Args:
+            scale: with the gate.
+            edges: (r + 1,) of the runs of matches.
         """
         near = np.abs(self.errors_px - scale.gate_px) < _GATE_BAND * scale.gate_px
         band = np.flatnonzero(self.projectable & near)
@@ -256,8 +264,9 @@ class BlockResiduals:
         across *= (whitened_norm(edge.block.sqrt_information, residuals) / errors)[:, None]
         root = np.column_stack([across, np.zeros(len(across))])
         weighted = replace(edge, block=edge.block.rewhiten(root))
-        added: Array = -weighted.with_scale(scale).sums(self.T_lidar_camera).hessian
-        return added / (2 * _GATE_BAND)
+        of_run = np.searchsorted(band, edges)
+        sums = weighted.with_scale(scale).frame_sums(self.T_lidar_camera, of_run)
+        return np.asarray(-sums.hessian / (2 * _GATE_BAND))
 
     def summary(self, scale: ResidualScale) -> Residuals:
         """What the result reports of them."""

@@ -1,6 +1,6 @@
 """Second derivatives of the cost at a solution: of the correspondences, and of all terms."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -91,7 +91,15 @@ def curvature_at(at: FittedObjective, robust_hessians: Mapping[str, Array]) -> C
 
 def convex_hessian(hessian: Array, otherwise: Array) -> Array:
     """The Hessian if it is positive definite; few matches near the gate may spoil it."""
-    return hessian if np.linalg.eigvalsh(hessian)[0] > 0 else otherwise
+    return hessian if _is_positive_definite(hessian) else otherwise
+
+
+def _is_positive_definite(hessian: Array) -> bool:
+    try:
+        np.linalg.cholesky(hessian)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def unknown(chosen: Sequence[bool]) -> Array:
@@ -157,10 +165,26 @@ def robust_hessian(block: ProjectionBlock, T_lidar_camera: gtsam.Pose3) -> Array
         block: correspondences of one camera.
         T_lidar_camera: where; the Hessian is in its tangent.
     """
-    near = np.tile(to_T_camera_lidar(T_lidar_camera), (12, 1, 1))
-    gradients = block.gradients_at_each(retract_all(near, _STEPS))
-    hessian = (gradients[:6] - gradients[6:]) / (2 * _STEP)
-    hessian = (hessian + hessian.T) / 2
-    if np.linalg.eigvalsh(hessian)[0] > 0:
-        return hessian
-    return block.sums(T_lidar_camera).hessian
+    gradients = block.gradients_at_each(_steps_from(T_lidar_camera))[None]
+    return np.asarray(_convex(gradients, lambda: block.sums(T_lidar_camera).hessian[None])[0])
+
+
+def robust_hessians_of(
+    block: ProjectionBlock, T_lidar_camera: gtsam.Pose3, sums: Array, runs: NDArray[np.int64]
+) -> Array:
+    """(r, 6, 6) :func:`robust_hessian` of each of (r, 2) runs, whose reweighted ones are known."""
+    gradients = block.run_gradients_at_each(_steps_from(T_lidar_camera), runs)
+    return _convex(gradients, lambda: sums)
+
+
+def _steps_from(T_lidar_camera: gtsam.Pose3) -> Array:
+    return retract_all(np.tile(to_T_camera_lidar(T_lidar_camera), (12, 1, 1)), _STEPS)
+
+
+def _convex(gradients: Array, reweighted: Callable[[], Array]) -> Array:
+    """(r, 6, 6) by (r, 12, 6) gradients to both sides; the other where it is not convex."""
+    halves: Array = (gradients[:, :6] - gradients[:, 6:]) / (4 * _STEP)
+    hessians = halves + halves.swapaxes(1, 2)
+    if not _is_positive_definite(hessians):
+        return np.array([*map(convex_hessian, hessians, reweighted())])
+    return hessians

@@ -111,7 +111,7 @@ class Linearization:
             step = cloud.between(values.atPose3(cloud_at_key(place)))
             found[place, 0] = _length(step, covariance)
         matched = {number: values.atPose3(matched_key(number)) for number in model.matched}
-        for place, number in model.matched_places():
+        for place, number in model.matched_places:
             step = matched[number].between(values.atPose3(matched_at_key(place, number)))
             found[place, 1 + number] = _length(step, parts.at_place[place, number])
         return found
@@ -255,7 +255,7 @@ def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) ->
         values.insert(matched_key(number), poses[number])
     for number in model.paired:
         values.insert(paired_key(number), poses[number])
-    for place, number in model.matched_places():
+    for place, number in model.matched_places:
         values.insert(matched_at_key(place, number), poses[number])
     values.insert(start_lenses(model.lenses))
     for key in [CLOUD, *map(cloud_at_key, range(model.places))]:

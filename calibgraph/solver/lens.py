@@ -224,6 +224,21 @@ def lens_estimates(fit: LatentPoseFit) -> dict[str, tuple[LensEstimate, ...]]:
     return found
 
 
+def lens_covariances(fit: LatentPoseFit) -> dict[str, Array]:
+    """Per camera whose lens is free, the (6 + k, 6 + k) joint marginal of pose, lens and clock.
+
+    Of xi in T_camera_lidar = exp(xi) estimate, then of the parameters in the order and the units of
+    :func:`lens_estimates`.
+    """
+    model, found = fit.linear.model, {}
+    for number, term in model.lenses.items():
+        joint = fit.linear.covariance_of([model.reported_keys[number], lens_key(number)])
+        units = [_unit(term.variable, row) for row in range(len(term.variable.free))]
+        scale = np.array([-1.0] * 6 + units)  # of T_lidar_camera the tangent is -xi
+        found[model.cameras[number]] = joint * np.outer(scale, scale)
+    return found
+
+
 def estimates_of(lens: LensVariable, values: Array, covariance: Array) -> tuple[LensEstimate, ...]:
     """The parameters of a lens, by its (k,) values and their (k + 6, k + 6) joint with the pose."""
     sigmas = np.sqrt(np.diag(covariance))
@@ -236,9 +251,8 @@ def _estimate(
     lens: LensVariable, row: int, values: Array, marginal: tuple[Array, Array]
 ) -> LensEstimate:
     """One parameter, with standard deviation and correlation with the pose of its camera."""
-    name, step = lens.free.parameters[row], lens.free.sigmas[row]
+    name, unit = lens.free.parameters[row], _unit(lens, row)
     before, after = (_in_its_unit(lens, name, v) for v in (np.zeros(len(values)), values))
-    unit = step * (before if name in (FOCAL, ASPECT) else 1.0)
     sigmas, correlation = marginal
     most = int(np.argmax(correlation[row]))
     return LensEstimate(
@@ -251,6 +265,13 @@ def _estimate(
         direction=_DIRECTIONS[most],
         correlation=float(correlation[row, most]),
     )
+
+
+def _unit(lens: LensVariable, row: int) -> float:
+    """The prior standard deviation of a parameter, in its unit."""
+    name, step = lens.free.parameters[row], lens.free.sigmas[row]
+    of_rig = _in_its_unit(lens, name, np.zeros(len(lens.free)))
+    return step * of_rig if name in (FOCAL, ASPECT) else step
 
 
 def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:

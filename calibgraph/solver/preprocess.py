@@ -99,13 +99,15 @@ def _count_repeats_once(
     Returns:
         The table, so sorted, the cameras of its rows, and per camera how many frames are repeats.
     """
-    frame, before = number_repeats(table, camera), _frames_by_camera(rig, table, camera)
-    if not np.array_equal(frame, table.frame):
-        table, order = replace(table, frame=frame), frame_order(camera, frame)
-        if order is not None:
-            table, camera = table.select(order), camera[order]
-        best = best_in_cell(rig, table, camera, config)
-        table, camera = table.select(best), camera[best]
+    frame = number_repeats(table, camera)
+    if np.array_equal(frame, table.frame):
+        return table, camera, dict.fromkeys(rig.cameras, 0)
+    before = _frames_by_camera(rig, table, camera)
+    table, order = replace(table, frame=frame), frame_order(camera, frame)
+    if order is not None:
+        table, camera = table.select(order), camera[order]
+    best = best_in_cell(rig, table, camera, config)
+    table, camera = table.select(best), camera[best]
     after = _frames_by_camera(rig, table, camera)
     return table, camera, {name: before[name] - after[name] for name in rig.cameras}
 

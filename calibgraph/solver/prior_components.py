@@ -38,7 +38,8 @@ def variance_components(
     for name, (within, evidence) in shown.items():
         number = cameras.index(name)
         at_place[:, number] = within.at_place(findings.place_variance)
-        scatter_at_place[:, number] = within.at_place(0.0)
+        stated = findings.place_variance > 0
+        scatter_at_place[:, number] = within.at_place(0.0) if stated else at_place[:, number]
         if evidence is not None:
             jacobian[number] = evidence.jacobian * sigmas
             weight = 1.0 / within.mean_variance(findings.place_variance)

@@ -16,7 +16,7 @@ from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.solver.error_model import ErrorFit
 from calibgraph.solver.fitted import FittedObjective
-from calibgraph.solver.lens import lens_estimates, moved_lenses, put_into
+from calibgraph.solver.lens import lens_covariances, lens_estimates, moved_lenses, put_into
 from calibgraph.solver.marginals import Marginals
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import Optimum
@@ -92,6 +92,11 @@ class Solution:
     def lens(self) -> dict[str, tuple[LensEstimate, ...]]:
         """Per camera whose lens is estimated, its parameters."""
         return {} if self.errors is None else lens_estimates(self.errors.fit)
+
+    @property
+    def lens_covariance(self) -> dict[str, Array]:
+        """Per camera whose lens is estimated, (6 + k, 6 + k) of pose, lens and clock."""
+        return {} if self.errors is None else lens_covariances(self.errors.fit)
 
     @cached_property
     def marginals(self) -> Marginals:

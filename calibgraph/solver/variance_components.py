@@ -113,7 +113,7 @@ def squared_displacements(fit: LatentPoseFit) -> dict[Component, Evidence]:
     weight = fit.place_weights(parts.robust_scale)
     squared = weight * linear.distances**2
     present = np.zeros(squared.shape, dtype=np.bool_)
-    for place, number in model.matched_places():
+    for place, number in model.matched_places:
         present[place, 1 + number] = True
     variables, distortions, known = 1 + len(model.matched) + len(model.paired), 0, 0.0
     if model.is_distorted:  # its residuals count as a part of its prior

@@ -51,16 +51,6 @@ class WithinPlace:
     frames: Array
     alike: float
 
-    @staticmethod
-    def of(
-        covariance: Array, efficiency: float, *, roots: Array, frames: Array, alike: float
-    ) -> WithinPlace:
-        """Split K, the (6, 6) ``covariance`` by all frames; the rest is as of the attributes."""
-        values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-        least = float(np.clip(values[0], _LEAST_VARIANCE, 1.0))
-        excess = (vectors * np.maximum(values - least, _LEAST_EXCESS * least)) @ vectors.T
-        return WithinPlace(least, excess, efficiency, roots, frames, alike)
-
     def mean_variance(self, place_variance: float) -> float:
         """Of all matches of the camera, in units of independent ones, in the mean over a pose."""
         within = self.least + float(np.trace(self.excess)) / 6
@@ -72,6 +62,13 @@ class WithinPlace:
         inverse = np.linalg.inv(self.roots)
         covariance: Array = inverse.transpose(0, 2, 1) @ (self.excess + shared) @ inverse
         return (covariance + covariance.transpose(0, 2, 1)) / 2 + _ROUNDING**2 * np.eye(6)
+
+
+def split_excess(covariance: Array) -> tuple[float, Array]:
+    """Least variance k, and excess K - k, of the (6, 6) covariance K by all frames."""
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    least = min(max(float(values[0]), _LEAST_VARIANCE), 1.0)
+    return least, (vectors * np.maximum(values - least, _LEAST_EXCESS * least)) @ vectors.T
 
 
 def within_place(at: FittedObjective, name: str, placed: BlockByPlace) -> WithinPlace:
@@ -89,8 +86,10 @@ def within_place(at: FittedObjective, name: str, placed: BlockByPlace) -> Within
     true = convex_hessian(robust + at.objective.gate_hessian.get(name, 0.0), robust) + WEAK
     scatter = frame_scatter(block, block.frame_gradients(pose, scale), placed, true)
     frames = placed.frames.astype(np.float64)
-    return WithinPlace.of(
-        *relative_covariance(scatter, root, true),
+    covariance, efficiency = relative_covariance(scatter, root, true)
+    return WithinPlace(
+        *split_excess(covariance),
+        efficiency,
         roots=np.asarray(np.linalg.cholesky(hessians + WEAK)),
         frames=frames,
         alike=float(np.square(frames).sum() / max(frames.sum(), 1)),

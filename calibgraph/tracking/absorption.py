@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
 
-import gtsam
 import numpy as np
 
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
@@ -17,26 +15,43 @@ from calibgraph.solver.camera_block import (
 from calibgraph.solver.elimination import Linearization
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.assessment import rig_at
-from calibgraph.tracking.cause import chance_limit, squared_sigmas
+from calibgraph.tracking.cause import chance_limit
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.frame_order import PLACE, Incoming
+from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
 from calibgraph.tracking.place_model import states_places
 from calibgraph.tracking.start import count_residuals
 from calibgraph.tracking.state import State
-from calibgraph.tracking.sums import Gated, Sums, minimum, sums_of_matches
+from calibgraph.tracking.sums import Sums, minimum, sums_of_matches
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
 _TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
 
 
-def with_open_frame(state: State, frame: LiveFrame) -> State:
-    """The state with a frame in its open epoch, in the place of that of the same number."""
-    last = state.epochs[-1]
-    others = tuple(f for f in last.frames if f.number != frame.number)
-    return replace(state, epochs=(*state.epochs[:-1], replace(last, frames=(*others, frame))))
+def with_open_frames(state: State, *frames: LiveFrame) -> State:
+    """The state with frames in its open epoch, in the place of those of the same numbers."""
+    last, numbers = state.epochs[-1], {frame.number for frame in frames}
+    others = (f for f in last.frames if f.number not in numbers)
+    return replace(state, epochs=(*state.epochs[:-1], replace(last, frames=(*others, *frames))))
+
+
+def begin_frame(state: State, one: Incoming) -> State:
+    """The state with a frame begun, none of whose matches is absorbed."""
+    state = replace(
+        state,
+        frame=one.number,
+        stamp_ns=one.stamp_ns,
+        updates=state.updates + 1,
+        findings=one.table.findings if len(one.table) else state.findings,
+    )
+    place, in_time = one.table.metadata.get(PLACE, ""), state.offsets is not None
+    frame = LiveFrame.empty(one.number, len(state.names), place, in_time=in_time)
+    return with_open_frames(state, frame)
 
 
 def blocks_by_camera(state: State, table: Correspondences) -> dict[int, CameraBlock]:
@@ -61,13 +76,7 @@ def at_minimum(state: State, closed: ClosedPlaces, more: Mapping[int, Sums] | No
         closed: its closed epochs.
         more: sums of further matches, per camera.
     """
-    return with_poses(state, minimum(closed.equation_5(state, more), state.T_lidar_camera))
-
-
-def with_poses(state: State, poses: tuple[gtsam.Pose3, ...]) -> State:
-    """The state with other estimates in its open epoch."""
-    last = replace(state.epochs[-1], T_lidar_camera=poses)
-    return replace(state, epochs=(*state.epochs[:-1], last))
+    return state.at_poses(minimum(closed.equation_5(state, more), state.T_lidar_camera))
 
 
 def select_agreeing(
@@ -117,9 +126,9 @@ def agrees_at_its_place(state: State, closed: ClosedPlaces, camera: int, own: Ou
         return False
     even = state.offsets is not None
     gated = Gated.at(own.T_lidar_camera, own.raw, one.scale, state.references[camera], even=even)
-    if gated is None:
+    if not gated.sums.matches[0]:
         return False
-    state = with_open_frame(state, frame.add(camera, own.raw, gated, state.offsets))
+    state = with_open_frames(state, frame.add(camera, gated, state.offsets))
     window, _ = closed.with_open_epoch(state, None)
     place = window.places.index(frame.place)
     displaced = Linearization.at(window.model, window.values).distances[place, [0, 1 + camera]]
@@ -146,14 +155,15 @@ def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> State:
 
 
 def absorb(
-    state: State, closed: ClosedPlaces, blocks: Mapping[int, CameraBlock]
-) -> tuple[State, dict[int, int]]:
-    """The state with the inliers of its last frame, and how many each camera has.
+    state: State, closed: ClosedPlaces, blocks: Mapping[int, CameraBlock], frames: int = 1
+) -> tuple[State, list[dict[int, int]]]:
+    """The state with the inliers of its last frames, and how many each has, per camera.
 
     In two passes: the gate is drawn at the minimum with all matches of the blocks.
     """
+    used = [dict[int, int]() for _ in range(frames)]
     if not blocks:
-        return state, {}
+        return state, used
     everything = {
         camera: sums_of_matches(
             block,
@@ -164,73 +174,94 @@ def absorb(
         for camera, block in blocks.items()
     }
     state = at_minimum(state, closed, everything)
-    frame, used = state.epochs[-1].frames[-1], dict[int, int]()
+    newest = [*state.epochs[-1].frames[-frames:]]
+    rows = {frame.number: row for row, frame in enumerate(newest)}
     for camera, block in blocks.items():
-        scale, reference = state.cameras[camera].scale, state.references[camera]
-        pose, even = state.T_lidar_camera[camera], state.offsets is not None
-        gated = Gated.at(pose, block, scale, reference, even=even)
+        gated = _gated(state, camera, block)
         if gated is None:
             continue
-        frame = frame.add(camera, block, gated, state.offsets)
+        raw, counts = gated.residuals.block, gated.sums.matches.astype(np.int64).tolist()
+        for of_block, number in enumerate(raw.frame_numbers.tolist()):
+            row = rows[number]
+            newest[row] = newest[row].add(camera, gated, state.offsets, row=of_block)
+            used[row][camera] = counts[of_block]
         state = _count_absorbed(state, camera, gated)
-        used[camera] = gated.used
-    state = add_to_totals(with_open_frame(state, frame), frame)
+    state = add_to_totals(with_open_frames(state, *newest), newest)
     return at_minimum(state, closed), used
 
 
+def _gated(state: State, camera: int, block: CameraBlock) -> Gated | None:
+    """The frames of a block with enough matches within the gate; None if there are none."""
+    scale, reference = state.cameras[camera].scale, state.references[camera]
+    pose, even = state.T_lidar_camera[camera], state.offsets is not None
+    gated = Gated.at(pose, block, scale, reference, even=even)
+    enough = gated.sums.matches > 0
+    if enough.all():
+        return gated
+    if not enough.any():
+        return None
+    kept = block.select(np.repeat(enough, block.frame_counts))
+    return Gated.at(pose, kept, scale, reference, even=even)
+
+
 def _count_absorbed(state: State, camera: int, gated: Gated) -> State:
-    """The state with a camera's block counted as absorbed, and its residuals counted."""
-    one = count_residuals(state.cameras[camera], gated.residuals)
-    agreements = (*one.agreements, (state.frame or 0, True))[-_LAST_FRAMES:]
+    """The state with a camera's frames absorbed, and their residuals counted."""
+    one, numbers = state.cameras[camera], gated.residuals.block.frame_numbers.tolist()
+    one = count_residuals(one, gated.residuals, gated.inliers)
+    agreements = (*one.agreements, *((number, True) for number in numbers))[-_LAST_FRAMES:]
     one = replace(one, agreements=agreements)
-    given = len(gated.residuals.errors_px)
-    return state.with_camera(camera, one.count(absorbed=1, given=given, used=gated.used))
+    given, used = len(gated.inliers), int(gated.sums.matches.sum())
+    return state.with_camera(camera, one.count(absorbed=len(numbers), given=given, used=used))
 
 
-def add_to_totals(state: State, frame: LiveFrame) -> State:
-    """The state with a frame added to the scatter of all frames.
+def add_to_totals(state: State, frames: Sequence[LiveFrame]) -> State:
+    """The state with frames added to the scatter of all frames, in their order.
 
     An unusual frame is down-weighted: it may come after a move that has not been detected yet.
     """
-    scores = frame.sums.score.copy()
-    for camera in frame.raw:
-        noise = state.frame_noise(camera)
+    sums, kept = Sums.stack([frame.sums for frame in frames]), _TOTAL_KEPT ** len(frames)
+    scores = sums.score.copy()
+    for camera in range(len(state.cameras)):
+        noise, own = state.frame_noise(camera), scores[:, camera]
         if noise is not None:
-            unusual = squared_sigmas(scores[camera], noise)
-            scores[camera] *= min(1.0, (_UNUSUAL / unusual) ** 0.5)
-    flat = scores.ravel()
+            unusual = (own * np.linalg.solve(noise, own.T).T).sum(axis=1)
+            own *= np.sqrt(_UNUSUAL / np.maximum(unusual, _UNUSUAL))[:, None]
+    ages = _TOTAL_KEPT ** np.arange(len(frames) - 1.0, -1.0, -1.0)
+    flat = scores.reshape(len(frames), -1)
     return replace(
         state,
-        total=_TOTAL_KEPT * state.total + np.outer(flat, flat),
-        total_hessian=_TOTAL_KEPT * state.total_hessian + frame.sums.hessian,
-        total_frames=_TOTAL_KEPT * state.total_frames + frame.sums.frames,
+        total=kept * state.total + (ages * flat.T) @ flat,
+        total_hessian=kept * state.total_hessian + np.tensordot(ages, sums.hessian, axes=1),
+        total_frames=kept * state.total_frames + ages @ sums.frames,
     )
 
 
-def count_absent(state: State, used: Collection[int]) -> tuple[State, list[Event]]:
+def count_absent(state: State, used: Collection[int], frame: Incoming) -> tuple[State, list[Event]]:
     """The state with the frames without usable matches counted; events ``blind`` and ``back``.
 
     Args:
-        state: after a frame.
-        used: the cameras whose matches were absorbed, by their places in the rig.
+        state: after a frame, or more.
+        used: the cameras whose matches of the frame were absorbed, by their places in the rig.
+        frame: this one.
     """
     events = []
-    limit, number = state.config.tracking.blind_frames, state.frame or 0
+    limit, number, stamp_ns = state.config.tracking.blind_frames, frame.number, frame.stamp_ns
     for camera, camera_state in enumerate(state.cameras):
         if not camera_state.started:
             continue
         absent = 0 if camera in used else camera_state.absent + 1
         name = state.names[camera]
         if absent == limit:
-            since = _number_of_frame_ago(state, limit)
-            events.append(Event("blind", name, since, number, state.stamp_ns))
+            since = _number_of_frame_ago(state, limit, number)
+            events.append(Event("blind", name, since, number, stamp_ns))
         if absent == 0 and camera_state.absent >= limit:
-            events.append(Event("back", name, number, number, state.stamp_ns))
-        state = state.with_camera(camera, replace(camera_state, absent=absent))
+            events.append(Event("back", name, number, number, stamp_ns))
+        if absent != camera_state.absent:
+            state = state.with_camera(camera, replace(camera_state, absent=absent))
     return state, events
 
 
-def _number_of_frame_ago(state: State, frames: int) -> int:
-    """Number of the frame so many frames ago, the last one counted; at least a live one."""
-    numbers = [frame.number for frame in state.live_frames]
+def _number_of_frame_ago(state: State, frames: int, last: int) -> int:
+    """Number of the frame so many frames before and with the last; at least a live one."""
+    numbers = [frame.number for frame in state.live_frames if frame.number <= last]
     return numbers[-min(frames, len(numbers))]

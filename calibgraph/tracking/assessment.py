@@ -12,7 +12,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
-from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.lens_estimate import LensEstimate, with_sigmas
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
@@ -84,11 +84,12 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
         estimates = window.T_lidar_camera(keys)
     covariance, few = window.covariance(keys), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
-    verdicts = {}
+    verdicts, apart = {}, estimates_of_halves(state, halves)
     for camera, name in enumerate(state.names):
         own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
-        apart = estimates_of_halves(state, halves, camera)
-        verdicts[name] = _verdict(state, sums, camera, covariance, conflicts=own, halves=apart)
+        verdicts[name] = _verdict(
+            state, sums, camera, covariance, conflicts=own, halves=apart.get(camera)
+        )
     return Assessment(estimates, covariance, verdicts, window, _lens_estimates(window))
 
 
@@ -213,7 +214,7 @@ def to_calibration(state: State, assessment: Assessment) -> Calibration:
     newest = replace(state, offsets=assessment.offsets(state))
     rig = rig_at(newest, assessment.T_lidar_camera)
     return Calibration(
-        rig=rig,
+        rig=with_sigmas(rig, assessment.lens),
         initial_rig=state.rig,
         covariance=covariance_by_camera(assessment, state.names),
         joint_covariance=known,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from calibgraph.arrays import Array
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram, median, no_groups
 

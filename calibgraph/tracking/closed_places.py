@@ -7,7 +7,7 @@ their robust loss has at the optimum of the last one: within 0.02 sigma that is 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
@@ -31,6 +31,7 @@ from calibgraph.tracking.contradictions import (
     poses_by_name,
 )
 from calibgraph.tracking.epoch_sums import split_halves, sum_closed_epochs
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
@@ -183,14 +184,16 @@ class ClosedPlaces:
             frames, kept, rows = (), (), [0] if every.frames.any() else []
         data = PlaceData.of(state, earlier, frames, {every.names[row]: row for row in rows})
         model = place_model(state, every, seen, data)
-        start = _start(state, model, data.names)
-        model = replace(model, pose_graph=self._summary(kept))
-        conflicts = find_conflicts(state, every, model, start)
+        conflicts = Conflicts()
+        if state.rig.relative_poses:
+            start = _start(state, model, data.names)
+            before = replace(model, pose_graph=self._summary(kept))
+            conflicts = find_conflicts(state, every, before, start)
         model = replace(model, pose_graph=self._pose_graph(kept, contradicting(conflicts)))
         if window is not None and window.has_graph_of(model, data.names):
             window.exchange(model)
         else:
-            window = Window(model, data.names, start)
+            window = Window(model, data.names, _start(state, model, data.names))
         return window, conflicts
 
     def _summary(self, kept: Rows) -> gtsam.NonlinearFactorGraph:
@@ -232,13 +235,14 @@ def _walked_sums(state: State) -> PlaceSums:
     return sums
 
 
-def settle(state: State) -> tuple[State, ClosedPlaces]:
-    """The state with optimum and variance ratios of its closed epochs, while these are few.
+def settle(state: State, *, together: bool) -> tuple[State, ClosedPlaces]:
+    """The state with optimum and variance ratios of its closed epochs.
 
-    Later an epoch changes little, and the frames after it do the work step by step.
+    When these are many an epoch changes little, and the frames after it do the work step by step;
+    but not if they come together.
     """
-    closed = ClosedPlaces.of(state)
-    if closed.is_settled:
+    closed, state = ClosedPlaces.of(state), replace(state, is_refined=together)
+    if closed.is_settled and not together:
         return state, closed
     for step in range(1, STEPS + 1):
         state, closed = refine(state, closed, step)

@@ -29,6 +29,7 @@ from calibgraph.tracking.run import Notify, Run
 from calibgraph.tracking.streams import Item, frames_of
 
 STATE_FOLDER, PICTURE = "state", "track.png"
+_TOGETHER = 50  # frames of a table that are read before they are taken in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,12 +75,14 @@ def track(
     """
     require_stdout()
     history = History()
+    waits = settings.follow or str(source[0]) == "-"  # frames come at their own times
     with _stopped_by_signals() as stop:
-        if settings.follow or str(source[0]) == "-":  # frames come at their own times
+        if waits:
             warm_up_tracker()
         items, calibrator = _opened(settings, source, stop, notify)
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
-        run = Run(calibrator, history, print_line, notify)
+        together = 1 if waits or settings.matcher is not None else _TOGETHER
+        run = Run(calibrator, history, print_line, notify, together)
         with calibrator:
             run.follow(items, every=settings.every if settings.matcher is None else 1, stop=stop)
             if calibrator.tracker.frame is None and not stop():

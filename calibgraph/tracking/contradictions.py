@@ -68,6 +68,8 @@ def find_conflicts(
     state: State, sums: PlaceSums, model: LatentPoseModel, values: gtsam.Values
 ) -> Conflicts:
     """Conflicts between the rig's relative poses and the correspondences, by place in the rig."""
+    if not state.rig.relative_poses:
+        return {}
     every = sums.rows.total()
     known = [
         camera

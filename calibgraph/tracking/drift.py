@@ -7,12 +7,11 @@ are kept as anchors, and the steps from there are tested at every new epoch.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from calibgraph.tracking.cause import CLEARLY, find_cause, unexplained
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.state import DriftWatch, State
 from calibgraph.tracking.steps import steps_between
 from calibgraph.tracking.sums import Sums

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from operator import index
 from pathlib import Path
 from types import TracebackType
@@ -20,6 +21,7 @@ from calibgraph.tracking.frame_order import (
 )
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.state_database import StateDatabase
+from calibgraph.tracking.stream_tables import StreamFrame
 from calibgraph.tracking.tracker import IncrementalCalibrator
 from calibgraph.tracking.update import Update
 
@@ -38,6 +40,7 @@ class DurableCalibrator:
         resumed: whether there was a state to continue from.
         repeated: after a crash, the updates since a snapshot, of which those of the last write may
             not have returned then; none after a :meth:`close`.
+        last_repeated: those of the last call among them.
 
     Args:
         folder: where the state is kept; one process at a time.
@@ -62,7 +65,6 @@ class DurableCalibrator:
         try:
             recovered = self._database.recovered
             self.damages = recovered.damages
-            self._pending = len(recovered.inputs)
             self._unwritten: tuple[bytes, int] | None = None
             if recovered.snapshot is None:
                 self.tracker = IncrementalCalibrator(begin() if begin else rig, config)
@@ -72,12 +74,11 @@ class DurableCalibrator:
                     self.tracker = IncrementalCalibrator.from_bytes(recovered.snapshot)
                 _require_same(Path(folder), self.tracker, rig, config or Config())
             self._held: list[bytes] | None = None
-            repeated: list[Update] = []
-            for record in recovered.inputs:
-                with _of_this_version(Path(folder)):
-                    frame, table = decode(record, "input")
-                    repeated.append(self.tracker.update(table, frame=frame))
-            self.repeated = tuple(repeated)
+            with _of_this_version(Path(folder)):
+                inputs = [*map(self._repeat, recovered.inputs)]
+            self.repeated = tuple(chain.from_iterable(inputs))
+            self.last_repeated = inputs[-1] if inputs else []
+            self._pending = len(self.repeated)
         except BaseException:
             self._database.close()
             raise
@@ -92,14 +93,47 @@ class DurableCalibrator:
             CorrespondenceError: as there. Nothing has changed then.
             OSError: if it cannot be written; then close this, and make a new one.
         """
-        table = with_metadata_per_frame(with_place(table, place))
-        record = _record(table, frame)
-        if self._held is not None:
+        table = _as_kept(table, place)
+        record = _record((frame, table))
+        with self._write() as held:
             update = self.tracker.update(table, frame=frame)
-            self._held.append(record)
+            held.append(record)
+            self._pending += 1
             return update
+
+    def update_together(self, frames: Sequence[StreamFrame]) -> list[Update]:
+        """As :meth:`IncrementalCalibrator.update_together`; they are on disk then.
+
+        Raises:
+            OSError: if they cannot be written; then close this, and make a new one.
+        """
+        with self._write() as held:
+            updates = self.tracker.update_together(frames)
+            if updates:
+                taken = frames[: len(updates)]
+                held.append(_record(*((one.frame, _as_kept(one.table, None)) for one in taken)))
+                self._pending += len(updates)
+            return updates
+
+    def _repeat(self, record: bytes) -> list[Update]:
+        """Take in again what a row of the journal has."""
+        frames = [StreamFrame(frame, table) for frame, table in decode(record, "input")]
+        if len(frames) == 1:
+            return [self.tracker.update(frames[0].table, frame=frames[0].frame)]
+        updates = self.tracker.update_together(frames)
+        if len(updates) < len(frames):
+            raise StateError("frames of one input do not go together")
+        return updates
+
+    @contextmanager
+    def _write(self) -> Iterator[list[bytes]]:
+        """The records of a write that is open, or of one of its own."""
+        if self._held is not None:
+            yield self._held
+            return
         with self.in_one_write():
-            return self.update(table, frame=frame)
+            assert self._held is not None
+            yield self._held
 
     @contextmanager
     def in_one_write(self) -> Iterator[None]:
@@ -119,7 +153,6 @@ class DurableCalibrator:
             self._held = None
             if held:
                 self._database.append(*held)
-                self._pending += len(held)
 
     def _continue_snapshot(self) -> None:
         """Encode the state when it is due, write it with the next update: neither waits long."""
@@ -127,6 +160,7 @@ class DurableCalibrator:
             self._write_snapshot(*self._unwritten)
         elif self._pending >= _SNAPSHOT_EVERY:
             self._unwritten = self.tracker.to_bytes(), self._database.number
+            self._pending = 0
 
     def close(self) -> None:
         """Write a last snapshot and release the folder."""
@@ -144,10 +178,10 @@ class DurableCalibrator:
 
     def _snapshot(self) -> None:
         self._write_snapshot(self.tracker.to_bytes(), self._database.number)
+        self._pending = 0
 
     def _write_snapshot(self, state: bytes, number: int) -> None:
         self._database.snapshot(state, number)
-        self._pending = self._database.number - number
         self._unwritten = None
 
     def __enter__(self) -> Self:
@@ -165,11 +199,16 @@ class DurableCalibrator:
             self.abandon()
 
 
-def _record(table: Correspondences, frame: int | None) -> bytes:
+def _as_kept(table: Correspondences, place: str | int | None) -> Correspondences:
+    return with_metadata_per_frame(with_place(table, place))
+
+
+def _record(*frames: tuple[int | None, Correspondences]) -> bytes:
     """An input as the journal keeps it."""
-    require_number(frame)
+    for frame, _ in frames:
+        require_number(frame)
     try:
-        return encode((None if frame is None else index(frame), table), "input")
+        return encode(tuple((None if n is None else index(n), t) for n, t in frames), "input")
     except UnicodeEncodeError as error:  # of a camera, which no rig has
         raise CorrespondenceError(f"a camera's name cannot be written ({error})") from error
 

@@ -6,11 +6,12 @@ epoch; the log-likelihoods of these predictions are its evidence, and the best o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.sums import Sums
 
 STRENGTHS = np.array([0.0, 0.2, 1.0, 5.0])

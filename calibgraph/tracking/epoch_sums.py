@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from calibgraph.arrays import Array
@@ -20,6 +22,14 @@ def sum_epochs(state: State, before: int | None = None) -> Sums:
 def sum_all_epochs(state: State, before: int | None = None) -> Sums:
     """The same with the time offsets, where they are estimated."""
     return sum_closed_epochs(state, before) + _until(state.epochs[-1], before)
+
+
+def sums_before_epochs(state: State) -> Iterator[Sums]:
+    """(n,) over the frames before each live epoch, of the poses alone."""
+    sums = Sums.stack([one.summary.selected for one in state.cameras])
+    for epoch in state.epochs:
+        yield state.of_poses(sums)
+        sums = _after_epoch(state, sums + epoch.sums, epoch)
 
 
 def sum_closed_epochs(state: State, before: int | None = None) -> Sums:
@@ -45,13 +55,16 @@ def in_its_half(state: State, epoch: Epoch, age: int) -> Sums:
     return epoch.sums[:, None] * weights
 
 
-def estimates_of_halves(state: State, halves: Sums, camera: int) -> tuple[Array, Array] | None:
-    """Two (4, 4) T_camera_lidar of a camera; None if one of them is undetermined."""
-    first, second = (halves[camera].pose.step(half) for half in range(2))
-    if first is None or second is None:
-        return None
-    reference = state.references[camera]
-    return to_T_camera_lidar(reference.retract(first)), to_T_camera_lidar(reference.retract(second))
+def estimates_of_halves(state: State, halves: Sums) -> dict[int, tuple[Array, Array]]:
+    """Two (4, 4) T_camera_lidar of each camera where both are determined."""
+    known = np.flatnonzero(halves.are_determined.all(axis=1))
+    sums, found = halves[known].pose, {}
+    steps = np.linalg.solve(sums.hessian, -sums.gradient[..., None])[..., 0]
+    for camera, (first, second) in zip(known.tolist(), steps, strict=True):
+        poses = map(state.references[camera].retract, (first, second))
+        one, two = map(to_T_camera_lidar, poses)
+        found[camera] = one, two
+    return found
 
 
 def _after_epoch(state: State, sums: Sums, epoch: Epoch) -> Sums:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from operator import add
 
 import gtsam
@@ -11,23 +10,24 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
-from calibgraph.solver.curvature import convex_hessian, robust_hessian
-from calibgraph.solver.within_place import WEAK
+from calibgraph.solver.camera_block import CameraBlock, merge
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, inliers_of
+from calibgraph.tracking.offset_search import explaining_offsets, follow
 from calibgraph.tracking.offsets import Offsets, delayed
 from calibgraph.tracking.place_sums import sums_by_place
+from calibgraph.tracking.regate import regate
 from calibgraph.tracking.state import State
 from calibgraph.tracking.steps import shift_between
 from calibgraph.tracking.sums import Sums, step_between, sums_of_matches
 from factors import to_runs
 
 
-def close_epoch(state: State, offsets: Offsets | None) -> tuple[State, list[Event]]:
+def close_epoch(state: State, offsets: Offsets | None, sums: Sums) -> tuple[State, list[Event]]:
     """The state with its open epoch closed and a new one begun.
 
     A camera that drifts keeps the estimate of each epoch; any other has the newest in all of them.
@@ -35,7 +35,10 @@ def close_epoch(state: State, offsets: Offsets | None) -> tuple[State, list[Even
     Args:
         state: after the last frame of the epoch.
         offsets: the newest time offsets, if they are estimated.
+        sums: (n,) of all frames.
     """
+    if offsets is not None:
+        state = state.at_poses(follow(state, sums, offsets))
     epochs = tuple(_at_newest(state, epoch) for epoch in state.epochs)
     state = replace(state, epochs=epochs)
     if len(epochs) > state.config.tracking.live_epochs:
@@ -93,9 +96,23 @@ def _with_references(
     )
 
 
-def at_offsets(state: State, offsets: Offsets) -> State:
-    """The state with its matches at other time offsets, within an epoch."""
-    return regate(_with_references(state, state.T_lidar_camera, offsets))
+def at_explaining_offsets(
+    state: State, sums: Sums, blocks: Mapping[int, CameraBlock]
+) -> tuple[State, dict[int, CameraBlock]]:
+    """The state, and a frame's blocks, at the time offsets with which these agree.
+
+    Args:
+        state: before the frame.
+        sums: (n,) of all frames.
+        blocks: of the frame, per camera.
+    """
+    before, offsets = state.offsets, explaining_offsets(state, sums, blocks)
+    if offsets is None or before is None:
+        return state, {**blocks}
+    later_s = offsets.values_s - before.values_s
+    state = replace(state.at_poses(follow(state, sums, offsets)), optimum=None)
+    state = regate(_with_references(state, state.T_lidar_camera, offsets))
+    return state, {c: delayed(block, later_s[c]) for c, block in blocks.items()}
 
 
 def _with_points_at(state: State, later_s: Array) -> State:
@@ -204,7 +221,7 @@ def _update_evidence(state: State, camera: int, epoch: Epoch, by_places: Array) 
     groups = tuple(group.add(score, int(sums.frames), alone) for group in one.groups)
     rows = pose_rows(camera)
     if state.offsets is not None:
-        alone_7 = replace(epoch.sums[camera], scatter=np.zeros((7, 7)))
+        alone_7 = epoch.sums[camera].change(scatter=np.zeros((7, 7)))
         noise = noise + state.of_pose(camera, alone_7).scatter / sums.frames
     noise = noise * sums.frames + sums.hessian @ by_places[rows, rows] @ sums.hessian
     walks = state.of_pose(camera, one.summary.walks)
@@ -220,78 +237,3 @@ def _select_walks(state: State) -> State:
         else:
             state = state.with_camera(camera, replace(camera_state, summary=summary))
     return state
-
-
-_GATE_STEPS = 3  # of Gauss-Newton: each leaves about a third of the way
-
-
-def regate(state: State) -> State:
-    """The state with its live frames gated, and linearized, at the newest estimates."""
-    frames = {
-        f.number: replace(f, inliers=dict(f.inliers), sums=f.sums.copy()) for f in state.live_frames
-    }
-    for camera, one in enumerate(state.cameras):
-        epochs = state.epochs if one.summary.walk else state.epochs[-1:]
-        for epoch in epochs:
-            group = epoch.frames if one.summary.walk else state.live_frames
-            own = [frames[f.number] for f in group if camera in f.raw]
-            if own:
-                _regate_camera(state, camera, own, epoch.T_lidar_camera[camera])
-    epochs = tuple(
-        replace(epoch, frames=tuple(frames[f.number] for f in epoch.frames))
-        for epoch in state.epochs
-    )
-    return replace(state, epochs=epochs)
-
-
-def _regate_camera(
-    state: State, camera: int, frames: Sequence[LiveFrame], T_lidar_camera: gtsam.Pose3
-) -> None:
-    """Fill in a camera's inliers of frames, and their sums at an estimate.
-
-    Hessians of frames are as they were, but for a share of what their sum is now.
-    """
-    scale, raw = state.cameras[camera].scale, merge([frame.raw[camera] for frame in frames])
-    gate = _gate_pose(state, camera, raw, T_lidar_camera)
-    rows = raw.within_gate(to_T_camera_lidar(gate), scale.gate_px)
-    for frame, found in zip(frames, np.split(rows, raw.frame_edges[1:-1]), strict=True):
-        if np.count_nonzero(found) >= MIN_MATCHES:
-            frame.inliers[camera] = found
-    inliers = raw.select(np.concatenate([frame.inliers[camera] for frame in frames]))
-    block = inliers.with_scale(scale)
-    here = block.frame_sums(T_lidar_camera, inliers.frame_edges)
-    robust = robust_hessian(block, T_lidar_camera)
-    true = convex_hessian(robust + raw.at(to_T_camera_lidar(gate)).gate_hessian(scale), robust)
-    if state.offsets is not None:
-        for frame in frames:
-            frame.sums.hessian[camera] = 0.0
-    missing = true - sum(frame.sums.hessian[camera] for frame in frames)
-    shares = here.hessian @ np.linalg.solve(here.hessian.sum(axis=0) + WEAK, missing)
-    step = step_between(T_lidar_camera, state.references[camera])
-    for row, frame in enumerate(frames):
-        sums, score = frame.sums, here.gradient[row]
-        sums.hessian[camera] += (shares[row] + shares[row].T) / 2
-        sums.gradient[camera] = score + sums.hessian[camera] @ step
-        sums.reweighted[camera] = here.hessian[row]
-        sums.score[camera], sums.scatter[camera] = score, np.outer(score, score)
-        sums.matches[camera] = np.count_nonzero(frame.inliers[camera])
-
-
-def _gate_pose(
-    state: State, camera: int, raw: CameraBlock, T_lidar_camera: gtsam.Pose3
-) -> gtsam.Pose3:
-    """Where the gate is drawn: the minimum of all matches, as in a batch.
-
-    That of the matches within a gate is drawn to where the gate was before. A camera that drifts,
-    or whose time offset is estimated, keeps its estimate, which later epochs have a part in.
-    """
-    one, reference = state.cameras[camera], state.references[camera]
-    if one.summary.walk or state.offsets is not None:
-        return T_lidar_camera
-    block, older = raw.with_scale(one.scale), one.summary.ungated
-    for _ in range(_GATE_STEPS):
-        sums, step = block.sums(T_lidar_camera), step_between(reference, T_lidar_camera)
-        pull = sums.gradient + older.gradient + older.hessian @ step
-        whole = sums.hessian + older.hessian + WEAK
-        T_lidar_camera = T_lidar_camera.retract(-np.linalg.solve(whole, pull))
-    return T_lidar_camera

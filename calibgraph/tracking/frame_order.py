@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import index
 
 import numpy as np
@@ -12,6 +12,8 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import PLACES
 from calibgraph.solver.repeats import REPEATED_SHARE, point_hashes
+from calibgraph.solver.shared_error import with_common_error
+from calibgraph.tracking.offsets import with_motion_in_use
 from calibgraph.tracking.state import State
 
 _LAST = 2**63 - 1  # other programs write it for "none"
@@ -30,15 +32,65 @@ PLACE = "place"
 """Key of a frame's metadata: the name of the place that it is of."""
 
 
+@dataclass(frozen=True, eq=False)
+class Incoming:
+    """A frame that comes after the last one.
+
+    Attributes:
+        number: of the frame.
+        stamp_ns: its time, or that of the last frame that had one, or None.
+        table: its correspondences, with the metadata of a single frame.
+    """
+
+    number: int
+    stamp_ns: int | None
+    table: Correspondences
+
+
+def incoming(
+    state: State,
+    table: Correspondences,
+    frame: int | None,
+    last: tuple[int | None, int | None] | None = None,
+) -> Incoming:
+    """A frame that an update can take.
+
+    Args:
+        state: of the frames before.
+        table: the correspondences of one frame.
+        frame: its number, which an empty table does not have.
+        last: number and time of the frame before; None: that of the state.
+
+    Raises:
+        CorrespondenceError: if it is none.
+    """
+    table = with_common_error(table, state.config)
+    if len(table):
+        table = with_motion_in_use(state.rig, state.config, table, state.knows_motion)
+    table = with_metadata_per_frame(with_place(table, None))
+    last = (state.frame, state.stamp_ns) if last is None else last
+    number, stamp = number_and_stamp(table, frame, last)
+    return Incoming(number, last[1] if stamp is None else stamp, table)
+
+
+def unsolvable(number: int, error: BaseException) -> CorrespondenceError:
+    """Why a frame is left out whose estimate cannot be solved for."""
+    return CorrespondenceError(
+        f"frame {number}: with its matches the estimate cannot be solved for "
+        f"({str(error).strip().splitlines()[0]}); it is left out",
+        frame=number,
+    )
+
+
 def number_and_stamp(
-    table: Correspondences, frame: int | None, state: State
+    table: Correspondences, frame: int | None, last: tuple[int | None, int | None]
 ) -> tuple[int, int | None]:
     """The number and the time stamp [ns] of the frame that a table holds.
 
     Args:
         table: the correspondences of one frame.
         frame: its number, which an empty table does not have.
-        state: of the frames before.
+        last: those of the frame before.
 
     Raises:
         CorrespondenceError: if the table holds several frames, or one that is not after the last,
@@ -58,7 +110,7 @@ def number_and_stamp(
     if frame is not None and number != frame:
         raise CorrespondenceError(f"the table is of frame {number}, not {frame}", frame=number)
     stamp = int(table.stamp_ns.max()) if table.stamp_ns is not None and len(table) else None
-    _require_after(state, number, stamp)
+    _require_after(last, number, stamp)
     return number, stamp
 
 
@@ -75,7 +127,7 @@ def require_number(frame: int | None) -> None:
         )
 
 
-def _require_after(state: State, number: int, stamp: int | None) -> None:
+def _require_after(last: tuple[int | None, int | None], number: int, stamp: int | None) -> None:
     for what, value in (("number", number), ("stamp_ns", stamp)):
         if value == _LAST:
             raise CorrespondenceError(
@@ -83,14 +135,14 @@ def _require_after(state: State, number: int, stamp: int | None) -> None:
                 "follow; correct it: it is left out",
                 frame=number,
             )
-    last, last_stamp = state.frame, state.stamp_ns
-    if last is not None and number <= last:
-        what = "comes again" if number == last else f"comes after frame {last}"
+    last_number, last_stamp = last
+    if last_number is not None and number <= last_number:
+        what = "comes again" if number == last_number else f"comes after frame {last_number}"
         raise CorrespondenceError(
             f"frame {number} {what}; frames must be in the order of their numbers: it is left out",
             frame=number,
         )
-    for what, value, before in (("number", number, last), ("stamp_ns", stamp, last_stamp)):
+    for what, value, before in (("number", number, last_number), ("stamp_ns", stamp, last_stamp)):
         if value is None or before is None:
             continue
         if value - before > max(_MOST_SKIPPED[what], abs(before) // _SKIPPED_SHARE):
@@ -174,7 +226,7 @@ def without_repeats(state: State, table: Correspondences) -> Correspondences:
     repeated = [
         name
         for camera, name in enumerate(state.names)
-        if name in table.cameras and _repeats(state, camera, table.of_camera(name))
+        if name in table.cameras and _repeats(state, camera, table)
     ]
     if not repeated:
         return table
@@ -184,11 +236,12 @@ def without_repeats(state: State, table: Correspondences) -> Correspondences:
 
 def _repeats(state: State, camera: int, table: Correspondences) -> bool:
     """Whether a camera's points are those of the last frame that it has any of."""
-    last = _last_hashes(state, camera)
-    if last is None or not len(table):
+    last, own = _last_hashes(state, camera), table.cameras.index(state.names[camera])
+    points = table.points_lidar_m[table.camera_index == own]
+    if last is None or not len(points):
         return False
-    again = np.isin(last, point_hashes(table.points_lidar_m))
-    return bool(again.mean() > REPEATED_SHARE)
+    new = {*point_hashes(points).tolist()}  # faster than arrays, of some hundred
+    return sum(map(new.__contains__, last.tolist())) > REPEATED_SHARE * len(last)
 
 
 def _last_hashes(state: State, camera: int) -> np.ndarray | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -15,9 +15,11 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
+from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.offset_sums import with_offset
 from calibgraph.tracking.offsets import Offsets, delayed, motion_in
-from calibgraph.tracking.sums import Gated, Sums
+from calibgraph.tracking.sums import Sums
 
 NO_DISTORTION = DistortionEvidence.none(WEAK, places=1)
 """Without matches."""
@@ -57,10 +59,9 @@ class LiveFrame:
         sums = self.sums.replace_at(camera, Sums.zeros())
         return replace(self, raw=raw, inliers=inliers, sums=sums)
 
-    def add(
-        self, camera: int, raw: CameraBlock, gated: Gated, offsets: Offsets | None
-    ) -> LiveFrame:
-        """The frame with a camera's matches."""
+    def add(self, camera: int, gated: Gated, offsets: Offsets | None, *, row: int = 0) -> LiveFrame:
+        """The frame with a camera's matches: those of a row of the gated frames."""
+        raw, inliers = gated.of_frame(row)
         twists = self.twists_per_s
         if twists is not None and offsets is not None and raw.block.motion is not None:
             twists = twists.copy()
@@ -68,8 +69,8 @@ class LiveFrame:
         return replace(
             self,
             raw={**self.raw, camera: raw},
-            inliers={**self.inliers, camera: gated.inliers},
-            sums=self.sums.replace_at(camera, gated.sums),
+            inliers={**self.inliers, camera: inliers},
+            sums=self.sums.replace_at(camera, gated.sums[row]),
             twists_per_s=twists,
         )
 

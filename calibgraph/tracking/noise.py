@@ -36,11 +36,14 @@ class ResidualHistogram:
     least: float = 0.0
 
     def add(self, residuals: BlockResiduals) -> ResidualHistogram:
-        """The histogram with a frame's residuals counted."""
-        sizes_px, sizes = residuals.sizes
-        counted = _counted(sizes_px)
-        new = [counted, counted if sizes is sizes_px else _counted(sizes)]
-        return ResidualHistogram(_RESIDUALS_KEPT * self.counts + new, residuals.block.least_spread)
+        """The histogram with the residuals of one or more frames counted, in their order."""
+        (sizes_px, sizes), frames = residuals.sizes, residuals.block.frames
+        kept = _RESIDUALS_KEPT ** np.arange(frames - 1.0, -1.0, -1.0)
+        weights = np.repeat(kept, residuals.block.frame_counts)[residuals.projectable]
+        counted = _counted(sizes_px, weights)
+        new = [counted, counted if sizes is sizes_px else _counted(sizes, weights)]
+        before = _RESIDUALS_KEPT**frames * self.counts
+        return ResidualHistogram(before + new, residuals.block.least_spread)
 
     def scale(self, config: Config) -> ResidualScale:
         """The scale of all the residuals, as by :meth:`CameraBlock.scale`."""
@@ -54,9 +57,9 @@ def median(values: Array) -> float:
     return float(ordered[half] if len(values) % 2 else (ordered[half - 1] + ordered[half]) / 2)
 
 
-def _counted(sizes: Array) -> Array:
+def _counted(sizes: Array, weights: Array) -> Array:
     places = np.searchsorted(_EDGES, sizes, side="right") - 1
-    counts = np.bincount(np.minimum(places, len(_EDGES) - 2), minlength=len(_EDGES) - 1)
+    counts = np.bincount(np.minimum(places, len(_EDGES) - 2), weights, len(_EDGES) - 1)
     return counts.astype(np.float64)
 
 

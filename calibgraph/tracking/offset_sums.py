@@ -6,8 +6,6 @@ the seventh column is the product of the others with this twist, which differs f
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from calibgraph.arrays import Array
@@ -33,8 +31,7 @@ def without_offset(sums: Sums, information: Array, overconfidence: Array) -> Sum
     gain = sums.hessian[..., :6, 6] / (sums.hessian[..., 6, 6] + known)[..., None]
     found = _mapped(sums, np.concatenate([_units(gain), -gain[..., None]], axis=-1))
     outer = gain[..., :, None] * gain[..., None, :] * known[..., None, None]
-    return replace(
-        found,
+    return found.change(
         hessian=found.hessian + outer,
         reweighted=found.reweighted + outer,
         scatter=found.scatter + outer * np.asarray(overconfidence)[..., None, None],
@@ -46,8 +43,7 @@ def after_offset_walk(sums: Sums, variance: Array, overconfidence: Array) -> Sum
     by = (variance / overconfidence[..., None])[..., None, :]
     gains = [np.linalg.inv(np.eye(7) + H * by) for H in (sums.hessian, sums.reweighted)]
     reweighted = gains[1] @ sums.reweighted
-    return replace(
-        sums.after_walk(variance, overconfidence)[0],
+    return sums.after_walk(variance, overconfidence)[0].change(
         score=(gains[0] @ sums.score[..., None])[..., 0],
         reweighted=(reweighted + reweighted.swapaxes(-1, -2)) / 2,
     )
@@ -60,8 +56,9 @@ def _units(alike: Array) -> Array:
 def _mapped(sums: Sums, M: Array) -> Sums:
     """The sums whose gradients are (..., e, d) M times these."""
     back = M.swapaxes(-1, -2)
-    return replace(
-        sums,
+    return Sums.of(
+        frames=sums.frames,
+        matches=sums.matches,
         hessian=M @ sums.hessian @ back,
         gradient=(M @ sums.gradient[..., None])[..., 0],
         reweighted=M @ sums.reweighted @ back,

@@ -119,7 +119,7 @@ def with_motion_in_use(
     require_motion(config.estimate, is_known=known)
     used = config.estimate or any(c.time_offset_s or c.readout_s for c in rig.cameras.values())
     if not used:
-        return replace(table, twist_per_s=None)
+        return replace(table, twist_per_s=None) if known else table
     if before is not None and before != known:
         found, earlier = ("no ", "one") if not known else ("a ", "none")
         raise CorrespondenceError(

@@ -50,7 +50,7 @@ class Optimum:
     ) -> Optimum:
         """Of a model of places of some names."""
         matched: dict[str, dict[int, gtsam.Pose3]] = {name: {} for name in names}
-        for place, camera in model.matched_places():
+        for place, camera in model.matched_places:
             matched[names[place]][camera] = values.atPose3(matched_at_key(place, camera))
         lenses = {key(number) for key in (lens_key, seen_lens_key) for number in model.lenses}
         vectors = {DISTORTION, *lenses}
@@ -89,7 +89,7 @@ class Optimum:
         values, known = start_values(model, guess), dict(self.shared)
         for place, name in enumerate(names):
             known[cloud_at_key(place)] = self.clouds.get(name, self.shared[CLOUD])
-        for place, camera in model.matched_places():
+        for place, camera in model.matched_places:
             expected = self.shared.get(matched_key(camera), values.atPose3(matched_key(camera)))
             of_place = self.matched.get(names[place], {})
             known[matched_at_key(place, camera)] = of_place.get(camera, expected)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.graph.objective import projection_graph
 from calibgraph.model.config import Config
@@ -30,9 +31,17 @@ def inlier_share(block: CameraBlock, T_lidar_camera: gtsam.Pose3, scale: Residua
 
 def agrees(block: CameraBlock, T_lidar_camera: gtsam.Pose3, camera_state: CameraState) -> bool:
     """Whether a T_lidar_camera explains about the usual share of a frame's matches."""
-    share = inlier_share(block, T_lidar_camera, camera_state.scale)
-    enough = share * len(block.frame) >= MIN_MATCHES
-    return enough and share >= AGREEMENT * camera_state.inlier_share
+    return bool(agreeing_frames(block, T_lidar_camera, camera_state).all())
+
+
+def agreeing_frames(
+    block: CameraBlock, T_lidar_camera: gtsam.Pose3, camera_state: CameraState
+) -> NDArray[np.bool_]:
+    """(f,) whether it does of each frame of a block."""
+    inside = block.within_gate(to_T_camera_lidar(T_lidar_camera), camera_state.scale.gate_px)
+    counts = np.add.reduceat(inside, block.frame_edges[:-1], dtype=np.int64)
+    least = AGREEMENT * camera_state.inlier_share * block.frame_counts
+    return np.asarray((counts >= MIN_MATCHES) & (counts >= least))
 
 
 def find_outlier_frame(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -33,6 +34,7 @@ from calibgraph.solver.within_place import (
     WithinPlace,
     allow_for_few_frames,
     relative_covariance,
+    split_excess,
 )
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
 from calibgraph.tracking.offset_terms import offset_term
@@ -82,10 +84,14 @@ class FrameSpread:
             found.covariance[camera], found.efficiency[camera] = of_camera
         return found
 
+    @cached_property
+    def _excesses(self) -> list[tuple[float, Array]]:
+        return [*map(split_excess, self.covariance)]
+
     def within(self, sums: PlaceSums, camera: int, rows: Numbers) -> WithinPlace:
         """As of a batch, of some places."""
-        return WithinPlace.of(
-            self.covariance[camera],
+        return WithinPlace(
+            *self._excesses[camera],
             float(self.efficiency[camera]),
             roots=np.linalg.cholesky(sums.rows.pose.reweighted[rows, camera] + WEAK),
             frames=sums.frames[rows, camera] / sums.places[rows, camera],
@@ -180,7 +186,7 @@ def marginals_of_places(fit: LatentPoseFit) -> list[gtsam.GaussianFactorGraph]:
     """Per place its marginal on the cloud and the cameras as matches show them everywhere."""
     model, placed = fit.linear.model, fit.linear.placed
     keys = [[cloud_at_key(place)] for place in range(model.places)]
-    for place, camera in model.matched_places():
+    for place, camera in model.matched_places:
         keys[place].insert(0, matched_at_key(place, camera))
     place_of_key = {key: place for place, own in enumerate(keys) for key in own}
     graphs = [gtsam.GaussianFactorGraph() for _ in keys]

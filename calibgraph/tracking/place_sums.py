@@ -7,11 +7,12 @@ Older ones are one row: its frames' errors count as those of as many places as a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.sums import Sums
 
@@ -124,7 +125,7 @@ class PlaceSums:
     def _merge_second(self) -> PlaceSums:
         """The second row added to the first."""
         second = self.rows[1]
-        second = replace(second, score=0.0 * second.score, scatter=second.scatter_about_mean)
+        second = second.change(score=0.0 * second.score, scatter=second.scatter_about_mean)
         return PlaceSums(
             (_OLDER, *self.names[2:]),
             self.rows.replace_at(1, self.rows[0] + second)[1:],
@@ -150,7 +151,7 @@ class PlaceSums:
             own: its sums, discounted by its walk.
         """
         reweighted = _without_negative(own.hessian)
-        part = replace(own, score=np.zeros_like(own.score), reweighted=reweighted)
+        part = own.change(score=np.zeros_like(own.score), reweighted=reweighted)
         none = Sums.zeros(len(self.means), width=own.width)
         return self.without(camera).add({name: none.replace_at(camera, part)})
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -16,6 +15,8 @@ from calibgraph.tracking.drift import follow_drift
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
+from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
 from calibgraph.tracking.offset_sums import with_offset
 from calibgraph.tracking.offset_terms import keep_offsets
@@ -24,7 +25,7 @@ from calibgraph.tracking.start import absorb_frames
 from calibgraph.tracking.state import DriftWatch, State, replace_item
 from calibgraph.tracking.step_detection import DetectedStep
 from calibgraph.tracking.steps import shift_since, steps_between
-from calibgraph.tracking.sums import Gated, Sums, step_between
+from calibgraph.tracking.sums import Sums, step_between
 
 Measured = tuple[Steps, dict[int, Array]]
 
@@ -220,10 +221,11 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         start = near[-1].T_lidar_camera if near else state.T_lidar_camera[camera]
         raw = merge(parts)
         T_lidar_camera = refine(raw, start, camera_state.scale, state.config)
-        own = Gated.at(T_lidar_camera, raw, camera_state.scale, state.references[camera])
-        if own is not None:
-            sums = replace(own.sums, frames=np.array(float(len(parts))))
-            found = found.replace_at(camera, sums)
+        scale, reference = camera_state.scale, state.references[camera]
+        together = np.array([0, len(raw)])
+        own = Gated.at(T_lidar_camera, raw, scale, reference, edges=together).sums[0]
+        if own.matches:
+            found = found.replace_at(camera, own.change(frames=np.array(float(len(parts)))))
     return _with_uncertain_offsets(state, found, detected)
 
 
@@ -239,7 +241,7 @@ def _with_uncertain_offsets(state: State, sums: Sums, detected: DetectedStep) ->
             twists[camera] = to_camera @ np.mean(own, axis=0)
     share = sums.frames / np.maximum(state.total_frames, 1.0)
     scatter = [s * state.total[pose_rows(c), pose_rows(c)] for c, s in enumerate(share)]
-    sums = replace(sums, scatter=np.array(scatter))
+    sums = sums.change(scatter=np.array(scatter))
     return state.of_poses(with_offset(sums, twists))
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.tracking.durable import DurableCalibrator
+from calibgraph.tracking.frame_group import in_groups, update_all
 from calibgraph.tracking.history import History
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
-from calibgraph.tracking.update import Update, json_line
+from calibgraph.tracking.update import Update, json_lines
 
 Notify = Callable[[str], None]
 
@@ -22,9 +23,10 @@ class Run:
         calibrator: takes the frames in.
         history: of the extrinsics; each update is added.
         write: called with each update as a line of JSON, once it is on disk; after a crash, first
-            with the last one before it, which may have been written already. A BrokenPipeError
-            ends the run.
+            with those of the last write before it, which may have been written already. A
+            BrokenPipeError ends the run.
         notify: called with warnings and events as sentences.
+        together: frames that may be taken in at once; a source that does not wait has more.
         updates: frames taken in.
         refused: input that was not a frame, or a frame that was left out.
         skipped: frames at the beginning that an earlier run had taken in already.
@@ -34,6 +36,7 @@ class Run:
     history: History
     write: Notify
     notify: Notify
+    together: int = 1
     updates: int = 0
     refused: int = 0
     skipped: int = 0
@@ -44,19 +47,16 @@ class Run:
         Args:
             items: the frames.
             every: take every so-many-th frame.
-            stop: called after each frame.
+            stop: called after each frame, or frames that come together.
         """
-        count, known = 0, self.calibrator.tracker.frame if self.calibrator.resumed else None
+        known = self.calibrator.tracker.frame if self.calibrator.resumed else None
         try:
-            for update in self.calibrator.repeated[-1:]:  # its line may not have been printed
-                self._report(update)
-            for item in items:
-                if isinstance(item, Refused):
-                    self._refuse(item.message)
+            self._report(self.calibrator.last_repeated)  # their lines may not have been printed
+            for some in in_groups(_every(items, every), self.together):
+                if isinstance(some, Refused):
+                    self._refuse(some.message)
                 else:
-                    if count % every == 0:
-                        self._take(item, known)
-                    count += 1
+                    self._take(some, known)
                 if stop():  # before waiting for the next one, or matching it
                     break
         except BrokenPipeError:
@@ -71,27 +71,37 @@ class Run:
             found = f"no frame comes after {self.calibrator.tracker.frame}"
             self.notify(f"warning: {found}; if that number is wrong, choose another --out")
 
-    def _take(self, frame: StreamFrame, known: int | None) -> None:
-        """Update with a frame, unless an earlier run has, or it is refused."""
-        if known is not None and frame.frame <= known and not self.updates:
-            if not self.skipped:
-                self.notify(f"frame {frame.frame} and others up to {known} are known: skipped")
-            self.skipped += 1
-            return
-        try:
-            update = self.calibrator.update(frame.table, frame=frame.frame)
-        except CorrespondenceError as error:
-            self._refuse(str(error))
-            return
-        self.updates += 1
-        self._report(update)
+    def _take(self, frames: Sequence[StreamFrame], known: int | None) -> None:
+        """Update with frames, but for those that an earlier run has, or that are refused."""
+        if known is not None and not self.updates:
+            old = [one.frame for one in frames if one.frame <= known]
+            if old and not self.skipped:
+                self.notify(f"frame {old[0]} and others up to {known} are known: skipped")
+            self.skipped += len(old)
+            frames = frames[len(old) :]
+        for found in update_all(self.calibrator, frames):
+            if isinstance(found, CorrespondenceError):
+                self._refuse(str(found))
+            else:
+                self.updates += len(found)
+                self._report(found)
 
     def _refuse(self, message: str) -> None:
         self.refused += 1
         self.notify(f"left out: {message}")
 
-    def _report(self, update: Update) -> None:
-        self.history.add(update)
-        self.write(json_line(update))
-        for event in update.events:
-            self.notify(f"frame {event.detected_frame}: {event}")
+    def _report(self, updates: Sequence[Update]) -> None:
+        for update, line in zip(updates, json_lines(updates), strict=True):
+            self.history.add(update)
+            self.write(line)
+            for event in update.events:
+                self.notify(f"frame {event.detected_frame}: {event}")
+
+
+def _every(items: Iterable[Item], every: int) -> Iterator[Item]:
+    """The items without all but every so-many-th frame."""
+    count = 0
+    for item in items:
+        if isinstance(item, Refused) or count % every == 0:
+            yield item
+        count += isinstance(item, StreamFrame)

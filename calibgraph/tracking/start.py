@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import replace
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.calibration import Calibration
@@ -24,10 +24,11 @@ from calibgraph.solver.camera_block import (
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.live_frames import Epoch
 from calibgraph.tracking.noise import ResidualHistogram, median
 from calibgraph.tracking.state import HISTORY, State, replace_item
-from calibgraph.tracking.sums import Gated
 
 _TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt
 
@@ -105,7 +106,7 @@ def _start_camera(state: State, camera: int, T_lidar_camera: gtsam.Pose3) -> Sta
     scale = histogram.scale(state.config)  # the gate by which inliers are counted below
     camera_state = replace(state.cameras[camera], started=True, waiting=(), refused=(), scale=scale)
     for one in residuals:
-        camera_state = count_residuals(camera_state, one)
+        camera_state = count_residuals(camera_state, one, one.inliers(scale))
     state = state.with_camera(camera, camera_state)
     state = replace(state, references=replace_item(state.references, camera, T_lidar_camera))
     return absorb_frames(state, camera, usable, T_lidar_camera)
@@ -132,9 +133,10 @@ def absorb_frames(
             found = (
                 None if raw is None else Gated.at(T_lidar_camera, raw, scale, reference, even=even)
             )
-            if raw is not None and found is not None:
-                frame = frame.add(camera, raw, found, state.offsets)
-                counts.update(absorbed=1, given=len(raw.frame), used=found.used)
+            if raw is not None and found is not None and found.sums.matches[0]:
+                frame = frame.add(camera, found, state.offsets)
+                used = int(found.sums.matches[0])
+                counts.update(absorbed=1, given=len(raw.frame), used=used)
             frames.append(frame)
         epochs.append(
             replace(
@@ -149,11 +151,14 @@ def absorb_frames(
     return state.with_camera(camera, state.cameras[camera].count(**counts))
 
 
-def count_residuals(camera_state: CameraState, residuals: BlockResiduals) -> CameraState:
-    """The camera with a frame's residuals counted."""
-    share = float(np.mean(residuals.inliers(camera_state.scale)))
-    newest = [share, median(residuals.errors_px)]
-    recent = np.vstack([camera_state.recent, newest])[-HISTORY:]
+def count_residuals(
+    camera_state: CameraState, residuals: BlockResiduals, inliers: NDArray[np.bool_]
+) -> CameraState:
+    """The camera with the residuals of frames counted, and which of them are within the gate."""
+    inner = residuals.block.frame_edges[1:-1]
+    shares = [np.count_nonzero(own) / len(own) for own in np.split(inliers, inner)]
+    medians = [*map(median, np.split(residuals.errors_px, inner))]
+    recent = np.vstack([camera_state.recent, np.column_stack([shares, medians])])[-HISTORY:]
     return replace(camera_state, recent=recent, residuals=camera_state.residuals.add(residuals))
 
 

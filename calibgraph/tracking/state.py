@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from itertools import chain
 from operator import add
@@ -20,6 +20,7 @@ from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import NO_DISTORTION, Epoch, LiveFrame
 from calibgraph.tracking.noise import inflation, widening
 from calibgraph.tracking.offset_sums import after_offset_walk, without_offset
@@ -71,6 +72,7 @@ class State:
         findings: of the errors that frames share, by their matcher.
         sizes: of these, as the data show them, over what the matcher states.
         optimum: of the graph of the closed epochs; None where it is not known.
+        is_refined: whether it is exact, so that nothing is left to the frames of the open epoch.
         offsets: time offsets of the cameras; None if they are not estimated.
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
@@ -92,6 +94,7 @@ class State:
     findings: MatcherFindings = MatcherFindings()
     sizes: VarianceRatios = VarianceRatios()
     optimum: Optimum | None = None
+    is_refined: bool = False
     offsets: Offsets | None = None
     frame: int | None = None
     stamp_ns: int | None = None
@@ -161,6 +164,11 @@ class State:
         if self.optimum is None or self.cameras[camera].summary.walk:
             return None
         return self.optimum.pose_at(place, camera)
+
+    def at_poses(self, T_lidar_camera: tuple[gtsam.Pose3, ...]) -> State:
+        """The state with other estimates in its open epoch."""
+        last = replace(self.epochs[-1], T_lidar_camera=T_lidar_camera)
+        return replace(self, epochs=(*self.epochs[:-1], last))
 
     def with_camera(self, index: int, camera: CameraState) -> State:
         """The state with one camera replaced."""

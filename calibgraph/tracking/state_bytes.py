@@ -10,13 +10,13 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import gtsam
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import InstanceOf, TypeAdapter, ValidationError
+from pydantic import Field, InstanceOf, TypeAdapter, ValidationError
 
 from calibgraph.errors import CalibrationError, in_words
 from calibgraph.files import describe
@@ -31,6 +31,7 @@ from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.events import Event, Size
+from calibgraph.tracking.frame_order import Incoming
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
 from calibgraph.tracking.offsets import Offsets
@@ -42,15 +43,15 @@ from factors import Lens, ProjectionBlock
 
 Kind = Literal["state", "input", "history"]
 
-_VERSION = 8
+_VERSION = 9
 """Earlier ones held other sums, or were of another encoding."""
 
 _DIGEST = hashlib.sha256().digest_size
 _TREES: dict[Kind, TypeAdapter[Any]] = {
-    "state": TypeAdapter(
-        tuple[InstanceOf[State], tuple[tuple[int, InstanceOf[Correspondences]], ...]]
+    "state": TypeAdapter(tuple[InstanceOf[State], tuple[tuple[InstanceOf[Incoming], ...], ...]]),
+    "input": TypeAdapter(
+        Annotated[tuple[tuple[int | None, InstanceOf[Correspondences]], ...], Field(min_length=1)]
     ),
-    "input": TypeAdapter(tuple[int | None, InstanceOf[Correspondences]]),
     "history": TypeAdapter(dict[str, Any]),
 }
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
@@ -149,6 +150,6 @@ _KINDS: tuple[tuple[type, Callable[[Any], Any], Callable[[Any], Any]], ...] = (
       for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
                    EpochSummary, Sums, PlaceSums, Optimum, DistortionEvidence, MatcherFindings,
                    VarianceRatios, ResidualHistogram, ResidualScale, Correspondences, CameraBlock,
-                   ProjectionBlock, Lens, Event, Size, Offsets)),
+                   ProjectionBlock, Lens, Event, Size, Offsets, Incoming)),
 )  # fmt: skip
 _CODES = {kind: code for code, (kind, _, _) in enumerate(_KINDS)}

@@ -62,7 +62,7 @@ def read(path: Path) -> tuple[Recovered, int]:
     finally:
         _remove_index(path, had_log=had_log)
     if is_open and not had_log:
-        line = f"{log}: is missing, updates may be lost; went on after update {number}"
+        line = f"{log}: is missing, updates may be lost; went on after input {number}"
         recovered = replace(recovered, damages=(*recovered.damages, line))
     return recovered, number
 
@@ -97,14 +97,14 @@ def _recover(database: sqlite3.Connection, path: Path, newest: int) -> Recovered
         if digest == checksum(number, content):
             start, snapshot = number, content
             break
-        damages.append(f"{path}: the snapshot after update {number} is damaged: not used")
+        damages.append(f"{path}: the snapshot after input {number} is damaged: not used")
     if damages and snapshot is None:
         raise _damaged(path, "no snapshot has the right checksum")
     query = "SELECT number, content, digest FROM journal WHERE number > ? ORDER BY number"
     rows = database.execute(query, (start,)).fetchall()
     for expected, row in zip_longest(range(start + 1, newest + 1), rows):
         if row is None or row[0] != expected or row[2] != checksum(*row[:2]):
-            raise _damaged(path, f"update {expected} is missing or has a wrong checksum")
+            raise _damaged(path, f"input {expected} is missing or has a wrong checksum")
     return Recovered(snapshot, tuple(content for _, content, _ in rows), tuple(damages))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import accumulate
 
 import numpy as np
@@ -12,7 +12,8 @@ from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
-from calibgraph.tracking.epoch_sums import sum_epochs
+from calibgraph.tracking.epoch_sums import sums_before_epochs
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.live_frames import Epoch, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.state import State
@@ -46,9 +47,9 @@ def detect_step(state: State) -> DetectedStep | None:
     It is accepted when enough outlier frames agree with each other, and every other camera has had
     as many frames to show whether it moved too.
     """
-    needed = state.config.tracking.step_frames
-    if not any(_has_enough(camera_state, needed) for camera_state in state.cameras):
+    if not may_have_moved(state):
         return None
+    needed = state.config.tracking.step_frames
     clusters = {c: _cluster(camera_state) for c, camera_state in enumerate(state.cameras)}
     found_by = {
         c: near
@@ -69,6 +70,12 @@ def detect_step(state: State) -> DetectedStep | None:
     if waiting and longest < needed + _PATIENCE:
         return None
     return DetectedStep(since, frozenset(found_by), clusters)
+
+
+def may_have_moved(state: State) -> bool:
+    """Whether outlier frames may show a step."""
+    needed = state.config.tracking.step_frames
+    return any(_has_enough(camera_state, needed) for camera_state in state.cameras)
 
 
 def _has_enough(camera_state: CameraState, needed: int) -> bool:
@@ -117,11 +124,12 @@ def detect_small_step(state: State) -> DetectedStep | None:
         return None
     sums = [_scattered_as_usual(state, epoch) for epoch in reversed(state.epochs)]
     afterwards = [*accumulate(sums)][::-1]
-    for epoch, after in zip(state.epochs[1:], afterwards[1:], strict=True):
+    befores = sums_before_epochs(state)
+    next(befores)
+    for epoch, before, after in zip(state.epochs[1:], befores, afterwards[1:], strict=True):
         if not epoch.frames:
             continue
-        since = epoch.frames[0].number
-        before, later = sum_epochs(state, since), state.of_poses(after)
+        since, later = epoch.frames[0].number, state.of_poses(after)
         for camera, camera_state in enumerate(state.cameras):
             if not camera_state.started or _shift_excess(state, camera, before, later) <= best:
                 continue  # by what places share it is less still
@@ -143,7 +151,7 @@ def _scattered_as_usual(state: State, epoch: Epoch) -> Sums:
     left = np.maximum(poses.frames - 1, 0).sum(axis=0)[:, None, None]
     by_camera = poses.scatter_about_mean.sum(axis=0) / np.maximum(left, 1.0)
     frames = [
-        replace(f, sums=replace(f.sums, scatter=f.sums.frames[:, None, None] * by_camera))
+        replace(f, sums=f.sums.change(scatter=f.sums.frames[:, None, None] * by_camera))
         for f in epoch.frames
     ]
     return epoch.sums_of(frames)

@@ -73,8 +73,10 @@ class CameraColumns(BaseModel):
         """The columns that the line has, in the order of the model."""
         return tuple(key for key in type(self).model_fields if key in self.model_fields_set)
 
-    def table(self, camera: str, frame: int, stamp_ns: int | None) -> Correspondences:
-        """The correspondences of this camera.
+    def table(
+        self, camera: str, frame: int, stamp_ns: int | None, *, indexed: bool
+    ) -> Correspondences:
+        """The correspondences of this camera; ``indexed``: with the index of each point, or -1.
 
         Raises:
             CorrespondenceError: if a value is out of its range.
@@ -91,7 +93,7 @@ class CameraColumns(BaseModel):
             confidence=as_confidence(np.array(confidence, np.float64)),
             information_px=self._stack(INFORMATION) if informed else None,
             stamp_ns=None if stamp_ns is None else np.full(n, stamp_ns, np.int64),
-            point_index=np.array(self.point_index or [-1] * n, np.int64),
+            point_index=np.array(self.point_index or [-1] * n, np.int64) if indexed else None,
         )
 
     def _stack(self, keys: Sequence[str]) -> NDArray[np.float64]:
@@ -128,12 +130,13 @@ class FrameLine(BaseModel):
             CorrespondenceError: if a value is out of its range.
         """
         stamp_ns = self.stamp_ns if "stamp_ns" in self.model_fields_set else None
+        indexed = any("point_index" in columns.given for columns in self.cameras.values())
         tables = [
-            columns.table(camera, self.frame, stamp_ns) for camera, columns in self.cameras.items()
+            columns.table(camera, self.frame, stamp_ns, indexed=indexed)
+            for camera, columns in self.cameras.items()
         ]
-        if not any("point_index" in columns.given for columns in self.cameras.values()):
-            tables = [replace(table, point_index=None) for table in tables]
-        table = concatenate([_empty_table({**header, **self.metadata}), *tables])
+        table = concatenate(tables) if tables else _EMPTY
+        table = table.with_metadata({**header, **self.metadata})
         if self.twist_per_s is not None:
             table = replace(table, twist_per_s=np.tile(self.twist_per_s, (len(table), 1)))
         return StreamFrame(self.frame, with_place(table, self.place))
@@ -196,14 +199,11 @@ def _parse(line: bytes, where: str, header: Mapping[str, Any]) -> Item | dict[st
         return refused(where, f"is not JSON ({error}); send one frame a line, as JSON")
 
 
-def _empty_table(metadata: dict[str, Any]) -> Correspondences:
-    """A table without rows that holds the metadata."""
-    return Correspondences(
-        cameras=(),
-        camera_index=np.empty(0, np.int32),
-        frame=np.empty(0, np.int64),
-        pixels_px=np.empty((0, 2)),
-        points_lidar_m=np.empty((0, 3)),
-        confidence=np.empty(0, np.float32),
-        metadata=metadata,
-    )
+_EMPTY = Correspondences(
+    cameras=(),
+    camera_index=np.empty(0, np.int32),
+    frame=np.empty(0, np.int64),
+    pixels_px=np.empty((0, 2)),
+    points_lidar_m=np.empty((0, 3)),
+    confidence=np.empty(0, np.float32),
+)

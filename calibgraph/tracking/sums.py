@@ -17,7 +17,7 @@ so that ``H'^-1 B' H'^-1 = H^-1 B H^-1 + Q`` exactly, whatever the gain. k, the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -27,17 +27,14 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import camera_key
-from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
-from calibgraph.solver.curvature import convex_hessian, robust_hessian
+from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.curvature import convex_hessian
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.solver.within_place import WEAK
-from factors import smallest_scaled_eigenvalue
+from factors import smallest_scaled_eigenvalue, smallest_scaled_eigenvalues
 
 _POSE = 6
-_MATRIX, _VECTOR, _NUMBER = 2, 1, 0
-_AXES = _MATRIX, _VECTOR, _MATRIX, _VECTOR, _MATRIX, _NUMBER, _NUMBER
-_SHARES = 0.5, 1.0  # of the true Hessian in that by weights
+_MATRICES, _VECTORS = ("hessian", "reweighted", "scatter"), ("gradient", "score")
+_WIDTHS = {d * (3 * d + 2) + 2: d for d in (_POSE, _POSE + 1)}
 _STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away
 _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
@@ -46,35 +43,74 @@ _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near
 class Sums:
     """Sums over frames. The leading axes (...), of cameras, places or others, are alike in all.
 
-    Of the pose, d is 6; with the time offset [s] of the camera last, d is 7.
+    Of the pose, d is 6; with the time offset [s] of the camera last, d is 7. What is summed are
+    views of one array, so that adding is one operation.
 
     Attributes:
-        hessian: (..., d, d) true Hessian of the robust cost, in the tangent of T_lidar_camera.
-        gradient: (..., d) at the reference, which ``State`` holds.
-        reweighted: (..., d, d) Hessian by the matches' weights in the loss: it is positive
-            semidefinite, of however few.
-        score: (..., d) sum of the frames' gradients, each at the estimate of its time.
-        scatter: (..., d, d) sum of the outer products of the same.
-        frames, matches: (...) how many.
+        packed: (..., 3 d^2 + 2 d + 2) of the properties, one after the other.
     """
 
-    hessian: Array
-    gradient: Array
-    reweighted: Array
-    score: Array
-    scatter: Array
-    frames: Array
-    matches: Array
+    packed: Array
+
+    @staticmethod
+    def of(**values: Array) -> Sums:
+        """Of all the properties."""
+        return Sums.zeros(*values["frames"].shape, width=values["gradient"].shape[-1]).change(
+            **values
+        )
 
     @staticmethod
     def zeros(*shape: int, width: int = _POSE) -> Sums:
         """Over no frames, with these leading axes, and d."""
-        return Sums(*(np.zeros((*shape, *[width] * own)) for own in _AXES))
+        return Sums(np.zeros((*shape, width * (3 * width + 2) + 2)))
 
     @property
     def width(self) -> int:
         """The number d."""
-        return int(self.gradient.shape[-1])
+        return _WIDTHS[self.packed.shape[-1]]
+
+    @property
+    def hessian(self) -> Array:
+        """(..., d, d) true Hessian of the robust cost, in the tangent of T_lidar_camera."""
+        return self._matrix(0)
+
+    @property
+    def reweighted(self) -> Array:
+        """(..., d, d) Hessian by the matches' weights in the loss.
+
+        It is positive semidefinite, of however few.
+        """
+        return self._matrix(1)
+
+    @property
+    def scatter(self) -> Array:
+        """(..., d, d) sum of the outer products of the gradients of ``score``."""
+        return self._matrix(2)
+
+    @property
+    def gradient(self) -> Array:
+        """(..., d) at the reference, which ``State`` holds."""
+        d = self.width
+        return self.packed[..., -2 - 2 * d : -2 - d]
+
+    @property
+    def score(self) -> Array:
+        """(..., d) sum of the frames' gradients, each at the estimate of its time."""
+        return self.packed[..., -2 - self.width : -2]
+
+    @property
+    def frames(self) -> Array:
+        """(...) how many."""
+        return self.packed[..., -2]
+
+    @property
+    def matches(self) -> Array:
+        """(...) how many."""
+        return self.packed[..., -1]
+
+    def _matrix(self, place: int) -> Array:
+        d, shape = self.width, self.packed.shape[:-1]
+        return self.packed[..., place * d * d : (place + 1) * d * d].reshape(*shape, d, d)
 
     @property
     def scatter_about_mean(self) -> Array:
@@ -89,49 +125,51 @@ class Sums:
         if self.width == _POSE:
             return self
         rows = slice(_POSE)
-        cut = {_NUMBER: (), _VECTOR: (..., rows), _MATRIX: (..., rows, rows)}
-        return Sums(*(v[cut[own]] for v, own in zip(vars(self).values(), _AXES, strict=True)))
+        vectors = {name: getattr(self, name)[..., rows] for name in _VECTORS}
+        matrices = {name: getattr(self, name)[..., rows, rows] for name in _MATRICES}
+        return Sums.of(**vectors, **matrices, frames=self.frames, matches=self.matches)
 
     @staticmethod
     def stack(parts: Sequence[Sums]) -> Sums:
         """The sums along a new first axis."""
-        return Sums(*map(np.array, zip(*(vars(part).values() for part in parts), strict=True)))
+        return Sums(np.array([part.packed for part in parts]))
 
     def copy(self) -> Sums:
         """The same, to be filled in."""
-        return Sums(*map(np.copy, vars(self).values()))
+        return Sums(self.packed.copy())
+
+    def change(self, **values: Array) -> Sums:
+        """The sums with other values of some properties."""
+        found = self.copy()
+        for name, value in values.items():
+            getattr(found, name)[...] = value
+        return found
 
     def __add__(self, other: Sums) -> Sums:
-        return Sums(*map(np.add, vars(self).values(), vars(other).values()))
+        return Sums(self.packed + other.packed)
 
     def __mul__(self, weight: Array) -> Sums:
         """All of them times (...) weights."""
-        return Sums(
-            *(
-                values * np.reshape(weight, (*np.shape(weight), *[1] * own))
-                for values, own in zip(vars(self).values(), _AXES, strict=True)
-            )
-        )
+        return Sums(self.packed * np.asarray(weight)[..., None])
 
     def __getitem__(self, index: Any) -> Sums:
         """A part of the leading axes."""
-        return Sums(*(values[index] for values in vars(self).values()))
+        return Sums(self.packed[index])
 
     def replace_at(self, index: Any, item: Sums) -> Sums:
         """The sums with a part of the leading axes replaced."""
         found = self.copy()
-        for values, new in zip(vars(found).values(), vars(item).values(), strict=True):
-            values[index] = new
+        found.packed[index] = item.packed
         return found
 
     def total(self) -> Sums:
         """The sum over the first axis."""
-        return Sums(*(values.sum(axis=0) for values in vars(self).values()))
+        return Sums(self.packed.sum(axis=0))
 
     def shift_reference(self, steps: Array) -> Sums:
         """The sums about references that are moved by (..., d) tangent steps."""
         moved = (self.hessian @ steps[..., None])[..., 0]
-        return replace(self, gradient=self.gradient + moved)
+        return self.change(gradient=self.gradient + moved)
 
     def after_walk(self, variance: Array, overconfidence: Array | float) -> tuple[Sums, Array]:
         """The sums after a random walk, and (...) which share of them is left.
@@ -145,13 +183,19 @@ class Sums:
         hessian, back = gain @ self.hessian, gain.swapaxes(-1, -2)
         hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
         kept = np.trace(gain[..., :_POSE, :_POSE], axis1=-2, axis2=-1) / _POSE
-        walked = replace(
-            self * kept,
+        walked = (self * kept).change(
             hessian=hessian,
             gradient=(gain @ self.gradient[..., None])[..., 0],
             scatter=gain @ self.scatter @ back + hessian * variance[..., None, :] @ hessian,
         )
         return walked, kept
+
+    @property
+    def are_determined(self) -> NDArray[np.bool_]:
+        """(...) whether all directions of the pose are."""
+        hessians = self.pose.hessian
+        values = smallest_scaled_eigenvalues(hessians.reshape(-1, _POSE, _POSE))
+        return (values > _LEAST_EIGENVALUE).reshape(hessians.shape[:-2])
 
     def step(self, camera: int) -> Array | None:
         """(6,) from a camera's reference to the minimum of its sums; None if undetermined."""
@@ -173,62 +217,6 @@ def is_determined(hessian: Array) -> bool:
 def step_between(one: gtsam.Pose3, two: gtsam.Pose3) -> Array:
     """(6,) tangent step from one T_lidar_camera to another."""
     return np.asarray(one.localCoordinates(two))
-
-
-@dataclass(frozen=True, eq=False)
-class Gated:
-    """One frame's matches of a camera, gated at a T_lidar_camera.
-
-    Attributes:
-        residuals: of all of them, there.
-        inliers: (m,) which of them are within the gate.
-        sums: of these.
-    """
-
-    residuals: BlockResiduals
-    inliers: NDArray[np.bool_]
-    sums: Sums
-
-    @property
-    def used(self) -> int:
-        """How many are within the gate."""
-        return int(self.sums.matches)
-
-    @staticmethod
-    def at(
-        T_lidar_camera: gtsam.Pose3,
-        raw: CameraBlock,
-        scale: ResidualScale,
-        reference: gtsam.Pose3,
-        *,
-        even: bool = False,
-    ) -> Gated | None:
-        """The matches near the minimum; None if too few are within the gate.
-
-        Args:
-            T_lidar_camera: where they are linearized.
-            raw: all of them.
-            scale: of the residuals.
-            reference: T_lidar_camera at which the gradient is taken.
-            even: let the true Hessian be a multiple of that by weights. A time offset shows by
-                differences of frames, in which the scatter of true Hessians would count.
-        """
-        residuals = raw.at(to_T_camera_lidar(T_lidar_camera))
-        inliers = residuals.inliers(scale)
-        if np.count_nonzero(inliers) < MIN_MATCHES:
-            return None
-        pose = residuals.T_lidar_camera
-        block = raw.select(inliers).with_scale(scale)
-        here = block.sums(pose)
-        hessian = robust_hessian(block, pose) + residuals.gate_hessian(scale)
-        if even:
-            share = np.trace(np.linalg.solve(here.hessian + WEAK, hessian)) / _POSE
-            hessian = float(np.clip(share, *_SHARES)) * here.hessian
-        gradient = here.gradient + hessian @ step_between(pose, reference)
-        scatter = np.outer(here.gradient, here.gradient)
-        counts = np.array(1.0), np.array(float(len(block)))
-        sums = Sums(hessian, gradient, here.hessian, here.gradient, scatter, *counts)
-        return Gated(residuals, inliers, sums)
 
 
 def equation_5(
@@ -263,5 +251,5 @@ def sums_of_matches(
 ) -> Sums:
     """Hessian by their weights, and gradient at a reference, of matches in and out of the gate."""
     here = block.with_scale(scale).sums(T_lidar_camera)
-    sums = replace(Sums.zeros(), hessian=here.hessian, gradient=here.gradient)
+    sums = Sums.zeros().change(hessian=here.hessian, gradient=here.gradient)
     return sums.shift_reference(step_between(T_lidar_camera, reference))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import gtsam
@@ -15,37 +16,34 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.shared_error import with_common_error
 from calibgraph.tracking.absorption import (
     absorb,
     at_minimum,
+    begin_frame,
     blocks_by_camera,
     count_absent,
     select_agreeing,
-    with_open_frame,
-    with_poses,
 )
 from calibgraph.tracking.assessment import Assessment, assess, to_calibration
 from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
-from calibgraph.tracking.epochs import at_offsets, close_epoch
+from calibgraph.tracking.epochs import at_explaining_offsets, close_epoch
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.frame_group import Blocks, usual_frames
 from calibgraph.tracking.frame_order import (
-    PLACE,
-    number_and_stamp,
-    with_metadata_per_frame,
+    Incoming,
+    incoming,
+    unsolvable,
     with_place,
     without_repeats,
 )
-from calibgraph.tracking.live_frames import LiveFrame
-from calibgraph.tracking.offset_search import explaining_offsets, follow
-from calibgraph.tracking.offsets import delayed, with_motion_in_use
+from calibgraph.tracking.frozen import replace
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.step_detection import detect_small_step, detect_step
-from calibgraph.tracking.update import Update, make_update
+from calibgraph.tracking.stream_tables import StreamFrame
+from calibgraph.tracking.update import Update, make_updates
 
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
 
@@ -54,8 +52,8 @@ class IncrementalCalibrator:
     """All cameras' extrinsics, updated frame by frame.
 
     Each frame costs the same, however many came before: live epochs keep their matches, older ones
-    are a summary of constant size, a quadratic about the estimate at the time (true Hessian, so the
-    next order is the third), with the gate of that time. All else is as in a batch.
+    are a quadratic about the estimate at the time (true Hessian, so the next order is the third),
+    with the gate of that time. All else is as in a batch.
 
     Args:
         rig: cameras with their initial guess, and independently known relative poses.
@@ -64,10 +62,9 @@ class IncrementalCalibrator:
 
     _state: State
     _epoch_start: State
-    _since_epoch_start: list[tuple[int, Correspondences]]
-
-    _assessed: tuple[State, Assessment] | None = None
+    _since_epoch_start: list[tuple[Incoming, ...]]
     _closed: ClosedPlaces
+    _assessed: tuple[State, Assessment] | None = None
 
     def __init__(self, rig: Rig, config: Config | None = None) -> None:
         self._resume(State.initial(rig, config or Config()))
@@ -111,9 +108,8 @@ class IncrementalCalibrator:
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """The graph whose optimum and marginal are reported, as :meth:`Solution.graph`.
 
-        Its variables are those of ``calibgraph.graph.variables``. Places that no frame of the open
-        epoch is of are one factor. With a preset of the paper it is Eq. 5, whose optimum alone is
-        reported.
+        Its variables are those of ``calibgraph.graph.variables``; places that no frame of the open
+        epoch is of are one factor. With a preset of the paper it is Eq. 5, without its marginal.
         """
         if self.config.preset != "auto":
             return self._closed.equation_5(self._state)
@@ -137,78 +133,99 @@ class IncrementalCalibrator:
                 have, a frame that does not come after the last one, or wrong metadata. Nothing has
                 changed then.
         """
-        table = with_common_error(table, self._state.config)
-        if len(table):
-            known = self._state.knows_motion
-            table = with_motion_in_use(self._state.rig, self._state.config, table, known)
-        table = with_metadata_per_frame(with_place(table, place))
-        number, stamp = number_and_stamp(table, frame, self._state)
-        new = without_repeats(self._state, table)
+        one = incoming(self._state, with_place(table, place), frame)
+        new = without_repeats(self._state, one.table)
         blocks = blocks_by_camera(self._state, new)
+        with self._undone_on_error([one]):
+            return self._take(one, new, blocks)
+
+    def update_together(self, frames: Sequence[StreamFrame]) -> list[Update]:
+        """Take in the first of some frames at once: one solve, one assessment.
+
+        As many as show nothing unusual, up to the end of an epoch. All their updates have the
+        estimate after the last of them. None is taken in if the first needs :meth:`update`.
+        """
+        group, blocks = usual_frames(self._state, frames)
+        if not group:
+            return []
+        try:
+            with self._undone_on_error(group):
+                return self._take_together(group, blocks)
+        except CorrespondenceError:  # of one of them
+            return []
+
+    @contextmanager
+    def _undone_on_error(self, frames: Sequence[Incoming]) -> Iterator[None]:
+        """Frames are taken in inside; after an error of any kind nothing of them remains."""
         start, since = self._epoch_start, list(self._since_epoch_start)
         try:
-            self._begin_frame(number, stamp, table)
-            return self._take(new, blocks)
-        except BaseException as error:  # of any kind: nothing of the frame must remain
+            for one in frames:
+                self._state = begin_frame(self._state, one)
+            self._since_epoch_start.append(tuple(frames))
+            yield
+        except BaseException as error:
             self._resume(start)
-            for earlier, its_table in since:
-                self.update(its_table, frame=earlier)
+            for earlier in since:
+                self._repeat(earlier)
             if isinstance(error, _UNSOLVABLE):
-                raise CorrespondenceError(
-                    f"frame {number}: with its matches the estimate cannot be solved for "
-                    f"({str(error).strip().splitlines()[0]}); it is left out",
-                    frame=number,
-                ) from error
+                raise unsolvable(frames[0].number, error) from error
             raise
 
-    def _begin_frame(self, number: int, stamp: int | None, table: Correspondences) -> None:
-        self._since_epoch_start.append((number, table))
-        state = self._state
-        place = table.metadata.get(PLACE, "")
-        state = replace(
-            state,
-            frame=number,
-            stamp_ns=state.stamp_ns if stamp is None else stamp,
-            updates=state.updates + 1,
-            findings=table.findings if len(table) else state.findings,
-        )
-        in_time = state.offsets is not None
-        frame = LiveFrame.empty(number, len(state.names), place, in_time=in_time)
-        self._state = with_open_frame(state, frame)
+    def _repeat(self, frames: Sequence[Incoming]) -> None:
+        """Take in again what has been taken in at once."""
+        again = [StreamFrame(one.number, one.table) for one in frames]
+        if len(again) == 1:
+            self.update(again[0].table, frame=again[0].frame)
+        elif len(self.update_together(again)) < len(frames):
+            raise StateError("has frames that do not go together")
 
-    def _take(self, table: Correspondences, blocks: dict[int, CameraBlock]) -> Update:
+    def _take(self, one: Incoming, table: Correspondences, blocks: Blocks) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
-        blocks = self._at_explaining_offsets(blocks)
+        sums = self._closed.all_sums(self._state)
+        state, blocks = at_explaining_offsets(self._state, sums, blocks)
+        if state is not self._state:
+            self._state = state
+            self._rebuild()
         self._state, agreeing = select_agreeing(self._state, self._closed, blocks)
-        self._state, used = absorb(self._state, self._closed, agreeing)
+        self._state, (used,) = absorb(self._state, self._closed, agreeing)
         self._state, events = start_cameras(self._state, table, blocks)
         if events:
             self._rebuild()
-        self._state, seen = count_absent(self._state, used)
-        events += seen + self._restart_after_step()
-        self._refine()
-        if len(self._state.epochs[-1].frames) >= self._state.config.tracking.epoch_frames:
-            events += self._close_epoch()
-        return make_update(self._state, self._assess(), tuple(events), used)
+        self._state, seen = count_absent(self._state, used, one)
+        detected = detect_step(self._state)
+        if detected is not None:  # moved so far that frames disagree with the estimate
+            self._state, moved = restart_after_step(self._state, detected)
+            self._rebuild()
+            seen += moved
+        events += seen + self._end_frames(1)
+        (update,) = make_updates(self._state, self._assess(), [(one, events, used)])
+        return update
 
-    def _at_explaining_offsets(self, blocks: dict[int, CameraBlock]) -> dict[int, CameraBlock]:
-        """The blocks, and the state, at the time offsets with which they agree."""
-        before, sums = self._state.offsets, self._closed.all_sums(self._state)
-        offsets = explaining_offsets(self._state, sums, blocks)
-        if offsets is None or before is None:
-            return blocks
-        state = with_poses(self._state, follow(self._state, sums, offsets))
-        self._state = replace(at_offsets(state, offsets), optimum=None)
-        self._rebuild()
-        later_s = offsets.values_s - before.values_s
-        return {camera: delayed(block, later_s[camera]) for camera, block in blocks.items()}
+    def _take_together(self, group: Sequence[Incoming], blocks: Blocks) -> list[Update]:
+        """Absorb frames that all agree with the estimates."""
+        self._state, used = absorb(self._state, self._closed, blocks, len(group))
+        taken = []
+        for one, own in zip(group, used, strict=True):
+            self._state, events = count_absent(self._state, own, one)
+            taken.append((one, events, own))
+        taken[-1][1].extend(self._end_frames(len(group)))
+        return make_updates(self._state, self._assess(), taken)
 
-    def _refine(self) -> None:
+    def _end_frames(self, count: int) -> list[Event]:
+        """The rest of the work of some frames, and the end of the epoch if they fill it."""
+        frames = len(self._state.epochs[-1].frames)
+        for step in range(frames - count + 1, frames + 1):
+            self._refine(step)
+        if frames < self._state.config.tracking.epoch_frames:
+            return []
+        return self._close_epoch(together=count > 1)
+
+    def _refine(self, step: int) -> None:
         """Do a part of the work that the end of an epoch has left to the frames after it."""
-        state, step = self._state, len(self._state.epochs[-1].frames)
+        state = self._state
         if self._closed.state.findings != state.findings:
-            self._closed = ClosedPlaces.of(state)
-        if step <= STEPS and len(state.epochs) > 1:
+            self._closed, state = ClosedPlaces.of(state), replace(state, is_refined=False)
+        if step <= STEPS and len(state.epochs) > 1 and not state.is_refined:
             self._state, self._closed = refine(state, self._closed, step)
 
     def _assess(self) -> Assessment:
@@ -234,8 +251,8 @@ class IncrementalCalibrator:
         try:
             tracker = IncrementalCalibrator(state.rig, state.config)
             tracker._resume(state)
-            for number, table in since:
-                tracker.update(table, frame=number)
+            for frames in since:
+                tracker._repeat(frames)
         except Exception as error:  # of any kind: parts of the state may contradict each other
             raise StateError(f"is no tracker's state ({in_words(error)})") from error
         return tracker
@@ -268,27 +285,16 @@ class IncrementalCalibrator:
         self._closed, self._assessed = closed or ClosedPlaces.of(self._state), None
         self._state = at_minimum(self._state, self._closed)
 
-    def _restart_after_step(self) -> list[Event]:
-        """Restart what has moved so far that frames disagree with the estimate."""
-        detected = detect_step(self._state)
-        if detected is None:
-            return []
-        self._state, events = restart_after_step(self._state, detected)
-        self._rebuild()
-        return list(events)
-
-    def _close_epoch(self) -> list[Event]:
+    def _close_epoch(self, *, together: bool) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, begin another."""
         state, offsets = self._state, self._state.offsets
         if self._assessed is not None:
             state = replace(state, optimum=self._assessed[1].newest(state.optimum))
             offsets = self._assessed[1].offsets(state)
-        if offsets is not None:
-            state = with_poses(state, follow(state, self._closed.all_sums(state), offsets))
-        self._state, events = close_epoch(state, offsets)
+        self._state, events = close_epoch(state, offsets, self._closed.all_sums(state))
         detected = detect_small_step(self._state)
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
             events += more
-        self._resume(*settle(self._state))
+        self._resume(*settle(self._state, together=together))
         return events

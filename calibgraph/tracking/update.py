@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +17,7 @@ from calibgraph.model.verdict import Verdict
 from calibgraph.report.as_json import finite
 from calibgraph.tracking.assessment import Assessment, covariance_by_camera
 from calibgraph.tracking.events import Event
+from calibgraph.tracking.frame_order import Incoming
 from calibgraph.tracking.state import State
 
 
@@ -49,55 +50,71 @@ class Update:
     lens: dict[str, tuple[LensEstimate, ...]] = field(default_factory=dict)
 
 
-def make_update(
+def make_updates(
     state: State,
     assessment: Assessment,
-    events: tuple[Event, ...],
-    used: Mapping[int, int],
-) -> Update:
-    """The update after the last frame of a state.
+    taken: Sequence[tuple[Incoming, Sequence[Event], Mapping[int, int]]],
+) -> list[Update]:
+    """The updates after the last frames of a state.
 
     Args:
-        state: after the frame.
+        state: after the frames.
         assessment: of its estimates.
-        events: detected with the frame.
-        used: per camera, by its place in the rig, how many matches were absorbed.
+        taken: the frames that were taken in at once; the events detected with each, and per camera,
+            by its place in the rig, how many of its matches were absorbed.
     """
     names = state.names
-    poses = map(to_T_camera_lidar, assessment.T_lidar_camera)
-    return Update(
-        frame=state.frame or 0,
-        stamp_ns=state.stamp_ns,
-        T_camera_lidar=dict(zip(names, poses, strict=True)),
-        covariance=covariance_by_camera(assessment, names),
-        verdicts=assessment.verdicts,
-        events=events,
-        used={names[camera]: count for camera, count in used.items()},
-        left_out=tuple(
-            name
-            for name, camera_state in zip(names, state.cameras, strict=True)
-            if camera_state.agreements[-1:] == ((state.frame, False),)
-        ),
-        lens=assessment.lens,
-    )
+    poses = dict(zip(names, map(to_T_camera_lidar, assessment.T_lidar_camera), strict=True))
+    covariance = covariance_by_camera(assessment, names)
+    last = {n: one.agreements[-1:] for n, one in zip(names, state.cameras, strict=True)}
+    return [
+        Update(
+            frame=one.number,
+            stamp_ns=one.stamp_ns,
+            T_camera_lidar=poses,
+            covariance=covariance,
+            verdicts=assessment.verdicts,
+            events=tuple(events),
+            used={names[camera]: count for camera, count in used.items()},
+            left_out=tuple(n for n in names if last[n] == ((one.number, False),)),
+            lens=assessment.lens,
+        )
+        for one, events, used in taken
+    ]
 
 
 def json_line(update: Update) -> str:
     """The update as one line of JSON; units are in the keys, matrices row by row."""
-    cameras = {name: _camera(update, name) for name in update.T_camera_lidar}
-    content = {
-        "frame": update.frame,
-        "stamp_ns": update.stamp_ns,
-        "cameras": cameras,
-        "events": [_event(event) for event in update.events],
-    }
+    return json_lines([update])[0]
+
+
+def json_lines(updates: Sequence[Update]) -> list[str]:
+    """A line of each update; what frames that were taken in at once share is encoded once."""
+    estimates: dict[int, dict[str, str]] = {}
+    lines = []
+    for update in updates:
+        shared = id(update.T_camera_lidar)
+        if shared not in estimates:
+            estimates[shared] = {name: _estimate(update, name) for name in update.T_camera_lidar}
+        cameras = ", ".join(
+            f"{_json(name)}: {{{text}, {_of_frame(update, name)}}}"
+            for name, text in estimates[shared].items()
+        )
+        head = f'"frame": {update.frame}, "stamp_ns": {_json(update.stamp_ns)}'
+        events = _json([_event(event) for event in update.events])
+        lines.append(f'{{{head}, "cameras": {{{cameras}}}, "events": {events}}}')
+    return lines
+
+
+def _json(content: Any) -> str:
     return json.dumps(finite(content), allow_nan=False)
 
 
-def _camera(update: Update, name: str) -> dict[str, Any]:
+def _estimate(update: Update, name: str) -> str:
+    """The members of a camera's object that hold for all frames."""
     covariance, verdict = update.covariance[name], update.verdicts[name]
     sigmas = None if covariance is None else np.sqrt(np.diag(covariance))
-    return {
+    content = {
         "T_camera_lidar": update.T_camera_lidar[name].tolist(),
         "covariance": None if covariance is None else covariance.tolist(),
         "rotation_sigma_deg": None if sigmas is None else np.degrees(sigmas[:3]).tolist(),
@@ -106,10 +123,14 @@ def _camera(update: Update, name: str) -> dict[str, Any]:
         "cannot_tell": verdict.cannot_tell,
         "reasons": list(verdict.reasons),
         "actions": list(summarize({name: verdict}).actions),
-        "used": update.used.get(name, 0),
-        "left_out": name in update.left_out,
         **{key: value for one in update.lens.get(name, ()) for key, value in _offset(one).items()},
     }
+    return _json(content)[1:-1]
+
+
+def _of_frame(update: Update, name: str) -> str:
+    """The other members."""
+    return f'"used": {update.used.get(name, 0)}, "left_out": {_json(name in update.left_out)}'
 
 
 def _offset(one: LensEstimate) -> dict[str, Any]:

@@ -51,7 +51,7 @@ class Window:
     def has_graph_of(self, model: LatentPoseModel, places: Sequence[str]) -> bool:
         """Whether a model has the variables and the held factors of this one."""
         same = self.model.pose_graph is model.pose_graph and self.places == tuple(places)
-        return same and [*self.model.matched_places()] == [*model.matched_places()]
+        return same and self.model.matched_places == model.matched_places
 
     def exchange(self, model: LatentPoseModel) -> None:
         """Put the errors and places of a model in the place of those before."""

@@ -197,6 +197,18 @@ class Evidence:
         joint = None if camera in self.solution.held else self.joint_covariance
         return self._block(joint, camera)
 
+    @property
+    def lens_covariance(self) -> dict[str, Array]:
+        """Per camera whose lens is estimated, (6 + k, 6 + k): the pose's part is ``covariance_of``.
+
+        What widens that beyond the solution's graph is not correlated with the lens.
+        """
+        found = self.solution.lens_covariance
+        for name, joint in found.items():
+            if (own := self.covariance_of(name)) is not None:
+                joint[:6, :6] = own
+        return found
+
     def _block(self, joint: Array | None, camera: str) -> Array | None:
         return None if joint is None else self._rows_of(joint, camera)
 

@@ -136,13 +136,35 @@ def test_a_repeated_round_names_what_is_estimated(truth: Rig) -> None:
             return put_clock_error(found, truth, twists, Clock(0.1))
 
     told: list[str] = []
-    match_in_rounds(
+    run = match_in_rounds(
         calibgraph.load_dataset(SAMPLE, truth),
         matcher=Late(),
         config=Config(estimate=("offset",)),
         progress=lambda what, *_: told.append(what),
     )
     assert told[:2] == ["matching", "matching (offset: repeat 1, at most 4)"]
+    assert not run.warnings
+
+
+def test_a_clock_that_does_not_settle_is_warned_of(truth: Rig) -> None:
+    """Every match is of another offset: four repeats, then a line."""
+    offsets_s = [0.0, 0.05, 0.1, 0.15, 0.2, 0.25]
+
+    class Restless(Minimal):
+        knows_motion = True
+
+        def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN202
+            twists = draw_twists(len(dataset.frames), np.random.default_rng(0))
+            return put_clock_error(simulate(dataset, truth), truth, twists, Clock(offsets_s.pop(0)))
+
+    run = match_in_rounds(
+        calibgraph.load_dataset(SAMPLE, truth),
+        matcher=Restless(),
+        config=Config(estimate=("offset",)),
+        progress=no_progress,
+    )
+    assert len(run.rounds) == 5
+    assert run.warnings[-1].startswith("offset: after 4 repeats of the matching still changes by")
 
 
 def test_a_minimal_matcher_calibrates(truth: Rig) -> None:

@@ -52,6 +52,8 @@ def test_a_result_has_files_a_report_and_exports(working: TestClient, solved: st
     assert report.text.startswith("<!DOCTYPE html>")
     assert "sandbox" in report.headers["content-security-policy"]
     assert b"<robot" in working.get(f"{at}/exports/urdf").content
+    infos = zipfile.ZipFile(io.BytesIO(working.get(f"{at}/exports/camera_info").content))
+    assert {name.removesuffix(".yaml") for name in infos.namelist()} == {"left", "right"}
     assert working.get(f"{at}/exports/nonsense").status_code == 404
 
 

@@ -17,6 +17,7 @@ from calibgraph.service.tracker_request import FramesTaken, Refusal, TrackerRequ
 from calibgraph.tracking import durable
 from calibgraph.tracking.history import History
 from calibgraph.tracking.state_database import StateDatabase
+from calibgraph.tracking.stream_tables import StreamFrame
 from tests.tracking.drives import as_lines, drive, expected_lines, pair_of
 
 GUESS = perturb(pair_of(), rotation_deg=1, translation_m=0.1, seed=1)
@@ -63,7 +64,7 @@ def writes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.parametrize(
     ("frames", "seconds", "sizes"),
-    [(50, 1e9, [14]), (5, 1e9, [5, 5, 4]), (7, 1e9, [7, 7]), (50, 0.0, [1] * 14)],
+    [(50, 1e9, [7]), (5, 1e9, [5, 1, 1]), (7, 1e9, [6, 2]), (50, 0.0, [6, 1])],
 )
 def test_a_write_ends_after_some_frames_or_some_time(  # noqa: PLR0913
     trackers: _Trackers, tables: list[Correspondences], writes: list[int],
@@ -73,8 +74,9 @@ def test_a_write_ends_after_some_frames_or_some_time(  # noqa: PLR0913
     monkeypatch.setattr(open_tracker, "_WRITE_FRAMES", frames)
     monkeypatch.setattr(open_tracker, "_WRITE_S", seconds)
     found = updates_in(send(trackers, tmp_path / "car", tables))
-    assert found == [json.loads(line) for line in expected_lines(GUESS, tables)]
-    assert writes == sizes
+    lines = expected_lines(GUESS, tables, together=min(frames, 10))
+    assert found == [json.loads(line) for line in lines]
+    assert writes == sizes  # of inputs: the first frames one by one, then those of an epoch
 
 
 def test_a_kill_in_a_long_request_leaves_its_earlier_writes_and_a_short_repetition(
@@ -86,15 +88,15 @@ def test_a_kill_in_a_long_request_leaves_its_earlier_writes_and_a_short_repetiti
     """Writes of two frames, and a snapshot that is due after two: 12 are on disk at the 14th."""
     monkeypatch.setattr(open_tracker, "_WRITE_FRAMES", 2)
     monkeypatch.setattr(durable, "_SNAPSHOT_EVERY", 2)
-    update, copy = DurableCalibrator.update, tmp_path / "killed"
+    update, copy = DurableCalibrator.update_together, tmp_path / "killed"
 
-    def copied(calibrator: DurableCalibrator, table: Correspondences, **options: Any) -> Any:
-        if options["frame"] == tables[-1].frame[0]:
+    def copied(calibrator: DurableCalibrator, frames: list[StreamFrame]) -> Any:
+        if frames[-1].frame == tables[-1].frame[0]:
             shutil.copytree(tmp_path / "car" / STATE, copy)
-        return update(calibrator, table, **options)
+        return update(calibrator, frames)
 
     with monkeypatch.context() as patch:
-        patch.setattr(DurableCalibrator, "update", copied)
+        patch.setattr(DurableCalibrator, "update_together", copied)
         assert len(updates_in(send(trackers, tmp_path / "car", tables))) == len(tables)
     with DurableCalibrator(copy, GUESS) as resumed:
         assert resumed.tracker.frame == tables[11].frame[0]
@@ -116,6 +118,7 @@ def test_an_error_keeps_the_frames_before_it_with_plot_and_events(
 
     with monkeypatch.context() as patch:
         patch.setattr(DurableCalibrator, "update", broken)
+        patch.setattr(DurableCalibrator, "update_together", lambda *_: [])
         answer = send(trackers, car, tables)
     assert answer == Refusal(422, "singular matrix")
     lines = expected_lines(GUESS, tables)
@@ -125,6 +128,7 @@ def test_an_error_keeps_the_frames_before_it_with_plot_and_events(
     assert len(History.load(car / open_tracker.HISTORY)) == 9
     answer = send(trackers, car, tables)
     assert json.loads(answer.body)["known"] == 9
+    lines = expected_lines(GUESS, *([table] for table in tables[:10]), tables[10:], together=10)
     assert updates_in(answer) == [json.loads(line) for line in lines[9:]]
     trackers.close()
     assert len(History.load(car / open_tracker.HISTORY)) == len(tables)

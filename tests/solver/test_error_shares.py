@@ -91,7 +91,7 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
     shown = np.einsum("pn,pnij->ij", parts.distortion_weight, parts.distortion_information)
     rows = starts[DISTORTION] + np.arange(3)
     information[np.ix_(rows, rows)] += shown
-    for number, (place, camera) in enumerate(model.matched_places()):
+    for number, (place, camera) in enumerate(model.matched_places):
         edge = model.place_graph.at(model.places + number)
         root = edge.noiseModel().R()
         whitened, _ = edge.linearize(linear.values).jacobian()

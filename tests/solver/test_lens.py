@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calibgraph import Config, MatcherErrors, Rig, preset, simulate_correspondences, solve
+from calibgraph import (
+    Config,
+    MatcherErrors,
+    Rig,
+    load_calibration,
+    preset,
+    simulate_correspondences,
+    solve,
+)
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.graph.lens import LensSigmas, LensVariable
 from calibgraph.graph.variables import aligned_key, body_key, lens_key
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import twist_between
+from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import IntrinsicsSigma
+from calibgraph.report.as_json import result_summary
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.lens import lens_estimates
@@ -24,6 +35,7 @@ from tests.draws.lenses import put_lens_error
 from tests.solver.test_elimination import STATED
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
+ORDERS_OF = {"fisheye": ("k1", "k2", "k3", "k4"), "omni": ("xi", "k1", "k2", "p1", "p2")}
 FIVE_SIGMAS = 5.0  # one of 3 million
 
 
@@ -208,6 +220,94 @@ def test_the_rig_gets_the_lens_and_without_the_flag_keeps_its_own(
         assert camera.intrinsics_px.fx == pytest.approx(found.lens[name][0].value, rel=1e-9)
         assert found.initial_rig.cameras[name] == wrong.cameras[name]
         assert "uncertain lenses and clocks" in found.error_sources[name].translation
+
+
+@pytest.mark.parametrize("name", ["fisheye", "omni"])
+def test_lenses_that_see_all_round_are_estimated(name: str) -> None:
+    """Focal length and k1 wrong at once; xi of a unified lens stays."""
+    camera, first = next(iter(rig_of(name).cameras.items()))
+    truth = Rig(cameras={camera: first})
+    table = simulate_correspondences(truth, frames=10, matches=150, errors=ERRORS, seed=0)
+    wrong = put_lens_error(put_lens_error(truth, "focal", 0.01), "distortion", 0.02)
+    before = solve_joint(wrong, table)
+    after = solve_joint(wrong, table, Config(estimate="focal,distortion"))
+    worst = [max(squared_errors(found, truth)) for found in (before, after)]
+    assert worst[1] < chi2.isf(1e-6, 6) < worst[0]
+    for camera, estimates in after.lens.items():
+        right, found = truth.cameras[camera], after.solved_rig.cameras[camera]
+        coefficients = dict(zip(ORDERS_OF[name], right.distortion, strict=True))
+        values = {"focal": right.intrinsics_px.fx, **coefficients}
+        for one in estimates:
+            assert abs(one.value - values[one.name]) < FIVE_SIGMAS * one.sigma
+        assert estimates[0].is_determined and estimates[1].is_determined
+        if name == "omni":
+            assert found.distortion[0] == right.distortion[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "needed"),
+    [
+        ("focal", "record several distances, towards the corners, too"),
+        ("aspect", "record near things at the sides, above and below"),
+        ("centre_y", "record near and far things over the whole image"),
+        ("k1", "record matches near the corners of the image"),
+        ("p2", "record matches near the corners of the image"),
+        ("readout", "record turns and changes of speed"),
+    ],
+)
+def test_what_is_not_determined_names_what_to_record(name: str, needed: str) -> None:
+    one = LensEstimate(name, "", 1.0, 0.1, 1.0, 0.1, "z", 0.5)
+    assert one.describe() == f"not determined by these data; {needed}; with z 0.50"
+    assert replace(one, sigma=0.01).describe() == "with z 0.50"
+
+
+def test_the_rig_states_how_well_its_new_lens_is_known(
+    drawn: tuple[Rig, Correspondences],
+) -> None:
+    truth, table = drawn
+    found = solve(truth, table, Config(estimate="lens"))
+    for name, estimates in found.lens.items():
+        sigmas = {one.name: one.sigma for one in estimates}
+        camera, before = found.rig.cameras[name], found.initial_rig.cameras[name]
+        assert camera.intrinsics_sigma_px is not None and before.intrinsics_sigma_px is None
+        assert camera.intrinsics_sigma_px.focal == pytest.approx(sigmas["focal"], rel=1e-9)
+        centre = max(sigmas["centre_x"], sigmas["centre_y"])
+        assert camera.intrinsics_sigma_px.centre == centre
+        assert camera.distortion_sigma == max(sigmas["k1"], sigmas["k2"])
+        assert camera.time_offset_sigma_s is None
+    next_prior = LensVariable.of(found.rig.cameras["image_2"], ("focal",)).free.sigmas
+    focal = found.lens["image_2"][0]
+    assert next_prior[0] == pytest.approx(focal.sigma / focal.value, rel=1e-9)
+
+
+def test_the_joint_covariance_of_pose_and_lens_is_kept(
+    drawn: tuple[Rig, Correspondences], tmp_path: Path
+) -> None:
+    """Its blocks are those that are reported, and a longer lens moves the pose as it says."""
+    truth, table = drawn
+    found = solve(truth, table, Config(estimate=("focal",)))
+    found.save(tmp_path)
+    written, summary = load_calibration(tmp_path), result_summary(found, [])
+    longer = found.rig
+    for name, joint in found.lens_covariance.items():
+        assert joint.shape == (7, 7)
+        np.testing.assert_array_equal(joint[:6, :6], found.covariance[name])
+        assert joint[6, 6] ** 0.5 == pytest.approx(found.lens[name][0].sigma, rel=1e-9)
+        assert np.linalg.eigvalsh(joint / np.sqrt(np.outer(np.diag(joint), np.diag(joint))))[0] > 0
+        np.testing.assert_array_equal(written.lens_covariance[name], joint)
+        of_json = summary["cameras"][name]["lens_covariance"]
+        assert of_json["parameters"][5:] == ["translation_z_m", "focal_px"]
+        assert of_json["covariance"] == joint.tolist()
+        camera = longer.cameras[name]
+        share = 1.0 + 2.0 / camera.intrinsics_px.fx
+        intrinsics = {key: share * getattr(camera.intrinsics_px, key) for key in ("fx", "fy")}
+        moved = camera.intrinsics_px.model_copy(update=intrinsics)
+        cameras = {**longer.cameras, name: camera.model_copy(update={"intrinsics_px": moved})}
+        longer = longer.model_copy(update={"cameras": cameras})
+    fixed = solve(longer, table)
+    for name, joint in found.lens_covariance.items():
+        ahead_m = twist_between(fixed.T_camera_lidar[name], found.T_camera_lidar[name])[5]
+        assert ahead_m == pytest.approx(2.0 * joint[5, 6] / joint[6, 6], rel=0.1)
 
 
 def test_a_result_is_a_rig_whose_lens_is_the_mean_of_the_next_prior(

@@ -24,6 +24,7 @@ from tests.tracking.drives import (
     World,
     drive,
     expected_lines,
+    file_lines,
     pair_of,
 )
 
@@ -36,8 +37,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     guess.save(folder / "rig.yaml")
     guess = load_rig(folder / "rig.yaml")
     concatenate(tables).save(folder / "matches.parquet")
-    lines = expected_lines(guess, tables)
-    return World(guess, folder / "rig.yaml", folder / "matches.parquet", tables, lines)
+    lines, of_file = expected_lines(guess, tables), file_lines(guess, tables)
+    return World(guess, folder / "rig.yaml", folder / "matches.parquet", tables, lines, of_file)
 
 
 @pytest.fixture

@@ -18,6 +18,8 @@ from calibgraph import (
     MatcherErrors,
     Rig,
 )
+from calibgraph.tracking.frame_group import in_groups, update_all
+from calibgraph.tracking.stream_tables import StreamFrame
 from calibgraph.tracking.update import json_line
 from tests.conftest import make_camera
 from tests.draws.drives import simulate_drive
@@ -70,9 +72,21 @@ def as_lines(tables: Sequence[Correspondences]) -> bytes:
     return b"".join(json.dumps(content_of(table)).encode() + b"\n" for table in tables)
 
 
-def expected_lines(rig: Rig, tables: Sequence[Correspondences]) -> list[str]:
-    tracker = IncrementalCalibrator(rig)
-    return [json_line(tracker.update(table)) for table in tables]
+def expected_lines(rig: Rig, *parts: Sequence[Correspondences], together: int = 1) -> list[str]:
+    """Of frames one by one, or of some runs over tables, as ``track`` reads them."""
+    tracker, lines = IncrementalCalibrator(rig), list[str]()
+    for tables in parts:
+        frames = [StreamFrame(int(table.frame[0]), table) for table in tables]
+        for group in in_groups(frames, together):
+            assert isinstance(group, list)
+            for updates in update_all(tracker, group):
+                assert isinstance(updates, list)
+                lines += map(json_line, updates)
+    return lines
+
+
+def file_lines(rig: Rig, *parts: Sequence[Correspondences]) -> list[str]:
+    return expected_lines(rig, *parts, together=50)
 
 
 def frames_in(out: str) -> list[int]:
@@ -92,6 +106,7 @@ class World:
     source: Path
     tables: list[Correspondences]
     lines: list[str]
+    file_lines: list[str]  # of whole files, whose frames come together
 
 
 def files_in(folder: Path) -> dict[str, bytes]:

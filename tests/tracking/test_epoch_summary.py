@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from calibgraph.tracking.epoch_summary import STRENGTHS, EpochSummary
@@ -16,8 +14,7 @@ def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
     """H'^-1 B' H'^-1 = H^-1 B H^-1 + Q, whatever the gain."""
     rng = np.random.default_rng(0)
     A, C = rng.standard_normal((2, 6, 6))
-    epoch = replace(
-        Sums.zeros(),
+    epoch = Sums.zeros().change(
         hessian=A @ A.T + np.eye(6),
         gradient=rng.standard_normal(6),
         scatter=C @ C.T,

@@ -189,7 +189,15 @@ def sums_of(rng: np.random.Generator, frames: int) -> Sums:
     hessian, gradient = A @ A.swapaxes(1, 2), rng.normal(size=(frames, 6))
     scatter = gradient[:, :, None] * gradient[:, None, :]
     ones = np.ones(frames)
-    return Sums(hessian, gradient, hessian, gradient, scatter, ones, ones)
+    return Sums.of(
+        hessian=hessian,
+        gradient=gradient,
+        reweighted=hessian,
+        score=gradient,
+        scatter=scatter,
+        frames=ones,
+        matches=ones,
+    )
 
 
 def test_an_offset_is_a_move_by_the_twist() -> None:

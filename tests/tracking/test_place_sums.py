@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -19,14 +17,14 @@ def part(name: str, seed: int, frames: int = 3) -> dict[str, Sums]:
     roots, scores = rng.standard_normal((2, 6, 6)), rng.standard_normal((frames, 2, 6))
     hessian = roots @ roots.swapaxes(1, 2)
     return {
-        name: Sums(
-            hessian,
-            rng.standard_normal((2, 6)),
-            hessian,
-            scores.sum(axis=0),
-            np.einsum("fni,fnj->nij", scores, scores),
-            np.full(2, float(frames)),
-            np.full(2, 100.0 * frames),
+        name: Sums.of(
+            hessian=hessian,
+            gradient=rng.standard_normal((2, 6)),
+            reweighted=hessian,
+            score=scores.sum(axis=0),
+            scatter=np.einsum("fni,fnj->nij", scores, scores),
+            frames=np.full(2, float(frames)),
+            matches=np.full(2, 100.0 * frames),
         )
     }
 
@@ -87,7 +85,7 @@ def test_what_a_drift_leaves_is_of_one_place(name: str) -> None:
     """The drift discounts the sums, of which none are kept place by place."""
     sums = sums_of(part("a", 0), part("b", 1))
     none, scatter = Sums.zeros(), 3 * np.eye(6)
-    held = replace(none, hessian=2 * np.eye(6), scatter=scatter, frames=np.array(7.5))
+    held = none.change(hessian=2 * np.eye(6), scatter=scatter, frames=np.array(7.5))
     found = sums.with_camera_at(name, 1, held)
     row = found.names.index(name)
     np.testing.assert_array_equal(

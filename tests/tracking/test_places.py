@@ -205,7 +205,7 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     rig = pair_of()
     tracker = IncrementalCalibrator(rig, Config(of="mount"))
     tracker.update(states(drive(rig, 1)[0], scan_motion_m=0.2))
-    sums = PlaceSums.empty(2).add({"a": replace(part("a", 0)["a"], gradient=np.zeros((2, 6)))})
+    sums = PlaceSums.empty(2).add({"a": part("a", 0)["a"].change(gradient=np.zeros((2, 6)))})
     spread = np.array([2.0 * np.eye(6), 3.0 * np.eye(6)])
     seen = FrameSpread(spread, np.ones(2))
     shifts = 0.1 * np.random.default_rng(0).normal(size=(2, 6, 3))

@@ -54,13 +54,13 @@ def test_a_file_that_is_no_saved_tracker_is_refused_in_one_line(pair: Rig, tmp_p
     IncrementalCalibrator(pair).save(path)
     data = path.read_bytes()
     head = data.index(b"\n") + 1
-    assert data[:head] == b"calibgraph-tracker-state/8\n"
+    assert data[:head] == b"calibgraph-tracker-state/9\n"
     for wrong, match in (
         (data[:-1], "is damaged: its checksum is wrong"),
         (data[:-9] + bytes(9), "is damaged: its checksum is wrong"),
         (data[:head], "is damaged: its checksum is wrong"),
-        (b"", "begins with '', expected 'calibgraph-tracker-state/8'"),
-        (b"calibgraph-tracker-state/9\n" + data[head:], "begins with 'calibgraph-tracker-state/9'"),
+        (b"", "begins with '', expected 'calibgraph-tracker-state/9'"),
+        (b"calibgraph-tracker-state/8\n" + data[head:], "begins with 'calibgraph-tracker-state/8'"),
         (b"calibgraph-tracker-file/1\n" + data[head:], "begins with 'calibgraph-tracker-file/1'"),
         (b"SQLite format 3\0" + bytes(100), "begins with 'SQLite format 3"),
     ):
@@ -73,7 +73,7 @@ def test_a_file_that_is_no_saved_tracker_is_refused_in_one_line(pair: Rig, tmp_p
 
 def sealed(body: bytes, kind: Kind = "state") -> bytes:
     """With the mark and the checksum of a whole file."""
-    return f"calibgraph-tracker-{kind}/8\n".encode() + sha256(body).digest() + body
+    return f"calibgraph-tracker-{kind}/9\n".encode() + sha256(body).digest() + body
 
 
 def array(dtype: str, shape: list[int], data: bytes) -> msgpack.ExtType:

@@ -123,7 +123,7 @@ def test_a_damaged_snapshot_is_replaced_by_the_one_before_and_the_inputs_since(
     assert (result.snapshot, len(result.inputs)) == (truth[: 3 * INPUT_BYTES], 5)
     assert held(result) == truth
     assert result.damages == (
-        f"{tmp_path / DATABASE}: the snapshot after update 6 is damaged: not used",
+        f"{tmp_path / DATABASE}: the snapshot after input 6 is damaged: not used",
     )
 
 
@@ -132,13 +132,13 @@ def test_a_damaged_snapshot_is_replaced_by_the_one_before_and_the_inputs_since(
     [
         ("UPDATE snapshot SET content = x'00'", "no snapshot has the right checksum"),
         ("UPDATE snapshot SET content = 'text'", "no snapshot has the right checksum"),
-        ("UPDATE journal SET content = x'00' WHERE number = 8", "update 8 is missing or has a"),
-        ("UPDATE journal SET digest = zeroblob(32) WHERE number = 7", "update 7 is missing or"),
-        ("UPDATE journal SET number = 9 WHERE number = 7", "update 7 is missing or has a wrong"),
-        ("DELETE FROM journal WHERE number = 7", "update 7 is missing or has a wrong checksum"),
+        ("UPDATE journal SET content = x'00' WHERE number = 8", "input 8 is missing or has a"),
+        ("UPDATE journal SET digest = zeroblob(32) WHERE number = 7", "input 7 is missing or"),
+        ("UPDATE journal SET number = 9 WHERE number = 7", "input 7 is missing or has a wrong"),
+        ("DELETE FROM journal WHERE number = 7", "input 7 is missing or has a wrong checksum"),
         ("DROP TABLE journal", "is damaged"),
         ("DELETE FROM status", "is damaged"),
-        ("UPDATE status SET number = 9", "update 9 is missing"),
+        ("UPDATE status SET number = 9", "input 9 is missing"),
         ("UPDATE status SET number = 7", "is damaged"),
     ],
 )

@@ -1,7 +1,6 @@
 """COLMAP's cameras.txt: lenses by number; its pixel (0.5, 0.5) is the centre of the first one."""
 
 import math
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from calibgraph.errors import FileError
@@ -11,32 +10,19 @@ from calibgraph.io.lenses import CameraLens, fitted_coefficients, listed_intrins
 from factors import LensModel
 
 _HALF_PIXEL = 0.5
-_Values = Sequence[float]
 _FIELDS = 4  # before the parameters: id, model, width, height
-
-
-def _one_focal(p: _Values) -> tuple[float, float, float, float]:
-    return p[0], p[0], p[1], p[2]
-
-
-def _two_focals(p: _Values) -> tuple[float, float, float, float]:
-    return p[0], p[1], p[2], p[3]
-
-
-_MODELS: dict[
-    str, tuple[int, LensModel, Callable[[_Values], tuple[float, float, float, float]], int]
-] = {
-    "SIMPLE_PINHOLE": (3, "pinhole", _one_focal, 3),
-    "PINHOLE": (4, "pinhole", _two_focals, 4),
-    "SIMPLE_RADIAL": (4, "pinhole", _one_focal, 3),
-    "RADIAL": (5, "pinhole", _one_focal, 3),
-    "OPENCV": (8, "pinhole", _two_focals, 4),
-    "FULL_OPENCV": (12, "pinhole", _two_focals, 4),
-    "OPENCV_FISHEYE": (8, "fisheye", _two_focals, 4),
-    "SIMPLE_RADIAL_FISHEYE": (4, "fisheye", _one_focal, 3),
-    "RADIAL_FISHEYE": (5, "fisheye", _one_focal, 3),
+_MODELS: dict[str, tuple[LensModel, int, int]] = {
+    "SIMPLE_PINHOLE": ("pinhole", 1, 0),
+    "PINHOLE": ("pinhole", 2, 0),
+    "SIMPLE_RADIAL": ("pinhole", 1, 1),
+    "RADIAL": ("pinhole", 1, 2),
+    "OPENCV": ("pinhole", 2, 4),
+    "FULL_OPENCV": ("pinhole", 2, 8),
+    "OPENCV_FISHEYE": ("fisheye", 2, 4),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, 1),
+    "RADIAL_FISHEYE": ("fisheye", 1, 2),
 }
-"""Per model: number of parameters, model here, its focal lengths and centre, their number."""
+"""Per model: that here, its number of focal lengths, and of coefficients after the centre."""
 
 
 def is_colmap(text: str) -> bool:
@@ -70,10 +56,12 @@ def _lens(words: list[str], path: Path, number: int) -> tuple[str, CameraLens]:
             path, f"{where}: lens model {name!r} is none of calibgraph's; of COLMAP's there are "
             f"{', '.join(_MODELS)}"
         )  # fmt: skip
-    count, model, intrinsics, start = _MODELS[name]
+    model, focals, distorted = _MODELS[name]
+    count = focals + 2 + distorted
     if len(values) != count or not all(math.isfinite(value) for value in values):
         raise FileError(path, f"{where}: {name} has {count} parameters, found {words[_FIELDS:]}")
-    fx, fy, cx, cy = intrinsics(values)
-    shifted = listed_intrinsics((fx, fy, cx - _HALF_PIXEL, cy - _HALF_PIXEL), f"{path}: {where}")
-    coefficients = fitted_coefficients(values[start:], model, path)
+    fx, fy = values[0], values[focals - 1]
+    cx, cy = (centre - _HALF_PIXEL for centre in values[focals : focals + 2])
+    shifted = listed_intrinsics((fx, fy, cx, cy), f"{path}: {where}")
+    coefficients = fitted_coefficients(values[focals + 2 :], model, path)
     return f"camera_{identity}", CameraLens(model, (width, height), shifted, coefficients)

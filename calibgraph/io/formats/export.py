@@ -6,9 +6,10 @@ from typing import Final
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.files import read_yaml, write_bytes, write_text
+from calibgraph.files import read_yaml, require_place_for_folder, write_bytes, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
 from calibgraph.io.formats.autoware import write_autoware
+from calibgraph.io.formats.camera_info import write_camera_infos
 from calibgraph.io.formats.documents import commented
 from calibgraph.io.formats.kalibr import write_kalibr
 from calibgraph.io.formats.koide import write_koide
@@ -29,7 +30,11 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Rig, rigid_transform
 from calibgraph.outputs import Output, require_writable
 
-WRITERS: Final[Mapping[str, Callable[[RigExport], str | bytes]]] = {
+Content = str | bytes
+Writer = Callable[[RigExport], Content | Mapping[str, Content]]
+"""Of one file, or of the files of a folder by name."""
+
+WRITERS: Final[Mapping[str, Writer]] = {
     "kalibr": write_kalibr,
     "ros1": write_ros1,
     "ros2": write_ros2,
@@ -40,12 +45,13 @@ WRITERS: Final[Mapping[str, Callable[[RigExport], str | bytes]]] = {
     "kitti": write_kitti,
     "nuscenes": write_nuscenes,
     "koide": write_koide,
+    "camera_info": write_camera_infos,
     "opencv": write_opencv,
     "npz": write_npz,
     "json": write_json,
 }
 _WITH_BASE = ("autoware", "nuscenes")
-_WITHOUT_COMMENTS = "kitti"
+_WITHOUT_COMMENTS, _FOLDER = "kitti", "camera_info"
 _MARKS = (b"calibgraph export", b"calibgraph_export")
 
 
@@ -64,7 +70,8 @@ def export_calibration(
 
     Args:
         source: a result or a rig, or the path of one.
-        path: the file to write. Only a file that was exported before is replaced.
+        path: the file to write, of ``camera_info`` the folder. Only a file that was exported before
+            is replaced.
         format: a name of ``calibgraph.io.formats.names.EXPORT_FORMATS``.
         cameras: names of those to write; all if None.
         lidar_frame: frame id of the LiDAR; the rig's name of it if None.
@@ -75,7 +82,8 @@ def export_calibration(
         even_if_failed: whether to write cameras whose verdict is FAIL.
 
     Returns:
-        The files: one, and for ``kitti``, which has no comments, a text file beside it.
+        The files: one, and for ``kitti``, which has no comments, a text file beside it; for
+        ``camera_info`` one of each camera.
 
     Raises:
         CalibrationError: if the verdict is FAIL, or the format or the file cannot hold it.
@@ -127,21 +135,35 @@ def _loaded(path: Path | str) -> Calibration | Rig:
 
 
 def outputs_of_export(path: Path, format: str) -> list[Output]:
-    """The file of an export, and for the format without comments a text file beside it."""
-    beside = [path.with_name(f"{path.stem}.direction.txt")] if format == _WITHOUT_COMMENTS else []
-    return [Output(file, "export", _MARKS) for file in (path, *beside)]
+    """The files of an export that its name tells, before cameras are known: none of a folder."""
+    if format == _FOLDER:
+        require_place_for_folder(path)
+        return []
+    beside = [_statement_of(path)] if format == _WITHOUT_COMMENTS else []
+    return _outputs((path, *beside))
+
+
+def _statement_of(path: Path) -> Path:
+    """Beside the file of a format without comments, one with its direction."""
+    return path.with_name(f"{path.stem}.direction.txt")
+
+
+def _outputs(files: Iterable[Path]) -> list[Output]:
+    return [Output(file, "export", _MARKS) for file in files]
 
 
 def _write(export: RigExport, path: Path, format: str) -> tuple[Path, ...]:
     """Write all files or, if one may not be replaced, none."""
-    outputs = outputs_of_export(path, format)
-    contents = [WRITERS[format](export)]
+    written = WRITERS[format](export)
+    contents = {path: written} if isinstance(written, (str, bytes)) else {
+        path / name: content for name, content in written.items()
+    }  # fmt: skip
     if format == _WITHOUT_COMMENTS:
-        contents.append(commented(kitti_statement(export)))
-    require_writable(outputs)
-    for output, content in zip(outputs, contents, strict=True):
+        contents[_statement_of(path)] = commented(kitti_statement(export))
+    require_writable(_outputs(contents))
+    for file, content in contents.items():
         if isinstance(content, bytes):
-            write_bytes(output.path, content)
+            write_bytes(file, content)
         else:
-            write_text(output.path, content)
-    return tuple(output.path for output in outputs)
+            write_text(file, content)
+    return tuple(contents)

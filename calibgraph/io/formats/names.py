@@ -14,6 +14,7 @@ EXPORT_FORMATS: Final[Mapping[str, str]] = {
     "kitti": "KITTI odometry's calib.txt: P0 to P3 and Tr",
     "nuscenes": "nuScenes' calibrated_sensor.json: sensor -> ego, quaternions w x y z",
     "koide": "koide3's calib.json (direct_visual_lidar_calibration): one camera, T_lidar_camera",
+    "camera_info": "folder of a ROS camera_info YAML per camera: lenses, no extrinsics",
     "opencv": "OpenCV FileStorage YAML: matrices, distortion, T_camera_lidar",
     "npz": "NumPy archive: T_camera_lidar, T_lidar_camera, lenses, covariance",
     "json": "plain JSON: T_camera_lidar, T_lidar_camera, lenses, covariance",

@@ -76,12 +76,17 @@ class RigExport:
             )
         return next(iter(self.cameras.items()))
 
+    @property
+    def origin(self) -> str:
+        """The first line of a comment: the mark of exports, and the verdict."""
+        verdict = f"verdict {self.verdict}" if self.verdict else "a rig file, without verdict"
+        return f"{EXPORT_MARK}; {verdict}"
+
     def statement(self, *direction: str) -> list[str]:
         """Lines for a comment: origin, direction, and a worked point of each camera."""
-        verdict = f"verdict {self.verdict}" if self.verdict else "a rig file, without verdict"
         frames = ", ".join(f"{name}: {frame}" for name, frame in self.optical_frames.items())
         lines = [
-            f"{EXPORT_MARK}; {verdict}",
+            self.origin,
             *direction,
             f"LiDAR frame: {self.lidar_frame}; optical frames: {frames}",
             AXES_SENTENCE,

@@ -42,10 +42,10 @@ def exported_text(path: Path) -> str:
 
 
 def test_each_format_has_a_meaning_a_writer_and_an_independent_reader() -> None:
-    assert set(EXPORT_FORMATS) == set(WRITERS) == set(READERS)
+    assert set(EXPORT_FORMATS) == set(WRITERS) == {*READERS, "camera_info"}  # has no extrinsics
 
 
-@pytest.mark.parametrize("format", WRITERS)
+@pytest.mark.parametrize("format", READERS)
 def test_an_independent_reader_finds_the_same_extrinsics(format: str, tmp_path: Path) -> None:
     rig = rig_for(format)
     path = tmp_path / f"file.{format if format == 'npz' else 'txt'}"
@@ -56,7 +56,7 @@ def test_an_independent_reader_finds_the_same_extrinsics(format: str, tmp_path: 
         np.testing.assert_allclose(found[name], T, atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("format", WRITERS)
+@pytest.mark.parametrize("format", READERS)
 def test_the_worked_point_proves_the_direction(format: str, tmp_path: Path) -> None:
     rig = rig_for(format)
     path = tmp_path / f"file.{format if format == 'npz' else 'txt'}"
@@ -246,7 +246,7 @@ def test_only_files_that_were_exported_before_are_replaced(tmp_path: Path) -> No
     with pytest.raises(FileError, match="would be replaced"):
         export_calibration(path, path, "kalibr")
     assert path.read_text() == before
-    for format in WRITERS.keys() - {"kitti", "koide"}:
+    for format in READERS.keys() - {"kitti", "koide"}:
         for _ in range(2):
             export_calibration(rig, tmp_path / f"again.{format}", format)
     export_calibration(rig, tmp_path / "calib.txt", "kitti")

@@ -1,0 +1,177 @@
+"""How far results of disjoint frames of one rig are apart, beside their error bars.
+
+    python -m benchmarks.accuracy.disjoint --halves kitti_places,05+06+07+08 --draws 6
+    python -m benchmarks.accuracy.disjoint --halves "" --pairs 05/06,05/07,06/07
+
+``--halves``: two random halves of a recording's frames, drawn ``--draws`` times. ``--pairs``: two
+recordings of one rig. No reference takes part, so that its own error does not count. Halves of few
+places share them, with the errors of a place: their difference is smaller than two recordings'.
+What all places share is in both error bars and in no difference, so that 1 is an upper limit.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from benchmarks.accuracy import ledger
+from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.scenes import Folders
+from benchmarks.tables import ROOT, Table, add_record_option
+from calibgraph import Calibration, calibrate, perturb
+from calibgraph.model.geometry import twist_between
+
+Array = NDArray[np.float64]
+
+START_DEG, START_M = 5.0, 0.3
+HALVES, PAIRS = "halves", "recordings"
+WITHIN_95 = float(chi2.ppf(0.95, 6)) / 6
+ALL = "all"
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """One camera's result.
+
+    Attributes:
+        T_camera_lidar: (4, 4).
+        covariance: (6, 6) rotation [rad] and translation [m] in the camera's axes.
+        status: its verdict.
+    """
+
+    T_camera_lidar: Array
+    covariance: Array
+    status: str
+
+
+def main() -> None:
+    """Run cases, print the table."""
+    options = parse_options()
+    halves = [
+        Key(HALVES, "random", name, seed)
+        for seed in range(options.first, options.first + options.draws)
+        for name in options.halves
+    ]
+    pairs = [Key(PAIRS, "each", pair, options.first) for pair in options.pairs]
+    runs = Runs(Folders(options.realdata, None))
+    records = ledger.records_of(options, [*halves, *pairs], runs)
+    ledger.publish_cases("accuracy.disjoint", [report(records)], records, record=options.record)
+
+
+def parse_options() -> argparse.Namespace:
+    """The options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    names: Callable[[str], list[str]] = lambda text: [*filter(None, text.split(","))]  # noqa: E731
+    parser.add_argument("--halves", type=names, default=["kitti_places", "00", "05+06+07+08"])
+    parser.add_argument("--pairs", type=names, default=["05/06", "05/07", "06/08", "07/08"])
+    parser.add_argument("--draws", type=int, default=6, help="of halves")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "disjoint.jsonl")
+    parser.add_argument("--summary", type=Path, help="print the table of a file, run nothing")
+    add_record_option(parser)
+    return parser.parse_args()
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Calibrates both parts of a case."""
+
+    folders: Folders
+
+    def __call__(self, case: Key) -> Record:
+        """The differences of all cameras that both parts have."""
+        if case.level == HALVES:
+            first, second = (_half_of(self.folders, case.data, case.seed, k) for k in range(2))
+        else:
+            first, second = (_whole(self.folders, name, case.seed) for name in case.data.split("/"))
+        both = [name for name in first if name in second]
+        return {"cameras": {name: difference(first[name], second[name]) for name in both}}
+
+
+def _half_of(folders: Folders, name: str, seed: int, which: int) -> dict[str, Estimate]:
+    data, _ = folders.load(name)
+    return _calibrate(folders, name, seed, rows=split(len(data.frames), seed)[which])
+
+
+@cache  # a recording is in several pairs
+def _whole(folders: Folders, name: str, seed: int) -> dict[str, Estimate]:
+    return _calibrate(folders, name, seed)
+
+
+def _calibrate(
+    folders: Folders, name: str, seed: int, rows: Sequence[int] | None = None
+) -> dict[str, Estimate]:
+    data, truth = folders.load(name)
+    frames = [data.frames[i] for i in (range(len(data.frames)) if rows is None else rows)]
+    guess = perturb(truth, rotation_deg=START_DEG, translation_m=START_M, seed=seed, uniform=True)
+    return estimates(calibrate(data.only(frames), guess))
+
+
+def estimates(result: Calibration) -> dict[str, Estimate]:
+    """The cameras that have an error bar."""
+    return {
+        name: Estimate(T, covariance, result.camera_verdicts[name].status)
+        for name, T in result.T_camera_lidar.items()
+        if (covariance := result.covariance.get(name)) is not None
+    }
+
+
+def split(count: int, seed: int) -> tuple[list[int], list[int]]:
+    """Two random halves of ``count`` frames, each in order; the second has the odd one."""
+    order = np.random.default_rng(seed).permutation(count)
+    return sorted(order[: count // 2].tolist()), sorted(order[count // 2 :].tolist())
+
+
+def difference(first: Estimate, second: Estimate) -> Record:
+    """The difference of two results: its size, and its square in the sum of their covariances."""
+    xi = twist_between(first.T_camera_lidar, second.T_camera_lidar)
+    squared = float(xi @ np.linalg.solve(first.covariance + second.covariance, xi)) / 6
+    return {
+        "difference_deg": float(np.degrees(np.linalg.norm(xi[:3]))),
+        "difference_cm": float(100 * np.linalg.norm(xi[3:])),
+        "normalised_squared": squared,
+        "statuses": [first.status, second.status],
+    }
+
+
+COLUMNS = (
+    "data", "cameras", "median [deg]", "[cm]", "largest [deg]", "[cm]",
+    "squared in its covariance, over 6", "in the 95 % region", "both PASS",
+)  # fmt: skip
+
+
+def report(records: Sequence[Record]) -> Table:
+    """A row per recording or pair of recordings, and of all."""
+    groups: dict[str, list[Record]] = {}
+    for record in records:
+        for name in (f"{record['level']} of {record['data']}", ALL):
+            groups.setdefault(name, []).extend(record.get("cameras", {}).values())
+    last = {ALL: groups.pop(ALL, [])}
+    rows = [_cells(name, found) for name, found in {**groups, **last}.items() if found]
+    return Table("Differences of results of disjoint frames", COLUMNS, tuple(rows))
+
+
+def _cells(name: str, found: Sequence[Record]) -> tuple[str, ...]:
+    size = np.array([[c["difference_deg"], c["difference_cm"]] for c in found])
+    squared = np.array([c["normalised_squared"] for c in found])
+    passed = sum(c["statuses"] == ["PASS", "PASS"] for c in found)
+    return (
+        name, str(len(found)), *(f"{v:.2f}" for v in np.median(size, axis=0)),
+        *(f"{v:.2f}" for v in size.max(axis=0)), f"{squared.mean():.2f}",
+        f"{np.mean(squared <= WITHIN_95):.0%}", str(passed),
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""Cases of ``verdicts`` as the model of the probability sees them: a sample per camera."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.special import expit
+
+from benchmarks.accuracy import data_cases, table_cases
+from benchmarks.accuracy.ledger import Record
+from benchmarks.accuracy.verdicts import STATUSES, class_of
+from calibgraph.model.verdict import TOLERANCE, ErrorProbability
+from calibgraph.trust.lens_parameter import probability_of_lens
+from calibgraph.trust.probability import (
+    CHANCE,
+    contributions,
+    probability_beyond,
+    worst_severities,
+)
+
+Array = np.ndarray
+
+SHARE_OFF = 0.1
+AMBIGUOUS = ("two_poses_45",)
+"""Kinds in which the matches cannot tell which of two extrinsics is right: a FAIL is wanted,
+although the result is right. They take no part in the fit nor in how well the probability holds;
+verdicts are counted with them."""
+UNCOUNTED = (*table_cases.UNDETECTABLE, *data_cases.UNDETECTABLE)
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One camera of one run.
+
+    Attributes:
+        level: "table" or "data".
+        kind: of the case.
+        severities: per kind of check.
+        by_bar: the probability that its error bar alone allows.
+        by_values: that of checks whose value is one: a wrong lens, a pose found by chance.
+        off: whether it is off.
+        right: whether it is right: well within the tolerance.
+        statuses: per kind of check, the worst.
+        worst: the largest severity of all checks.
+    """
+
+    level: str
+    kind: str
+    severities: dict[str, float]
+    by_bar: float
+    by_values: float
+    off: bool
+    right: bool
+    statuses: dict[str, str]
+    worst: float
+
+    @property
+    def vote(self) -> str:
+        """The worst status of its checks, as verdicts were made before there was a probability."""
+        return max(self.statuses.values(), key=STATUSES.index, default="PASS")
+
+    @property
+    def given(self) -> float:
+        """The probability by its error bar and such checks."""
+        return 1 - (1 - self.by_bar) * (1 - self.by_values)
+
+
+def samples_of(records: Iterable[Record]) -> list[Sample]:
+    """The results of cases that data can tell from right ones, without those decided anyway."""
+    return [
+        _sample(record, camera)
+        for record in records if record["kind"] not in UNCOUNTED
+        for camera in record.get("cameras", {}).values()
+        if not any(decisive for *_, decisive in camera["checks"])
+    ]  # fmt: skip
+
+
+def _sample(record: Record, camera: Record) -> Sample:
+    checks, which = camera["checks"], class_of(camera)
+    return Sample(
+        level=record["level"],
+        kind=record["kind"],
+        severities=worst_severities((kind, severity) for kind, _, _, severity, _ in checks),
+        by_bar=_beyond(camera),
+        by_values=_by_values(checks),
+        off=which == "off",
+        right=which == "right",
+        statuses=_worst_statuses(checks),
+        worst=max((severity for *_, severity, _ in checks), default=0.0),
+    )
+
+
+def _beyond(camera: Record) -> float:
+    """By the posterior; by the error bar alone in records that lack it."""
+    if camera.get("beyond") is not None:
+        return float(camera["beyond"])
+    rows = camera["covariance"]
+    return probability_beyond(None if rows is None else np.array(rows), TOLERANCE)
+
+
+def _by_values(checks: Sequence[Sequence[Any]]) -> float:
+    values = [(kind, status, value) for kind, status, value, *_ in checks]
+    by_chance = max((value or 0.0 for kind, _, value in values if kind == CHANCE), default=0.0)
+    return 1 - (1 - probability_of_lens(values)) * (1 - by_chance)
+
+
+def _worst_statuses(checks: Sequence[Sequence[Any]]) -> dict[str, str]:
+    ordered = sorted(checks, key=lambda check: STATUSES.index(check[1]))
+    return {kind: status for kind, status, *_ in ordered}
+
+
+def drop(sample: Sample, kinds: Collection[str]) -> Sample:
+    """The sample without some kinds of checks."""
+    kept = {kind: value for kind, value in sample.severities.items() if kind not in kinds}
+    return replace(sample, severities=kept)
+
+
+def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[ErrorProbability]:
+    """Of every sample."""
+    weights, other = model["weights"], model["other"]
+    grossly = [
+        expit(model["intercept"] + sum(contributions(s.severities, weights, other).values()))
+        for s in samples
+    ]
+    return [
+        ErrorProbability(1 - (1 - p) * (1 - s.by_values), s.by_bar)
+        for p, s in zip(grossly, samples, strict=True)
+    ]
+
+
+def probabilities(model: dict[str, Any], samples: Sequence[Sample]) -> Array:
+    """(n,) of every sample."""
+    return np.array([doubt.probability for doubt in doubts(model, samples)])
+
+
+def shares(samples: Sequence[Sample]) -> Array:
+    """(n,) what each sample counts, so that one result in ten is off."""
+    off = np.array([sample.off for sample in samples])
+    return np.where(off, SHARE_OFF / off.mean(), (1 - SHARE_OFF) / (1 - off.mean()))

@@ -1,0 +1,25 @@
+"""Changed copies of the tracker's frozen dataclasses: an update makes some fifty of them."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+Item = TypeVar("Item")
+
+
+def replace(one: Item, /, **changes: Any) -> Item:
+    """As ``dataclasses.replace`` of classes that check nothing, in a fifth of the time.
+
+    Raises:
+        TypeError: if it has no such field.
+    """
+    known: dict[str, object] = type(one).__dataclass_fields__  # type: ignore[attr-defined]
+    if not changes.keys() <= known.keys():
+        raise TypeError(f"no fields {sorted(changes.keys() - known.keys())}")
+    new = object.__new__(type(one))
+    values = vars(new)
+    values.update(vars(one))
+    values.update(changes)
+    for name in values.keys() - known.keys():  # values of cached properties
+        del values[name]
+    return new

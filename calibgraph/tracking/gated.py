@@ -1,0 +1,93 @@
+"""Frames of a camera whose matches are gated, and their sums."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
+from calibgraph.solver.curvature import robust_hessians_of
+from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.within_place import WEAK
+from calibgraph.tracking.sums import Sums, step_between
+from factors import to_runs
+
+_POSE = 6
+_SHARES = 0.5, 1.0  # of the true Hessian in that by weights
+
+
+@dataclass(frozen=True, eq=False)
+class Gated:
+    """Matches of a camera, gated at one T_lidar_camera.
+
+    Attributes:
+        residuals: of all of them, there.
+        inliers: (m,) which of them are within the gate.
+        sums: (f,) of these, frame by frame; none of a frame with too few.
+    """
+
+    residuals: BlockResiduals
+    inliers: NDArray[np.bool_]
+    sums: Sums
+
+    def of_frame(self, row: int) -> tuple[CameraBlock, NDArray[np.bool_]]:
+        """A frame's matches, and which of them are within the gate."""
+        raw = self.residuals.block
+        if raw.frames == 1:
+            return raw, self.inliers
+        first, end = raw.frame_edges[row : row + 2]
+        return raw.select(np.arange(first, end)), self.inliers[first:end]
+
+    @staticmethod
+    def at(
+        T_lidar_camera: gtsam.Pose3,
+        raw: CameraBlock,
+        scale: ResidualScale,
+        reference: gtsam.Pose3,
+        *,
+        even: bool = False,
+        edges: NDArray[np.int64] | None = None,
+    ) -> Gated:
+        """The matches near the minimum.
+
+        Args:
+            T_lidar_camera: where they are linearized.
+            raw: all of them.
+            scale: of the residuals.
+            reference: T_lidar_camera at which the gradient is taken.
+            even: let the true Hessian be a multiple of that by weights. A time offset shows by
+                differences of frames, in which the scatter of true Hessians would count.
+            edges: (f + 1,) of what counts as a frame; None: the frames.
+        """
+        residuals, edges = (
+            raw.at(to_T_camera_lidar(T_lidar_camera)),
+            raw.frame_edges if edges is None else edges,
+        )
+        inliers = residuals.inliers(scale)
+        counts = np.add.reduceat(inliers, edges[:-1], dtype=np.int64)
+        enough = counts >= MIN_MATCHES
+        inside = np.concatenate([[0], counts.cumsum()])
+        pose = residuals.T_lidar_camera
+        block = raw.select(inliers).with_scale(scale)
+        here = block.frame_sums(pose, inside)
+        hessian = robust_hessians_of(block, pose, here.hessian, to_runs(inside))
+        hessian = hessian + residuals.gate_hessians(scale, edges)
+        if even:
+            shares = np.linalg.solve(here.hessian + WEAK, hessian)
+            share = np.trace(shares, axis1=1, axis2=2) / _POSE
+            hessian = np.clip(share, *_SHARES)[:, None, None] * here.hessian
+        score = here.gradient
+        sums = Sums.of(
+            hessian=hessian,
+            gradient=score + hessian @ step_between(pose, reference),
+            reweighted=here.hessian,
+            score=score,
+            scatter=score[:, :, None] * score[:, None, :],
+            frames=np.ones(len(counts)),
+            matches=counts.astype(np.float64),
+        )
+        return Gated(residuals, inliers, sums if enough.all() else sums * enough.astype(np.float64))

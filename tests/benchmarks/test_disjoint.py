@@ -1,0 +1,80 @@
+"""Differences of results of disjoint frames."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from benchmarks.accuracy import disjoint
+from benchmarks.accuracy.disjoint import Estimate, Runs, difference, report, split
+from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.scenes import Folders
+
+KEY = Key("halves", "random", "05", 0)
+
+
+def moved(xi: np.ndarray) -> np.ndarray:
+    return np.array(gtsam.Pose3.Expmap(xi).matrix())
+
+
+def test_halves_are_disjoint_cover_all_frames_and_change_with_the_seed() -> None:
+    first, second = split(25, 3)
+    assert (len(first), len(second)) == (12, 13)
+    assert sorted([*first, *second]) == [*range(25)]
+    assert split(25, 4)[0] != first == sorted(first)
+
+
+def test_right_error_bars_give_one_and_95_percent() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6)) * 1e-3  # small: rotations add up as vectors
+    bars = (root @ root.T, np.diag(np.array([1, 2, 3, 4, 5, 6]) * 1e-6))
+    draws = 2000
+    noise = [rng.multivariate_normal(np.zeros(6), bar, draws) for bar in bars]
+
+    def both(i: int) -> Record:
+        results = (Estimate(moved(noise[k][i]), bars[k], "PASS") for k in range(2))
+        return {**asdict(KEY), "cameras": {"left": difference(*results)}}
+
+    rows = report([both(i) for i in range(draws)]).rows
+    found = dict(zip(disjoint.COLUMNS, rows[-1], strict=True))
+    # the mean of chi-squared of 6, over 6, scatters by sqrt(2 / 6 / draws) = 0.013, the share by
+    # sqrt(0.95 * 0.05 / draws) = 0.5 %
+    assert float(found["squared in its covariance, over 6"]) == pytest.approx(1, abs=0.05)
+    assert float(found["in the 95 % region"].rstrip("%")) == pytest.approx(95, abs=2)
+    assert found["both PASS"] == str(draws)
+
+
+def test_sizes_are_those_of_the_difference() -> None:
+    bar = np.diag([1e-6] * 6)
+    turned = moved(np.array([0.0, np.radians(0.3), 0.0, 0.0, 0.0, 0.0]))
+    found = difference(Estimate(np.eye(4), bar, "PASS"), Estimate(turned, bar, "WARN"))
+    assert found["difference_deg"] == pytest.approx(0.3)
+    assert found["difference_cm"] == pytest.approx(0)
+    assert found["normalised_squared"] == pytest.approx(np.radians(0.3) ** 2 / 2e-6 / 6)
+
+
+def test_a_recording_of_several_pairs_is_calibrated_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[str] = []
+
+    def calibrated(folders: Folders, name: str, seed: int) -> dict[str, Estimate]:
+        called.append(name)
+        bar = np.diag([1e-6] * 6)
+        cameras = ("left", "right") if name == "05" else ("left",)
+        return {camera: Estimate(np.eye(4), bar, "PASS") for camera in cameras}
+
+    monkeypatch.setattr(disjoint, "_calibrate", calibrated)
+    disjoint._whole.cache_clear()
+    runs = Runs(Folders(Path("nowhere"), None))
+    records = [
+        {**asdict(case), **runs(case)}
+        for case in (Key("recordings", "each", pair, 0) for pair in ("05/06", "05/07"))
+    ]
+    assert called == ["05", "06", "07"]
+    assert [[*record["cameras"]] for record in records] == [["left"], ["left"]]
+    assert [row[0] for row in report(records).rows] == [
+        "recordings of 05/06", "recordings of 05/07", "all",
+    ]  # fmt: skip

@@ -1,0 +1,81 @@
+"""How the probability of being off is judged: cuts, reliability, discrimination."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.accuracy.ledger import Record
+from benchmarks.accuracy.probability_tables import cuts, discrimination, reliability
+from benchmarks.accuracy.verdict_samples import Sample, probabilities, samples_of
+
+MODEL = {"intercept": -8.0, "weights": {"outliers": [0.0, 0.0, 16.0]}, "other": [0.0, 0.0, 0.0]}
+"""A check that FAILs makes a result certainly off; no other check says anything."""
+
+
+def sample(
+    *, off: bool, severity: float = 0.0, by_bar: float = 0.0, kind: str = "outliers"
+) -> Sample:
+    status = ("PASS", "WARN", "FAIL")[min(int(severity), 2)]
+    return Sample(
+        level="data", kind="good", severities={kind: severity}, by_bar=by_bar, by_values=0.0,
+        off=off, right=not off, statuses={kind: status}, worst=severity,
+    )  # fmt: skip
+
+
+def cells(table: object) -> dict[str, tuple[str, ...]]:
+    return {row[0]: row[1:] for row in table.rows}  # type: ignore[attr-defined]
+
+
+def test_right_results_are_counted_below_the_best_result_that_is_off() -> None:
+    right = [sample(off=False, by_bar=p) for p in (0.001, 0.002, 0.03, 0.2)]
+    off = [sample(off=True, severity=3.0), sample(off=True, by_bar=0.01)]
+    found = cells(discrimination("", MODEL, [*right, *off]))
+    assert found["probability"] == ("50%", "50%")
+    assert found["vote"] == ("0%", "0%")  # that check is as good where the bar alone is wide
+
+
+def test_one_in_twenty_may_pass_where_five_percent_are_allowed() -> None:
+    right = [sample(off=False, by_bar=0.02)]
+    off = [sample(off=True, by_bar=0.01), *(sample(off=True, by_bar=0.5) for _ in range(19))]
+    assert cells(discrimination("", MODEL, [*right, *off]))["probability"] == ("0%", "100%")
+
+
+def test_no_result_passes_whose_data_are_missing() -> None:
+    missing = sample(off=False, severity=1.5, kind="frames")
+    found = cells(discrimination("", MODEL, [missing, sample(off=True, by_bar=0.5)]))
+    assert found["probability"] == ("100%", "100%") and found["verdict"] == ("0%", "0%")
+    by_class = cuts("", MODEL, [missing])
+    row = dict(zip(by_class.columns[1:], cells(by_class)["probability"], strict=True))
+    assert row["right: WARN"] == "1" and row["right: PASS"] == "0"
+
+
+def test_a_certain_and_right_probability_has_no_error() -> None:
+    both = [sample(off=False), sample(off=True, severity=3.0)]
+    assert probabilities(MODEL, both) == pytest.approx([3e-4, 0.9997], abs=1e-4)
+    errors, bins = reliability("", MODEL, both)
+    results, vote, probability = errors.rows[0]
+    assert results == "2" and probability == "0.0000"
+    assert vote == f"{0.9 * 0.005**2 + 0.1 * 0.1**2:.4f}"  # one result in ten is off
+    assert [row[1] for row in bins.rows] == ["1", "1"]
+
+
+def test_a_camera_that_was_not_found_is_no_sample() -> None:
+    found: Record = {
+        "error_deg": 0.1, "error_cm": 1.0, "covariance": None, "beyond": 0.25,
+        "checks": [["outliers", "PASS", 0.1, 0.2, False], ["outliers", "WARN", 0.4, 1.2, False]],
+    }  # fmt: skip
+    lost: Record = {**found, "checks": [["search", "FAIL", None, 2.5, True]]}
+    record = {"level": "data", "kind": "good", "cameras": {"left": found, "right": lost}}
+    (only,) = samples_of([record])
+    assert (only.vote, only.worst, only.by_bar) == ("WARN", 1.2, 0.25)
+    assert only.right and not only.off
+
+
+def test_a_pose_found_by_chance_counts_beside_a_wrong_lens() -> None:
+    checks = [["chance", "PASS", 0.25, 0.5, False], ["lens_focal_length", "WARN", 0.2, 1.5, False]]
+    camera: Record = {
+        "error_deg": 0.1, "error_cm": 1.0, "covariance": None, "beyond": 0.0, "checks": checks,
+    }  # fmt: skip
+    (only,) = samples_of([{"level": "data", "kind": "good", "cameras": {"left": camera}}])
+    assert only.by_values == pytest.approx(1 - 0.75 * 0.8)
+    assert only.severities == {}  # neither is one of the graded checks

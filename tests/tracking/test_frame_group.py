@@ -1,0 +1,217 @@
+"""Frames that come together: one gate each, one solve, and what one by one would give."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from calibgraph import (
+    Calibration,
+    Config,
+    CorrespondenceError,
+    Correspondences,
+    DurableCalibrator,
+    IncrementalCalibrator,
+    Rig,
+    perturb,
+    solve,
+)
+from calibgraph.model.correspondences import concatenate
+from calibgraph.tracking.frame_group import in_groups, update_all
+from calibgraph.tracking.stream_tables import Refused, StreamFrame
+from calibgraph.tracking.update import Update, json_line
+from tests.draws.drives import simulate_drive
+from tests.tracking.drives import ERRORS, drive, pair_of
+
+EPOCH = 10
+
+
+def frames_of(tables: Sequence[Correspondences]) -> list[StreamFrame]:
+    return [StreamFrame(int(table.frame[0]), table) for table in tables]
+
+
+def guess_of(rig: Rig) -> Rig:
+    return perturb(rig, rotation_deg=1, translation_m=0.1, seed=1)
+
+
+def together(
+    tracker: IncrementalCalibrator, frames: Sequence[StreamFrame]
+) -> tuple[list[Update], list[int]]:
+    """The updates, and how many frames were taken in at once each time."""
+    groups = [found for found in update_all(tracker, frames) if isinstance(found, list)]
+    return [update for group in groups for update in group], [*map(len, groups)]
+
+
+def sigmas_apart(one: Update, two: Update | Calibration, camera: str) -> float:
+    """Length of the six-vector between two estimates, in the second's error bar."""
+    covariance = two.covariance[camera]
+    assert covariance is not None
+    step = one.T_camera_lidar[camera] @ np.linalg.inv(two.T_camera_lidar[camera])
+    xi = gtsam.Pose3.Logmap(gtsam.Pose3(step))
+    return float(np.sqrt(xi @ np.linalg.solve(covariance, xi)))
+
+
+def test_estimates_are_within_a_tenth_of_a_sigma_of_one_by_one() -> None:
+    """Where both know the same frames: at the ends of epochs."""
+    rig = pair_of()
+    tables = drive(rig, 60, matches=200)
+    alone = IncrementalCalibrator(guess_of(rig))
+    expected = [alone.update(table) for table in tables]
+    found, groups = together(IncrementalCalibrator(guess_of(rig)), frames_of(tables))
+    assert max(groups) == EPOCH and len(groups) < len(tables) / 3
+    assert [one.frame for one in found] == [one.frame for one in expected]
+    assert [one.left_out for one in found] == [one.left_out for one in expected]
+    for one, other in zip(found[19::EPOCH], expected[19::EPOCH], strict=True):
+        for camera in rig.cameras:
+            assert sigmas_apart(one, other, camera) < 0.1 * np.sqrt(6)
+            bars = np.diag(one.covariance[camera]) / np.diag(other.covariance[camera])
+            # By the scatter of some 20 frames, of which single matches are gated otherwise.
+            np.testing.assert_allclose(np.sqrt(bars), 1.0, atol=0.05)
+            assert one.verdicts[camera].status == other.verdicts[camera].status
+
+
+def test_along_places_estimates_are_those_of_a_batch() -> None:
+    """The end of an epoch is exact: one by one the next frames do that work, after the report."""
+    rig = pair_of()
+    tables = drive(rig, 60, matches=200)
+    found, _ = together(
+        IncrementalCalibrator(guess_of(rig)),
+        [
+            StreamFrame(i, replace(table, metadata={**table.metadata, "place": str(i // 7 % 3)}))
+            for i, table in enumerate(tables)
+        ],
+    )
+    batch = solve(guess_of(rig), concatenate(tables))
+    for camera in rig.cameras:
+        assert sigmas_apart(found[-1], batch, camera) < 0.2 * np.sqrt(6)
+
+
+def test_all_updates_of_a_group_have_the_estimate_after_it() -> None:
+    rig = pair_of()
+    tracker = IncrementalCalibrator(guess_of(rig))
+    found, _ = together(tracker, frames_of(drive(rig, 30)))
+    last = found[-EPOCH:]
+    assert {id(one.T_camera_lidar) for one in last} == {id(last[0].T_camera_lidar)}
+    present = tracker.calibration().T_camera_lidar
+    for name, T in last[0].T_camera_lidar.items():
+        np.testing.assert_array_equal(T, present[name])
+    assert len({tuple(one.used.values()) for one in last}) > 1  # each its own
+
+
+@pytest.mark.parametrize("size", [1.0, 0.15])
+def test_a_move_is_found_at_the_same_frame_as_one_by_one(size: float) -> None:
+    """Frames that disagree are taken in one by one; a small step shows at the end of an epoch."""
+    rig = pair_of()
+    T = rig.T_camera_lidar["left"]
+    step = gtsam.Pose3.Expmap(size * np.array([0.01, 0.01, 0.0, 0.03, 0.0, 0.0])).matrix()
+    after = rig.moved_to({"left": step @ T})
+    tables = list(
+        simulate_drive(
+            lambda frame: after if frame >= 123 else rig,
+            frames=180, matches=200, errors=ERRORS, seed=3,
+        )
+    )  # fmt: skip
+    alone = IncrementalCalibrator(guess_of(rig))
+    expected = [event for table in tables for event in alone.update(table).events]
+    found, groups = together(IncrementalCalibrator(guess_of(rig)), frames_of(tables))
+    events = [event for update in found for event in update.events]
+    assert [e.kind for e in expected][2:] == ["moved"]
+    for one, other in zip(events, expected, strict=True):
+        assert (one.kind, one.camera) == (other.kind, other.camera)
+        assert one.detected_frame == other.detected_frame
+        assert abs(one.frame - other.frame) <= 1
+    assert len(groups) < len(tables) / 3
+
+
+def test_frames_that_stand_out_are_taken_in_by_themselves() -> None:
+    """Failed matches, an unknown camera, an old number, a repeated cloud, a frame without rows."""
+    rig = pair_of()
+    tables = drive(rig, 40)
+    rng = np.random.default_rng(0)
+    failed = tables[23].points_lidar_m + rng.normal(size=tables[23].points_lidar_m.shape)
+    tables[23] = replace(tables[23], points_lidar_m=failed)
+    tables[31] = replace(tables[31], points_lidar_m=tables[30].points_lidar_m)
+    frames = frames_of(tables)
+    frames[33] = StreamFrame(33, tables[33].select(slice(0, 0)))
+    wrong = replace(tables[35], cameras=("left", "other"))
+    frames[35:36] = [StreamFrame(35, wrong), StreamFrame(7, tables[7]), frames[35]]
+    alone, expected, refused = IncrementalCalibrator(guess_of(rig)), [], []
+    for one in frames:
+        try:
+            expected.append(alone.update(one.table, frame=one.frame))
+        except CorrespondenceError as error:
+            refused.append(str(error))
+    results = [*update_all(IncrementalCalibrator(guess_of(rig)), frames)]
+    found = [update for group in results if isinstance(group, list) for update in group]
+    assert [str(one) for one in results if isinstance(one, CorrespondenceError)] == refused
+    assert len(refused) == 2
+    assert [(u.frame, u.left_out, {*u.used}) for u in found] == [
+        (u.frame, u.left_out, {*u.used}) for u in expected
+    ]
+    assert found[23].left_out == ("left", "right") and not found[31].used and not found[33].used
+
+
+def test_a_blind_camera_is_reported_at_its_frame() -> None:
+    rig = pair_of()
+    blind = [t.of_camera("left") if 22 <= i < 45 else t for i, t in enumerate(drive(rig, 60))]
+    alone = IncrementalCalibrator(guess_of(rig))
+    expected = [[*map(str, alone.update(table).events)] for table in blind]
+    found, _ = together(IncrementalCalibrator(guess_of(rig)), frames_of(blind))
+    assert [[*map(str, update.events)] for update in found] == expected
+    assert sum(map(len, expected)) == 4  # two start, one is blind, and back
+
+
+def test_an_error_in_a_group_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = pair_of()
+    frames = frames_of(drive(rig, 28))
+    tracker = IncrementalCalibrator(guess_of(rig))
+    together(tracker, frames[:25])
+    before = tracker.to_bytes()
+
+    def singular(*_: object) -> None:
+        patch.undo()  # what had been taken in is taken in again
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("calibgraph.tracking.tracker.make_updates", singular)
+        assert tracker.update_together(frames[25:]) == []
+    assert tracker.to_bytes() == before
+
+
+def test_a_restart_goes_on_with_the_same_numbers(tmp_path: Path) -> None:
+    """In the middle of an epoch, from bytes and from disk."""
+    rig = pair_of()
+    frames = frames_of(drive(rig, 40))
+    tracker = IncrementalCalibrator(guess_of(rig))
+    together(tracker, frames[:27])
+    copy = IncrementalCalibrator.from_bytes(tracker.to_bytes())
+    expected, _ = together(tracker, frames[27:])
+    assert [*map(json_line, together(copy, frames[27:])[0])] == [*map(json_line, expected)]
+    calibrator = DurableCalibrator(tmp_path, guess_of(rig))
+    together(calibrator, frames[:27])
+    calibrator.abandon()  # as a kill leaves it
+    with DurableCalibrator(tmp_path, guess_of(rig)) as resumed:
+        assert resumed.repeated[-1].frame == 26 and len(resumed.last_repeated) == 7
+        again, _ = together(resumed, frames[27:])
+    assert [*map(json_line, again)] == [*map(json_line, expected)]
+
+
+def test_time_offsets_are_estimated_one_by_one() -> None:
+    rig = pair_of()
+    tracker = IncrementalCalibrator(rig, Config(estimate="offset"))
+    frames = frames_of(drive(rig, 3))
+    assert tracker.update_together(frames) == []
+
+
+def test_groups_are_in_the_order_of_their_numbers() -> None:
+    rig = pair_of()
+    one, two, three = frames_of(drive(rig, 3))
+    wrong = Refused("half a line")
+    groups = in_groups([one, two, three, wrong, two, one, three], 2)
+    found = [group if isinstance(group, Refused) else [f.frame for f in group] for group in groups]
+    assert found == [[0, 1], [2], wrong, [1], [0, 2]]
