@@ -109,7 +109,7 @@ class Evidence:
         return self._widened(self.covariance_of_matches)
 
     def widening(self, camera: str) -> float:
-        """Sigma by the images' evidence over that by the matches, of the widest axis; at least 1."""
+        """Sigma by the images' evidence over that by the matches; the largest of six axes."""
         wide = self._block(self.joint_covariance, camera)
         by_matches = self._block(self.covariance_of_matches, camera)
         if wide is None or by_matches is None:

@@ -83,8 +83,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
               of_tolerance=True),
     Threshold("flat_evidence", "sigma by the images over that by the matches", "at most", 3.0,
               math.inf, "times", "Do the images leave the pose more open than the matches do?",
-              "Poses near a result are within 3 sigma of the matches (`NEAR`); a larger ratio is of "
-              "poses elsewhere. The wider sigma is reported, and no verdict follows from this check.",
+              "Poses near a result are within 3 sigma of the matches; a larger ratio is of poses "
+              "elsewhere. The wider sigma is the error bar, so that the check changes no verdict.",
               "the error bar is that by the images"),
     Threshold("correspondences_used", "correspondences used", "at least", 50, 0, "",
               "Are there enough correspondences?", "Fewer leave little to check six numbers by."),
