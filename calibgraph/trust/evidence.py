@@ -108,14 +108,6 @@ class Evidence:
         """
         return self._widened(self.covariance_of_matches)
 
-    def widening(self, camera: str) -> float:
-        """Sigma by the images' evidence over that by the matches; the largest of six axes."""
-        wide = self._block(self.joint_covariance, camera)
-        by_matches = self._block(self.covariance_of_matches, camera)
-        if wide is None or by_matches is None:
-            return 1.0
-        return float(np.sqrt((np.diag(wide) / np.diag(by_matches)).max()))
-
     @property
     def mount_covariance(self) -> Array | None:
         """(6 N, 6 N) second moments of the mounts about the solution, widened alike."""
