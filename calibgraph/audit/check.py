@@ -125,7 +125,7 @@ def _judge(
     run: MatchingRun, tolerance: Tolerance, progress: Progress
 ) -> tuple[dict[str, CameraAudit], LidarAudit | None]:
     """The audits of all cameras, and of the LiDAR where every measurement can be trusted."""
-    evidence = RunEvidence(run, {}).solution
+    evidence = RunEvidence(run, {}, asks_guess=True).solution
     doubts = _doubts(run, evidence, progress)
     cameras = {
         name: judge_camera(evidence, name, doubts[name], tolerance) for name in run.guess.cameras

@@ -77,8 +77,10 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
     least = _least_share(evidence.error_sources.get(name))
     status, reason = judge_axes(deviation, sigma, quantiles, tolerance, least=least)
     if status == "WRONG" and name in evidence.posteriors:
-        widest = np.sqrt(np.diag(evidence.posteriors[name].widest(covariance)))
-        if judge_axes(deviation, widest, quantiles, tolerance)[0] != "WRONG":
+        posterior = evidence.posteriors[name]
+        widest = np.sqrt(np.diag(posterior.widest(covariance)))
+        allowed = posterior.log_ratio < quantiles.significant.max() ** 2
+        if allowed or judge_axes(deviation, widest, quantiles, tolerance)[0] != "WRONG":
             status, reason = "CANNOT TELL", f"{_IMAGES_ALLOW}; {reason}"
     if doubt:
         status, reason = "CANNOT TELL", doubt

@@ -91,10 +91,8 @@ class Calibration:
         places: frame numbers of each place; empty if nobody looked for places, and of ``track``.
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
         warnings: of ``calibrate``: about the dataset, its guess, and a lens that did not settle.
-        correspondences: of ``solve``, those that the preprocessing kept; of ``calibrate``, those of
-            its last round.
-        camera_matches: what cameras see in common, with the surfaces that were used; None if it was
-            not looked for.
+        correspondences: that the preprocessing kept; of ``calibrate``, of its last round.
+        camera_matches: between cameras, with the surfaces used; None if they were not looked for.
         inputs: SHA-256 of the input files, by path.
         build_graph: see :attr:`graph`; None in a result from a file or another process.
         versions: of this package and the libraries that matter.
@@ -241,10 +239,8 @@ class Calibration:
         if table is None:
             path.unlink(missing_ok=True)
             return None
-        marks: dict[str, str] = {
-            result_files.VERDICT_KEY: self.verdict.status,
-            result_files.WRITTEN_KEY: result_files.RESULT,
-        }
+        status, written = result_files.VERDICT_KEY, result_files.WRITTEN_KEY
+        marks: dict[str, str] = {status: self.verdict.status, written: result_files.RESULT}
         replace(table, metadata={**table.metadata, **marks}).save(path)
         return sha256(path)
 

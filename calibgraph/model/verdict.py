@@ -34,6 +34,9 @@ ABOUT_THE_DATA = frozenset(
     }
 )
 """Kinds of checks that count data: beyond a limit, nothing seems wrong yet."""
+FLAT_EVIDENCE = "flat_evidence"
+"""Kind of the check that compares the error bars by images and by matches. The wider one is in the
+result, so that the check itself changes no verdict."""
 _SURE = 0.99
 
 
@@ -204,8 +207,9 @@ class Verdict:
 
     @property
     def _kinds_beyond(self) -> set[str]:
-        """The kinds of the checks that are beyond a limit."""
-        return {check.kind or check.name for check in self.checks if check.status != "PASS"}
+        """The kinds of the checks that are beyond a limit, but for those that decide nothing."""
+        beyond = {check.kind or check.name for check in self.checks if check.status != "PASS"}
+        return beyond - {FLAT_EVIDENCE}
 
     @property
     def cannot_tell(self) -> bool:

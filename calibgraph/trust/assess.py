@@ -39,6 +39,7 @@ from calibgraph.trust.solution_checks import (
     assumed_spread_checks,
     bootstrap_checks,
     estimate_checks,
+    flat_evidence_checks,
     outlier_frame_checks,
     prior_share_checks,
     repeated_frame_checks,
@@ -48,6 +49,7 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     guess_checks,               # does a convention error explain the distance from the guess?
     swap_checks,                # are the images of two cameras swapped?
     point_distance_checks,      # are the points in metres?
+    flat_evidence_checks,       # do the images leave the pose more open than the matches?
     estimate_checks,            # residuals, sigmas, relative poses, halves, counts, convergence
     pair_agreement_checks,      # do two cameras' images agree with the correspondences?
     matcher_checks,             # findings of the matcher: search, learned shares, z-score

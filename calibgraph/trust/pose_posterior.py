@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -24,7 +24,7 @@ from scipy.special import expit
 from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.likelihood import FAR, log_likelihood
-from calibgraph.model.geometry import pose_rows, relative_transform
+from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
 from calibgraph.trust.frame_scores import FrameScorer
@@ -54,11 +54,14 @@ class PosePosterior:
         near: (n, 6) samples, if the rounds ended where the matches say.
         elsewhere: (n, 6) samples, if they ended elsewhere.
         share: the probability that they ended elsewhere.
+        log_ratio: twice the logarithm of the highest density elsewhere over that at a pose in
+            question; infinite if there is none.
     """
 
     near: Array
     elsewhere: Array
     share: float
+    log_ratio: float = np.inf
 
     @property
     def moments(self) -> Array:
@@ -107,6 +110,7 @@ def measure_posteriors(
     covariances: Mapping[str, Array],
     groups: Sequence[Sequence[str]],
     *,
+    asked: Mapping[str, Array] | None = None,
     seed: int = 0,
 ) -> dict[str, PosePosterior]:
     """Per camera of a group, the posterior about a result.
@@ -116,6 +120,7 @@ def measure_posteriors(
         rig: the result.
         covariances: per camera, (6, 6) of the result by its matches.
         groups: cameras that move together, see :func:`group_tied`; they have one evidence.
+        asked: per camera, (4, 4) T_camera_lidar in question, for ``log_ratio``.
         seed: of the samples.
     """
     with core_pool() as cores, ThreadPoolExecutor(max(len(groups), 1)) as pool:
@@ -134,14 +139,22 @@ def measure_posteriors(
                 for name in group
             ]
             terms = list(zip([*map(likelihood_of, group)], adjoints, strict=True))
-            found = _posterior_of(
-                lambda twists: np.mean([of(twists @ moved.T) for of, moved in terms], axis=0),
-                covariances[group[0]],
-                seed,
-            )
-            return {
-                name: found.moved(adjoint) for name, adjoint in zip(group, adjoints, strict=True)
-            }
+
+            def likelihood(twists: Array) -> Array:
+                found = [of(twists @ moved.T) for of, moved in terms]
+                return np.asarray(np.mean(found, axis=0))
+
+            found = _posterior_of(likelihood, covariances[group[0]], seed)
+            posteriors = {}
+            for name, adjoint in zip(group, adjoints, strict=True):
+                of_camera = found.moved(adjoint)
+                if asked is not None:
+                    away = twist_between(asked[name], rig.T_camera_lidar[name])
+                    of_first = np.asarray(np.linalg.solve(adjoint, away), np.float64)
+                    ratio = _log_ratio(likelihood, found.elsewhere, of_first)
+                    of_camera = replace(of_camera, log_ratio=ratio)
+                posteriors[name] = of_camera
+            return posteriors
 
         return {name: each for of in pool.map(measure, groups) for name, each in of.items()}
 
@@ -153,6 +166,13 @@ def _posterior_of(
     near, of_near = sample_posterior(likelihood, NEAR**2 * by_matches, samples=SAMPLES, seed=seed)
     far, of_far = sample_posterior(likelihood, np.diag(REACH**2), samples=SAMPLES, seed=seed)
     return PosePosterior(near, far, float(expit(np.log(ODDS_ELSEWHERE) + of_far - of_near)))
+
+
+def _log_ratio(likelihood: Callable[[Array], Array], elsewhere: Array, asked: Array) -> float:
+    """Twice the log of the highest density of samples elsewhere over that at a twist (6,)."""
+    twists = np.vstack([asked, elsewhere])
+    density = likelihood(twists) - 0.5 * ((twists / REACH) ** 2).sum(axis=1)
+    return float(2.0 * (density.max() - density[0]))
 
 
 def group_tied(

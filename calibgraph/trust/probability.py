@@ -23,6 +23,7 @@ from calibgraph.arrays import Array
 from calibgraph.model.verdict import (
     ABOUT_THE_DATA,
     COMMON_ERROR,
+    FLAT_EVIDENCE,
     PASS_BELOW,
     Check,
     ErrorProbability,
@@ -84,7 +85,7 @@ def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
     worst: dict[str, float] = {}
     for kind, severity in checks:
         worst[kind] = max(severity, worst.get(kind, 0.0))
-    left_out = {*LENS_KINDS, COMMON_ERROR, CHANCE}
+    left_out = {*LENS_KINDS, COMMON_ERROR, CHANCE, FLAT_EVIDENCE}
     left_out |= ABOUT_THE_DATA if CHANCE in worst else frozenset()
     return {kind: severity for kind, severity in worst.items() if kind not in left_out}
 

@@ -15,11 +15,19 @@ from calibgraph.trust.pose_posterior import PosePosterior, measure_posteriors
 
 @dataclass(frozen=True, eq=False)
 class RunEvidence:
-    """All rounds of matching and solving, and the SHA-256 of the files they read."""
+    """All rounds of matching and solving, and the SHA-256 of the files they read.
+
+    Attributes:
+        run: of the rounds.
+        hashes: per file.
+        progress: called as images are scored.
+        asks_guess: whether the guess is a pose in question, as in ``check``.
+    """
 
     run: MatchingRun
     hashes: Mapping[str, str]
     progress: Progress = no_progress
+    asks_guess: bool = False
 
     @cached_property
     def solution(self) -> Evidence:
@@ -44,5 +52,10 @@ class RunEvidence:
             return {}
         seed = run.solution.config.seed
         return measure_posteriors(
-            run.dataset, run.solution.solved_rig, covariances, groups, seed=seed
+            run.dataset,
+            run.solution.solved_rig,
+            covariances,
+            groups,
+            asked=run.guess.T_camera_lidar if self.asks_guess else None,
+            seed=seed,
         )

@@ -84,6 +84,16 @@ def common_error_checks(estimate: Estimate) -> list[Check]:
     return [Check("common error", "WARN", text, kind=COMMON_ERROR)]
 
 
+def flat_evidence_checks(evidence: Evidence) -> Checks:
+    """Whether the images leave a pose more open than the matches, where images are known."""
+    wide, by_matches = evidence.joint_covariance, evidence.covariance_of_matches
+    if wide is None or by_matches is None:
+        return {}
+    ratios = np.sqrt(np.diag(wide) / np.diag(by_matches)).reshape(-1, 6).max(axis=1)
+    row, of_cameras = threshold("flat_evidence"), zip(evidence.cameras, ratios, strict=True)
+    return {name: [row.check(ratio)] for name, ratio in of_cameras if name in evidence.posteriors}
+
+
 def relative_pose_checks(estimate: Estimate) -> list[Check]:
     """Whether the rig's relative poses agree with the correspondences."""
     return [_check_relative_pose(conflict) for conflict in estimate.conflicts]

@@ -84,6 +84,11 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("halves_translation", "difference between even and odd frames", "at most", 6.0, 15.0,
               "cm", "The same.", _COUNTED,
               of_tolerance=True),
+    Threshold("flat_evidence", "sigma by the images over that by the matches", "at most", 3.0,
+              math.inf, "times", "Do the images leave the pose more open than the matches do?",
+              "Poses near a result are within 3 sigma of the matches; a larger ratio is of poses "
+              "elsewhere. The wider sigma is the error bar, so that the check changes no verdict.",
+              "the error bar is that by the images"),
     Threshold("correspondences_used", "correspondences used", "at least", 50, 0, "",
               "Are there enough correspondences?", "Fewer leave little to check six numbers by."),
     Threshold("frames", "frames", "at least", ENOUGH_FRAMES, 0, "",
@@ -269,9 +274,8 @@ def thresholds_markdown() -> str:
         *(_line(row) for row in THRESHOLDS),
         "",
         "\\* At the default tolerance of "
-        f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. A limit "
-        "of FAIL, or in the table below, grows with the tolerance, and does not fall below this "
-        "value.",
+        f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. A limit of "
+        "FAIL, or in the table below, grows with the tolerance, and never falls below this value.",
         "",
         "| key | limit | meaning |",
         "|---|---|---|",

@@ -27,6 +27,7 @@ from calibgraph.trust.pose_posterior import (
     measure_posteriors,
     widen,
 )
+from calibgraph.trust.probability import TABLES, judge
 from tests.trust.conftest import SAMPLE, simulated
 
 Array = NDArray[np.float64]
@@ -181,6 +182,35 @@ def test_no_deployed_pose_is_wrong_that_the_images_alone_allow(pair: Rig) -> Non
         assert audit.sigma is not None and np.degrees(audit.sigma[:3].max()) < 0.1
 
 
+def test_a_deployed_pose_that_the_images_find_as_likely_as_the_result_is_not_wrong(
+    pair: Rig,
+) -> None:
+    """A second mode of little mass hardly widens the moments; the likelihood ratio sees it."""
+    deployed = perturb(pair, rotation_deg=0.8, translation_m=0.0, seed=1)
+    solution = solve_joint(pair, simulated(pair, frames=20))
+    for log_ratio, status in ((4.0, "CANNOT TELL"), (100.0, "WRONG")):
+        found = replace(certain(1e-3 * WIDE), log_ratio=log_ratio)
+        evidence = Evidence(solution, deployed, lambda *_, found=found: {"left": found})
+        assert judge_camera(evidence, "left", "", Tolerance(0.5, 10.0)).status == status
+
+
+def test_the_likelihood_ratio_is_low_at_the_truth_and_high_a_degree_away(
+    dataset: Dataset, truth: Rig
+) -> None:
+    """About a wrong result, from which the truth is 0.8 deg away, too."""
+    wrong = perturb(truth, rotation_deg=0.8, translation_m=0.1, seed=3)
+    away = perturb(truth, rotation_deg=1.0, translation_m=0.1, seed=4)
+    found = {
+        name: measure_posteriors(
+            dataset, rig, {NAME: BY_MATCHES}, [(NAME,)], asked=asked.T_camera_lidar
+        )[NAME].log_ratio
+        for name, rig, asked in (
+            ("right", truth, truth), ("wrong", wrong, truth), ("off", truth, away),
+        )
+    }  # fmt: skip
+    assert max(found["right"], found["wrong"]) < 16 < found["off"]
+
+
 def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: Rig) -> None:
     solution = solve_joint(pair, simulated(pair, frames=20))
     evidence = Evidence(solution, pair, lambda *_: dict.fromkeys(pair.cameras, certain(4 * WIDE)))
@@ -189,6 +219,28 @@ def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: 
     assert found.error_probability.by_error_bar > 0.9
     assert found.error_probability.by_checks < 0.01
     assert found.status == "WARN" and found.cannot_tell
+    (check,) = (each for each in found.checks if each.kind == "flat_evidence")
+    assert check.status == "WARN" and check.value is not None and check.value > 3
+
+
+@pytest.mark.parametrize(("wider", "status"), [(2.0, "PASS"), (4.0, "WARN")])
+def test_a_wider_surface_is_a_finding_that_changes_no_verdict(
+    pair: Rig, wider: float, status: str
+) -> None:
+    """The check states how much wider; the verdict is the one without it."""
+    solution = solve_joint(pair, simulated(pair, frames=20))
+    covariance = Evidence(solution, pair).covariance_of("left")
+    assert covariance is not None
+    evidence = Evidence(solution, pair, lambda *_: {"left": certain(wider**2 * covariance)})
+    found = to_calibration(evidence, assess(evidence)).camera_verdicts["left"]
+    (check,) = (each for each in found.checks if each.kind == "flat_evidence")
+    assert check.status == status
+    assert check.value == pytest.approx(wider)
+    others = tuple(each for each in found.checks if each is not check)
+    assert found.error_probability is not None
+    without = judge(others, found.error_probability.by_error_bar, TOLERANCE, TABLES)
+    assert (without.status, without.cannot_tell) == (found.status, found.cannot_tell)
+    assert without.error_probability == found.error_probability
 
 
 def test_where_the_images_are_flat_other_scenes_are_advised_and_not_more_of_the_same() -> None:
