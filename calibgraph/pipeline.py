@@ -13,6 +13,7 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
+from calibgraph.elsewhere import follow_images
 from calibgraph.io.dataset import Dataset
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.camera_matches import CameraMatches
@@ -70,8 +71,9 @@ def calibrate(
     run = refine_with_camera_pairs(run, report)  # what cameras see in common
     with run.watch("hash_inputs"):
         inputs = hash_inputs(run.dataset)
+    evidence = follow_images(RunEvidence(run, inputs, report))  # if they say: elsewhere
+    run = evidence.run
     with run.watch("checks"):
-        evidence = RunEvidence(run, inputs, report)
         checks = assess_run(evidence)
     report("done", 1, 1)
     return replace(

@@ -9,10 +9,8 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
@@ -24,7 +22,6 @@ from calibgraph.matching.places import find_places
 from calibgraph.matching.protocol import Matcher
 from calibgraph.matching.run import (
     MatchingRun,
-    Rematch,
     RoundSummary,
     require_known_motion,
     round_in_words,
@@ -33,27 +30,21 @@ from calibgraph.matching.run import (
 )
 from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.model.config import Config, Terms
-from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.lens_estimate import LensEstimate, change_of_lens, unsettled
-from calibgraph.model.perturbation import perturb
 from calibgraph.model.places import Places, as_groups
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, Stopwatch, with_note
+from calibgraph.rematch import rematch
 from calibgraph.solver.joint import solve_joint, solve_without_failing
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.inputs import check_inputs
-from calibgraph.trust.rematch_checks import REMATCH_DEG, REMATCH_M, compare_ends
 
 Datasets = Dataset | Path | str | Sequence[Path | str]
 AnyMatcher = Matcher | Correspondences | Path | str
 
 _log = logging.getLogger(__name__)
-
-_BETTER = 1.03
-"""Ratio of z-scores from which the end of a displaced start replaces the first end. On KITTI, ends
-8 to 12 cm off had 8 to 16 % lower z-scores than those at 3 cm; equally good ends differ by a few
-percent."""
 
 _STANDS, _REPEATS = 0.5, 4
 """Change of a lens or clock, in standard deviations, from which the last round is repeated; how
@@ -206,94 +197,3 @@ def _solve(
         if cause is None:
             raise
         raise CorrespondenceError(f"{error}; {cause}", camera=error.camera) from error
-
-
-def rematch(run: MatchingRun, progress: Progress, out_of_time: Callable[[], bool]) -> MatchingRun:
-    """Match again from a start displaced from the result, if the matcher names rounds for it.
-
-    Where an objective is flat, as along the axis of a camera in a straight street, rounds may end
-    before its top. A camera whose second end has a clearly higher z-score is taken from there,
-    unless the ends are so far apart that the camera fails.
-    """
-    rounds = run.matcher.tracking_rounds
-    if not rounds or not run.solution.objective.uses_correspondences:
-        return run
-    first = run.solution.solved_rig
-    try:
-        again = _from_displaced_start(run, (*rounds, run.matcher.rounds - 1), progress, out_of_time)
-        if again is None:
-            return run
-        run = replace(run, rematch=Rematch(first, again.solution.solved_rig))
-        better = _better_cameras(run, again)
-        return _with_cameras_of(run, again, better) if better else run
-    except CorrespondenceError as error:
-        return replace(run, rematch=Rematch(first, None, str(error)))
-
-
-@dataclass(frozen=True, eq=False)
-class _LastRound:
-    """A last round: its correspondences, their solution, how far it moved the cameras."""
-
-    correspondences: Correspondences
-    solution: Solution
-    summary: RoundSummary
-
-
-def _from_displaced_start(
-    run: MatchingRun, rounds: Sequence[int], progress: Progress, out_of_time: Callable[[], bool]
-) -> _LastRound | None:
-    """The rounds from a displaced start; None if the time is over before their end."""
-    config, terms = run.solution.config, run.solution.terms
-    rig = run.solution.solved_rig
-    estimate = perturb(rig, rotation_deg=REMATCH_DEG, translation_m=REMATCH_M, seed=config.seed)
-    places = run.correspondences.places
-    last = None
-    for index in dict.fromkeys(rounds):
-        if out_of_time():
-            return None
-        table = run.matcher.match(
-            run.dataset,
-            estimate,
-            round_index=index,
-            progress=lambda what, done, total: progress("matching again", done, total),
-        )
-        table = with_motion(table, run.dataset).with_places(places)
-        solution = solve_joint(estimate.with_lenses_of(run.guess), table, config, terms)
-        last = _LastRound(table, solution, summarize_round(table, estimate, solution.solved_rig))
-        estimate = solution.solved_rig
-    return last
-
-
-def _better_cameras(run: MatchingRun, again: _LastRound) -> set[str]:
-    """The cameras with a higher z-score at the second end, which is not far from the first."""
-    before, now = (t.findings.z_score for t in (run.correspondences, again.correspondences))
-    near = {
-        name
-        for name, checks in compare_ends(run.rematch).items()
-        if all(check.status != "FAIL" for check in checks)
-    }
-    return {n for n in near if now.get(n, -np.inf) > _BETTER * before.get(n, np.inf)}
-
-
-def _with_cameras_of(run: MatchingRun, again: _LastRound, better: set[str]) -> MatchingRun:
-    """The run with some cameras' correspondences, starts and summaries of the second end."""
-    parts = [
-        (again.correspondences if name in better else run.correspondences).of_camera(name)
-        for name in run.guess.cameras
-    ]
-    findings = run.correspondences.findings
-    z_score = dict(findings.z_score)
-    z_score |= {name: again.correspondences.findings.z_score[name] for name in better}
-    mixed = concatenate(parts).with_metadata(run.correspondences.metadata)
-    mixed = mixed.with_findings(replace(findings, z_score=z_score))
-    second = again.solution.rig.T_camera_lidar
-    at_prior = run.solution.rig.with_lenses_of(run.guess)
-    start = at_prior.moved_to({name: second[name] for name in better})
-    settings = run.solution.config, run.solution.terms
-    last = {**run.rounds[-1], **{name: again.summary[name] for name in better}}
-    return replace(
-        run,
-        correspondences=mixed,
-        solution=solve_joint(start, mixed, *settings),
-        rounds=(*run.rounds[:-1], last),
-    )

@@ -129,10 +129,15 @@ class Evidence:
         """Per free camera, its posterior by the images' evidence."""
         if self.covariance_of_matches is None:
             return {}
-        free = [name for name in self.cameras if name not in self.solution.held]
         known = self.covariance_of_matches
-        own = {name: self._rows_of(known, name) for name in free}
-        return self.measure_posteriors(own, group_tied(free, self._relative_poses))
+        own = {name: self._rows_of(known, name) for group in self.tied for name in group}
+        return self.measure_posteriors(own, self.tied)
+
+    @cached_property
+    def tied(self) -> list[tuple[str, ...]]:
+        """The free cameras, in groups that can only be elsewhere together."""
+        free = [name for name in self.cameras if name not in self.solution.held]
+        return group_tied(free, self._relative_poses)
 
     @property
     def _relative_poses(self) -> Iterator[tuple[str, str, Array]]:
