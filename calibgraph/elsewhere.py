@@ -3,8 +3,9 @@
 Coarse levels can lead the rounds to a pose a degree off, where fine levels agree as well as chance
 lets them, and from which they find no way back: grass and asphalt lead so. The posterior of the
 pose by the fine scores knows better poses within its reach. Where it tells that the rounds more
-probably ended elsewhere than not, its mean there is the start of the fine rounds. Their end is
-taken if the cameras agree better there than at the first end.
+probably ended elsewhere than not, the densest of its samples there is the start of the last rounds:
+it repeats, while the mean lies between modes. Their end is taken if the cameras agree better there
+than at the first end.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from calibgraph.rounds import assign_places
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.run_evidence import RunEvidence
 
-_TIMES = 3  # at most; the mean of a posterior cut off by its prior is on the way, not the end
+_TIMES = 3  # at most: a posterior that its prior cuts off shows the way, not the end
 
 
 def follow_images(evidence: RunEvidence) -> RunEvidence:
@@ -48,10 +49,10 @@ def _go_on(evidence: RunEvidence, groups: Sequence[tuple[str, ...]]) -> Matching
     """The run with the groups that agree better at the end of rounds from there; None if none."""
     run, posteriors = evidence.run, evidence.solution.posteriors
     rig = run.solution.solved_rig
-    means = {name: posteriors[name].elsewhere.mean(axis=0) for group in groups for name in group}
+    densest = {name: posteriors[name].elsewhere[0] for group in groups for name in group}
     start = rig.moved_to({
-        name: gtsam.Pose3.Expmap(mean).matrix() @ rig.T_camera_lidar[name]
-        for name, mean in means.items()
+        name: gtsam.Pose3.Expmap(twist).matrix() @ rig.T_camera_lidar[name]
+        for name, twist in densest.items()
     })  # fmt: skip
     rounds = run.matcher.tracking_rounds[-1], run.matcher.rounds - 1
     with run.watch("match_again"), suppress(CorrespondenceError):

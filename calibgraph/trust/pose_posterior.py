@@ -52,7 +52,7 @@ class PosePosterior:
 
     Attributes:
         near: (n, 6) samples, if the rounds ended where the matches say.
-        elsewhere: (n, 6) samples, if they ended elsewhere.
+        elsewhere: (n, 6) samples, if they ended elsewhere; the densest first.
         share: the probability that they ended elsewhere.
         log_ratio: twice the logarithm of the highest density elsewhere over that at a pose in
             question; infinite if there is none.

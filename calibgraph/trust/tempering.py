@@ -26,6 +26,8 @@ def sample_posterior(
 ) -> tuple[Array, float]:
     """Draw (n, k) samples of prior times likelihood; with the log of the integral, the evidence.
 
+    The densest sample comes first.
+
     Args:
         log_likelihood: (n,) of (n, k) points.
         prior: (k, k) covariance of the prior, a Gaussian about 0.
@@ -47,7 +49,8 @@ def sample_posterior(
             odds = exponent * (found - values) + _log_prior(proposed) - _log_prior(points)
             accepted = np.log(rng.random(samples)) < odds
             points[accepted], values[accepted] = proposed[accepted], found[accepted]
-    return points @ root.T, evidence
+    densest_first = np.argsort(-(values + _log_prior(points)), kind="stable")
+    return points[densest_first] @ root.T, evidence
 
 
 def _next_step(values: Array, left: float) -> float:

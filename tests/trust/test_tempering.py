@@ -48,5 +48,7 @@ def test_both_of_two_modes_are_found() -> None:
         return np.logaddexp(first, second)
 
     found, _ = sample_posterior(two, PRIOR, samples=2000, seed=0)
+    density = two(found) - 0.5 * np.einsum("ni,ij,nj->n", found, np.linalg.inv(PRIOR), found)
+    assert density[0] == density.max()
     assert 0.3 < (found[:, 0] > 0).mean() < 0.7
     assert np.sqrt((found[:, 0] ** 2).mean()) == pytest.approx(1.0, rel=0.1)
