@@ -19,7 +19,7 @@ from typer.main import get_command
 
 def thresholds() -> str:
     """The thresholds of all checks."""
-    from calibgraph.trust.thresholds import thresholds_markdown
+    from docs.thresholds_table import thresholds_markdown
 
     return thresholds_markdown()
 

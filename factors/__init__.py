@@ -4,7 +4,8 @@ Every factor acts on ``T_lidar_camera``, the pose of a camera in the LiDAR frame
 This package is a leaf: it imports numpy, numba and gtsam, and nothing of calibgraph.
 """
 
-from factors.block import ProjectionBlock, block_factor, to_runs
+from factors.block import ProjectionBlock, block_factor
+from factors.block_arrays import to_runs
 from factors.block_sums import BlockSums, square_root
 from factors.clock import Clock, displace
 from factors.conditioning import (

@@ -26,8 +26,8 @@ from factors.block_arrays import (
     check_shape,
     contiguous,
     join_roots,
-    read_only,
     rows_of_root,
+    to_runs,
 )
 from factors.block_sums import BlockSums, square_root, unpack_sums
 from factors.compiled import one_at_a_time
@@ -260,13 +260,6 @@ class ProjectionBlock(RobustBlock):
         sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
         error, jacobian, regular = root_of_sums(sums)
         return (error, jacobian.T) if regular else square_root(unpack_sums(sums.sum(axis=0)))
-
-
-def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(r, 2) the runs ``edges[i]:edges[i + 1]``, from (r + 1,) edges."""
-    runs = np.empty((len(edges) - 1, 2), dtype=np.int64)
-    runs[:, 0], runs[:, 1] = edges[:-1], edges[1:]
-    return read_only(runs)
 
 
 @lru_cache

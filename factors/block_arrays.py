@@ -94,3 +94,10 @@ def rows_of_root(root: Array | None) -> tuple[Array | None, int]:
         return None, 0
     isotropic = not root[:, 1].any() and np.array_equal(root[:, 0], root[:, 2])
     return np.ascontiguousarray(root.T), 1 if isotropic else 3
+
+
+def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(r, 2) the runs ``edges[i]:edges[i + 1]``, from (r + 1,) edges."""
+    runs = np.empty((len(edges) - 1, 2), dtype=np.int64)
+    runs[:, 0], runs[:, 1] = edges[:-1], edges[1:]
+    return read_only(runs)

@@ -20,7 +20,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.block import ProjectionBlock, to_runs
+from factors.block import ProjectionBlock
+from factors.block_arrays import to_runs
 from factors.block_sums import BlockSums, square_root
 from factors.epipolar import EpipolarBlock
 from factors.surface import SurfaceBlock

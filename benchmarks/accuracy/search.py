@@ -87,7 +87,7 @@ def run_case(case: Key, folders: Folders) -> Record:
     table = result.correspondences
     return {
         **ledger.to_record(result, truth),
-        "places": None if table is None else len(table.places.split(np.unique(table.frames))),
+        "places": None if table is None else len(table.places.split(np.unique(table.frame))),
         "rig": result.verdict.status,
         "pairs": {
             name: [pair.rotation_error_deg, pair.translation_error_cm]

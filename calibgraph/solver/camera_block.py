@@ -72,7 +72,7 @@ class CameraBlock:
 
     @property
     def frames(self) -> int:
-        """How many frames they come from."""
+        """Their number."""
         return len(self.frame_edges) - 1
 
     @property
@@ -82,8 +82,7 @@ class CameraBlock:
 
     def in_frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(n,) which correspondences belong to frames of some numbers."""
-        edges = self.frame_edges
-        return np.repeat(np.isin(self.frame[edges[:-1]], numbers), np.diff(edges))
+        return np.repeat(np.isin(self.frame_numbers, numbers), self.frame_counts)
 
     def sorted_by(self, of_frame: NDArray[np.int64]) -> CameraBlock:
         """The same correspondences in the order of a number of their frames, (f,)."""
@@ -127,17 +126,14 @@ class CameraBlock:
     def all_sizes(
         self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None
     ) -> tuple[Array, Array]:
-        """Norms of the residuals over the median of a standard Gaussian's.
-
-        The median of Gaussian ones of one standard deviation per axis is that standard deviation.
+        """Norms of the residuals over the median of a standard Gaussian's: sigmas of an axis.
 
         Args:
             T_camera_lidar: (1, 4, 4), or (r, 4, 4) with one of each run.
             runs: (r, 2) of all correspondences, see ``ProjectionBlock.run_residuals``.
 
         Returns:
-            (n,) unweighted errors [px]; (n,) whitened errors; infinite where a point is not
-            projectable.
+            (n,) unweighted errors [px]; (n,) whitened ones; infinite where not projectable.
         """
         medians = median_norm(self.information)
         if self.information is None:
@@ -213,7 +209,7 @@ class BlockResiduals:
         block: the correspondences.
         T_lidar_camera: where.
         residuals_px: (n, 2) predicted minus observed pixel, unweighted.
-        projectable: (n,) whether the point is in front of the camera and inside the lens' domain.
+        projectable: (n,) whether the point is ahead, and inside the lens' domain.
     """
 
     block: CameraBlock
@@ -241,11 +237,7 @@ class BlockResiduals:
         """(n,) which lie within the gate, in front of the camera."""
         return np.asarray(self.projectable & (self.errors_px <= scale.gate_px))
 
-    def gate_hessian(self, scale: ResidualScale) -> Array:
-        """(6, 6) of all matches, see :meth:`gate_hessians`."""
-        return np.asarray(self.gate_hessians(scale, np.array([0, len(self.errors_px)]))[0])
-
-    def gate_hessians(self, scale: ResidualScale, edges: NDArray[np.int64]) -> Array:
+    def gate_hessians(self, scale: ResidualScale, edges: NDArray[np.int64] | None = None) -> Array:
         """(r, 6, 6) what the gate's moving with the extrinsic adds to the Hessian of the inliers.
 
         A step of the extrinsic takes matches over the edge of the gate, out on one side and in on
@@ -254,8 +246,9 @@ class BlockResiduals:
 
         Args:
             scale: with the gate.
-            edges: (r + 1,) of the runs of matches.
+            edges: (r + 1,) of the runs of matches; None: all are one.
         """
+        edges = np.array([0, len(self.errors_px)]) if edges is None else edges
         near = np.abs(self.errors_px - scale.gate_px) < _GATE_BAND * scale.gate_px
         band = np.flatnonzero(self.projectable & near)
         edge = self.block.select(band)

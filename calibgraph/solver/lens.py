@@ -1,9 +1,8 @@
 """Lenses that are estimated together with the extrinsics: their part of the error model.
 
-What matches of one frame share, or of all frames, also looks like another lens. It belongs between
-the lens l_c and s_c, as the matches show it: with C the covariance of pose and lens by independent
-matches, S that by the scatter of frames, and k the variance that matches are left with in the graph
-(``solver.within_place``), its covariance is S - k C, and what places and all matches share.
+What matches of one frame, or of all, share also looks like another lens. It is between the lens l_c
+and s_c, as matches show it. With C the covariance by independent matches, S by the scatter of
+frames, and k the variance of matches in the graph, it is S - k C, and what places and all share.
 """
 
 from __future__ import annotations

@@ -89,7 +89,8 @@ class Objective:
     def gate_hessian(self) -> dict[str, Array]:
         """(6, 6) per camera after the gate, see ``BlockResiduals.gate_hessian``."""
         return {
-            name: block.at(T).gate_hessian(scale) for name, (block, T, scale) in self.gated.items()
+            name: block.at(T).gate_hessians(scale)[0]
+            for name, (block, T, scale) in self.gated.items()
         }
 
     def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:

@@ -74,7 +74,7 @@ def _regate_camera(
     block = inliers.with_scale(scale)
     here = block.frame_sums(T_lidar_camera, inliers.frame_edges)
     robust = robust_hessian(block, T_lidar_camera)
-    true = convex_hessian(robust + raw.at(to_T_camera_lidar(gate)).gate_hessian(scale), robust)
+    true = convex_hessian(robust + raw.at(to_T_camera_lidar(gate)).gate_hessians(scale)[0], robust)
     hessian = Sums.stack([frame.sums[camera] for frame in frames]).hessian
     if state.offsets is not None:
         hessian = np.zeros_like(hessian)

@@ -57,9 +57,8 @@ class Evidence:
     Attributes:
         solution: of the joint solve.
         guess: the rig as it was first guessed.
-        measure_posteriors: of the (6, 6) covariances by the matches, per camera, and of groups of
-            cameras that move together, the posteriors by the images' evidence; none where nothing
-            but correspondences is known.
+        measure_posteriors: the posteriors by the images, of the (6, 6) covariances by the matches
+            and of groups of cameras that move together; none where there are no images.
     """
 
     solution: Solution
@@ -256,12 +255,10 @@ class Evidence:
 
         None if nothing pulls, or by less than ``pull_sigmas`` of the camera's own solution.
         """
-        if self.solution.marginals.data_only is None or camera not in self.solution.inliers.blocks:
+        data_only = self.solution.marginals.data_only
+        if data_only is None or camera not in self.solution.inliers.blocks:
             return None
-        own, covariance = (
-            self.solution.marginals.data_only.T_camera_lidar[camera],
-            self.solution.marginals.data_only.covariance,
-        )
+        own, covariance = data_only.T_camera_lidar[camera], data_only.covariance
         joint = self.solution.T_camera_lidar[camera]
         if covariance is not None:
             first = 6 * tuple(self.solution.inliers.blocks).index(camera)

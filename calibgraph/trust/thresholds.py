@@ -1,6 +1,4 @@
-"""Every threshold that decides PASS, WARN or FAIL, in one table; printed for the documentation.
-
-    python -m calibgraph.trust.thresholds > table.md
+"""Every threshold that decides PASS, WARN or FAIL, in one table, which the documentation has, too.
 
 Limits are in units of the error that a user would suffer, and are the same for every rig. To add a
 check: a row here, a function that looks the row up by its key, and that function's name in
@@ -15,7 +13,7 @@ from functools import lru_cache
 from statistics import NormalDist
 
 from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE
-from calibgraph.model.threshold import Threshold, in_unit, is_reachable, ratio_of
+from calibgraph.model.threshold import Threshold, ratio_of
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.lens import MATCH_SHARE
@@ -264,41 +262,3 @@ def limit(key: str, tolerance: tuple[float, float] = TOLERANCE) -> float:
     """The value of a limit, for a tolerance [deg, cm]."""
     row = _LIMITS[key]
     return row.value * (max(ratio_of(row.unit, tolerance), 1.0) if row.of_tolerance else 1.0)
-
-
-def thresholds_markdown() -> str:
-    """Both tables in Markdown, a line per row."""
-    lines = [
-        "| key | question | measured | PASS | FAIL (else WARN) | reason, or the data it is from |",
-        "|---|---|---|---|---|---|",
-        *(_line(row) for row in THRESHOLDS),
-        "",
-        "\\* At the default tolerance of "
-        f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. A limit of "
-        "FAIL, or in the table below, grows with the tolerance, and never falls below this value.",
-        "",
-        "| key | limit | meaning |",
-        "|---|---|---|",
-        *(_limit_line(row) for row in LIMITS),
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _limit_line(row: Limit) -> str:
-    scaled = " \\*" if row.of_tolerance else ""
-    return f"| `{row.key}` | {in_unit(row.value, row.unit)}{scaled} | {row.meaning} |"
-
-
-def _line(row: Threshold) -> str:
-    beyond = "above" if row.direction == "at most" else "below"
-    passes = f"{row.direction} {in_unit(row.warn, row.unit, digits=4)}"
-    passes += " \\*" if row.of_tolerance else ""
-    fails = "never"
-    if is_reachable(row.fail, row.unit, row.direction):
-        fails = f"{beyond} {in_unit(row.fail, row.unit, digits=4)}"
-    cells = (f"`{row.key}`", row.question, row.name, passes, fails, row.reason)
-    return f"| {' | '.join(cells)} |"
-
-
-if __name__ == "__main__":
-    print(thresholds_markdown(), end="")

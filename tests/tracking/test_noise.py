@@ -52,7 +52,7 @@ def test_the_gates_share_of_the_hessian_is_that_of_moved_gates(pair: Rig) -> Non
     T = pair.T_camera_lidar["left"]
     scale = matches.scale(T, Config())
     pose = gtsam.Pose3(T).inverse()
-    added = matches.at(T).gate_hessian(scale)
+    added = matches.at(T).gate_hessians(scale)[0]
     for axis in range(3):
         step = np.zeros(6)
         step[axis] = 4e-4  # 0.3 px, as wide as the band

@@ -9,7 +9,8 @@ import pytest
 
 from calibgraph import Config, Rig, solve
 from calibgraph.model.threshold import Threshold
-from calibgraph.trust.thresholds import LIMITS, THRESHOLDS, limit, thresholds_markdown
+from calibgraph.trust.thresholds import LIMITS, THRESHOLDS, limit
+from docs.thresholds_table import thresholds_markdown
 from tests.conftest import ROOT
 from tests.trust.conftest import simulated
 

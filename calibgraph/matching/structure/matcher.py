@@ -74,8 +74,7 @@ class StructureMatcher:
         search_m: the same of the translation [m].
         most_frames: most frames of a dataset that are used, chosen of more; None for all.
         levels: the rounds, coarse to fine.
-        window_weights: file of a network that weighs the windows, the package's or one of
-            ``train_windows``; None to count all windows alike.
+        window_weights: file of a network that weighs the windows; None: all count alike.
 
     Raises:
         FileError: if that file is missing or malformed.
