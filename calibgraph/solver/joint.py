@@ -4,12 +4,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from calibgraph.errors import CorrespondenceError
 from calibgraph.graph.lens import lens_variables
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import require_motion
 from calibgraph.model.config import TERMS, Config, Terms
-from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.correspondences import MAX_COORDINATE, Correspondences
 from calibgraph.model.places import Places
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
@@ -19,7 +21,7 @@ from calibgraph.solver.error_model import refine_with_error_model
 from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.frame_weights import weigh_all_frames
 from calibgraph.solver.lens import Lenses, moved_lenses, put_into
-from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective
+from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective, Transforms
 from calibgraph.solver.pair_refinement import refine_with_pairs
 from calibgraph.solver.preprocess import Preprocessed, preprocess
 from calibgraph.solver.solution import Solution
@@ -96,6 +98,7 @@ def solve_joint(
             FittedObjective(inliers, scales, optimum.T_camera_lidar, held),
             optimum, kept.table.findings, kept.table.places)
 
+    require_in_reach(optimum.T_camera_lidar)
     outlier_frames = frames.outlier_frames
     counts = count_correspondences(
         kept, objective, inliers, pairwise, outlier_frames=outlier_frames
@@ -107,6 +110,21 @@ def solve_joint(
     )
     return found if camera_matches is None else add_camera_pairs(found, camera_matches)
 # fmt: on
+
+
+def require_in_reach(T_camera_lidar: Transforms) -> None:
+    """Refuse extrinsics that no rig file holds: nonsense has its minimum anywhere.
+
+    Raises:
+        CorrespondenceError: if a camera is farther away than a coordinate may be.
+    """
+    for name, T in T_camera_lidar.items():
+        if not (away_m := np.abs(T[:3, 3]).max()) <= MAX_COORDINATE:
+            raise CorrespondenceError(
+                f"its correspondences place it {away_m:.2g} m away: they determine no extrinsic; "
+                "check which pixels and points belong together",
+                camera=name,
+            )
 
 
 def _solve_with_lenses(

@@ -106,7 +106,7 @@ def test_half_a_motion_and_an_infinite_one_are_refused(tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text(text)
     with pytest.raises(FileError):
         load_correspondences(tmp_path / "table.csv")
-    with pytest.raises(CalibrationError, match="twist must be under"):
+    with pytest.raises(CalibrationError, match="twist must be finite"):
         rows(np.full((2, 6), np.inf))
 
 

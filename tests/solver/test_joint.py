@@ -21,7 +21,7 @@ from calibgraph import (
 )
 from calibgraph.model.config import TERMS
 from calibgraph.solver import objective
-from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.joint import require_in_reach, solve_joint
 from tests.conftest import stereo_relative_pose
 
 CLEAN = MatcherErrors(noise_px=0.0)
@@ -320,3 +320,12 @@ def test_information_along_an_edge_is_used_and_across_it_is_not(pair: Rig) -> No
 def test_unknown_terms_are_refused(pair: Rig) -> None:
     with pytest.raises(ValueError, match="unknown terms"):
         solve(pair, simulate_correspondences(pair), terms="everything")
+
+
+def test_an_extrinsic_that_no_rig_holds_is_refused_with_its_camera() -> None:
+    T = np.eye(4)
+    require_in_reach({"left": T})
+    T[0, 3] = -2e6
+    with pytest.raises(CorrespondenceError, match=r"2e\+06 m away: they determine no") as error:
+        require_in_reach({"left": T})
+    assert error.value.camera == "left"
