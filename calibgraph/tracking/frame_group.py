@@ -96,7 +96,7 @@ def usual_frames(state: State, frames: Iterable[StreamFrame]) -> tuple[list[Inco
     if state.offsets is not None or may_have_moved(state):
         return [], {}
     group = _alike(state, frames)
-    if len(group) < 2 or without_repeats(state, group[0].table) is not group[0].table:  # noqa: PLR2004
+    if len(group) < 2:  # noqa: PLR2004
         return [], {}
     blocks = _blocks(state, group)
     if blocks is None:
@@ -112,7 +112,10 @@ def usual_frames(state: State, frames: Iterable[StreamFrame]) -> tuple[list[Inco
 
 
 def _alike(state: State, frames: Iterable[StreamFrame]) -> list[Incoming]:
-    """The first frames, up to the end of the epoch, that state the same of their errors."""
+    """The first frames, up to the end of the epoch, that state the same of their errors.
+
+    None repeats a frame of before: a camera may have its first matches in any of them.
+    """
     group = list[Incoming]()
     room = state.config.tracking.epoch_frames - len(state.epochs[-1].frames)
     last = state.frame, state.stamp_ns
@@ -123,6 +126,8 @@ def _alike(state: State, frames: Iterable[StreamFrame]) -> list[Incoming]:
             break
         known = {*one.table.cameras} <= {*state.names}
         if not known or (group and _columns(group[0].table) != _columns(one.table)):
+            break
+        if without_repeats(state, one.table) is not one.table:
             break
         group.append(one)
         last = one.number, one.stamp_ns

@@ -128,6 +128,19 @@ def test_a_move_is_found_at_the_same_frame_as_one_by_one(size: float) -> None:
     assert len(groups) < len(tables) / 3
 
 
+def one_by_one(
+    tracker: IncrementalCalibrator, frames: Sequence[StreamFrame]
+) -> tuple[list[Update], list[str]]:
+    """The updates, and why frames are left out."""
+    updates, refused = [], []
+    for one in frames:
+        try:
+            updates.append(tracker.update(one.table, frame=one.frame))
+        except CorrespondenceError as error:
+            refused.append(str(error))
+    return updates, refused
+
+
 def test_frames_that_stand_out_are_taken_in_by_themselves() -> None:
     """Failed matches, an unknown camera, an old number, a repeated cloud, a frame without rows."""
     rig = pair_of()
@@ -140,12 +153,7 @@ def test_frames_that_stand_out_are_taken_in_by_themselves() -> None:
     frames[33] = StreamFrame(33, tables[33].select(slice(0, 0)))
     wrong = replace(tables[35], cameras=("left", "other"))
     frames[35:36] = [StreamFrame(35, wrong), StreamFrame(7, tables[7]), frames[35]]
-    alone, expected, refused = IncrementalCalibrator(guess_of(rig)), [], []
-    for one in frames:
-        try:
-            expected.append(alone.update(one.table, frame=one.frame))
-        except CorrespondenceError as error:
-            refused.append(str(error))
+    expected, refused = one_by_one(IncrementalCalibrator(guess_of(rig)), frames)
     results = [*update_all(IncrementalCalibrator(guess_of(rig)), frames)]
     found = [update for group in results if isinstance(group, list) for update in group]
     assert [one.message for one in results if isinstance(one, Refused)] == refused
@@ -154,6 +162,64 @@ def test_frames_that_stand_out_are_taken_in_by_themselves() -> None:
         (u.frame, u.left_out, {*u.used}) for u in expected
     ]
     assert found[23].left_out == ("left", "right") and not found[31].used and not found[33].used
+
+
+@pytest.fixture(scope="module")
+def started() -> bytes:
+    """After 16 frames."""
+    rig = pair_of()
+    tracker = IncrementalCalibrator(guess_of(rig))
+    together(tracker, frames_of(drive(rig, 16)))
+    return tracker.to_bytes()
+
+
+def hostile_frames(seed: int, first: int, last: int) -> list[StreamFrame]:
+    """Frames most of which lack a camera or matches, repeat an earlier one, or are wrong."""
+    rng, tables = np.random.default_rng(seed), drive(pair_of(), last)
+    for number in range(first, last):
+        table, earlier = tables[number], tables[number - int(rng.integers(1, 5))]
+        size = table.points_lidar_m.shape
+        kinds = [
+            table.of_camera("left"),
+            table.of_camera("right"),
+            table.select(slice(0, int(rng.integers(0, 12)))),
+            replace(earlier, frame=np.full(len(earlier), number)),
+            replace(table, stamp_ns=np.full(len(table), 10**9 * number)),
+            replace(table, points_lidar_m=table.points_lidar_m + 3 * rng.normal(size=size)),
+            replace(table, metadata={**table.metadata, "place": str(rng.integers(0, 3))}),
+        ]
+        kind = int(rng.integers(0, 2 * len(kinds)))
+        tables[number] = kinds[kind] if kind < len(kinds) else table
+    return [StreamFrame(number, tables[number]) for number in range(first, last)]
+
+
+@pytest.mark.parametrize(
+    "seed", [*range(3), *(pytest.param(n, marks=pytest.mark.slow) for n in range(3, 40))]
+)
+def test_whatever_comes_the_same_is_absorbed_as_one_by_one(seed: int, started: bytes) -> None:
+    """Also a camera's last cloud that comes again after frames without the camera."""
+    frames = hostile_frames(seed, 16, 32)
+    expected, _ = one_by_one(IncrementalCalibrator.from_bytes(started), frames)
+    found, _ = together(IncrementalCalibrator.from_bytes(started), frames)
+    assert [(u.frame, u.left_out, {*u.used}, [*map(str, u.events)]) for u in found] == [
+        (u.frame, u.left_out, {*u.used}, [*map(str, u.events)]) for u in expected
+    ]
+
+
+@pytest.mark.parametrize("kept", [0, 5])
+def test_a_camera_that_repeats_after_frames_without_matches_counts_once(
+    kept: int, started: bytes
+) -> None:
+    """Frame 17 has its cloud of frame 15 again; frame 16 has none, or too few matches."""
+    tables = drive(pair_of(), 20)
+    left, right = tables[16].of_camera("left"), tables[16].of_camera("right")
+    again = tables[15].of_camera("right")
+    again = replace(again, frame=np.full(len(again), 17))
+    tables[16] = concatenate([left, right.select(slice(0, kept))])
+    tables[17] = concatenate([tables[17].of_camera("left"), again])
+    found, groups = together(IncrementalCalibrator.from_bytes(started), frames_of(tables[16:]))
+    assert [[*u.used] for u in found] == [["left"], ["left"], *[["left", "right"]] * 2]
+    assert groups == [1, 1, 2]
 
 
 def test_a_blind_camera_is_reported_at_its_frame() -> None:
