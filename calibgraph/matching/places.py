@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame, seconds_between
 from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
@@ -118,6 +118,14 @@ class PlaceWalk:
 
 
 def _given_motion(before: Frame, now: Frame) -> Motion:
+    """The motion by poses or twists; None if one cannot be found, which the matcher reports."""
+    try:
+        return _by_poses_or_twists(before, now)
+    except (CalibrationError, OSError):
+        return None
+
+
+def _by_poses_or_twists(before: Frame, now: Frame) -> Motion:
     """The motion by the poses of both frames, or by their twists if they are close in time."""
     one, two = before.T_world_lidar, now.T_world_lidar
     if one is not None and two is not None:
@@ -238,9 +246,12 @@ def _motion(
     given = _given_motion(frame, later)
     if given is not None or before is None or after is None:
         return given
+    try:
+        cloud = frame.load_cloud()[:, :3].astype(np.float64)
+    except DatasetError:  # it is to be corrected for a motion that cannot be found
+        return None
     rows = match_features(before, after)
     rays = before.rays[rows[:, 0]]
-    cloud = frame.load_cloud()[:, :3].astype(np.float64)
     T = lens.T_camera_lidar
     planes = planes_at(rays, cloud @ T[:3, :3].T + T[:3, 3])
     inverse = np.einsum("ni,ni->n", planes, rays)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 import calibgraph
 from calibgraph import Dataset, Rig
+from calibgraph.errors import DatasetError
 from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching import places
@@ -114,6 +116,23 @@ def test_a_frame_that_cannot_be_read_is_of_the_place_before() -> None:
     finder = PlaceFinder(data.rig)
     frames = (data.frames[0], replace(data.frames[1], image_paths=gone))
     assert [finder.first_of_place(frame) for frame in frames] == [frames[0].index] * 2
+
+
+@pytest.mark.parametrize("what", ["find_motion", "find_twist"])
+def test_a_frame_whose_motion_cannot_be_found_is_of_the_place_before(what: str) -> None:
+    """Its scan does not fit its neighbours'; frame by frame and in a batch."""
+
+    def misfit() -> Any:
+        raise DatasetError("the scans do not fit")
+
+    data, name = sample()
+    stamps = [str(10**15 + 10**5 * frame.index) for frame in data.frames[:3]]  # 0.1 s apart
+    frames = [replace(f, name=s) for f, s in zip(data.frames, stamps, strict=False)]
+    frames[1] = replace(frames[1], **{what: misfit})
+    finder = PlaceFinder(data.rig)
+    assert [finder.first_of_place(frame) for frame in frames] == [0, 0, 0]
+    found = find_places(replace(data, frames=tuple(frames)), name, data.rig.cameras[name])
+    assert 1 in found[0]
 
 
 # Places that were visited before
