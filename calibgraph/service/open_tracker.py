@@ -115,20 +115,29 @@ def take_frames(tracker: OpenTracker, request: TrackerRequest) -> FramesTaken | 
         OSError: if they cannot be written; then abandon the tracker, and open it anew.
     """
     from calibgraph.tracking.frame_group import in_groups
-    from calibgraph.tracking.streams import Refused
     from calibgraph.tracking.update import json_lines
 
+    wrong = _first_of_no_vehicle(request)
+    if wrong is not None:
+        return Refusal(422, f"{wrong.message}; none of these frames was taken in")
     taken = _Taken()
-    items = [*_items(request, taken.refused)]
-    for item in items:
-        if isinstance(item, Refused) and item.by_motion:
-            return Refusal(422, f"{item.message}; none of these frames was taken in")
-    groups = in_groups(items, min(_TOGETHER, _WRITE_FRAMES))
+    groups = in_groups(_items(request, taken.refused), min(_TOGETHER, _WRITE_FRAMES))
     while _take_by_one_write(tracker, groups, taken):
         pass
     lines = ", ".join(json_lines(taken.updates))
     rest = json.dumps({"known": taken.known, "refused": taken.refused}).removeprefix("{")
     return FramesTaken(len(taken.updates), f'{{"updates": [{lines}], {rest}')
+
+
+def _first_of_no_vehicle(request: TrackerRequest) -> Refused | None:
+    """The first frame with a motion of no vehicle; a body that states motions is read twice."""
+    from calibgraph.model.table_columns import TWIST
+    from calibgraph.tracking.streams import Refused
+
+    if not any(key in request.body for key in (b"twist_per_s", TWIST[0].encode())):
+        return None
+    found = (item for item in _items(request, []) if isinstance(item, Refused))
+    return next((item for item in found if item.by_motion), None)
 
 
 def _take_by_one_write(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from calibgraph import Correspondences, DurableCalibrator, perturb
 from calibgraph.service import open_tracker
 from calibgraph.service.tracker_process import STATE, _Trackers
 from calibgraph.service.tracker_request import FramesTaken, Refusal, TrackerRequest
-from calibgraph.tracking import durable
+from calibgraph.tracking import durable, stream_lines
 from calibgraph.tracking.history import History
 from calibgraph.tracking.state_database import StateDatabase
 from calibgraph.tracking.stream_tables import StreamFrame
@@ -115,6 +116,30 @@ def test_a_request_with_a_motion_of_no_vehicle_is_refused_whole(
     assert answer.detail.startswith("frames, line 2: row 0 (camera 'left', frame 1): twist must be")
     assert answer.detail.endswith("; none of these frames was taken in")
     assert len(updates_in(send(trackers, tmp_path / "car", tables[:3]))) == 3
+
+
+@pytest.mark.parametrize("twist", [None, [0.0, 0.0, 0.1, 8.0, 0.0, 0.0]])
+def test_few_frames_of_a_long_request_are_in_memory_beside_its_body(
+    trackers: _Trackers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, twist: list[float] | None
+) -> None:
+    """Also where all of it is looked through for its motion before."""
+    read, held, most = stream_lines.frames_of_lines, list[weakref.ref[Any]](), 0
+
+    def watched(chunks: Any, where: str) -> Any:
+        nonlocal most
+        for item in read(chunks, where):
+            held.append(weakref.ref(item))
+            most = max(most, sum(one() is not None for one in held))
+            yield item
+            del item
+
+    monkeypatch.setattr(stream_lines, "frames_of_lines", watched)
+    lines = [json.loads(line) for line in as_lines(drive(pair_of(), 40)).splitlines()]
+    more = {} if twist is None else {"twist_per_s": twist}
+    body = "\n".join(json.dumps({**line, **more}) for line in lines).encode()
+    answer = trackers.answer(TrackerRequest("frames", str(tmp_path / "car"), body))
+    assert len(updates_in(answer)) == len(lines)
+    assert most <= 2 * open_tracker._TOGETHER  # a group, and the next one
 
 
 def test_an_error_keeps_the_frames_before_it_with_plot_and_events(
