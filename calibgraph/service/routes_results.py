@@ -40,7 +40,10 @@ def _result_folder(state: Service, caller: Reader, id: str) -> Path:
     if record.state != "succeeded":
         why = f" ({record.error})" if record.error else ""
         raise Problem(409, f"the job has no result: it is {record.state}{why}")
-    return state.folder.of_job(id) / RESULT
+    folder = state.folder.of_job(id) / RESULT
+    if not folder.exists():  # it has expired meanwhile
+        raise no_such_job()
+    return folder
 
 
 @router.get(
@@ -89,10 +92,12 @@ def _chunks(file: Any) -> Iterator[bytes]:
 def report(id: JobId, state: State, caller: Reader) -> Response:
     """The report of a result, or the page of a check: one page that explains it."""
     path = _result_folder(state, caller, id) / FILES / REPORT_FILE
-    if not path.exists():
-        raise Problem(404, "no report was asked for")
+    try:
+        content = path.read_bytes()  # a few megabytes
+    except FileNotFoundError:
+        raise Problem(404, "no report was asked for") from None
     policy = {"Content-Security-Policy": REPORT_POLICY}
-    return FileResponse(path, media_type="text/html", headers=policy)
+    return Response(content, media_type="text/html", headers=policy)
 
 
 @router.get(

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from sqlalchemy import inspect, text
 from starlette.testclient import TestClient
 
 from calibgraph import load_rig, solve
 from calibgraph.service.app import create_app
 from calibgraph.service.database import open_database
+from calibgraph.service.folders import DataFolder
 from calibgraph.service.jobs import JobTable
 from calibgraph.service.settings import Settings
 from tests.service.conftest import URL, Make, Problem, service_folder
@@ -146,6 +148,24 @@ def test_old_results_expire(make_server: Make, small: Problem) -> None:
     client.app.state.service.runner.remove_expired()  # type: ignore[attr-defined]
     assert client.get(at).status_code == 404
     assert not list((service_folder(client) / "jobs").iterdir())
+
+
+@pytest.mark.parametrize("part", ["result", "report.html", "files.zip", "exports/urdf"])
+def test_a_result_that_expires_meanwhile_is_of_no_job(
+    working: TestClient, solved: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, part: str
+) -> None:
+    """The job was found; its folder is not."""
+    monkeypatch.setattr(DataFolder, "of_job", lambda *_: tmp_path)
+    answer = working.get(f"/v1/jobs/{solved}/{part}")
+    assert answer.status_code == 404 and answer.json()["detail"].startswith("no such job")
+
+
+def test_a_report_that_goes_before_it_is_sent_is_no_error(
+    working: TestClient, solved: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(DataFolder, "of_job", lambda *_: tmp_path)
+    monkeypatch.setattr(Path, "exists", lambda _: True)
+    assert working.get(f"/v1/jobs/{solved}/report.html").status_code == 404
 
 
 def test_uris_are_read_inside_roots_alone(
