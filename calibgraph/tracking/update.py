@@ -23,7 +23,7 @@ from calibgraph.tracking.state import State
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """The estimates after a frame.
+    """The estimates after a frame; its arrays are read-only.
 
     Attributes:
         frame: its number.
@@ -66,18 +66,21 @@ def make_updates(
     names = state.names
     poses = dict(zip(names, map(to_T_camera_lidar, assessment.T_lidar_camera), strict=True))
     covariance = covariance_by_camera(assessment, names)
+    for array in (*poses.values(), *covariance.values()):
+        if array is not None:
+            array.setflags(write=False)  # the updates share them
     last = {n: one.agreements[-1:] for n, one in zip(names, state.cameras, strict=True)}
     return [
         Update(
             frame=one.number,
             stamp_ns=one.stamp_ns,
-            T_camera_lidar=poses,
-            covariance=covariance,
-            verdicts=assessment.verdicts,
+            T_camera_lidar=dict(poses),
+            covariance=dict(covariance),
+            verdicts=dict(assessment.verdicts),
             events=tuple(events),
             used={names[camera]: count for camera, count in used.items()},
             left_out=tuple(n for n in names if last[n] == ((one.number, False),)),
-            lens=assessment.lens,
+            lens=dict(assessment.lens),
         )
         for one, events, used in taken
     ]
@@ -90,10 +93,11 @@ def json_line(update: Update) -> str:
 
 def json_lines(updates: Sequence[Update]) -> list[str]:
     """A line of each update; what frames that were taken in at once share is encoded once."""
-    estimates: dict[int, dict[str, str]] = {}
+    estimates: dict[tuple[int, ...], dict[str, str]] = {}
     lines = []
     for update in updates:
-        shared = id(update.T_camera_lidar)
+        parts = update.T_camera_lidar, update.covariance, update.verdicts, update.lens
+        shared = tuple(id(value) for part in parts for value in part.values())
         if shared not in estimates:
             estimates[shared] = {name: _estimate(update, name) for name in update.T_camera_lidar}
         cameras = ", ".join(

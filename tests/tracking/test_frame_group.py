@@ -24,7 +24,7 @@ from calibgraph import (
 from calibgraph.model.correspondences import concatenate
 from calibgraph.tracking.frame_group import in_groups, update_all
 from calibgraph.tracking.stream_tables import Refused, StreamFrame
-from calibgraph.tracking.update import Update, json_line
+from calibgraph.tracking.update import Update, json_line, json_lines
 from tests.draws.drives import simulate_drive
 from tests.tracking.drives import ERRORS, drive, pair_of
 
@@ -96,11 +96,26 @@ def test_all_updates_of_a_group_have_the_estimate_after_it() -> None:
     tracker = IncrementalCalibrator(guess_of(rig))
     found, _ = together(tracker, frames_of(drive(rig, 30)))
     last = found[-EPOCH:]
-    assert {id(one.T_camera_lidar) for one in last} == {id(last[0].T_camera_lidar)}
+    assert len({id(one.T_camera_lidar["left"]) for one in last}) == 1
     present = tracker.calibration().T_camera_lidar
     for name, T in last[0].T_camera_lidar.items():
         np.testing.assert_array_equal(T, present[name])
     assert len({tuple(one.used.values()) for one in last}) > 1  # each its own
+
+
+def test_an_update_cannot_change_another_one_or_the_tracker() -> None:
+    rig = pair_of()
+    tracker = IncrementalCalibrator(guess_of(rig))
+    *_, one, other = together(tracker, frames_of(drive(rig, 20)))[0]
+    before = json_lines([one, other])
+    with pytest.raises(ValueError, match="read-only"):
+        one.T_camera_lidar["left"][0, 3] += 1.0
+    covariance = one.covariance["left"]
+    assert covariance is not None and not covariance.flags.writeable
+    for part in (one.T_camera_lidar, one.covariance, one.verdicts):
+        del part["left"]  # type: ignore[attr-defined]
+    assert json_line(other) == json_lines([one, other])[1] == before[1]
+    assert "left" in tracker.calibration().camera_verdicts
 
 
 @pytest.mark.parametrize("size", [1.0, 0.15])
