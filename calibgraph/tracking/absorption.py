@@ -19,7 +19,7 @@ from calibgraph.tracking.cause import chance_limit
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import PLACE, Incoming
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
@@ -37,12 +37,12 @@ def with_open_frames(state: State, *frames: LiveFrame) -> State:
     """The state with frames in its open epoch, in the place of those of the same numbers."""
     last, numbers = state.epochs[-1], {frame.number for frame in frames}
     others = (f for f in last.frames if f.number not in numbers)
-    return replace(state, epochs=(*state.epochs[:-1], replace(last, frames=(*others, *frames))))
+    return changed(state, epochs=(*state.epochs[:-1], changed(last, frames=(*others, *frames))))
 
 
 def begin_frame(state: State, one: Incoming) -> State:
     """The state with a frame begun, none of whose matches is absorbed."""
-    state = replace(
+    state = changed(
         state,
         frame=one.number,
         stamp_ns=one.stamp_ns,
@@ -146,7 +146,7 @@ def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> State:
     """
     camera_state, number = state.cameras[camera], state.frame or 0
     kept = camera_state.outlier_frames
-    camera_state = replace(
+    camera_state = changed(
         camera_state,
         outlier_frames=kept if own is None else (*kept, own)[-_LAST_FRAMES:],
         agreements=(*camera_state.agreements, (number, False))[-_LAST_FRAMES:],
@@ -209,7 +209,7 @@ def _count_absorbed(state: State, camera: int, gated: Gated) -> State:
     one, numbers = state.cameras[camera], gated.residuals.block.frame_numbers.tolist()
     one = count_residuals(one, gated.residuals, gated.inliers)
     agreements = (*one.agreements, *((number, True) for number in numbers))[-_LAST_FRAMES:]
-    one = replace(one, agreements=agreements)
+    one = changed(one, agreements=agreements)
     given, used = len(gated.inliers), int(gated.sums.matches.sum())
     return state.with_camera(camera, one.count(absorbed=len(numbers), given=given, used=used))
 
@@ -228,7 +228,7 @@ def add_to_totals(state: State, frames: Sequence[LiveFrame]) -> State:
             own *= np.sqrt(_UNUSUAL / np.maximum(unusual, _UNUSUAL))[:, None]
     ages = _TOTAL_KEPT ** np.arange(len(frames) - 1.0, -1.0, -1.0)
     flat = scores.reshape(len(frames), -1)
-    return replace(
+    return changed(
         state,
         total=kept * state.total + (ages * flat.T) @ flat,
         total_hessian=kept * state.total_hessian + np.tensordot(ages, sums.hessian, axes=1),
@@ -257,7 +257,7 @@ def count_absent(state: State, used: Collection[int], frame: Incoming) -> tuple[
         if absent == 0 and camera_state.absent >= limit:
             events.append(Event("back", name, number, number, stamp_ns))
         if absent != camera_state.absent:
-            state = state.with_camera(camera, replace(camera_state, absent=absent))
+            state = state.with_camera(camera, changed(camera_state, absent=absent))
     return state, events
 
 

@@ -10,7 +10,7 @@ from calibgraph.arrays import Array
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.epoch_summary import EpochSummary
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram, median, no_groups
 
@@ -62,4 +62,4 @@ class CameraState:
         counts = dict(self.counts)
         for key, number in more.items():
             counts[key] = counts.get(key, 0) + number
-        return replace(self, counts=counts)
+        return changed(self, counts=counts)

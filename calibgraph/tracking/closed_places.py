@@ -31,7 +31,7 @@ from calibgraph.tracking.contradictions import (
     poses_by_name,
 )
 from calibgraph.tracking.epoch_sums import split_halves, sum_closed_epochs
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.offset_walk import add_epoch, times_of, times_with, to_present
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
@@ -97,7 +97,7 @@ class ClosedPlaces:
             fit, dropped = fit_without_contradictions(state, sums, model, values)
         else:
             dropped = state.optimum.contradicting
-            model = replace(model, pose_graph=pose_priors(state, dropped))
+            model = changed(model, pose_graph=pose_priors(state, dropped))
             fit = LatentPoseFit(Linearization.at(model, values), 0, True)
         return ClosedPlaces(state, sums, seen, data, fit, dropped)
 
@@ -196,9 +196,9 @@ class ClosedPlaces:
         conflicts = Conflicts()
         if state.rig.relative_poses:
             start = _start(state, model, data.names)
-            before = replace(model, pose_graph=self._summary(kept))
+            before = changed(model, pose_graph=self._summary(kept))
             conflicts = find_conflicts(state, every, before, start)
-        model = replace(model, pose_graph=self._pose_graph(kept, contradicting(conflicts)))
+        model = changed(model, pose_graph=self._pose_graph(kept, contradicting(conflicts)))
         if window is not None and window.has_graph_of(model, data.names):
             window.exchange(model)
         else:
@@ -257,7 +257,7 @@ def settle(state: State, *, together: bool) -> tuple[State, ClosedPlaces]:
     When these are many an epoch changes little, and the frames after it do the work step by step;
     but not if they come together.
     """
-    closed, state = ClosedPlaces.of(state), replace(state, is_refined=together)
+    closed, state = ClosedPlaces.of(state), changed(state, is_refined=together)
     if closed.is_settled and not together:
         return state, closed
     for step in range(1, STEPS + 1):
@@ -274,11 +274,11 @@ def refine(state: State, closed: ClosedPlaces, step: int) -> tuple[State, Closed
     if step % 2:
         if step == 1 or closed.state.sizes != state.sizes:
             closed = closed.fitted(state)
-            state = replace(state, optimum=closed.optimum)
+            state = changed(state, optimum=closed.optimum)
     elif closed.state.sizes == state.sizes and closed.shows_ratios:
         found = estimate_variance_ratios(closed.fit, state.sizes)
         if not found.is_near(state.sizes):
-            state = replace(state, sizes=found)
+            state = changed(state, sizes=found)
     return state, closed
 
 

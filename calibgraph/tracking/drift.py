@@ -11,7 +11,7 @@ from calibgraph.tracking.cause import CLEARLY, find_cause, unexplained
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.state import DriftWatch, State
 from calibgraph.tracking.steps import steps_between
 from calibgraph.tracking.sums import Sums
@@ -29,11 +29,11 @@ def follow_drift(state: State, camera: int, walk: int) -> State:
         anchors = Sums.stack([one.summary.walks[0] for one in state.cameras])
         since = _frames_ago(state, camera_state.summary, walk)
         watch = DriftWatch(camera, state.updates, since, anchors)
-        state = replace(state, drift=watch)
+        state = changed(state, drift=watch)
     if camera_state.summary.walk:
         return state
     return state.with_camera(
-        camera, replace(camera_state, summary=camera_state.summary.with_walk(walk))
+        camera, changed(camera_state, summary=camera_state.summary.with_walk(walk))
     )
 
 
@@ -52,7 +52,7 @@ def report_drift(state: State) -> tuple[State, list[Event]]:
     own, own_now = dict(enumerate(then.scatter)), dict(enumerate(now.scatter))
     steps, _ = steps_between(state, (then, own), (now, own_now))
     if watch.camera not in steps.cameras:
-        return replace(state, drift=None), []
+        return changed(state, drift=None), []
     by_lidar, by_camera = unexplained(steps)
     waited = state.updates - watch.begun
     if abs(by_lidar - by_camera) < CLEARLY and waited < _PATIENCE and len(steps.cameras) > 1:
@@ -65,6 +65,6 @@ def report_drift(state: State) -> tuple[State, list[Event]]:
         size = Size.of(*steps.of(steps.cameras.index(watch.camera)))
     event = Event("drifts", name, watch.frame, state.frame or 0, state.stamp_ns, size)
     for camera in range(len(state.cameras)) if cause.lidar else (watch.camera,):
-        camera_state = replace(state.cameras[camera], drift_reported_at=state.updates)
+        camera_state = changed(state.cameras[camera], drift_reported_at=state.updates)
         state = state.with_camera(camera, camera_state)
-    return replace(state, drift=None), [event]
+    return changed(state, drift=None), [event]

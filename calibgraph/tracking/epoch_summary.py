@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.sums import Sums
 
 STRENGTHS = np.array([0.0, 0.2, 1.0, 5.0])
@@ -56,11 +56,11 @@ class EpochSummary:
         """The sums about a reference that is moved by a tangent step."""
         walks, halves = (sums.shift_reference(step) for sums in (self.walks, self.halves))
         ungated = self.ungated.shift_reference(step[: self.ungated.width])
-        return replace(self, walks=walks, halves=halves, ungated=ungated)
+        return changed(self, walks=walks, halves=halves, ungated=ungated)
 
     def add(self, epoch: Sums, ungated: Sums) -> EpochSummary:
         """The sums with an epoch's added, taken at the same reference."""
-        return replace(
+        return changed(
             self,
             walks=self.walks + epoch,
             halves=self.halves + epoch[None] * np.eye(2)[self.next_half],
@@ -77,7 +77,7 @@ class EpochSummary:
         """
         walks, kept = self.walks.after_walk(variance, overconfidence)
         by = kept[self.walk]
-        return replace(self, walks=walks, halves=self.halves * by, ungated=self.ungated * by)
+        return changed(self, walks=walks, halves=self.halves * by, ungated=self.ungated * by)
 
     def update_evidence(self, walks: Sums, epoch: Sums, noise: Array) -> EpochSummary:
         """The summary with the walks' evidence updated by how well each predicts an epoch.
@@ -98,7 +98,7 @@ class EpochSummary:
         logarithm = np.linalg.slogdet(covariance)[1]
         logarithm = logarithm - logarithm.min()
         gain = -0.5 * (np.minimum(distance, _DISTANCE_CAP) + logarithm)
-        return replace(self, evidence=_EVIDENCE_KEPT * self.evidence + gain)
+        return changed(self, evidence=_EVIDENCE_KEPT * self.evidence + gain)
 
     def select_walk(self) -> EpochSummary:
         """The summary with the walk selected by the evidence.
@@ -112,11 +112,11 @@ class EpochSummary:
                 return self
             return self.with_walk(best)
         if self.evidence[0] - self.evidence[self.walk] > _SELECT_STATIC:
-            return replace(self, walk=0, evidence=np.zeros_like(self.evidence))
+            return changed(self, walk=0, evidence=np.zeros_like(self.evidence))
         walk = self.walk
         if self.evidence[best] - self.evidence[walk] > _PREFER_WALK:
             walk = best
-        summary = replace(self, walk=walk)
+        summary = changed(self, walk=walk)
         if self.evidence[walk] - self.evidence[0] > _PREFER_WALK:
             summary = summary._restart_static_from(walk)
         return summary
@@ -133,11 +133,11 @@ class EpochSummary:
 
     def with_walk(self, walk: int) -> EpochSummary:
         """The summary with a walk selected, whose evidence begins anew."""
-        new = replace(self, walk=walk, evidence=np.zeros_like(self.evidence))
+        new = changed(self, walk=walk, evidence=np.zeros_like(self.evidence))
         return new._restart_static_from(walk)
 
     def _restart_static_from(self, walk: int) -> EpochSummary:
         """The summary with the static sums restarted from those of a walk."""
         evidence = self.evidence.copy()
         evidence[0] = evidence[walk]
-        return replace(self, walks=self.walks.replace_at(0, self.walks[walk]), evidence=evidence)
+        return changed(self, walks=self.walks.replace_at(0, self.walks[walk]), evidence=evidence)

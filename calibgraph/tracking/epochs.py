@@ -15,7 +15,7 @@ from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, inliers_of
 from calibgraph.tracking.offset_search import explaining_offsets, follow
 from calibgraph.tracking.offset_walk import add_epoch, bounded
@@ -41,26 +41,26 @@ def close_epoch(state: State, offsets: Offsets | None, sums: Sums) -> tuple[Stat
     if offsets is not None:
         state = state.at_poses(follow(state, sums, offsets))
     epochs = tuple(_at_newest(state, epoch) for epoch in state.epochs)
-    state = replace(state, epochs=epochs)
+    state = changed(state, epochs=epochs)
     if len(epochs) > state.config.tracking.live_epochs:
         state = _summarize_oldest(state)
     state = _with_references(state, state.T_lidar_camera, offsets)
     cameras = tuple(
-        replace(one, scale=one.residuals.scale(state.config)) if one.started else one
+        changed(one, scale=one.residuals.scale(state.config)) if one.started else one
         for one in state.cameras
     )
-    state = replace(state, cameras=cameras)
+    state = changed(state, cameras=cameras)
     state = regate(state)
     epochs = state.epochs
     following = Epoch.empty(state.T_lidar_camera, state.width)
     epochs = (*epochs[:-1], _with_distortion(state, epochs[-1]), following)
-    return report_drift(replace(state, epochs=epochs))
+    return report_drift(changed(state, epochs=epochs))
 
 
 def _at_newest(state: State, epoch: Epoch) -> Epoch:
     estimates = zip(state.cameras, epoch.T_lidar_camera, state.T_lidar_camera, strict=True)
     poses = tuple(own if one.summary.walk else newest for one, own, newest in estimates)
-    return replace(epoch, T_lidar_camera=poses)
+    return changed(epoch, T_lidar_camera=poses)
 
 
 def _with_distortion(state: State, epoch: Epoch) -> Epoch:
@@ -77,19 +77,19 @@ def _with_references(
     """The state with its sums about other references, but those of live frames."""
     steps = np.array([*map(step_between, state.references, references)])
     if offsets is not None and state.offsets is not None:
-        offsets = replace(offsets, times=state.offsets.times)
+        offsets = changed(offsets, times=state.offsets.times)
         later_s = offsets.values_s - state.offsets.values_s
         steps = np.column_stack([steps, later_s])
-        state = _with_points_at(replace(state, offsets=offsets), later_s)
+        state = _with_points_at(changed(state, offsets=offsets), later_s)
     cameras = tuple(
-        replace(camera_state, summary=camera_state.summary.shift_reference(step))
+        changed(camera_state, summary=camera_state.summary.shift_reference(step))
         for camera_state, step in zip(state.cameras, steps, strict=True)
     )
     drift = state.drift
     if drift is not None:
-        drift = replace(drift, anchors=drift.anchors.shift_reference(steps))
+        drift = changed(drift, anchors=drift.anchors.shift_reference(steps))
     places = state.places.shift_reference(steps)
-    return replace(state, cameras=cameras, references=references, places=places, drift=drift)
+    return changed(state, cameras=cameras, references=references, places=places, drift=drift)
 
 
 def at_explaining_offsets(
@@ -106,7 +106,7 @@ def at_explaining_offsets(
     if offsets is None or before is None:
         return state, {**blocks}
     later_s = offsets.values_s - before.values_s
-    state = replace(state.at_poses(follow(state, sums, offsets)), optimum=None)
+    state = changed(state.at_poses(follow(state, sums, offsets)), optimum=None)
     state = regate(_with_references(state, state.T_lidar_camera, offsets))
     return state, {c: delayed(block, later_s[c]) for c, block in blocks.items()}
 
@@ -114,23 +114,23 @@ def at_explaining_offsets(
 def _with_points_at(state: State, later_s: Array) -> State:
     """The state with the points of all kept matches some seconds later, (n,)."""
     epochs = tuple(
-        replace(
+        changed(
             epoch,
             frames=tuple(
-                replace(f, raw={c: delayed(raw, later_s[c]) for c, raw in f.raw.items()})
+                changed(f, raw={c: delayed(raw, later_s[c]) for c, raw in f.raw.items()})
                 for f in epoch.frames
             ),
         )
         for epoch in state.epochs
     )
     cameras = tuple(
-        replace(
+        changed(
             one,
             outlier_frames=tuple(frame.delayed(seconds) for frame in one.outlier_frames),
         )
         for one, seconds in zip(state.cameras, later_s, strict=True)
     )
-    return replace(state, epochs=epochs, cameras=cameras)
+    return changed(state, epochs=epochs, cameras=cameras)
 
 
 def _summarize_oldest(state: State) -> State:
@@ -140,22 +140,22 @@ def _summarize_oldest(state: State) -> State:
     by_places = shift_between(state, (), epoch.frames)
     cameras = range(len(state.cameras))
     evidence = tuple(_update_evidence(state, camera, epoch, by_places) for camera in cameras)
-    state = _select_walks(replace(state, cameras=evidence))
+    state = _select_walks(changed(state, cameras=evidence))
     for camera, one in enumerate(state.cameras):
         summary = one.summary
         if epoch.sums.frames[camera]:
             summary = summary.add(epoch.sums[camera], _ungated(state, epoch, camera))
         variance = state.walk_variance(STRENGTHS, len(epoch.frames))
         summary = summary.propagate(variance, state.overconfidence(camera))
-        state = state.with_camera(camera, replace(one, summary=summary))
+        state = state.with_camera(camera, changed(one, summary=summary))
     distortion = tuple(map(add, state.distortion, epoch.distortion))
-    state = replace(state, epochs=tuple(younger), distortion=distortion)
+    state = changed(state, epochs=tuple(younger), distortion=distortion)
     return _with_places(state, epoch, drifted)
 
 
 def _at_places(state: State, epoch: Epoch) -> list[LiveFrame]:
     """The frames of an epoch, linearized at the poses of their places at the optimum."""
-    frames = [replace(frame, sums=frame.sums.copy()) for frame in epoch.frames]
+    frames = [changed(frame, sums=frame.sums.copy()) for frame in epoch.frames]
     for camera, (estimate, reference) in enumerate(
         zip(epoch.T_lidar_camera, state.references, strict=True)
     ):
@@ -198,13 +198,13 @@ def _with_places(state: State, epoch: Epoch, drifted: Sequence[bool]) -> State:
         frames = len(epoch.frames)
         summed = add_epoch(state, state.places, offsets.times, parts=parts, frames=frames)
         places, times = bounded(state, *summed)
-        offsets = replace(offsets, times=times)
+        offsets = changed(offsets, times=times)
     for camera, (one, before) in enumerate(zip(state.cameras, drifted, strict=True)):
         if one.summary.walk:
             places = places.without(camera)
         elif before and parts:
             places = places.with_camera_at([*parts][-1], camera, one.summary.selected)
-    return replace(state, places=places, offsets=offsets)
+    return changed(state, places=places, offsets=offsets)
 
 
 def _update_evidence(state: State, camera: int, epoch: Epoch, by_places: Array) -> CameraState:
@@ -225,7 +225,7 @@ def _update_evidence(state: State, camera: int, epoch: Epoch, by_places: Array) 
         noise = noise + state.of_pose(camera, alone_7).scatter / sums.frames
     noise = noise * sums.frames + sums.hessian @ by_places[rows, rows] @ sums.hessian
     walks = state.of_pose(camera, one.summary.walks)
-    return replace(one, summary=one.summary.update_evidence(walks, sums, noise), groups=groups)
+    return changed(one, summary=one.summary.update_evidence(walks, sums, noise), groups=groups)
 
 
 def _select_walks(state: State) -> State:
@@ -235,5 +235,5 @@ def _select_walks(state: State) -> State:
         if summary.walk > 0 == camera_state.summary.walk:
             state = follow_drift(state, camera, summary.walk)
         else:
-            state = state.with_camera(camera, replace(camera_state, summary=summary))
+            state = state.with_camera(camera, changed(camera_state, summary=summary))
     return state

@@ -7,12 +7,14 @@ from typing import Any, TypeVar
 Item = TypeVar("Item")
 
 
-def replace(one: Item, /, **changes: Any) -> Item:
-    """As ``dataclasses.replace`` of classes that check nothing, in a fifth of the time.
+def changed(one: Item, /, **changes: Any) -> Item:
+    """A copy with other fields, in a fifth of the time of ``dataclasses.replace``.
 
     Raises:
-        TypeError: if it has no such field.
+        TypeError: if it has no such field, or checks its fields, which would not be done here.
     """
+    if hasattr(one, "__post_init__"):
+        raise TypeError(f"{type(one).__name__} checks its fields; use dataclasses.replace")
     known: dict[str, object] = type(one).__dataclass_fields__  # type: ignore[attr-defined]
     if not changes.keys() <= known.keys():
         raise TypeError(f"no fields {sorted(changes.keys() - known.keys())}")

@@ -15,7 +15,7 @@ from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.offset_sums import with_offset
 from calibgraph.tracking.offsets import Offsets, delayed, motion_in
@@ -57,7 +57,7 @@ class LiveFrame:
         raw = {c: m for c, m in self.raw.items() if c != camera}
         inliers = {c: rows for c, rows in self.inliers.items() if c != camera}
         sums = self.sums.replace_at(camera, Sums.zeros())
-        return replace(self, raw=raw, inliers=inliers, sums=sums)
+        return changed(self, raw=raw, inliers=inliers, sums=sums)
 
     def add(self, camera: int, gated: Gated, offsets: Offsets | None, *, row: int = 0) -> LiveFrame:
         """The frame with a camera's matches: those of a row of the gated frames."""
@@ -66,7 +66,7 @@ class LiveFrame:
         if twists is not None and offsets is not None and raw.block.motion is not None:
             twists = twists.copy()
             twists[camera] = offsets.adjoints[camera] @ raw.block.motion[0, :6]
-        return replace(
+        return changed(
             self,
             raw={**self.raw, camera: raw},
             inliers={**self.inliers, camera: inliers},
@@ -128,7 +128,7 @@ class Epoch:
             pose = self.T_lidar_camera[camera]
             found = distortion_evidence(own, scale, pose, WEAK, places=places).as_of_one_place()
         before, after = self.distortion[:camera], self.distortion[camera + 1 :]
-        return replace(self, distortion=(*before, found, *after))
+        return changed(self, distortion=(*before, found, *after))
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,7 @@ class OutlierFrame:
     def delayed(self, seconds: float) -> OutlierFrame:
         """The frame with its points where they are some seconds later; its pose fits them."""
         T_lidar_camera = motion_in(self.raw, seconds).compose(self.T_lidar_camera)
-        return replace(self, raw=delayed(self.raw, seconds), T_lidar_camera=T_lidar_camera)
+        return changed(self, raw=delayed(self.raw, seconds), T_lidar_camera=T_lidar_camera)
 
 
 def inliers_of(frames: Iterable[LiveFrame], camera: int) -> CameraBlock | None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.sums import Sums
 
@@ -55,7 +55,7 @@ class PlaceSums:
     @property
     def pose(self) -> PlaceSums:
         """The sums of the poses, time offsets at their references."""
-        return replace(self, rows=self.rows.pose)
+        return changed(self, rows=self.rows.pose)
 
     @property
     def frames(self) -> Array:
@@ -93,14 +93,14 @@ class PlaceSums:
 
     def shift_reference(self, steps: Array) -> PlaceSums:
         """The sums about references that are moved by (n, d) tangent steps."""
-        return replace(self, rows=self.rows.shift_reference(steps))
+        return changed(self, rows=self.rows.shift_reference(steps))
 
     def add(self, parts: Mapping[str, Sums]) -> PlaceSums:
         """The sums with (n,) sums at some places added, these the last visited."""
         sums = self
         for name, part in parts.items():
             sums = sums._visit(name)
-            sums = replace(sums, rows=sums.rows.replace_at(-1, sums.rows[-1] + part))
+            sums = changed(sums, rows=sums.rows.replace_at(-1, sums.rows[-1] + part))
         return sums
 
     def _visit(self, name: str) -> PlaceSums:
@@ -110,10 +110,10 @@ class PlaceSums:
         others = [row for row, other in enumerate(self.names) if other != name]
         names = (*(self.names[row] for row in others), name)
         if name in self.names:
-            return replace(self, names=names, rows=self.rows[[*others, self.names.index(name)]])
+            return changed(self, names=names, rows=self.rows[[*others, self.names.index(name)]])
         new = Sums.zeros(len(self.means), width=self.rows.width)
         rows = [*(self.rows[row] for row in others), new]
-        return replace(self, names=names, rows=Sums.stack(rows))
+        return changed(self, names=names, rows=Sums.stack(rows))
 
     def bounded(self, most: int = MOST_PLACES) -> PlaceSums:
         """The sums with no more places kept apart: those not visited longest are older."""
@@ -138,7 +138,7 @@ class PlaceSums:
         none = Sums.zeros(width=self.rows.width)
         rows = self.rows.replace_at((slice(None), camera), none)
         kept = np.arange(len(self.means)) != camera
-        return replace(
+        return changed(
             self, rows=rows, means=self.means * kept, older_squared=self.older_squared * kept
         )
 

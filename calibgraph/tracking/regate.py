@@ -13,7 +13,7 @@ from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.within_place import WEAK
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
@@ -38,9 +38,9 @@ def regate(state: State) -> State:
         for row, f in enumerate(live)
     )
     epochs = tuple(
-        replace(epoch, frames=tuple(islice(frames, len(epoch.frames)))) for epoch in state.epochs
+        changed(epoch, frames=tuple(islice(frames, len(epoch.frames)))) for epoch in state.epochs
     )
-    return replace(state, epochs=epochs)
+    return changed(state, epochs=epochs)
 
 
 def _linearized_together(state: State, camera: int) -> Iterator[tuple[list[int], gtsam.Pose3]]:

@@ -15,7 +15,7 @@ from calibgraph.tracking.drift import follow_drift
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.epoch_sums import sum_epochs
 from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
 from calibgraph.tracking.offset_sums import with_offset
@@ -99,7 +99,7 @@ def _date_step(state: State, detected: DetectedStep) -> tuple[DetectedStep, Meas
     since = frames[min(place, len(frames) - 1)].number
     if since == detected.since:
         return detected, measured
-    dated = replace(detected, since=since)
+    dated = changed(detected, since=since)
     remeasured = _measure_steps(state, dated)
     if set(found_by) <= set(remeasured[0].cameras):
         return dated, remeasured
@@ -151,13 +151,13 @@ def _restart_camera(
     camera_state = state.cameras[camera]
     set_aside = {frame.number for frame in camera_state.outlier_frames}
     epochs = tuple(
-        replace(epoch, frames=tuple(frame.without(camera) for frame in epoch.frames))
+        changed(epoch, frames=tuple(frame.without(camera) for frame in epoch.frames))
         for epoch in state.epochs
     )
     camera_state = camera_state.count(
         left_out=-sum(1 for part in parts if part.frame[0] in set_aside)
     )
-    camera_state = replace(
+    camera_state = changed(
         camera_state,
         summary=EpochSummary.empty(state.width),
         outlier_frames=(),
@@ -166,10 +166,10 @@ def _restart_camera(
         absent=0,
     )
     drift = None if state.drift is not None and state.drift.camera == camera else state.drift
-    at_new_pose = replace(  # its matches follow the distortion in another way now
+    at_new_pose = changed(  # its matches follow the distortion in another way now
         state.distortion[camera], jacobian=NO_DISTORTION.jacobian, hessian=NO_DISTORTION.hessian
     )
-    state = replace(
+    state = changed(
         state,
         epochs=epochs,
         places=state.places.without(camera),
@@ -188,7 +188,7 @@ def _with_anchor_at(drift: DriftWatch | None, camera: int, step: Array) -> Drift
         return None
     own = drift.anchors[camera]
     own = own.shift_reference(np.pad(step, (0, own.width - len(step))))
-    return replace(drift, anchors=drift.anchors.replace_at(camera, own))
+    return changed(drift, anchors=drift.anchors.replace_at(camera, own))
 
 
 def _drop_pairs_of(state: State, cameras: Iterable[int]) -> State:
@@ -198,7 +198,7 @@ def _drop_pairs_of(state: State, cameras: Iterable[int]) -> State:
         for place, pair in enumerate(state.rig.relative_poses)
         if any(state.names[c] in (pair.a, pair.b) for c in cameras)
     ]
-    return replace(state, dropped_pairs=tuple(sorted({*state.dropped_pairs, *wrong})))
+    return changed(state, dropped_pairs=tuple(sorted({*state.dropped_pairs, *wrong})))
 
 
 def _blocks_since(state: State, detected: DetectedStep, camera: int) -> list[CameraBlock]:

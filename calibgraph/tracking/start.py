@@ -24,7 +24,7 @@ from calibgraph.solver.camera_block import (
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.live_frames import Epoch
 from calibgraph.tracking.noise import ResidualHistogram, median
@@ -56,7 +56,7 @@ def start_cameras(
 def _try_to_start(state: State, camera: int, table: Correspondences) -> State:
     camera_state, name = state.cameras[camera], state.names[camera]
     waiting = (*camera_state.waiting, table.of_camera(name))[-HISTORY:]
-    state = state.with_camera(camera, replace(camera_state, waiting=waiting))
+    state = state.with_camera(camera, changed(camera_state, waiting=waiting))
     if not _is_attempt_due(len(camera_state.waiting) + 1, state.config.tracking.start_frames):
         return state
     rig = Rig(lidar=state.rig.lidar, cameras={name: state.rig.cameras[name]})
@@ -69,7 +69,7 @@ def _try_to_start(state: State, camera: int, table: Correspondences) -> State:
     if state.offsets is not None and result.lens:
         (offset,) = result.lens[name]
         offsets = state.offsets.with_camera(camera, offset.value, offset.sigma)
-        state = replace(state, offsets=offsets)
+        state = changed(state, offsets=offsets)
     T_lidar_camera = to_T_lidar_camera(result.T_camera_lidar[name])
     return _start_camera(state, camera, T_lidar_camera)
 
@@ -89,9 +89,9 @@ def _is_attempt_due(frames: int, first: int) -> bool:
 
 
 def _wait_longer(state: State, camera: int, reasons: tuple[str, ...]) -> State:
-    camera_state = replace(state.cameras[camera], refused=reasons)
+    camera_state = changed(state.cameras[camera], refused=reasons)
     if len(camera_state.waiting) >= HISTORY:  # tried with a full window: the older half makes room
-        camera_state = replace(camera_state, waiting=camera_state.waiting[HISTORY // 2 :])
+        camera_state = changed(camera_state, waiting=camera_state.waiting[HISTORY // 2 :])
     return state.with_camera(camera, camera_state)
 
 
@@ -104,11 +104,11 @@ def _start_camera(state: State, camera: int, T_lidar_camera: gtsam.Pose3) -> Sta
     for one in residuals:
         histogram = histogram.add(one)
     scale = histogram.scale(state.config)  # the gate by which inliers are counted below
-    camera_state = replace(state.cameras[camera], started=True, waiting=(), refused=(), scale=scale)
+    camera_state = changed(state.cameras[camera], started=True, waiting=(), refused=(), scale=scale)
     for one in residuals:
         camera_state = count_residuals(camera_state, one, one.inliers(scale))
     state = state.with_camera(camera, camera_state)
-    state = replace(state, references=replace_item(state.references, camera, T_lidar_camera))
+    state = changed(state, references=replace_item(state.references, camera, T_lidar_camera))
     return absorb_frames(state, camera, usable, T_lidar_camera)
 
 
@@ -120,7 +120,7 @@ def absorb_frames(
     Blocks of live frames are added to them; older ones are left out.
     """
     if state.offsets is not None:
-        state = replace(state, offsets=state.offsets.with_axes(camera, T_lidar_camera))
+        state = changed(state, offsets=state.offsets.with_axes(camera, T_lidar_camera))
     even = state.offsets is not None
     by_number = {int(part.frame[0]): part for part in blocks}
     scale, reference = state.cameras[camera].scale, state.references[camera]
@@ -139,7 +139,7 @@ def absorb_frames(
                 counts.update(absorbed=1, given=len(raw.frame), used=used)
             frames.append(frame)
         epochs.append(
-            replace(
+            changed(
                 epoch,
                 frames=tuple(frames),
                 T_lidar_camera=replace_item(epoch.T_lidar_camera, camera, T_lidar_camera),
@@ -147,7 +147,7 @@ def absorb_frames(
         )
     if any(state.findings.bend_sigmas):
         epochs = [epoch.with_distortion(camera, scale) for epoch in epochs]
-    state = replace(state, epochs=tuple(epochs), optimum=None)
+    state = changed(state, epochs=tuple(epochs), optimum=None)
     return state.with_camera(camera, state.cameras[camera].count(**counts))
 
 
@@ -159,7 +159,7 @@ def count_residuals(
     shares = [np.count_nonzero(own) / len(own) for own in np.split(inliers, inner)]
     medians = [*map(median, np.split(residuals.errors_px, inner))]
     recent = np.vstack([camera_state.recent, np.column_stack([shares, medians])])[-HISTORY:]
-    return replace(camera_state, recent=recent, residuals=camera_state.residuals.add(residuals))
+    return changed(camera_state, recent=recent, residuals=camera_state.residuals.add(residuals))
 
 
 def _camera_block(state: State, camera: int, table: Correspondences) -> CameraBlock | None:

@@ -20,7 +20,7 @@ from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.epoch_summary import EpochSummary
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import NO_DISTORTION, Epoch, LiveFrame
 from calibgraph.tracking.noise import inflation, widening
 from calibgraph.tracking.offset_sums import without_offset
@@ -167,12 +167,12 @@ class State:
 
     def at_poses(self, T_lidar_camera: tuple[gtsam.Pose3, ...]) -> State:
         """The state with other estimates in its open epoch."""
-        last = replace(self.epochs[-1], T_lidar_camera=T_lidar_camera)
-        return replace(self, epochs=(*self.epochs[:-1], last))
+        last = changed(self.epochs[-1], T_lidar_camera=T_lidar_camera)
+        return changed(self, epochs=(*self.epochs[:-1], last))
 
     def with_camera(self, index: int, camera: CameraState) -> State:
         """The state with one camera replaced."""
-        return replace(self, cameras=replace_item(self.cameras, index, camera))
+        return changed(self, cameras=replace_item(self.cameras, index, camera))
 
     @property
     def width(self) -> int:

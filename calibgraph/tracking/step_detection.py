@@ -13,7 +13,7 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
 from calibgraph.tracking.epoch_sums import sums_before_epochs
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import Epoch, OutlierFrame
 from calibgraph.tracking.offset_terms import score_after
 from calibgraph.tracking.outlier_frames import agrees
@@ -152,7 +152,7 @@ def _scattered_as_usual(state: State, epoch: Epoch) -> Sums:
     left = np.maximum(poses.frames - 1, 0).sum(axis=0)[:, None, None]
     by_camera = poses.scatter_about_mean.sum(axis=0) / np.maximum(left, 1.0)
     frames = [
-        replace(f, sums=f.sums.change(scatter=f.sums.frames[:, None, None] * by_camera))
+        changed(f, sums=f.sums.change(scatter=f.sums.frames[:, None, None] * by_camera))
         for f in epoch.frames
     ]
     return epoch.sums_of(frames)

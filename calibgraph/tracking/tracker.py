@@ -36,7 +36,7 @@ from calibgraph.tracking.frame_order import (
     with_place,
     without_repeats,
 )
-from calibgraph.tracking.frozen import replace
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.restart import handle_small_step, restart_after_step
 from calibgraph.tracking.start import start_cameras
 from calibgraph.tracking.state import State
@@ -224,7 +224,7 @@ class IncrementalCalibrator:
         """Do a part of the work that the end of an epoch has left to the frames after it."""
         state = self._state
         if self._closed.state.findings != state.findings:
-            self._closed, state = ClosedPlaces.of(state), replace(state, is_refined=False)
+            self._closed, state = ClosedPlaces.of(state), changed(state, is_refined=False)
         if step <= STEPS and len(state.epochs) > 1 and not state.is_refined:
             self._state, self._closed = refine(state, self._closed, step)
 
@@ -289,7 +289,7 @@ class IncrementalCalibrator:
         """Summarize the oldest live epoch, test for a small step, begin another."""
         state, offsets = self._state, self._state.offsets
         if self._assessed is not None:
-            state = replace(state, optimum=self._assessed[1].newest(state.optimum))
+            state = changed(state, optimum=self._assessed[1].newest(state.optimum))
             offsets = self._assessed[1].offsets(state)
         self._state, events = close_epoch(state, offsets, self._closed.all_sums(state))
         detected = detect_small_step(self._state)
