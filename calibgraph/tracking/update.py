@@ -23,7 +23,9 @@ from calibgraph.tracking.state import State
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """The estimates after a frame; its arrays are read-only.
+    """The estimates after a frame.
+
+    Frames that are taken in at once share their arrays, which are read-only.
 
     Attributes:
         frame: its number.
