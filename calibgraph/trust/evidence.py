@@ -23,6 +23,7 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
+from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.solution import Solution
@@ -95,7 +96,9 @@ class Evidence:
         """Per camera that has correspondences, of all of them, not only the inliers."""
         solution = self.solution
         return {
-            name: block.at(solution.T_camera_lidar[name]).summary(solution.scales[name])
+            name: BlockResiduals.at(solution.T_camera_lidar[name], block).summary(
+                solution.scales[name]
+            )
             for name, block in solution.objective.blocks.items()
         }
 
