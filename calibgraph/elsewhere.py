@@ -1,48 +1,52 @@
-"""Rounds from where the images say that cameras are, if the rounds before have ended elsewhere.
+"""Rounds that go on from where the images agree better, if the rounds before ended elsewhere.
 
-Coarse levels can lead the rounds to a pose a degree off, where fine levels agree as well as chance
-lets them, and from which they find no way back: grass and asphalt lead so. The posterior of the
-pose by the fine scores knows better poses within its reach. Where it tells that the rounds more
-probably ended elsewhere than not, the densest of its samples there is the start of the last rounds:
-it repeats, while the mean lies between modes. Their end is taken if the cameras agree better there
-than at the first end.
+Coarse levels can lead the rounds to a pose a degree off, as over grass and asphalt. There fine
+levels agree hardly better than by chance, and find no way back. The posterior of the pose by the
+fine scores covers a degree about the result. If more than half of its mass is elsewhere, its
+densest sample there is the start of the last rounds. It repeats from start to start; the mean lies
+between modes. Their end is taken if the cameras agree better there than at the first end.
+
+The posterior that chose the pose cannot vouch for it: such a camera is WARN at best.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from contextlib import suppress
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import gtsam
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.matching.run import MatchingRun
+from calibgraph.model.geometry import pose_difference
 from calibgraph.overlaps import refine_with_camera_pairs
-from calibgraph.rematch import LastRound, rounds_from, with_cameras_of
+from calibgraph.rematch import LastRound, rematch, rounds_from, with_cameras_of
 from calibgraph.rounds import assign_places
+from calibgraph.solver.joint import solve_without_failing
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.run_evidence import RunEvidence
 
 _TIMES = 3  # at most: a posterior that its prior cuts off shows the way, not the end
+_log = logging.getLogger(__name__)
 
 
-def follow_images(evidence: RunEvidence) -> RunEvidence:
-    """The evidence of the run, or of one that goes on from where the images say."""
+def go_on_elsewhere(evidence: RunEvidence) -> RunEvidence:
+    """The evidence of the run, or of one whose rounds have gone on."""
     for _ in range(_TIMES):
         if evidence.run.out_of_time or not evidence.run.matcher.tracking_rounds:
-            return evidence
-        groups = _elsewhere(evidence.solution)
+            break
+        groups = groups_elsewhere(evidence.solution)
         run = _go_on(evidence, groups) if groups else None
         if run is None:
-            return evidence
+            break
         evidence = replace(evidence, run=run)
     return evidence
 
 
-def _elsewhere(solution: Evidence) -> list[tuple[str, ...]]:
-    """The groups of cameras that more probably ended elsewhere than not."""
-    return [group for group in solution.tied if solution.posteriors[group[0]].share > 1 / 2]
+def groups_elsewhere(solution: Evidence) -> list[tuple[str, ...]]:
+    """The groups of tied cameras whose posterior has more than half of its mass elsewhere."""
+    found = solution.posteriors  # of no camera without images, or without a covariance
+    return [each for each in solution.tied if each[0] in found and found[each[0]].share > 1 / 2]
 
 
 def _go_on(evidence: RunEvidence, groups: Sequence[tuple[str, ...]]) -> MatchingRun | None:
@@ -54,17 +58,38 @@ def _go_on(evidence: RunEvidence, groups: Sequence[tuple[str, ...]]) -> Matching
         name: gtsam.Pose3.Expmap(twist).matrix() @ rig.T_camera_lidar[name]
         for name, twist in densest.items()
     })  # fmt: skip
-    rounds = run.matcher.tracking_rounds[-1], run.matcher.rounds - 1
-    with run.watch("match_again"), suppress(CorrespondenceError):
-        again = rounds_from(run, start, rounds, progress=evidence.progress)
-        better = [] if again is None else [g for g in groups if _agrees_better(run, again, g)]
-        if again is not None and better:
-            names = {name for group in better for name in group}
-            run = assign_places(with_cameras_of(run, again, names))
-            return refine_with_camera_pairs(run, evidence.progress)
-    return None
+    fine = run.matcher.tracking_rounds[-1:]
+    try:
+        with run.watch("match_again"):
+            again = rounds_from(
+                run, start, (*fine, run.matcher.rounds - 1), evidence.progress,
+                solve=solve_without_failing,
+            )  # fmt: skip
+            if again is None:
+                return None
+            better = {n for group in groups if _agrees_better(run, again, group) for n in group}
+            if not better:
+                return None
+            run = _note(with_cameras_of(run, again, better), rig.T_camera_lidar, better)
+            run = rematch(run, evidence.progress, fine)  # coarse rounds would lead away again
+            run = assign_places(run)
+        return refine_with_camera_pairs(run, evidence.progress)
+    except CorrespondenceError as error:
+        _log.info("rounds from where the images agree better: %s", error)
+        return None
+    finally:
+        run.matcher.release()
 
 
 def _agrees_better(run: MatchingRun, again: LastRound, group: tuple[str, ...]) -> bool:
     before, now = (t.findings.z_score for t in (run.correspondences, again.correspondences))
     return sum(now.get(name, 0.0) for name in group) > sum(before.get(name, 0.0) for name in group)
+
+
+def _note(run: MatchingRun, T_before: Mapping[str, Array], names: set[str]) -> MatchingRun:
+    """The run, with how far each of some cameras has gone from where the rounds ended."""
+    T = run.solution.T_camera_lidar
+    moved = {name: pose_difference(T_before[name], T[name]) for name in names}
+    for name, (degrees, centimetres) in moved.items():
+        _log.info("%s: rounds went on, by %.2g deg, %.2g cm", name, degrees, centimetres)
+    return replace(run, went_on={**run.went_on, **moved})

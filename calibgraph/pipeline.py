@@ -13,7 +13,7 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-from calibgraph.elsewhere import follow_images
+from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.dataset import Dataset
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.camera_matches import CameraMatches
@@ -71,7 +71,7 @@ def calibrate(
     run = refine_with_camera_pairs(run, report)  # what cameras see in common
     with run.watch("hash_inputs"):
         inputs = hash_inputs(run.dataset)
-    evidence = follow_images(RunEvidence(run, inputs, report))  # if they say: elsewhere
+    evidence = go_on_elsewhere(RunEvidence(run, inputs, report))  # where the rounds ended wrong
     run = evidence.run
     with run.watch("checks"):
         checks = assess_run(evidence)

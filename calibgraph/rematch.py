@@ -27,14 +27,21 @@ _BETTER = 1.03
 percent."""
 
 
-def rematch(run: MatchingRun, progress: Progress, out_of_time: Callable[[], bool]) -> MatchingRun:
+def rematch(
+    run: MatchingRun, progress: Progress, rounds: Sequence[int] | None = None
+) -> MatchingRun:
     """Match again from a start displaced from the result, if the matcher names rounds for it.
 
     Where an objective is flat, as along the axis of a camera in a straight street, rounds may end
     before its top. A camera whose second end has a clearly higher z-score is taken from there,
     unless the ends are so far apart that the camera fails.
+
+    Args:
+        run: with the result.
+        progress: called as the work goes on.
+        rounds: those from the displaced start, before the last; None: the matcher's.
     """
-    rounds = run.matcher.tracking_rounds
+    rounds = run.matcher.tracking_rounds if rounds is None else rounds
     if not rounds or not run.solution.objective.uses_correspondences:
         return run
     first = run.solution.solved_rig
@@ -42,13 +49,7 @@ def rematch(run: MatchingRun, progress: Progress, out_of_time: Callable[[], bool
         start = perturb(
             first, rotation_deg=REMATCH_DEG, translation_m=REMATCH_M, seed=run.solution.config.seed
         )
-        again = rounds_from(
-            run,
-            start,
-            (*rounds, run.matcher.rounds - 1),
-            progress=progress,
-            out_of_time=out_of_time,
-        )
+        again = rounds_from(run, start, (*rounds, run.matcher.rounds - 1), progress)
         if again is None:
             return run
         run = replace(run, rematch=Rematch(first, again.solution.solved_rig))
@@ -71,11 +72,18 @@ def rounds_from(
     run: MatchingRun,
     start: Rig,
     rounds: Sequence[int],
-    *,
     progress: Progress,
-    out_of_time: Callable[[], bool] = lambda: False,
+    *,
+    solve: Callable[..., Solution] = solve_joint,
 ) -> LastRound | None:
     """The last of some rounds from another start; None if the time is over before their end.
+
+    Args:
+        run: with the data, the matcher and the settings.
+        start: where the cameras are at the first of the rounds.
+        rounds: their numbers.
+        progress: called as the work goes on.
+        solve: how the matches of a round are solved.
 
     Raises:
         CorrespondenceError: if a camera gets too few correspondences.
@@ -83,7 +91,7 @@ def rounds_from(
     config, terms = run.solution.config, run.solution.terms
     places, estimate, last = run.correspondences.places, start, None
     for index in dict.fromkeys(rounds):
-        if out_of_time():
+        if run.is_late():
             return None
         table = run.matcher.match(
             run.dataset,
@@ -92,7 +100,7 @@ def rounds_from(
             progress=lambda what, done, total: progress("matching again", done, total),
         )
         table = with_motion(table, run.dataset).with_places(places)
-        solution = solve_joint(estimate.with_lenses_of(run.guess), table, config, terms)
+        solution = solve(estimate.with_lenses_of(run.guess), table, config, terms)
         last = LastRound(table, solution, summarize_round(table, estimate, solution.solved_rig))
         estimate = solution.solved_rig
     return last
@@ -116,8 +124,8 @@ def with_cameras_of(run: MatchingRun, again: LastRound, better: Collection[str])
         for name in run.guess.cameras
     ]
     findings = run.correspondences.findings
-    z_score = dict(findings.z_score)
-    z_score |= {name: again.correspondences.findings.z_score[name] for name in better}
+    found = again.correspondences.findings.z_score
+    z_score = {**findings.z_score, **{name: found[name] for name in better if name in found}}
     mixed = concatenate(parts).with_metadata(run.correspondences.metadata)
     mixed = mixed.with_findings(replace(findings, z_score=z_score))
     second = again.solution.rig.T_camera_lidar

@@ -100,11 +100,12 @@ def match_in_rounds(
         warnings = (*warnings, unsettled(config.estimate, moved, repeat))
     missed = full.rounds - 1 - index
     run = MatchingRun(
-        data, full, guess, table, solution, tuple(rounds), watch, missed, warnings=warnings
-    )
+        data, full, guess, table, solution, tuple(rounds), watch, missed,
+        warnings=warnings, is_late=out_of_time,
+    )  # fmt: skip
     if not out_of_time():
         with watch("match_again"):
-            run = rematch(run, progress, out_of_time)
+            run = rematch(run, progress)
     full.release()
     with watch("places"):
         run = assign_places(run)

@@ -13,13 +13,17 @@ import pytest
 import calibgraph
 from calibgraph import Config
 from calibgraph.arrays import Array
-from calibgraph.elsewhere import follow_images
+from calibgraph.elsewhere import go_on_elsewhere, groups_elsewhere
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.geometry import pose_difference
+from calibgraph.model.verdict import TOLERANCE, WENT_ON, Check
 from calibgraph.progress import no_progress
+from calibgraph.rematch import LastRound, with_cameras_of
 from calibgraph.rounds import match_in_rounds
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.pose_posterior import PosePosterior
+from calibgraph.trust.probability import STRUCTURE, judge
+from calibgraph.trust.rematch_checks import going_on_checks
 from calibgraph.trust.run_evidence import RunEvidence
 from tests.conftest import SAMPLE
 
@@ -56,7 +60,7 @@ def follow(run: MatchingRun, *posteriors: PosePosterior) -> tuple[RunEvidence, R
     evidence = RunEvidence(run, {})
     given = [{ONE: each} for each in posteriors]
     with patch.object(RunEvidence, "_measure_posteriors", side_effect=given):
-        return evidence, follow_images(evidence)
+        return evidence, go_on_elsewhere(evidence)
 
 
 def test_a_result_that_the_images_do_not_doubt_stays(run: MatchingRun) -> None:
@@ -73,6 +77,11 @@ def test_rounds_go_on_from_where_the_images_say(run: MatchingRun) -> None:
     degrees, centimetres = pose_difference(after.run.solution.T_camera_lidar[ONE], right)
     assert degrees < 0.1 and centimetres < 2.0
     assert after.run.correspondences.findings.z_score[ONE] > 5.0
+    assert after.run.went_on[ONE][0] == pytest.approx(0.6, abs=0.1)
+    assert after.run.rematch is not None  # of the new end
+    assert pose_difference(after.run.rematch.first.T_camera_lidar[ONE], right)[0] < 0.1
+    (check,) = going_on_checks(after)[ONE]
+    assert "ended 0.6 deg" in check.text
 
 
 def test_an_end_that_agrees_less_is_not_taken(run: MatchingRun) -> None:
@@ -80,6 +89,36 @@ def test_an_end_that_agrees_less_is_not_taken(run: MatchingRun) -> None:
     wrong = displaced(run, away, z_score=1e3)
     before, after = follow(wrong, told(-away, share=0.9))
     assert after is before
+
+
+def test_the_time_limit_holds(run: MatchingRun) -> None:
+    away = np.r_[0.0, np.radians(0.6), 0.0, 0.0, 0.0, 0.1]
+    wrong = replace(displaced(run, away, z_score=1.0), is_late=lambda: True)
+    before, after = follow(wrong, told(-away, share=0.9))
+    assert after is before
+
+
+def test_without_posteriors_no_camera_is_elsewhere(run: MatchingRun) -> None:
+    """As with terms that have no covariance, and matchers of one's own."""
+    evidence = RunEvidence(run, {})
+    with patch.object(RunEvidence, "_measure_posteriors", return_value={}):
+        assert evidence.solution.tied == [(ONE,)]
+        assert groups_elsewhere(evidence.solution) == []
+
+
+def test_a_camera_that_was_lost_at_the_second_end_is_not_an_error(run: MatchingRun) -> None:
+    findings = replace(run.correspondences.findings, z_score={})
+    again = LastRound(run.correspondences.with_findings(findings), run.solution, run.rounds[-1])
+    kept = with_cameras_of(run, again, {ONE})
+    assert kept.correspondences.findings.z_score == run.correspondences.findings.z_score
+
+
+def test_a_pose_that_the_posterior_chose_is_no_pass() -> None:
+    check = Check("rounds that went on", "WARN", "as it is", 0.6, kind=WENT_ON)
+    without, judged = (judge(each, 0.0, TOLERANCE, STRUCTURE) for each in ((), (check,)))
+    assert without.status == "PASS"
+    assert judged.status == "WARN" and judged.cannot_tell
+    assert judged.error_probability == without.error_probability
 
 
 @pytest.mark.realdata

@@ -1,7 +1,7 @@
 """The result of matching and solving in rounds: the input of the checks on images."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -54,6 +54,9 @@ class MatchingRun:
         out_of_time: whether the time limit has passed.
         warnings: about the dataset and its guess; about a lens or clock that did not settle.
         rematch: the test from a displaced start; None if it was not made.
+        is_late: whether the time limit has passed by now.
+        went_on: per camera whose rounds went on from where its images agree better, how far that
+            was [deg, cm].
     """
 
     dataset: Dataset
@@ -67,6 +70,8 @@ class MatchingRun:
     out_of_time: bool = False
     warnings: tuple[str, ...] = ()
     rematch: Rematch | None = None
+    is_late: Callable[[], bool] = lambda: False
+    went_on: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def require_known_motion(data: Dataset, matcher: FullMatcher, parts: Sequence[LensPart]) -> None:

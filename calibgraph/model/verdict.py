@@ -31,9 +31,13 @@ ABOUT_THE_DATA = frozenset(
         "sigma_rotation",
         "sigma_translation",
         "terms",
+        "went_on",
     }
 )
 """Kinds of checks that count data: beyond a limit, nothing seems wrong yet."""
+WENT_ON = "went_on"
+"""Kind of the check of a camera whose pose was chosen by the images' posterior: it does not fail,
+and keeps from a PASS, since the same posterior cannot vouch for it."""
 FLAT_EVIDENCE = "flat_evidence"
 """Kind of the check that compares the error bars by images and by matches. The wider one is in the
 result, so that the check itself changes no verdict."""

@@ -65,6 +65,7 @@ def solve_joint(
         raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
     config, watch = config or Config(), Stopwatch()
     require_known(rig, config.excluded_cameras)
+    _require_same_cameras(rig, camera_matches)
     if lenses is None and config.estimate:
         return _solve_with_lenses(rig, table, config, terms, camera_matches=camera_matches)
 
@@ -110,6 +111,15 @@ def solve_joint(
     )
     return found if camera_matches is None else add_camera_pairs(found, camera_matches)
 # fmt: on
+
+
+def _require_same_cameras(rig: Rig, matches: CameraMatches | None) -> None:
+    of = set() if matches is None else {name for pair in matches.pairs() for name in pair}
+    if unknown := sorted(of - rig.cameras.keys()):
+        raise CorrespondenceError(
+            f"camera matches of {', '.join(unknown)}: the rig has no such camera, but "
+            f"{', '.join(rig.cameras)}; take the matches of the same result"
+        )
 
 
 def require_in_reach(T_camera_lidar: Transforms) -> None:

@@ -90,6 +90,7 @@ def track(
                 raise FileError("standard input" if str(source[0]) == "-" else source[0], held)
             result = calibrator.tracker.calibration()
     run.report_counts()
+    result = replace(result, initial_rig=settings.rig)  # not where the first batch has located it
     return result, _write_results(settings.out, result, history if run.updates else None)
 
 

@@ -29,6 +29,7 @@ from calibgraph.trust.matcher_checks import matcher_checks
 from calibgraph.trust.pair_agreement import pair_agreement_checks
 from calibgraph.trust.place_checks import place_checks
 from calibgraph.trust.rematch_checks import (
+    going_on_checks,
     last_round_checks,
     rematch_checks,
     repeated_cloud_checks,
@@ -70,6 +71,7 @@ RUN_CHECKS: tuple[Callable[[RunEvidence], Checks], ...] = (
     range_checks,               # is the result within the matcher's range?
     repeated_cloud_checks,      # are the frames independent?
     rematch_checks,             # does matching from a displaced start end here?
+    going_on_checks,            # did the rounds end elsewhere first?
     time_limit_checks,          # was anything left out for lack of time?
     image_checks,               # do the images agree with the result?
     image_offset_checks,        # would they agree better at another time?

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.run import Rematch
 from calibgraph.model.geometry import pose_difference
-from calibgraph.model.verdict import TOLERANCE, Check
+from calibgraph.model.verdict import TOLERANCE, WENT_ON, Check
 from calibgraph.trust.evidence import Checks
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import threshold
@@ -79,6 +79,18 @@ def compare_ends(rematch: Rematch | None, tolerance: tuple[float, float] = TOLER
             threshold("rematch_translation", tolerance).check(centimetres, name=words),
         ]
     return checks
+
+
+def going_on_checks(evidence: RunEvidence) -> Checks:
+    """Which rounds ended elsewhere than the images allow, and went on from there."""
+    text = (
+        "rounds of matching ended {:.2g} deg, {:.2g} cm away, where the images agree less, and "
+        "went on from where they agree better: this scene misleads coarse levels"
+    )
+    return {
+        name: [Check("rounds that went on", "WARN", text.format(*moved), moved[0], kind=WENT_ON)]
+        for name, moved in evidence.run.went_on.items()
+    }
 
 
 def time_limit_checks(evidence: RunEvidence) -> Checks:

@@ -14,6 +14,9 @@ from calibgraph import (
     Rig,
     concatenate,
     evaluate,
+    load_dataset,
+    load_rig,
+    match_cameras,
     perturb,
     preset,
     simulate_correspondences,
@@ -22,7 +25,7 @@ from calibgraph import (
 from calibgraph.model.config import TERMS
 from calibgraph.solver import objective
 from calibgraph.solver.joint import require_in_reach, solve_joint
-from tests.conftest import stereo_relative_pose
+from tests.conftest import SAMPLE, stereo_relative_pose
 
 CLEAN = MatcherErrors(noise_px=0.0)
 
@@ -329,3 +332,12 @@ def test_an_extrinsic_that_no_rig_holds_is_refused_with_its_camera() -> None:
     with pytest.raises(CorrespondenceError, match=r"2e\+06 m away: they determine no") as error:
         require_in_reach({"left": T})
     assert error.value.camera == "left"
+
+
+def test_camera_matches_of_another_rig_are_refused_by_name() -> None:
+    truth = load_rig(SAMPLE / "reference.yaml")
+    matches = match_cameras(load_dataset(SAMPLE, truth).select("0:1"), truth)
+    rig = Rig(cameras={"front_left": truth.cameras["front_left"]})
+    table = simulate_correspondences(rig, frames=3)
+    with pytest.raises(CorrespondenceError, match="front_right.*the rig has no such camera"):
+        solve_joint(rig, table, camera_matches=matches)
