@@ -94,13 +94,9 @@ class Evidence:
     @cached_property
     def residuals(self) -> dict[str, Residuals]:
         """Per camera that has correspondences, of all of them, not only the inliers."""
-        solution = self.solution
-        return {
-            name: BlockResiduals.at(solution.T_camera_lidar[name], block).summary(
-                solution.scales[name]
-            )
-            for name, block in solution.objective.blocks.items()
-        }
+        poses, scales = self.solution.T_camera_lidar, self.solution.scales
+        blocks = self.solution.objective.blocks.items()
+        return {n: BlockResiduals.at(poses[n], block).summary(scales[n]) for n, block in blocks}
 
     @cached_property
     def joint_covariance(self) -> Array | None:
