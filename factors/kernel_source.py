@@ -18,11 +18,15 @@ def source_files(module: str) -> list[Path]:
 
     Followed are the names in the kernels, then those in what defines them, through imports, in the
     modules of the same package and of this one. A file too many is possible, such as that of a
-    constant with the name of a kernel's variable. A constant may not be read from a file.
+    constant with the name of a kernel's variable. Where the decorator has another name than
+    ``compiled``, or is an attribute of a module, all that the module uses is followed.
+
+    Not followed are values that a constant gets from a file, from a function by ``global``, or from
+    another module by ``module.CONSTANT = value``.
     """
     packages = {name.partition(".")[0] for name in (module, __name__)}
     found: set[_Name] = set()
-    pending = set(_definitions(module)[_DECORATOR])
+    pending = set(_definitions(module)[_DECORATOR]) or {(module, _ALL)}
     while pending:
         found |= pending
         used = {use for name in pending for use in _uses(name)}

@@ -16,6 +16,7 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert, relative_transform, to_T_lidar_camera
 from calibgraph.model.rig import Rig
+from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import CameraBlock, camera_blocks
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.objective import Objective, Transforms
@@ -223,7 +224,7 @@ def oracle_weights(matches: CameraBlock, T_camera_lidar: Array) -> Array:
     weights = []
     for edge in pairwise(matches.frame_edges):
         part = matches.select(np.arange(*edge))
-        spread = robust_spread(part.at(T_camera_lidar).sizes[1])
+        spread = robust_spread(BlockResiduals.at(T_camera_lidar, part).sizes[1])
         block = replace(part.block, scale=CAUCHY_SCALE_SIGMAS * max(spread, part.least_spread))
         sums = block.sums(to_T_lidar_camera(T_camera_lidar))
         squared_error = sums.gradient @ np.linalg.pinv(sums.hessian, hermitian=True) @ sums.gradient

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -45,6 +46,7 @@ def calibrate(
             time_limit_s=matching.limit_s,
             progress=progress,
         )
+        result = _warned_of_same_data(result, matching.rig)
         written = write_result(result, out, data)
     _print_frames_used(len(result.frames), data)
     _print_and_exit(result, written, as_json=as_json)
@@ -115,6 +117,7 @@ def solve(
         result = solve(load_rig(rig), correspondences, settings, terms, camera_matches=seen)
         result = result.with_inputs({str(path): sha256(path)
                                      for path in table_files(correspondences)})  # fmt: skip
+        result = _warned_of_same_data(result, rig)
         written = write_result(result, out)
         if graph is not None:
             write_text(graph, to_dot(result.graph))
@@ -122,6 +125,22 @@ def solve(
         print(result.graph)
         raise typer.Exit(1 if result.verdict.status == "FAIL" else 0)
     _print_and_exit(result, written, as_json=as_json)
+
+
+def _warned_of_same_data(result: Calibration, rig: Path | None) -> Calibration:
+    """With a warning if what was estimated has a prior that is from the same data."""
+    from calibgraph.io.calibrations import is_made_from
+    from calibgraph.io.rigs import rig_file
+
+    inputs = result.inputs.values()
+    if rig is None or not result.config.estimate or not is_made_from(rig_file(rig), inputs):
+        return result
+    text = (
+        f"{rig} was made from the same data, which count twice in the estimates of lens and clock: "
+        "their sigmas are too small. Give the rig that you began with"
+    )
+    logging.getLogger(__name__).warning(text)
+    return replace(result, warnings=(*result.warnings, text))
 
 
 def _print_frames_used(used: int, data: Dataset) -> None:

@@ -1,6 +1,6 @@
 """Results from disk: the YAML file of a calibration, and the table beside it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -238,6 +238,21 @@ def _table(
 def is_calibration(content: Mapping[str, Any]) -> bool:
     """Whether the content of a YAML file is a result."""
     return content.get("format") == CALIBRATION_FORMAT
+
+
+class _Sources(BaseModel):
+    """The keys of a result's file that hold hashes of what it was made from."""
+
+    inputs: dict[str, str] = {}
+    correspondences_sha256: str | None = None
+
+
+def is_made_from(path: Path, hashes: Iterable[str]) -> bool:
+    """Whether a rig's file is a result that was made from a source of one of these SHA-256."""
+    if not is_calibration_file(path):
+        return False
+    sources = load_model(_Sources, path)
+    return not {sources.correspondences_sha256, *sources.inputs.values()}.isdisjoint(hashes)
 
 
 class _ErrorBars(BaseModel):

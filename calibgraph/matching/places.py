@@ -43,13 +43,11 @@ Motion = NDArray[np.float64] | None
 def find_places(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -> list[list[int]]:
     """The numbers of the frames of each place, in the order of the frames.
 
-    Where no pose or twist is known and features do not show the motion, as beyond some 5 m, the
-    clouds may. A frame farther than
-    PLACE_M from the first of its place, or of another recording, or after an unknown motion, is
-    compared with the first frames of all places. It is of the most similar one within PLACE_M, else
-    of a new one. If neither images nor clouds show the motion, unlike clouds are evidence of
-    another place; a cloud in which little stands upright is none, and its frame stays at the place
-    before.
+    Without poses and twists, features show the motion up to some 5 m, and clouds beyond. A frame
+    farther than PLACE_M from the first of its place, of another recording, or after an unknown
+    motion, is compared with the first frames of all places. It joins the most similar place within
+    PLACE_M, or begins a new one. Unlike clouds show another place only if enough stands upright in
+    both: else a frame after an unknown motion stays at the place before.
 
     Raises:
         FileError: if an image or a cloud cannot be read.

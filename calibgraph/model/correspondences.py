@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError, MotionError
-from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.findings import MatcherFindings, joined_metadata
 from calibgraph.model.places import KEYS, Places
 from calibgraph.model.table_columns import (
     COORDINATES,
@@ -274,7 +274,7 @@ def _optional(values: ArrayLike | None, dtype: type) -> Any:
 
 
 def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
-    """Concatenate tables; the first gives the metadata.
+    """Concatenate tables; the first gives the metadata, but for findings of different searches.
 
     Raises:
         ValueError: if there are none.
@@ -284,8 +284,7 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
     names = tuple(sorted({name for table in tables for name in table.cameras}))
     same = "frame", "pixels_px", "points_lidar_m", "confidence"
     columns: dict[str, Any] = {n: np.concatenate([getattr(t, n) for t in tables]) for n in same}
-    numbers = [np.array([names.index(n) for n in t.cameras], np.int32) for t in tables]
-    pairs = zip(numbers, tables, strict=True)
+    pairs = [(np.array([names.index(n) for n in t.cameras], np.int32), t) for t in tables]
     found = [number[t.camera_index] if len(t) else t.camera_index for number, t in pairs]
     columns["camera_index"] = np.concatenate(found)
     if any(table.information_px is not None for table in tables):
@@ -297,4 +296,5 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
         given = [getattr(table, name) for table in tables if len(table)]
         if given and all(column is not None for column in given):
             columns[name] = np.concatenate(given)
-    return Correspondences(cameras=names, metadata=tables[0].metadata, **columns)
+    metadata = joined_metadata([table.metadata for table in tables])
+    return Correspondences(cameras=names, metadata=metadata, **columns)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -11,6 +11,7 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.model.error_components import UNKNOWN, error_components
 
 _FINITE = ("z_score", "found", "missed", "chance")
+_OF_ONE_SEARCH = ("found", "missed", "chance")
 _PER_CAMERA = (*_FINITE, "start_dependence", "memorization", "failed_share")
 _FORMER_KEYS = {"contrast": "z_score", "recall": "memorization"}
 STAGE1, _SOURCES = "stage1", ("pnp", "rig")
@@ -135,6 +136,21 @@ class MatcherFindings:
     def bend_sigmas(self) -> tuple[float, float, float]:
         """Scan distortion: elevation offset [rad], elevation scale, uncompensated motion [m]."""
         return self.elevation_rad, self.elevation_stretch, self.scan_motion_m
+
+
+def joined_metadata(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The metadata of joined tables, by theirs: the first, with what all searches found.
+
+    Where searches differ, only the cameras that one has missed remain of them, at their lowest.
+    """
+    searches = [{key: one.get(key) or {} for key in _OF_ONE_SEARCH} for one in tables]
+    if all(one == searches[0] for one in searches):
+        return dict(tables[0])
+    missed: dict[str, float] = {}
+    for camera, z_score in (item for one in searches for item in one["missed"].items()):
+        missed[camera] = min(z_score, missed.get(camera, z_score))
+    kept = {key: value for key, value in tables[0].items() if key not in _OF_ONE_SEARCH}
+    return kept | ({"missed": missed} if missed else {})
 
 
 def _prior_of(matcher: object) -> dict[str, float]:

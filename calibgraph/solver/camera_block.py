@@ -1,4 +1,4 @@
-"""One camera's correspondences, ready for the graph, and their residuals at an extrinsic."""
+"""One camera's correspondences, ready for the graph."""
 
 from __future__ import annotations
 
@@ -13,19 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.model.calibration import Residuals
 from calibgraph.model.clock import at_pixels, motion_of
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.residual_scale import MIN_SIGMA_PX, ResidualScale, robust_spread, scale_from
-from calibgraph.solver.spread_kernel import median, quantiles
+from calibgraph.solver.spread_kernel import quantiles
 from calibgraph.solver.whitening import (
     IDENTITY,
     constrained_error_px,
     constrained_root,
-    error_gradient,
     median_norm,
     sqrt_information,
     whitened_norm,
@@ -35,7 +33,6 @@ from factors import ProjectionBlock, to_runs
 MIN_MATCHES = 6
 """Of fewer correspondences a pose (three determine it) leaves too few residuals to check it by."""
 
-_GATE_BAND = 0.1  # relative half width of the band about the gate whose density is measured
 _MAX_SAMPLE = 5000  # correspondences for a choice of candidates: a mean loss is known to 1 or 2 %
 _FIRST = 1000  # correspondences: if one of them is projectable, the others need not be evaluated
 
@@ -72,7 +69,7 @@ class CameraBlock:
 
     @property
     def frames(self) -> int:
-        """Their number."""
+        """How many frames they come from."""
         return len(self.frame_edges) - 1
 
     @property
@@ -117,23 +114,20 @@ class CameraBlock:
         information = None if self.information is None else self.information[rows]
         return CameraBlock(self.block.select(rows), information, self.frame[rows])
 
-    def at(self, T_camera_lidar: Array) -> BlockResiduals:
-        """The residuals at a (4, 4) T_camera_lidar, for callers that use them more than once."""
-        T_lidar_camera = to_T_lidar_camera(T_camera_lidar)
-        residuals, projectable = self.block.residuals(T_lidar_camera)
-        return BlockResiduals(self, T_lidar_camera, residuals, projectable)
-
     def all_sizes(
         self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None
     ) -> tuple[Array, Array]:
-        """Norms of the residuals over the median of a standard Gaussian's: sigmas of an axis.
+        """Norms of the residuals over the median of a standard Gaussian's.
+
+        The median of Gaussian ones of one standard deviation per axis is that standard deviation.
 
         Args:
             T_camera_lidar: (1, 4, 4), or (r, 4, 4) with one of each run.
             runs: (r, 2) of all correspondences, see ``ProjectionBlock.run_residuals``.
 
         Returns:
-            (n,) unweighted errors [px]; (n,) whitened ones; infinite where not projectable.
+            (n,) unweighted errors [px]; (n,) whitened errors; infinite where a point is not
+            projectable.
         """
         medians = median_norm(self.information)
         if self.information is None:
@@ -147,8 +141,8 @@ class CameraBlock:
 
     def errors_px(self, T_camera_lidar: Array) -> tuple[Array, NDArray[np.bool_]]:
         """(n,) unweighted errors [px] along constrained directions; (n,) whether projectable."""
-        at = self.at(T_camera_lidar)
-        return at.errors_px, at.projectable
+        residuals, projectable = self.block.residuals(to_T_lidar_camera(T_camera_lidar))
+        return constrained_error_px(residuals, self.information), projectable
 
     def without_outliers(self, T_camera_lidar: Array, scale: ResidualScale) -> CameraBlock:
         """The inliers (paper, two-pass solver, step 2): within the gate, and projectable."""
@@ -185,7 +179,7 @@ class CameraBlock:
     def _any_projectable(self, T_camera_lidar: Array) -> bool:
         """Whether any correspondence is in front of the camera: mostly, one of the first is."""
         first = self.select(np.arange(min(_FIRST, len(self.frame))))
-        return any(some.at(T_camera_lidar).projectable.any() for some in (first, self))
+        return any(some.errors_px(T_camera_lidar)[1].any() for some in (first, self))
 
     @cached_property
     def least_spread(self) -> float:
@@ -199,77 +193,6 @@ class CameraBlock:
             return np.full(len(runs), MIN_SIGMA_PX)
         sizes = np.sqrt(root[:, 0] ** 2 + root[:, 2] ** 2)
         return np.asarray(MIN_SIGMA_PX * quantiles(sizes, runs, 0.5))
-
-
-@dataclass(frozen=True, eq=False)
-class BlockResiduals:
-    """The residuals of a block at one extrinsic, evaluated once.
-
-    Attributes:
-        block: the correspondences.
-        T_lidar_camera: where.
-        residuals_px: (n, 2) predicted minus observed pixel, unweighted.
-        projectable: (n,) whether the point is ahead, and inside the lens' domain.
-    """
-
-    block: CameraBlock
-    T_lidar_camera: gtsam.Pose3
-    residuals_px: Array
-    projectable: NDArray[np.bool_]
-
-    @cached_property
-    def errors_px(self) -> Array:
-        """(n,) unweighted errors [px], along the directions that each match constrains."""
-        return constrained_error_px(self.residuals_px, self.block.information)
-
-    @cached_property
-    def sizes(self) -> tuple[Array, Array]:
-        """As :meth:`CameraBlock.all_sizes`, of the projectable points alone."""
-        medians = median_norm(self.block.information)
-        medians = medians[self.projectable] if medians.ndim else medians
-        sizes_px = self.errors_px[self.projectable] / medians
-        root = self.block.block.sqrt_information
-        if self.block.information is None and root is None:
-            return sizes_px, sizes_px
-        return sizes_px, whitened_norm(root, self.residuals_px)[self.projectable] / medians
-
-    def inliers(self, scale: ResidualScale) -> NDArray[np.bool_]:
-        """(n,) which lie within the gate, in front of the camera."""
-        return np.asarray(self.projectable & (self.errors_px <= scale.gate_px))
-
-    def gate_hessians(self, scale: ResidualScale, edges: NDArray[np.int64] | None = None) -> Array:
-        """(r, 6, 6) what the gate's moving with the extrinsic adds to the Hessian of the inliers.
-
-        A step of the extrinsic takes matches over the edge of the gate, out on one side and in on
-        the other, and their gradients with them. The term is some percent of the Hessian, and
-        negative. It is measured on the matches near the edge, on both sides of it.
-
-        Args:
-            scale: with the gate.
-            edges: (r + 1,) of the runs of matches; None: all are one.
-        """
-        edges = np.array([0, len(self.errors_px)]) if edges is None else edges
-        near = np.abs(self.errors_px - scale.gate_px) < _GATE_BAND * scale.gate_px
-        band = np.flatnonzero(self.projectable & near)
-        edge = self.block.select(band)
-        residuals, errors = self.residuals_px[band], self.errors_px[band]
-        across = error_gradient(residuals, errors, edge.information)
-        across *= (whitened_norm(edge.block.sqrt_information, residuals) / errors)[:, None]
-        root = np.column_stack([across, np.zeros(len(across))])
-        weighted = replace(edge, block=edge.block.rewhiten(root))
-        of_run = np.searchsorted(band, edges)
-        sums = weighted.with_scale(scale).frame_sums(self.T_lidar_camera, of_run)
-        return np.asarray(-sums.hessian / (2 * _GATE_BAND))
-
-    def summary(self, scale: ResidualScale) -> Residuals:
-        """What the result reports of them."""
-        return Residuals(
-            median_px=median(self.errors_px),
-            inlier_share=float(np.mean(self.inliers(scale))),
-            sigma_px=robust_spread(self.sizes[0]),
-            loss_scale_px=scale.loss_scale,
-            gate_px=scale.gate_px,
-        )
 
 
 def merge(parts: Sequence[CameraBlock]) -> CameraBlock:

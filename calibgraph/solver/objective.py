@@ -17,6 +17,7 @@ from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.objective import join, objective_graph, pose_key, projection_graph
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.rig import Rig
+from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, pair_graph
 from calibgraph.solver.optimizer import Optimum, optimize
@@ -87,9 +88,9 @@ class Objective:
 
     @cached_property
     def gate_hessian(self) -> dict[str, Array]:
-        """(6, 6) per camera after the gate, see ``BlockResiduals.gate_hessian``."""
+        """(6, 6) per camera after the gate, see ``BlockResiduals.gate_hessians``."""
         return {
-            name: block.at(T).gate_hessians(scale)[0]
+            name: BlockResiduals.at(T, block).gate_hessians(scale)[0]
             for name, (block, T, scale) in self.gated.items()
         }
 

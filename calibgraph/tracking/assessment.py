@@ -17,7 +17,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES, sigmas_of_hessian
-from calibgraph.solver.lens import estimates_of
+from calibgraph.solver.lens_estimates import estimates_of
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.epoch_sums import estimates_of_halves, in_its_half

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.solver.camera_block import MIN_MATCHES, BlockResiduals, CameraBlock
+from calibgraph.solver.block_residuals import BlockResiduals
+from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.curvature import robust_hessians_of
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.within_place import WEAK
@@ -64,7 +65,7 @@ class Gated:
             edges: (f + 1,) of what counts as a frame; None: the frames.
         """
         residuals, edges = (
-            raw.at(to_T_camera_lidar(T_lidar_camera)),
+            BlockResiduals.at(to_T_camera_lidar(T_lidar_camera), raw),
             raw.frame_edges if edges is None else edges,
         )
         inliers = residuals.inliers(scale)

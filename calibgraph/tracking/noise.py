@@ -16,7 +16,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.config import Config
-from calibgraph.solver.camera_block import BlockResiduals
+from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.residual_scale import ResidualScale, iterate_spread, scale_from
 
 _EDGES = np.concatenate([[0.0], np.geomspace(1e-5, 1e5, 2304)])  # 1 % wide

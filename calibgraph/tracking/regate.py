@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.curvature import convex_hessian, robust_hessian
 from calibgraph.solver.within_place import WEAK
@@ -74,7 +75,8 @@ def _regate_camera(
     block = inliers.with_scale(scale)
     here = block.frame_sums(T_lidar_camera, inliers.frame_edges)
     robust = robust_hessian(block, T_lidar_camera)
-    true = convex_hessian(robust + raw.at(to_T_camera_lidar(gate)).gate_hessians(scale)[0], robust)
+    residuals = BlockResiduals.at(to_T_camera_lidar(gate), raw)
+    true = convex_hessian(robust + residuals.gate_hessians(scale)[0], robust)
     hessian = Sums.stack([frame.sums[camera] for frame in frames]).hessian
     if state.offsets is not None:
         hessian = np.zeros_like(hessian)

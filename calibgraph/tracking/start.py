@@ -16,11 +16,8 @@ from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
-from calibgraph.solver.camera_block import (
-    BlockResiduals,
-    CameraBlock,
-    camera_blocks,
-)
+from calibgraph.solver.block_residuals import BlockResiduals
+from calibgraph.solver.camera_block import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.events import Event
@@ -99,7 +96,7 @@ def _start_camera(state: State, camera: int, T_lidar_camera: gtsam.Pose3) -> Sta
     """The state with a camera's first frames absorbed at its first estimate."""
     parts = [_camera_block(state, camera, table) for table in state.cameras[camera].waiting]
     usable = [part for part in parts if part is not None]
-    residuals = [part.at(to_T_camera_lidar(T_lidar_camera)) for part in usable]
+    residuals = [BlockResiduals.at(to_T_camera_lidar(T_lidar_camera), part) for part in usable]
     histogram = ResidualHistogram()
     for one in residuals:
         histogram = histogram.add(one)

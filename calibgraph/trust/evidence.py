@@ -23,6 +23,7 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
+from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.solution import Solution
@@ -93,11 +94,9 @@ class Evidence:
     @cached_property
     def residuals(self) -> dict[str, Residuals]:
         """Per camera that has correspondences, of all of them, not only the inliers."""
-        solution = self.solution
-        return {
-            name: block.at(solution.T_camera_lidar[name]).summary(solution.scales[name])
-            for name, block in solution.objective.blocks.items()
-        }
+        poses, scales = self.solution.T_camera_lidar, self.solution.scales
+        blocks = self.solution.objective.blocks.items()
+        return {n: BlockResiduals.at(poses[n], block).summary(scales[n]) for n, block in blocks}
 
     @cached_property
     def joint_covariance(self) -> Array | None:

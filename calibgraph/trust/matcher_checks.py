@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
+from calibgraph.matching.structure.acceptance import FEW_FRAMES, SEARCH, probability_by_chance
+from calibgraph.matching.structure.global_search import ALONE
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.threshold import Threshold
-from calibgraph.model.verdict import TOLERANCE, Check
+from calibgraph.model.verdict import FAIL_ABOVE, TOLERANCE, Check
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.solution_checks import check_sigmas
 from calibgraph.trust.thresholds import threshold
+
+_OF_FEW_FRAMES = replace(SEARCH, sigma=0.0)  # in which the search has measured the location
 
 
 def matcher_checks(evidence: Evidence) -> Checks:
@@ -20,12 +25,23 @@ def matcher_checks(evidence: Evidence) -> Checks:
     The error that all frames share is part of the error bar, with which it is checked; where there
     is no error bar it is checked alone.
     """
-    findings = evidence.findings
+    findings = _with_chance_of_few_frames(evidence)
     shared_sigmas = findings.systematic_sigmas if evidence.joint_covariance is None else None
     tolerance = evidence.solution.config.tolerance
     return {
         name: check_findings(findings, name, shared_sigmas, tolerance) for name in evidence.cameras
     }
+
+
+def _with_chance_of_few_frames(evidence: Evidence) -> MatcherFindings:
+    """The findings without what is found by chance in more frames, where no search measures it."""
+    table, findings = evidence.solution.correspondences, evidence.findings
+    few = {
+        name: chance
+        for name, chance in findings.chance.items()
+        if len(np.unique(table.of_camera(name).frame)) <= FEW_FRAMES
+    }
+    return replace(findings, chance=few)
 
 
 def check_findings(
@@ -53,11 +69,21 @@ def check_findings(
 
 
 def _agreement_checks(findings: MatcherFindings, camera: str) -> list[Check]:
-    """Whether image and cloud agree better than by chance, which some searches measure."""
+    """Whether image and cloud agree better than by chance.
+
+    A search in few frames measures that; its finding stands unless the rounds have lost the pose.
+    """
     z_score, chance = findings.z_score.get(camera), findings.chance.get(camera)
-    if chance is not None:  # the check of the search has it where the camera was missed
-        return [] if camera in findings.missed else [threshold("chance").check(chance)]
+    if chance is not None and camera in findings.missed:
+        return []  # the check of the search has it
+    if chance is not None and z_score is not None and not _is_lost(z_score):
+        return [threshold("chance").check(chance)]
     return [] if z_score is None else [threshold("z_score").check(z_score)]
+
+
+def _is_lost(z_score: float) -> bool:
+    """Whether a pose of this z-score after the last round may well be one by chance."""
+    return probability_by_chance(z_score, ALONE, _OF_FEW_FRAMES) > FAIL_ABOVE
 
 
 def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:

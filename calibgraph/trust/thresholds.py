@@ -111,7 +111,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("chance", "probability that a search finds as much by chance", "at most",
               FALSE_ACCEPTANCE, FAIL_ABOVE, "share",
               "Do images and clouds of one to three frames agree better than by chance?",
-              "The search accepts no more; the verdict's own cut. In place of `z_score`."),
+              "The search accepts no more; the verdict's own cut. In place of `z_score`, unless "
+              "the rounds end at a pose as by chance."),
     # the frames
     Threshold("competing_solution", "matches of a competing solution over those of this one",
               "at most", 0.25, 0.5, "share",

@@ -55,6 +55,22 @@ def test_solve_then_evaluate(solved: CommandRun, call: Call) -> None:
     assert "left->right" in table
 
 
+def test_a_prior_from_the_same_data_is_warned_of(solved: CommandRun, call: Call) -> None:
+    """With an estimate of the lens: a guess alone is no prior. Also of a copy of the table."""
+    problem, note = solved.folder.parent, "was made from the same data"
+    table, kept = problem / "table.parquet", solved.folder / "correspondences.parquet"
+    for rig, given, options, warned in (
+        (solved.folder, table, ("--estimate", "focal"), True),
+        (solved.folder, kept, ("--estimate", "focal"), True),
+        (solved.folder, table, (), False),
+        (problem / "rig.yaml", table, ("--estimate", "focal"), False),
+    ):
+        out = problem / "again"
+        _, _, err = call("solve", rig, given, *options, "--out", out)
+        assert (note in err) == warned
+        assert any(note in text for text in load_calibration(out).warnings) == warned
+
+
 def test_solve_estimates_a_lens_and_its_files_have_it(solved: CommandRun, call: Call) -> None:
     problem = solved.folder.parent
     out = problem / "with_lens"

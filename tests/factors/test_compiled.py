@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -17,6 +19,8 @@ from factors.compiled import compiled
 from factors.kernel_source import source_files
 from tests.conftest import ROOT
 
+PACKAGES = "calibgraph", "factors"
+IMPORT = "from factors.compiled import compiled"
 MAIN = """
 from factors.compiled import compiled
 from kernels.constants import HALF
@@ -47,6 +51,10 @@ CHAIN = {  # what the kernels of main use is in all but last
     "f": "F = 3",
     "last": "LAST = 5",
 }
+SOURCES = (
+    "import kernels.main; from factors.kernel_source import source_files\n"
+    "print(*sorted(file.stem for file in source_files('kernels.main')))"
+)
 CALL = "from kernels.main import kernel\nprint(kernel(3.0), sum(kernel.stats.cache_hits.values()))"
 LOSS = (
     "import numpy as np; from factors.loss import loss_and_weight as kernel\n"
@@ -164,11 +172,64 @@ def test_what_kernels_use_is_followed_through_all_kinds_of_definitions_and_impor
     (tmp_path / "kernels").mkdir()
     for name, text in CHAIN.items():
         (tmp_path / "kernels" / f"{name}.py").write_text(text)
-    code = (
-        "import kernels.main; from factors.kernel_source import source_files\n"
-        "print(*sorted(file.stem for file in source_files('kernels.main')))"
-    )
-    assert run(code, path=tmp_path)[0] == "a b c d e f main"
+    assert run(SOURCES, path=tmp_path)[0] == "a b c d e f main"
+
+
+@pytest.mark.parametrize(
+    ("imported", "decorator"),
+    [("import factors.compiled as c", "c.compiled"), (f"{IMPORT} as jit", "jit")],
+)
+def test_where_the_decorator_has_another_name_all_that_the_module_uses_is_followed(
+    imported: str, decorator: str, tmp_path: Path
+) -> None:
+    (tmp_path / "kernels").mkdir()
+    main = CHAIN["main"].replace(IMPORT, imported).replace("@compiled", f"@{decorator}")
+    assert IMPORT not in main.splitlines() and "@compiled" not in main
+    for name, text in {**CHAIN, "main": main}.items():
+        (tmp_path / "kernels" / f"{name}.py").write_text(text)
+    found = run(SOURCES, path=tmp_path)[0].split()
+    assert {*found} >= {*"abcdef", "main", "last"}
+
+
+def test_constants_are_assigned_in_their_own_module_and_not_by_functions() -> None:
+    """So the sources of a kernel are all that determines it; decorators have the known name."""
+    for file in (file for folder in PACKAGES for file in (ROOT / folder).rglob("*.py")):
+        assert departures(ast.parse(file.read_bytes())) == [], file
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "from factors import loss\nloss.K = 2",
+        "import factors.loss as other\nother.K[0] += 2",
+        "def change():\n    global K\n    K = 2",
+        f"{IMPORT} as jit",
+        "import factors.compiled as c\n@c.compiled()\ndef kernel():\n    pass",
+    ],
+)
+def test_a_constant_changed_from_elsewhere_is_found(text: str) -> None:
+    assert departures(ast.parse(text))
+
+
+def departures(module: ast.Module) -> list[str]:
+    """What sources do not follow: ``global``, changes of what is imported, other decorators."""
+    nodes = [*ast.walk(module)]
+    imported = {
+        (alias.asname or alias.name).partition(".")[0]
+        for node in nodes
+        if isinstance(node, ast.ImportFrom | ast.Import)
+        for alias in node.names
+        if (getattr(node, "module", None) or alias.name).partition(".")[0] in PACKAGES
+    }
+    return [
+        ast.unparse(node)
+        for node in nodes
+        if isinstance(node, ast.Global)
+        or (isinstance(node, ast.Attribute) and node.attr == "compiled")
+        or (isinstance(node, ast.alias) and node.name == "compiled" and node.asname)
+        or (isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store))
+        and re.split(r"[.\[]", ast.unparse(node))[0] in imported
+    ]
 
 
 def test_the_sums_depend_on_kernels_and_on_the_layout_of_their_tiles_alone() -> None:

@@ -29,7 +29,7 @@ from calibgraph.model.rig import IntrinsicsSigma
 from calibgraph.report.as_json import result_summary
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.lens import lens_estimates
+from calibgraph.solver.lens_estimates import lens_estimates
 from calibgraph.solver.solution import Solution
 from tests.draws.lenses import put_lens_error
 from tests.solver.test_elimination import STATED

@@ -13,6 +13,7 @@ from calibgraph import (
     Rig,
     simulate_correspondences,
 )
+from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.noise import ResidualHistogram
@@ -34,7 +35,8 @@ def test_the_histogram_finds_the_scale_of_all_frames(pair: Rig) -> None:
     T = pair.T_camera_lidar["left"]
     spread = ResidualHistogram()
     for frame in range(40):
-        spread = spread.add(matches_of(pair, table.select(table.frame == frame), "left").at(T))
+        block = matches_of(pair, table.select(table.frame == frame), "left")
+        spread = spread.add(BlockResiduals.at(T, block))
     expected = matches_of(pair, table, "left").scale(T, Config())
     found = spread.scale(Config())
     assert found.sigma_px == pytest.approx(expected.sigma_px, rel=3e-3)
@@ -52,7 +54,7 @@ def test_the_gates_share_of_the_hessian_is_that_of_moved_gates(pair: Rig) -> Non
     T = pair.T_camera_lidar["left"]
     scale = matches.scale(T, Config())
     pose = gtsam.Pose3(T).inverse()
-    added = matches.at(T).gate_hessians(scale)[0]
+    added = BlockResiduals.at(T, matches).gate_hessians(scale)[0]
     for axis in range(3):
         step = np.zeros(6)
         step[axis] = 4e-4  # 0.3 px, as wide as the band

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -73,20 +74,53 @@ def test_an_error_that_is_in_the_error_bar_is_not_listed_as_zero(pair: Rig) -> N
     assert not [check.name for check in verdict.checks if "frames share" in check.name]
 
 
-def test_a_search_that_measured_chance_is_judged_by_that_and_by_nothing_else(pair: Rig) -> None:
+FOUND = {"found": {"left": 12.0, "right": 12.0}, "chance": {"left": 2e-4, "right": 1e-6}}
+
+
+def at_z_score(value: float) -> dict[str, Any]:
+    return STATED | {"z_score": {"left": value, "right": value}}
+
+
+def test_a_search_that_measured_chance_is_judged_by_that_where_it_ends_well(pair: Rig) -> None:
     """In one frame, which all checks that count data are about."""
     table = calibgraph.simulate_correspondences(pair, frames=1, matches=200)
-    low = {"z_score": {"left": 3.0, "right": 3.0}}
-    found = {"found": {"left": 12.0, "right": 12.0}, "chance": {"left": 2e-4, "right": 1e-6}}
-    blamed = calibgraph.solve(pair, replace(table, metadata=STATED | low)).camera_verdicts
+    metadata = at_z_score(8.5)
+    blamed = calibgraph.solve(pair, replace(table, metadata=metadata)).camera_verdicts
     assert blamed["left"].status == "FAIL"
-    verdicts = calibgraph.solve(pair, replace(table, metadata=STATED | low | found)).camera_verdicts
+    verdicts = calibgraph.solve(pair, replace(table, metadata=metadata | FOUND)).camera_verdicts
     assert verdicts["left"].status == verdicts["right"].status == "WARN"
     assert verdicts["left"].cannot_tell
     kinds = {check.kind for check in verdicts["left"].checks}
     assert "chance" in kinds and "z_score" not in kinds
     by_checks = [verdicts[name].error_probability.by_checks for name in ("left", "right")]  # type: ignore[union-attr]
     assert by_checks[0] - by_checks[1] == pytest.approx(2e-4, rel=0.02)
+
+
+@pytest.mark.parametrize(("frames", "z_score"), [(1, 1.0), (3, 5.0), (4, 8.5), (30, 1.0)])
+def test_what_a_search_found_excuses_neither_a_lost_end_nor_many_frames(
+    pair: Rig, frames: int, z_score: float
+) -> None:
+    """The verdict is then that of a table without the search's findings."""
+    table = calibgraph.simulate_correspondences(pair, frames=frames, matches=200)
+    without, with_search = (
+        calibgraph.solve(pair, replace(table, metadata=metadata)).camera_verdicts["left"]
+        for metadata in (at_z_score(z_score), at_z_score(z_score) | FOUND)
+    )
+    assert with_search.status == "FAIL"
+    assert with_search.error_probability == without.error_probability
+
+
+def test_joined_frames_are_not_judged_by_the_search_in_one(pair: Rig) -> None:
+    table = calibgraph.simulate_correspondences(pair, frames=3, matches=200)
+    frames = [
+        replace(table.select(table.frame == number), metadata=at_z_score(8.5) | findings)
+        for number, findings in enumerate((FOUND, {}, {"missed": {"right": 7.0}}))
+    ]
+    joined = calibgraph.concatenate(frames)
+    assert joined.findings.missed == {"right": 7.0}
+    assert not joined.findings.found and not joined.findings.chance
+    same = calibgraph.concatenate([replace(one, metadata=frames[0].metadata) for one in frames])
+    assert same.metadata == frames[0].metadata
 
 
 def test_a_camera_that_few_frames_do_not_show_fails_for_that_reason(pair: Rig) -> None:

@@ -19,6 +19,8 @@ from calibgraph.model.rig import Camera, Finite, Size
 
 _MODELS: Final = {"pinhole": "plumb_bob", "fisheye": "equidistant", "omnidirectional": "mei"}
 _PLUMB_BOB = 5
+LENS_MARK: Final = "the extrinsic is not part of a camera_info"
+"""Text of exported lenses alone."""
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
@@ -64,12 +66,12 @@ def write_camera_infos(export: RigExport) -> Mapping[str, str]:
     files: dict[str, str] = {}
     for name, camera in export.cameras.items():
         file = f"{frame_id(name)}.yaml"
-        if file in files:
+        if file.casefold() in map(str.casefold, files):  # one file where systems ignore case
             raise CalibrationError(f"camera {name!r}: another has the file {file}; rename one")
         statement = (
             export.origin,
             "K and D are of the images as recorded, R is the identity, P is K",
-            "the extrinsic is not part of a camera_info: export it as tf2, ros2-launch or urdf",
+            f"{LENS_MARK}: export it as tf2, ros2-launch or urdf",
             f"optical frame: {export.optical_frames[name]}",
         )
         files[file] = commented_yaml(statement, _content(name, camera))
@@ -87,7 +89,7 @@ def _content(name: str, camera: Camera) -> dict[str, Any]:
     return {
         "image_width": camera.width_px,
         "image_height": camera.height_px,
-        "camera_name": name,
+        "camera_name": frame_id(name),
         "camera_matrix": _matrix(K),
         "distortion_model": model,
         "distortion_coefficients": _matrix(np.array([distortion])),

@@ -9,7 +9,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.files import read_yaml, require_place_for_folder, write_bytes, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
 from calibgraph.io.formats.autoware import write_autoware
-from calibgraph.io.formats.camera_info import write_camera_infos
+from calibgraph.io.formats.camera_info import LENS_MARK, write_camera_infos
 from calibgraph.io.formats.documents import commented
 from calibgraph.io.formats.kalibr import write_kalibr
 from calibgraph.io.formats.koide import write_koide
@@ -28,7 +28,7 @@ from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Rig, rigid_transform
-from calibgraph.outputs import Output, require_writable
+from calibgraph.outputs import Output, is_marked, require_writable
 
 Content = str | bytes
 Writer = Callable[[RigExport], Content | Mapping[str, Content]]
@@ -71,7 +71,7 @@ def export_calibration(
     Args:
         source: a result or a rig, or the path of one.
         path: the file to write, of ``camera_info`` the folder. Only a file that was exported before
-            is replaced.
+            is replaced; in the folder those of other cameras are removed, unless some are named.
         format: a name of ``calibgraph.io.formats.names.EXPORT_FORMATS``.
         cameras: names of those to write; all if None.
         lidar_frame: frame id of the LiDAR; the rig's name of it if None.
@@ -100,7 +100,7 @@ def export_calibration(
     )
     if isinstance(found, Calibration) and not even_if_failed:
         _require_not_failed(found, [*prepared.cameras])
-    return _write(prepared, Path(path), format)
+    return _write(prepared, Path(path), format, whole=cameras is None)
 
 
 def _require_not_failed(result: Calibration, cameras: Sequence[str]) -> None:
@@ -152,8 +152,8 @@ def _outputs(files: Iterable[Path]) -> list[Output]:
     return [Output(file, "export", _MARKS) for file in files]
 
 
-def _write(export: RigExport, path: Path, format: str) -> tuple[Path, ...]:
-    """Write all files or, if one may not be replaced, none."""
+def _write(export: RigExport, path: Path, format: str, *, whole: bool) -> tuple[Path, ...]:
+    """Write all files or, if one may not be replaced, none; of a whole rig no others stay."""
     written = WRITERS[format](export)
     contents = {path: written} if isinstance(written, (str, bytes)) else {
         path / name: content for name, content in written.items()
@@ -161,6 +161,10 @@ def _write(export: RigExport, path: Path, format: str) -> tuple[Path, ...]:
     if format == _WITHOUT_COMMENTS:
         contents[_statement_of(path)] = commented(kitti_statement(export))
     require_writable(_outputs(contents))
+    others = path.glob("*.yaml") if format == _FOLDER and whole else ()
+    for file in [*others]:
+        if file not in contents and is_marked(file, LENS_MARK.encode()):
+            file.unlink()
     for file, content in contents.items():
         if isinstance(content, bytes):
             write_bytes(file, content)

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 
 FALSE_ACCEPTANCE = 1e-3
 """Accepted share of wrong poses, among cameras whose true pose is out of reach."""
+FEW_FRAMES = 3
+"""Up to so many frames of a camera, the location is measured in mirrored images."""
 
 
 @dataclass(frozen=True)

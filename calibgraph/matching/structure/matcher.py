@@ -197,9 +197,7 @@ class StructureMatcher:
         return cache
 
     def _first_round(self, candidates: Mapping[str, Located]) -> int:
-        if (
-            self.estimate
-        ):  # a search at the lens and clock of the rig ends where these are made up for
+        if self.estimate:  # the search's pose makes up for errors of the rig's lens and clock
             return 0
         confident = all(c.accepted and c.z_score >= CONFIDENT for c in candidates.values())
         looked_at = any(c.accepted and c.chance is not None for c in candidates.values())

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.matching.structure.acceptance import (
     FALSE_ACCEPTANCE,
+    FEW_FRAMES,
     probability_by_chance,
     second_look_chance,
 )
@@ -31,8 +32,8 @@ from calibgraph.model.geometry import relative_transform, transform
 from calibgraph.model.rig import Camera, Rig
 
 SEARCH_WINDOWS, DENSE_WINDOWS = 2100, 9000  # of the maps, per camera over all frames
-FEW_FRAMES, FEW_EFFORT = 3, 2
-"""Up to so many frames maps are of dense windows, there are more candidates of a box search by this
+FEW_EFFORT = 2
+"""In few frames maps are of dense windows, there are more candidates of a box search by this
 factor, and all are refined. In single frames of KITTI 05, 06 and raw 0005 right poses stand out by
 a z-score of 9 to 13 instead of 5 to 9 in these maps, where the best wrong ones have 9 to 11."""
 ROLLS_RAD = np.radians([0.0, -12.0, 12.0])

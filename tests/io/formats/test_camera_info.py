@@ -85,3 +85,30 @@ def test_what_has_no_place_in_files_of_ros_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="another has the file a_b.yaml"):
         export_calibration(alike, tmp_path / "infos", "camera_info")
     assert not (tmp_path / "infos").exists()
+
+
+def test_names_that_differ_in_case_alone_are_refused(tmp_path: Path) -> None:
+    """Where file systems ignore case, one would overwrite the other."""
+    camera = make_pair().cameras["left"]
+    alike = Rig(cameras={"Front": camera, "front": camera})
+    with pytest.raises(CalibrationError, match="another has the file"):
+        export_calibration(alike, tmp_path / "infos", "camera_info")
+
+
+def test_the_name_in_a_file_is_the_files(tmp_path: Path) -> None:
+    rig = Rig(cameras={"front left": make_pair().cameras["left"]})
+    (file,) = export_calibration(rig, tmp_path, "camera_info")
+    assert yaml.safe_load(file.read_text())["camera_name"] == file.stem == "front_left"
+
+
+def test_lenses_of_cameras_that_the_rig_has_no_more_are_removed(tmp_path: Path) -> None:
+    """Unless single cameras are exported; files of other kinds stay."""
+    rig = make_pair()
+    export_calibration(rig, tmp_path, "camera_info")
+    export_calibration(rig, tmp_path / "tree.yaml", "tf2")
+    (tmp_path / "mine.yaml").write_text("mine")
+    export_calibration(rig, tmp_path, "camera_info", cameras=["left"])
+    names = {"left.yaml", "mine.yaml", "tree.yaml"}
+    assert {file.name for file in tmp_path.iterdir()} == names | {"right.yaml"}
+    export_calibration(Rig(cameras={"left": rig.cameras["left"]}), tmp_path, "camera_info")
+    assert {file.name for file in tmp_path.iterdir()} == names
