@@ -17,10 +17,11 @@ import gtsam
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
-from calibgraph.matching.run import MatchingRun
+from calibgraph.matching.run import MatchingRun, Rematch
 from calibgraph.model.geometry import pose_difference
+from calibgraph.model.rig import Rig
 from calibgraph.overlaps import refine_with_camera_pairs
-from calibgraph.rematch import LastRound, rematch, rounds_from, with_cameras_of
+from calibgraph.rematch import LastRound, rounds_from, with_cameras_of
 from calibgraph.rounds import assign_places
 from calibgraph.solver.joint import solve_without_failing
 from calibgraph.trust.evidence import Evidence
@@ -71,8 +72,7 @@ def _go_on(evidence: RunEvidence, groups: Sequence[tuple[str, ...]]) -> Matching
             if not better:
                 return None
             run = _note(with_cameras_of(run, again, better), rig.T_camera_lidar, better)
-            run = rematch(run, evidence.progress, fine)  # coarse rounds would lead away again
-            run = assign_places(run)
+            run = assign_places(replace(run, rematch=_without(run.rematch, better)))
         return refine_with_camera_pairs(run, evidence.progress)
     except CorrespondenceError as error:
         _log.info("rounds from where the images agree better: %s", error)
@@ -93,3 +93,15 @@ def _note(run: MatchingRun, T_before: Mapping[str, Array], names: set[str]) -> M
     for name, (degrees, centimetres) in moved.items():
         _log.info("%s: rounds went on, by %.2g deg, %.2g cm", name, degrees, centimetres)
     return replace(run, went_on={**run.went_on, **moved})
+
+
+def _without(rematch: Rematch | None, names: set[str]) -> Rematch | None:
+    """The test from a displaced start, of the cameras that stayed.
+
+    Of others it tested a pose that is no longer the result; that their rounds depend on the start
+    is known, and noted.
+    """
+    if rematch is None or names >= {*rematch.first.cameras}:
+        return None
+    kept = {name: camera for name, camera in rematch.first.cameras.items() if name not in names}
+    return replace(rematch, first=Rig(cameras=kept))

@@ -27,21 +27,14 @@ _BETTER = 1.03
 percent."""
 
 
-def rematch(
-    run: MatchingRun, progress: Progress, rounds: Sequence[int] | None = None
-) -> MatchingRun:
+def rematch(run: MatchingRun, progress: Progress) -> MatchingRun:
     """Match again from a start displaced from the result, if the matcher names rounds for it.
 
     Where an objective is flat, as along the axis of a camera in a straight street, rounds may end
     before its top. A camera whose second end has a clearly higher z-score is taken from there,
     unless the ends are so far apart that the camera fails.
-
-    Args:
-        run: with the result.
-        progress: called as the work goes on.
-        rounds: those from the displaced start, before the last; None: the matcher's.
     """
-    rounds = run.matcher.tracking_rounds if rounds is None else rounds
+    rounds = run.matcher.tracking_rounds
     if not rounds or not run.solution.objective.uses_correspondences:
         return run
     first = run.solution.solved_rig
