@@ -3,8 +3,8 @@
 Coarse levels can lead the rounds to a pose a degree off, as over grass and asphalt. There fine
 levels agree hardly better than by chance, and find no way back. The posterior of the pose by the
 fine scores covers a degree about the result. If more than half of its mass is elsewhere, its
-densest sample there is the start of the last rounds. It repeats from start to start; the mean lies
-between modes. Their end is taken if the cameras agree better there than at the first end.
+densest sample there is the start of the last rounds. (Their mean may lie between modes, and differs
+from start to start.) The end of these rounds is taken if the cameras agree better there.
 
 The posterior that chose the pose cannot vouch for it: such a camera is WARN at best.
 """
@@ -33,11 +33,12 @@ _log = logging.getLogger(__name__)
 
 def go_on_elsewhere(evidence: RunEvidence) -> RunEvidence:
     """The evidence of the run, or of one whose rounds have gone on."""
+    T_first = evidence.run.solution.solved_rig.T_camera_lidar
     for _ in range(_TIMES):
         if evidence.run.out_of_time or not evidence.run.matcher.tracking_rounds:
             break
         groups = groups_elsewhere(evidence.solution)
-        run = _go_on(evidence, groups) if groups else None
+        run = _go_on(evidence, groups, T_first) if groups else None
         if run is None:
             break
         evidence = replace(evidence, run=run)
@@ -50,7 +51,9 @@ def groups_elsewhere(solution: Evidence) -> list[tuple[str, ...]]:
     return [each for each in solution.tied if each[0] in found and found[each[0]].share > 1 / 2]
 
 
-def _go_on(evidence: RunEvidence, groups: Sequence[tuple[str, ...]]) -> MatchingRun | None:
+def _go_on(
+    evidence: RunEvidence, groups: Sequence[tuple[str, ...]], T_first: Mapping[str, Array]
+) -> MatchingRun | None:
     """The run with the groups that agree better at the end of rounds from there; None if none."""
     run, posteriors = evidence.run, evidence.solution.posteriors
     rig = run.solution.solved_rig
@@ -71,7 +74,7 @@ def _go_on(evidence: RunEvidence, groups: Sequence[tuple[str, ...]]) -> Matching
             better = {n for group in groups if _agrees_better(run, again, group) for n in group}
             if not better:
                 return None
-            run = _note(with_cameras_of(run, again, better), rig.T_camera_lidar, better)
+            run = _note(with_cameras_of(run, again, better), T_first, better)
             run = assign_places(replace(run, rematch=_without(run.rematch, better)))
         return refine_with_camera_pairs(run, evidence.progress)
     except CorrespondenceError as error:
@@ -86,10 +89,10 @@ def _agrees_better(run: MatchingRun, again: LastRound, group: tuple[str, ...]) -
     return sum(now.get(name, 0.0) for name in group) > sum(before.get(name, 0.0) for name in group)
 
 
-def _note(run: MatchingRun, T_before: Mapping[str, Array], names: set[str]) -> MatchingRun:
-    """The run, with how far each of some cameras has gone from where the rounds ended."""
+def _note(run: MatchingRun, T_first: Mapping[str, Array], names: set[str]) -> MatchingRun:
+    """The run, with how far some cameras are by now from where the rounds ended first."""
     T = run.solution.T_camera_lidar
-    moved = {name: pose_difference(T_before[name], T[name]) for name in names}
+    moved = {name: pose_difference(T_first[name], T[name]) for name in names}
     for name, (degrees, centimetres) in moved.items():
         _log.info("%s: rounds went on, by %.2g deg, %.2g cm", name, degrees, centimetres)
     return replace(run, went_on={**run.went_on, **moved})

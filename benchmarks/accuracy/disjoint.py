@@ -152,7 +152,7 @@ COLUMNS = (
 
 
 def report(records: Sequence[Record]) -> Table:
-    """A row per recording or pair of recordings, and of all."""
+    """A row per recording or pair of recordings, and one of all together."""
     groups: dict[str, list[Record]] = {}
     for record in records:
         for name in (f"{record['level']} of {record['data']}", ALL):

@@ -6,7 +6,7 @@
 
 The weights come from the first files, the tables from the others, which share no recordings (but
 for the motorway), scenes or seeds with them. ``--write`` writes the weights into the package; a
-model of which no case is given keeps its own. Without ``--tune`` the package's weights are judged,
+model without cases keeps its own. Without ``--tune`` the package's weights are judged,
 or those of another version: ``--weights probability.json``.
 
 A result counts as off beyond 0.5 deg or 10 cm. Results that are off, and the others, count alike in

@@ -18,7 +18,7 @@ VOTE = {"PASS": 0.005, "WARN": 0.1, "FAIL": 0.9}
 """The probabilities that a vote stands for, to compare it with."""
 BINS = (0.0, 0.002, 0.005, 0.02, 0.1, 0.2, 0.5, 0.9, 1.0)
 FALSE_PASS = (0.005, 0.05)
-"""Shares of the results that are off, of which a PASS is allowed where right ones are counted."""
+"""Shares of wrong results that may be PASS, at which the right ones that are PASS are counted."""
 
 
 def status_of(sample: Sample, doubt: ErrorProbability) -> str:
@@ -28,7 +28,7 @@ def status_of(sample: Sample, doubt: ErrorProbability) -> str:
 
 
 def judged(name: str, model: dict[str, Any], samples: Sequence[Sample]) -> list[Table]:
-    """Verdicts beside those of a vote, and how well the probability holds."""
+    """Tables: verdicts by probability and by vote; how well the probability holds."""
     clear = [sample for sample in samples if sample.kind not in AMBIGUOUS]
     return [
         cuts(name, model, samples),
@@ -70,7 +70,7 @@ def reliability(name: str, model: dict[str, Any], samples: Sequence[Sample]) -> 
 
 
 def discrimination(name: str, model: dict[str, Any], samples: Sequence[Sample]) -> Table:
-    """How many right results could PASS where so few of those that are off may.
+    """The share of right results that are PASS at each share of wrong ones in ``FALSE_PASS``.
 
     The limit is moved to where the results that are off allow it: of the largest severity of all
     checks (the vote), of the probability, and of the probability where no check says that data are
