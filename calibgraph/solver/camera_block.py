@@ -18,6 +18,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
+from calibgraph.solver.repeats import point_hashes
 from calibgraph.solver.residual_scale import MIN_SIGMA_PX, ResidualScale, robust_spread, scale_from
 from calibgraph.solver.spread_kernel import quantiles
 from calibgraph.solver.whitening import (
@@ -76,6 +77,11 @@ class CameraBlock:
     def frame_counts(self) -> NDArray[np.int64]:
         """(f,) of the correspondences of each frame."""
         return np.diff(self.frame_edges)
+
+    @cached_property
+    def point_hashes(self) -> list[int]:
+        """(n,) of the bits of each point."""
+        return point_hashes(self.block.points_lidar_m).tolist()
 
     def in_frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(n,) which correspondences belong to frames of some numbers."""

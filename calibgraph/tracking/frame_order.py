@@ -241,17 +241,16 @@ def _repeats(state: State, camera: int, table: Correspondences) -> bool:
     if last is None or not len(points):
         return False
     new = {*point_hashes(points).tolist()}  # faster than arrays, of some hundred
-    return sum(map(new.__contains__, last.tolist())) > REPEATED_SHARE * len(last)
+    return sum(map(new.__contains__, last)) > REPEATED_SHARE * len(last)
 
 
-def _last_hashes(state: State, camera: int) -> np.ndarray | None:
+def _last_hashes(state: State, camera: int) -> list[int] | None:
     """Of the last frame's matches, absorbed ones or, before the camera has started, waiting."""
     waiting = state.cameras[camera].waiting
     if waiting:
         rows = waiting[-1].of_camera(state.names[camera])
-        return point_hashes(rows.points_lidar_m)
+        return point_hashes(rows.points_lidar_m).tolist()
     for frame in reversed(state.live_frames):
         if camera in frame.raw:
-            block = frame.raw[camera].block
-            return point_hashes(block.points_lidar_m)
+            return frame.raw[camera].point_hashes
     return None
