@@ -25,8 +25,8 @@ from factors.block_arrays import (
     RobustBlock,
     check_shape,
     contiguous,
-    read_only,
     join_roots,
+    read_only,
     rows_of_root,
     to_runs,
 )
@@ -120,7 +120,7 @@ class ProjectionBlock(RobustBlock):
     def select(self, rows: NDArray[Any]) -> ProjectionBlock:
         """The block with only some correspondences: a mask or an index array."""
         if rows.dtype == np.bool_:
-            rows = np.flatnonzero(rows)
+            rows = rows.nonzero()[0]
             if len(rows) == len(self):
                 return self
         root = self.sqrt_information

@@ -252,10 +252,15 @@ class Verdict:
         }
 
 
-def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
-    """The verdict of a rig: its worst camera's, with the checks of all, by their names."""
+def rig_verdict(cameras: Mapping[str, Verdict], *, named: bool = True) -> Verdict:
+    """The verdict of a rig: its worst camera's, with the checks of all, by their names.
+
+    Args:
+        cameras: the verdicts of its cameras.
+        named: let the text of a check begin with the name of its camera.
+    """
     checks = tuple(
-        replace(check, text=f"{name}: {check.text}")
+        replace(check, text=f"{name}: {check.text}") if named else check
         for name, verdict in cameras.items()
         for check in verdict.checks
     )
