@@ -6,7 +6,8 @@ Each client submits one of 50 small solves (two cameras, three frames) with a ke
 for it, fetches its result and compares it with the library's; then the next. Overhead: processor
 time of the server and its workers per solve, less that of the library in one process that reads the
 same files and writes the same result, measured before and after. Trackers: each gets a frame every
-1 / hz seconds; a frame counts when it is acknowledged. Clients and server share the cores.
+1 / hz seconds; a frame counts when it is acknowledged. Before, the processor time of a frame, of
+trackers that send without a pause. Clients and server share the cores.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import httpx
 import numpy as np
 
 from benchmarks.service.server import SETTINGS, Problem, Server, make_problems
-from benchmarks.service.tracker_load import track
+from benchmarks.service.tracker_load import measure_costs, track
 from benchmarks.tables import Table, add_record_option, publish
 from calibgraph import load_rig, solve
 from calibgraph.report.html import write_result
@@ -191,6 +192,7 @@ def main() -> None:
                 alone_s = (before_s + library_s(folder / "problems", PROBLEMS)) / 2
                 tables.append(_table(counts, wall_s, (own_s, used_s), alone_s))
             if options.trackers:
+                tables.append(measure_costs(server))
                 tables.append(track(server, options.trackers, options.hz, options.seconds))
         finally:
             server.stop()

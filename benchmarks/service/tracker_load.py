@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import httpx
@@ -13,11 +14,14 @@ import numpy as np
 from benchmarks.service.server import Server
 from benchmarks.tables import Table
 from calibgraph import Correspondences, MatcherErrors, Rig, perturb, simulate_correspondences
+from calibgraph.arrays import Array
 from calibgraph.simulation.rigs import rig_of
 
 _FRAMES = 20
 _MATCHES = 20
 _MOST_AT_ONCE = 10  # frames: a robot that has waited for long drops older ones
+BEFORE = 30  # frames, after which a tracker has started
+CASES = ((1, 1, 100), (1, 10, 200), (20, 1, 50), (20, 10, 100), (200, 1, 10), (200, 10, 50))
 _LINES = {"Content-Type": "application/x-ndjson"}
 
 
@@ -45,6 +49,49 @@ class Counts:
 def track(server: Server, trackers: int, hz: float, seconds: float) -> Table:
     """Send frames to trackers for some time; a frame that is late does not delay the others."""
     return asyncio.run(_track(server, trackers, hz, seconds))
+
+
+def measure_costs(server: Server, cases: Sequence[tuple[int, int, int]] = CASES) -> Table:
+    """Processor time of a frame, by trackers, frames of a request and frames of each tracker."""
+    rows = tuple(asyncio.run(_measure_cost(server, *case)) for case in cases)
+    columns = ("trackers", "frames a request", "frames/s", "workers ms", "server ms", "client ms")
+    return Table("Processor time of a frame", columns, rows)
+
+
+async def _measure_cost(
+    server: Server, trackers: int, together: int, frames: int
+) -> tuple[str, ...]:
+    truth = rig_of("kitti")
+    guess = perturb(truth, rotation_deg=0.5, translation_m=0.05, seed=1)
+    bodies = frame_bodies(truth)
+    lines = [
+        json.dumps({"frame": i, "cameras": bodies[i % _FRAMES]}) for i in range(BEFORE + frames)
+    ]
+
+    async def send(place: str, first: int, end: int) -> None:
+        for at in range(first, end, together):
+            content = "\n".join(lines[at : min(at + together, end)])
+            answer = await http.post(f"{place}/frames", content=content, headers=_LINES)
+            answer.raise_for_status()
+
+    limits = httpx.Limits(max_connections=None, max_keepalive_connections=trackers)
+    async with httpx.AsyncClient(base_url=server.url, timeout=120, limits=limits) as http:
+        places = [await _begin(http, guess) for _ in range(trackers)]
+        await asyncio.gather(*(send(place, 0, BEFORE) for place in places))
+        begun, start = _processor_s(server), time.monotonic()
+        await asyncio.gather(*(send(place, BEFORE, BEFORE + frames) for place in places))
+        used, wall_s = _processor_s(server) - begun, time.monotonic() - start
+        for place in places:
+            (await http.delete(place)).raise_for_status()
+    each_ms = 1e3 * used / (trackers * frames)
+    rate = f"{trackers * frames / wall_s:.0f}"
+    return str(trackers), str(together), rate, *(f"{ms:.2f}" for ms in each_ms)
+
+
+def _processor_s(server: Server) -> Array:
+    """Of the workers, the server and this process so far."""
+    own_s = server.own_processor_s()
+    return np.array([server.processor_s() - own_s, own_s, time.process_time()])
 
 
 async def _track(server: Server, trackers: int, hz: float, seconds: float) -> Table:
