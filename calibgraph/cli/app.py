@@ -8,7 +8,6 @@ CHANGED (``drift``), 2 bad input (one line), 3 the data cannot tell (both), 130 
 from __future__ import annotations
 
 import gc
-import inspect
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -21,6 +20,7 @@ import typer
 from calibgraph.cli import outputs
 from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve
+from calibgraph.cli.declaration import declare, help_of
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
 from calibgraph.cli.guess import bag, guess, init
@@ -100,15 +100,9 @@ COMMANDS: dict[Callable[..., None], outputs.Outputs] = {
 """Every command, and the files that it writes."""
 
 
-def _help_of(command: Callable[..., Any]) -> str:
-    """Its docstring, a line per paragraph: typer keeps the line breaks of all but the first."""
-    paragraphs = (inspect.getdoc(command) or "").split("\n\n")
-    return "\n\n".join(" ".join(text.split()) for text in paragraphs)
-
-
 for _command, _outputs in COMMANDS.items():
-    app.command(_command.__name__.rstrip("_").replace("_", "-"), help=_help_of(_command))(
-        outputs.keep_files(_command, _outputs)
+    app.command(_command.__name__.rstrip("_").replace("_", "-"), help=help_of(_command))(
+        outputs.keep_files(declare(_command), _outputs)
     )
 
 

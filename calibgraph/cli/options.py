@@ -17,13 +17,6 @@ DatasetArgument = Annotated[
 RigOption = Annotated[
     Path | None, typer.Option(metavar="RIG", help="Initial guess, instead of the dataset's own.")
 ]
-CameraMatchesOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Features that cameras have in common: camera_matches.parquet of a result.",
-    ),
-]
 CMRNEXT = "Matcher cmrnext"
 WeightsOption = Annotated[
     list[Path] | None,
@@ -76,19 +69,6 @@ PresetOption = Annotated[
     typer.Option(metavar="auto|kitti|walkley", help="Settings of the solve by name."),
 ]
 OutOption = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result.")]
-CommonDegOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="DEG",
-        min=0,
-        help="Error per axis that all frames share, 1 sigma; 0 if none. (default: as the table "
-        "states)",
-    ),
-]
-CommonCmOption = Annotated[
-    float | None,
-    typer.Option(metavar="CM", min=0, help="Likewise, of the position."),
-]
 _MAX_SEED = 2**31 - 1
 SeedOption = Annotated[int, typer.Option(min=0, max=_MAX_SEED, help="Seed of everything random.")]
 ConfigSeedOption = Annotated[
@@ -101,7 +81,7 @@ ConfigSeedOption = Annotated[
 ]
 
 
-def _require_stdout(as_json: bool) -> bool:
+def require_stdout(as_json: bool) -> bool:
     """Refuse ``--json`` to a closed stdout before the work, not after it."""
     if as_json:
         from calibgraph.report.as_json import require_stdout
@@ -110,18 +90,6 @@ def _require_stdout(as_json: bool) -> bool:
     return as_json
 
 
-PrintGraphOption = Annotated[
-    bool,
-    typer.Option(
-        "--print-graph",
-        callback=_require_stdout,
-        help="Print every factor of the graph whose optimum is the result, in place of tables.",
-    ),
-]
-GraphOption = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.dot", help="Write the graph in Graphviz's language to FILE.dot."),
-]
 JsonOption = Annotated[
-    bool, typer.Option("--json", callback=_require_stdout, help="Print JSON on stdout.")
+    bool, typer.Option("--json", callback=require_stdout, help="Print JSON on stdout.")
 ]
