@@ -38,12 +38,9 @@ def _draw_batch(scenes: Sequence[Scene], settings: TrainSettings, step: int) -> 
 def _draw_sample(
     scenes: Sequence[Scene], settings: TrainSettings, rng: np.random.Generator
 ) -> Sample:
-    of_samples = settings.samples(augment=True)
     for _ in range(_TRIES):
         scene = scenes[int(rng.integers(len(scenes)))]
-        sample = make_sample(
-            scene, settings=of_samples, architecture=settings.architecture, rng=rng
-        )
+        sample = make_sample(scene, settings, rng, augment=True)
         if sample is not None:
             return sample
     raise DatasetError(

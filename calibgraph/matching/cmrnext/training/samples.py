@@ -25,6 +25,7 @@ from calibgraph.matching.cmrnext.inputs import (
     rgb_tensor,
 )
 from calibgraph.matching.cmrnext.training.scenes import Scene
+from calibgraph.matching.cmrnext.training.settings import TrainSettings
 from calibgraph.model.geometry import invert, transform
 
 MIN_POINTS = 50
@@ -73,37 +74,20 @@ def draw_perturbation(rng: np.random.Generator, rotation_deg: float, translation
     return transform(turn, rng.uniform(-translation_m, high))
 
 
-@dataclass(frozen=True)
-class SampleSettings:
-    """Settings of samples.
-
-    Attributes:
-        rotation_deg, translation_m: largest perturbation per axis.
-        max_depth_m: divisor of depths.
-        half_resolution: whether the network's images have half the size.
-        crop_px: height and width of a random crop, at full resolution; None: the whole image.
-        augment: mirror, rotate and recolour at random.
-    """
-
-    rotation_deg: float
-    translation_m: float
-    max_depth_m: float
-    half_resolution: bool
-    crop_px: tuple[int, int] | None
-    augment: bool
-
-
 def make_sample(
-    scene: Scene,
-    *,
-    settings: SampleSettings,
-    architecture: Architecture,
-    rng: np.random.Generator,
+    scene: Scene, settings: TrainSettings, rng: np.random.Generator, *, augment: bool
 ) -> Sample | None:
-    """Perturb a scene's extrinsic; None if too few points are in the image."""
+    """Perturb a scene's extrinsic; None if too few points are in the image.
+
+    Args:
+        scene: with its trusted extrinsic.
+        settings: of the training.
+        rng: for all draws.
+        augment: mirror, rotate, recolour and crop at random, for training; else the whole image.
+    """
     view = View(scene.camera, crop_even=True)
     image, cloud = _load(scene, view)
-    if settings.augment:
+    if augment:
         image, cloud = _augment(image, cloud, view, rng)
     E = draw_perturbation(rng, settings.rotation_deg, settings.translation_m)
     lidar = LidarImage.render(cloud.astype(np.float32), invert(E), view)
@@ -111,7 +95,7 @@ def make_sample(
     ahead = truth[:, 2] > 0
     lidar, truth = lidar.select(ahead), truth[ahead]
     flow = view.project(truth) - lidar.pixels_px
-    corner, (height, width) = _draw_crop(lidar.shape, settings.crop_px, rng)
+    corner, (height, width) = _draw_crop(lidar.shape, settings.crop_px if augment else None, rng)
     cells = lidar.cells - corner
     inside = ((cells >= 0) & (cells < (height, width))).all(axis=1)
     inside &= (np.abs(flow) < _MAX_FLOW_PX).all(axis=1)
@@ -120,7 +104,7 @@ def make_sample(
     rows, columns = (slice(a, a + n) for a, n in zip(corner, (height, width), strict=True))
     rgb, depth = _to_tensors(
         image[rows, columns],
-        lidar_channels(lidar, architecture, settings.max_depth_m)[:, rows, columns],
+        lidar_channels(lidar, settings.architecture, settings.max_depth_m)[:, rows, columns],
         halved=settings.half_resolution,
     )
     return Sample(

@@ -56,8 +56,7 @@ def train(
         run = resume_run(out, device)
     else:
         run = start_run(out, settings or TrainSettings(), device, start)
-    of_samples, architecture = run.settings.samples(augment=False), run.settings.architecture
-    unseen = make_validation_samples(others, of_samples, architecture, seed=run.settings.seed)
+    unseen = make_validation_samples(others, run.settings)
     validations: list[Validation] = []
     losses: list[float] = []
     for samples in draw_batches(scenes, run.settings, start=run.step):
