@@ -19,8 +19,7 @@ from calibgraph.matching.cmrnext.training.losses import (
     optimum_loss,
     true_flow,
 )
-from calibgraph.matching.cmrnext.training.samples import Sample, stack_inputs
-from calibgraph.matching.cmrnext.training.scenes import Scene
+from calibgraph.matching.cmrnext.training.samples import Sample, Scene, stack_inputs
 from calibgraph.matching.cmrnext.training.settings import (
     CONFIG_PREFIX,
     TrainSettings,

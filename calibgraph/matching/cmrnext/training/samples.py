@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from calibgraph.arrays import Array
+from calibgraph.io.frame import Frame
 from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.inputs import (
     LidarImage,
@@ -24,9 +25,9 @@ from calibgraph.matching.cmrnext.inputs import (
     lidar_tensor,
     rgb_tensor,
 )
-from calibgraph.matching.cmrnext.training.scenes import Scene
 from calibgraph.matching.cmrnext.training.settings import TrainSettings
 from calibgraph.model.geometry import invert, transform
+from calibgraph.model.rig import Camera
 
 MIN_POINTS = 50
 _ROLL_DEG, _TURN_DEG = 5.0, 3.0
@@ -34,6 +35,15 @@ _JITTER = 0.2
 _BORDER = cv2.BORDER_REFLECT_101  # a black border would reveal the rotation
 _MAX_DOWN_M = 1.0  # the virtual camera stays above the ground
 _MAX_FLOW_PX = 1000.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One camera's image and the cloud of one frame."""
+
+    frame: Frame
+    name: str
+    camera: Camera
 
 
 @dataclass(frozen=True, eq=False)

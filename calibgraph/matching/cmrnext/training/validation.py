@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.io.dataset import spread_out
-from calibgraph.matching.cmrnext.training.samples import Sample, make_sample
-from calibgraph.matching.cmrnext.training.scenes import Scene
+from calibgraph.matching.cmrnext.training.samples import Sample, Scene, make_sample
 from calibgraph.matching.cmrnext.training.settings import TrainSettings
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
