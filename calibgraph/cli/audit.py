@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from calibgraph.cli import outputs
 from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
 from calibgraph.cli.options import DatasetArgument, FramesOption, JsonOption, SeedOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
@@ -27,7 +28,7 @@ def check(
     tolerance_cm: CentimetresOption = 10.0,
     frames: FramesOption = None,
     seed: SeedOption = 0,
-    page: Path | None = None,
+    page: Annotated[Path | None, outputs.PAGE_OF_AUDIT] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Is a deployed calibration still right? Exit 0: all OK, 1: WRONG, 3: the data cannot tell.
@@ -81,7 +82,7 @@ def drift(
     tolerance_deg: DegreesOption = 0.5,
     tolerance_cm: CentimetresOption = 10.0,
     own_lenses: bool = False,
-    plot: Path | None = None,
+    plot: Annotated[Path | None, outputs.PLOT_OF_DRIFT] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Which of several results of one rig deviates? Exit 0: none, 1: one CHANGED, 3: cannot tell.

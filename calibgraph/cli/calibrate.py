@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibgraph.cli import options
+from calibgraph.cli import options, outputs
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.option_groups import MatchingOptions, SolveOptions
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
@@ -54,7 +54,7 @@ def calibrate(
 def match(
     dataset: options.DatasetArgument,
     matching: MatchingOptions,
-    out: Path = Path("correspondences.parquet"),
+    out: Annotated[Path, outputs.TABLE] = Path("correspondences.parquet"),
     seed: options.SeedOption = 0,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -89,7 +89,7 @@ def solve(
     common_deg: Annotated[float | None, typer.Option(min=0)] = None,
     common_cm: Annotated[float | None, typer.Option(min=0)] = None,
     print_graph: Annotated[bool, typer.Option(callback=options.require_stdout)] = False,
-    graph: Path | None = None,
+    graph: Annotated[Path | None, outputs.GRAPH] = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from a table of correspondences, with a report.

@@ -16,6 +16,7 @@ from functools import wraps
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
+from typer.models import ParameterInfo
 
 _SECTION = re.compile(r"\n\n(?:Args|Attributes):\n")
 _ENTRY = re.compile(r"(\w+)(?: \((.+?)\))?: (.*)")
@@ -75,7 +76,8 @@ def _parameter(
     name: str, default: Any, hint: Any, entries: dict[str, tuple[str | None, str]]
 ) -> inspect.Parameter:
     """A parameter with its typer option or argument, and the help that belongs to it."""
-    kind, given = get_args(hint) if get_origin(hint) is Annotated else (hint, None)
+    kind, *extras = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    given = next((each for each in extras if isinstance(each, ParameterInfo)), None)
     if given is None:
         given = typer.Argument() if default is inspect.Parameter.empty else typer.Option()
     given = copy(given)
@@ -84,4 +86,6 @@ def _parameter(
     metavar, text = entries.get(name, (None, None))
     given.metavar, given.help = given.metavar or metavar, given.help or text
     keyword = inspect.Parameter.KEYWORD_ONLY
-    return inspect.Parameter(name, keyword, default=default, annotation=Annotated[kind, given])
+    others = [each for each in extras if not isinstance(each, ParameterInfo)]
+    hint = Annotated[kind, given, *others]  # type: ignore[valid-type]
+    return inspect.Parameter(name, keyword, default=default, annotation=hint)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibgraph.cli import outputs
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.terminal import print_plain, terminal
 from calibgraph.io.formats.names import EXPORT_FORMATS, IMPORT_FORMATS
@@ -95,7 +96,7 @@ def export(
             help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
         ),
     ],
-    out: Annotated[Path, typer.Option()],
+    out: Annotated[Path, typer.Option(), outputs.EXPORTED],
     camera: list[str] | None = None,
     lidar_frame: str | None = None,
     camera_frame: str | None = None,
@@ -162,7 +163,7 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
 
 def import_(
     files: RigFilesOptions,
-    out: Annotated[Path, typer.Option()],
+    out: Annotated[Path, typer.Option(), outputs.rig_of("import")],
     tie_deg: Annotated[float, typer.Option(min=0.001)] = 0.1,
     tie_m: Annotated[float, typer.Option(min=1e-5)] = 0.005,
 ) -> None:

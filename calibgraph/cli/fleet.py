@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from calibgraph.cli import outputs
 from calibgraph.cli.options import JsonOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
@@ -113,7 +114,7 @@ RowsArgument = Annotated[
 
 def fleet_report(
     rows: RowsArgument,
-    out: Path = Path("fleet.html"),
+    out: Annotated[Path, outputs.FLEET_PAGE] = Path("fleet.html"),
     before: str | None = None,
     link: str = "",
 ) -> None:
@@ -134,7 +135,7 @@ def fleet_report(
 
 def fleet_model(
     rows: RowsArgument,
-    out: Path = Path("fleet_model"),
+    out: Annotated[Path, outputs.FLEET_MODEL] = Path("fleet_model"),
     rig: list[str] | None = None,
 ) -> None:
     """What a fleet knows: nominal rigs with spreads, improved estimates, priors for new vehicles.

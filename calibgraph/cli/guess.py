@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibgraph.cli import outputs
 from calibgraph.cli.arguments import bag_options_from, checked_arguments
 from calibgraph.cli.exchange import RigFilesOptions, parse_names, print_doubts
 from calibgraph.cli.options import JsonOption, SeedOption, TopicOption
@@ -32,7 +33,7 @@ ForwardOption = Annotated[
 
 def guess(
     files: RigFilesOptions,
-    out: Annotated[Path, typer.Option()],
+    out: Annotated[Path, typer.Option(), outputs.rig_of("guess")],
     mount: MountOption = None,
     dataset: list[Path] | None = None,
     search: list[str] | None = None,
@@ -99,7 +100,7 @@ def init(
 
 def bag(
     path: Path,
-    out: Path | None = None,
+    out: Annotated[Path | None, outputs.rig_of("bag")] = None,
     topic: TopicOption = None,
     tie_deg: Annotated[float | None, typer.Option(min=0.001)] = None,
     tie_m: Annotated[float | None, typer.Option(min=1e-5)] = None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibgraph.cli import options
+from calibgraph.cli import options, outputs
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.option_groups import DatasetOptions
 from calibgraph.cli.options import JsonOption, SeedOption
@@ -46,7 +46,7 @@ def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
 
 def report(
     result: ResultArgument,
-    out: Path | None = None,
+    out: Annotated[Path | None, outputs.PAGE] = None,
     dataset: MovedOption = None,
 ) -> None:
     """Write a result as one HTML page that opens without a network.
@@ -92,7 +92,7 @@ def evaluate(
 
 def perturb(
     rig: Path,
-    out: Annotated[Path, typer.Option()],
+    out: Annotated[Path, typer.Option(), outputs.rig_of("perturb")],
     rotation_deg: Annotated[float, typer.Option(min=0)] = 20.0,
     translation_m: Annotated[float, typer.Option(min=0)] = 1.5,
     seed: SeedOption = 0,
@@ -126,8 +126,8 @@ def perturb(
 
 def view(
     result: ResultArgument,
-    rerun: Path | None = None,
-    mcap: Path | None = None,
+    rerun: Annotated[Path | None, outputs.RERUN] = None,
+    mcap: Annotated[Path | None, outputs.MCAP] = None,
     dataset: MovedOption = None,
 ) -> None:
     """Write a result for viewers: clouds, images and projected points, before and after.
@@ -157,7 +157,7 @@ def view(
 def doctor(
     dataset: options.DatasetArgument,
     chosen: DatasetOptions,
-    out: Path | None = None,
+    out: Annotated[Path | None, outputs.PICTURES] = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything.

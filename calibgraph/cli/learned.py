@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from calibgraph.cli import outputs
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.options import ConfigSeedOption, JsonOption
 from calibgraph.cli.terminal import print_json, progress_bar, terminal
@@ -12,7 +13,7 @@ from calibgraph.cli.terminal import print_json, progress_bar, terminal
 
 def weights(
     file: Path,
-    out: Path | None = None,
+    out: Annotated[Path | None, outputs.WEIGHTS] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check a file of CMRNext weights, print what is in it, and convert it to safetensors.
@@ -56,7 +57,7 @@ def _print_settings_option(module: str, settings: str) -> Any:
 
 def train(
     dataset: list[Path],
-    out: Annotated[Path, typer.Option()],
+    out: Annotated[Path, typer.Option(), outputs.TRAINING],
     config: Path | None = None,
     print_settings: Annotated[
         bool, _print_settings_option("calibgraph.matching.cmrnext", "TrainSettings")
@@ -125,7 +126,7 @@ def train(
 
 def train_windows(
     recording: list[Path],
-    out: Annotated[Path, typer.Option()],
+    out: Annotated[Path, typer.Option(), outputs.WINDOW_WEIGHTS],
     config: Path | None = None,
     print_settings: Annotated[
         bool,

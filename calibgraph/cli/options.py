@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from calibgraph.cli import outputs
+
 RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig with the initial guess.")]
 DatasetArgument = Annotated[
     list[Path],
@@ -68,7 +70,9 @@ PresetOption = Annotated[
     str | None,
     typer.Option(metavar="auto|kitti|walkley", help="Settings of the solve by name."),
 ]
-OutOption = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result.")]
+OutOption = Annotated[
+    Path, typer.Option(metavar="DIR", help="Folder for the result."), outputs.RESULT
+]
 _MAX_SEED = 2**31 - 1
 SeedOption = Annotated[int, typer.Option(min=0, max=_MAX_SEED, help="Seed of everything random.")]
 ConfigSeedOption = Annotated[

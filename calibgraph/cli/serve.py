@@ -6,6 +6,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
+from calibgraph.cli import outputs
 from calibgraph.cli.arguments import dataset_from, require_service
 from calibgraph.cli.options import DatasetArgument, FramesOption, RigOption
 from calibgraph.cli.terminal import print_plain, terminal
@@ -144,7 +145,7 @@ PORT = 8765
 
 def pick(
     dataset: DatasetArgument,
-    out: Annotated[Path, typer.Option()],
+    out: Annotated[Path, typer.Option(), outputs.PICKED],
     rig: RigOption = None,
     frames: FramesOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535)] = PORT,

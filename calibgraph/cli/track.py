@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibgraph.cli import options
+from calibgraph.cli import options, outputs
 from calibgraph.cli.arguments import bag_options_from, checked_arguments, config_from, matcher_from
 from calibgraph.cli.terminal import print_plain, terminal
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def track(
     rig: options.RigArgument,
     source: list[Path],
-    out: Path = Path("tracking"),
+    out: Annotated[Path, outputs.RESULT] = Path("tracking"),
     every: Annotated[int, typer.Option(min=1)] = 1,
     follow: bool = False,
     matcher: str | None = None,
