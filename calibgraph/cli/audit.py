@@ -9,24 +9,18 @@ import typer
 
 from calibgraph.cli import outputs
 from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
-from calibgraph.cli.options import DatasetArgument, FramesOption, JsonOption, SeedOption
+from calibgraph.cli.options import JsonOption, SeedOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
-DegreesOption = Annotated[
-    float, typer.Option(metavar="DEG", help="Largest deviation about an axis that is OK.")
-]
-CentimetresOption = Annotated[
-    float, typer.Option(metavar="CM", help="Largest deviation along an axis that is OK.")
-]
 _EXIT_CODES = {"OK": 0, "WRONG": 1, "CHANGED": 1, "CANNOT TELL": 3}
 
 
 def check(
     rig: Path,
-    dataset: DatasetArgument,
-    tolerance_deg: DegreesOption = 0.5,
-    tolerance_cm: CentimetresOption = 10.0,
-    frames: FramesOption = None,
+    dataset: list[Path],
+    tolerance_deg: float = 0.5,
+    tolerance_cm: float = 10.0,
+    frames: str | None = None,
     seed: SeedOption = 0,
     page: Annotated[Path | None, outputs.PAGE_OF_AUDIT] = None,
     as_json: JsonOption = False,
@@ -79,8 +73,8 @@ def check(
 def drift(
     results: list[Path],
     days: str | None = None,
-    tolerance_deg: DegreesOption = 0.5,
-    tolerance_cm: CentimetresOption = 10.0,
+    tolerance_deg: float = 0.5,
+    tolerance_cm: float = 10.0,
     own_lenses: bool = False,
     plot: Annotated[Path | None, outputs.PLOT_OF_DRIFT] = None,
     as_json: JsonOption = False,

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    dataset: options.DatasetArgument,
+    dataset: list[Path],
     matching: MatchingOptions,
-    out: options.OutOption = Path("calibration"),
+    out: Annotated[Path, outputs.RESULT] = Path("calibration"),
     *,
     solving: SolveOptions,
     as_json: options.JsonOption = False,
@@ -52,7 +52,7 @@ def calibrate(
 
 
 def match(
-    dataset: options.DatasetArgument,
+    dataset: list[Path],
     matching: MatchingOptions,
     out: Annotated[Path, outputs.TABLE] = Path("correspondences.parquet"),
     seed: options.SeedOption = 0,
@@ -80,9 +80,9 @@ def match(
 
 
 def solve(
-    rig: options.RigArgument,
+    rig: Path,
     correspondences: Path,
-    out: options.OutOption = Path("calibration"),
+    out: Annotated[Path, outputs.RESULT] = Path("calibration"),
     *,
     solving: SolveOptions,
     camera_matches: Path | None = None,
@@ -95,6 +95,7 @@ def solve(
     """Calibrate all cameras jointly from a table of correspondences, with a report.
 
     Args:
+        rig (RIG): Rig with the initial guess.
         correspondences (CORRESPONDENCES): Table, .parquet or .csv, or a folder of .parquet files;
             larger than memory too.
         camera_matches (FILE): Features that cameras have in common: camera_matches.parquet of a

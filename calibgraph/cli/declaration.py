@@ -2,7 +2,8 @@
 
 A command is a function with plain types. Its section ``Args`` has a line per option, ``name
 (VALUE): help``, with the value's name as the help shows it; a class of options has these lines
-under ``Attributes``. What has a default is an option, what has none an argument.
+under ``Attributes``; options that several commands share have theirs in
+:mod:`calibgraph.cli.options`. What has a default is an option, what has none an argument.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 from typer.models import ParameterInfo
+
+from calibgraph.cli import options
 
 _SECTION = re.compile(r"\n\n(?:Args|Attributes):\n")
 _ENTRY = re.compile(r"(\w+)(?: \((.+?)\))?: (.*)")
@@ -53,10 +56,10 @@ def _parameters(
     """The options of a parameter: itself, or those of its class."""
     if name not in groups:
         default = inspect.signature(command).parameters[name].default
-        yield _parameter(name, default, hints[name], _entries(command))
+        yield _parameter(name, default, hints[name], _entries(options) | _entries(command))
         return
     of_group = get_type_hints(groups[name], include_extras=True)
-    entries: dict[str, tuple[str | None, str]] = {}
+    entries = _entries(options)
     for base in reversed(groups[name].__mro__):
         entries |= _entries(base)
     for field in fields(groups[name]):
@@ -87,5 +90,5 @@ def _parameter(
     given.metavar, given.help = given.metavar or metavar, given.help or text
     keyword = inspect.Parameter.KEYWORD_ONLY
     others = [each for each in extras if not isinstance(each, ParameterInfo)]
-    hint = Annotated[kind, given, *others]  # type: ignore[valid-type]
+    hint = Annotated[kind, given, *others]
     return inspect.Parameter(name, keyword, default=default, annotation=hint)

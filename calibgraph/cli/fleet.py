@@ -107,13 +107,8 @@ def _print(summary: Summary, out: str, *, as_json: bool) -> None:
         print_plain(terminal(), f"failed: {count} ({kind}); see the column error, and _logs")
 
 
-RowsArgument = Annotated[
-    str, typer.Argument(metavar="URI", help="What calibgraph fleet wrote: a folder or a URI.")
-]
-
-
 def fleet_report(
-    rows: RowsArgument,
+    rows: str,
     out: Annotated[Path, outputs.FLEET_PAGE] = Path("fleet.html"),
     before: str | None = None,
     link: str = "",
@@ -134,7 +129,7 @@ def fleet_report(
 
 
 def fleet_model(
-    rows: RowsArgument,
+    rows: str,
     out: Annotated[Path, outputs.FLEET_MODEL] = Path("fleet_model"),
     rig: list[str] | None = None,
 ) -> None:

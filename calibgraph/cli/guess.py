@@ -16,28 +16,14 @@ from calibgraph.cli.terminal import print_json, print_plain, progress_bar, termi
 if TYPE_CHECKING:
     from calibgraph.model.rig import Rig
 
-MountOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=WORDS",
-        help="How a camera is mounted: front, front-left, left, rear-left, rear, ...; then "
-        "NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, "
-        "NUMBER m|cm ahead|behind|left|right|above|below of the LiDAR. May be repeated.",
-    ),
-]
-ForwardOption = Annotated[
-    str,
-    typer.Option(metavar="+x|-x|+y|-y", help="Axis of the LiDAR frame that points ahead; z is up."),
-]
-
 
 def guess(
     files: RigFilesOptions,
     out: Annotated[Path, typer.Option(), outputs.rig_of("guess")],
-    mount: MountOption = None,
+    mount: list[str] | None = None,
     dataset: list[Path] | None = None,
     search: list[str] | None = None,
-    forward: ForwardOption = "+x",
+    forward: str = "+x",
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -76,8 +62,8 @@ def guess(
 def init(
     dataset: Path,
     out: Path | None = None,
-    mount: MountOption = None,
-    forward: ForwardOption = "+x",
+    mount: list[str] | None = None,
+    forward: str = "+x",
     force: bool = False,
 ) -> None:
     """Write a rig.yaml to fill in: the cameras and image sizes of a folder, each key explained.

@@ -17,18 +17,12 @@ from calibgraph.cli.terminal import print_json, print_plain, progress_bar, termi
 if TYPE_CHECKING:
     from calibgraph.model.calibration import Calibration
 
-ResultArgument = Annotated[
-    Path, typer.Argument(metavar="DIR", help="Result: its folder, or its calibration.yaml.")
-]
-MovedOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--dataset",
-        metavar="DATASET",
-        help="Where the images and clouds are now, if they have moved; repeat it for several "
-        "folders, in the order in which they were calibrated.",
-    ),
-]
+
+_MOVED = typer.Option(
+    metavar="DATASET",
+    help="Where the images and clouds are now, if they have moved; repeat it for several folders, "
+    "in the order in which they were calibrated.",
+)
 
 
 def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
@@ -45,9 +39,9 @@ def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
 
 
 def report(
-    result: ResultArgument,
+    result: Path,
     out: Annotated[Path | None, outputs.PAGE] = None,
-    dataset: MovedOption = None,
+    dataset: Annotated[list[Path] | None, _MOVED] = None,
 ) -> None:
     """Write a result as one HTML page that opens without a network.
 
@@ -125,10 +119,10 @@ def perturb(
 
 
 def view(
-    result: ResultArgument,
+    result: Path,
     rerun: Annotated[Path | None, outputs.RERUN] = None,
     mcap: Annotated[Path | None, outputs.MCAP] = None,
-    dataset: MovedOption = None,
+    dataset: Annotated[list[Path] | None, _MOVED] = None,
 ) -> None:
     """Write a result for viewers: clouds, images and projected points, before and after.
 
@@ -155,7 +149,7 @@ def view(
 
 
 def doctor(
-    dataset: options.DatasetArgument,
+    dataset: list[Path],
     chosen: DatasetOptions,
     out: Annotated[Path | None, outputs.PICTURES] = None,
     as_json: options.JsonOption = False,

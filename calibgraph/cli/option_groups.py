@@ -44,8 +44,8 @@ class DatasetOptions:
         stamps (header|record): Stamps of the sensors, or of recording. (default: header)
     """
 
-    rig: options.RigOption = None
-    frames: options.FramesOption = None
+    rig: Path | None = None
+    frames: str | None = None
     topic: options.TopicOption = None
     every_s: Annotated[float | None, _bag_option(min=0.001)] = None
     tolerance_s: Annotated[float | None, _bag_option(min=0)] = None
@@ -133,8 +133,8 @@ class SolveOptions:
     """
 
     terms: str = "full"
-    preset: options.PresetOption = None
-    config: options.ConfigOption = None
+    preset: str | None = None
+    config: Path | None = None
     seed: options.ConfigSeedOption = None
     bootstrap: Annotated[int | None, typer.Option(min=2, max=100_000)] = None
     tolerance_deg: float | None = None

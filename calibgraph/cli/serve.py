@@ -8,7 +8,6 @@ import typer
 
 from calibgraph.cli import outputs
 from calibgraph.cli.arguments import dataset_from, require_service
-from calibgraph.cli.options import DatasetArgument, FramesOption, RigOption
 from calibgraph.cli.terminal import print_plain, terminal
 from calibgraph.errors import CalibrationError
 
@@ -144,10 +143,10 @@ PORT = 8765
 
 
 def pick(
-    dataset: DatasetArgument,
+    dataset: list[Path],
     out: Annotated[Path, typer.Option(), outputs.PICKED],
-    rig: RigOption = None,
-    frames: FramesOption = None,
+    rig: Path | None = None,
+    frames: str | None = None,
     port: Annotated[int, typer.Option(min=0, max=65535)] = PORT,
     show: Annotated[bool, typer.Option("--show/--no-show")] = True,
 ) -> None:

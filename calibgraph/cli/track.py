@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def track(
-    rig: options.RigArgument,
+    rig: Path,
     source: list[Path],
     out: Annotated[Path, outputs.RESULT] = Path("tracking"),
     every: Annotated[int, typer.Option(min=1)] = 1,
@@ -25,8 +25,8 @@ def track(
     estimate: str | None = None,
     interval_s: float | None = None,
     motion: options.MotionOption = None,
-    config: options.ConfigOption = None,
-    preset: options.PresetOption = None,
+    config: Path | None = None,
+    preset: str | None = None,
     seed: options.ConfigSeedOption = None,
     weights: options.WeightsOption = None,
     device: options.DeviceOption = None,
@@ -43,6 +43,7 @@ def track(
     as wide. With --matcher structure places are found from the images.
 
     Args:
+        rig (RIG): Rig with the initial guess.
         source (SOURCE...): Table of correspondences (.parquet, .csv), a growing folder of them, or
             - for standard input (an Arrow IPC stream, or a JSON line per frame). With --matcher:
             dataset folders, KITTI sequences or ROS bags of one rig, as one drive.
