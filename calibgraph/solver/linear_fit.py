@@ -17,7 +17,7 @@ from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_twist import fill_twist_columns
 from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.spread_kernel import median
+from calibgraph.solver.residual_scale import quantile
 from calibgraph.solver.whitening import upper_root
 from calibgraph.solver.within_place import WEAK
 from factors import ProjectionBlock, unit_diagonal
@@ -124,7 +124,7 @@ def fit_camera(
     weighted = np.empty_like(flat)
     for _ in range(_MAX_ITERATIONS):
         squares = np.square((errors - values @ flat).reshape(2, -1)).sum(axis=0)
-        scale = loss_scale or _LOSS_MEDIANS * math.sqrt(median(squares)) + 1e-12
+        scale = loss_scale or _LOSS_MEDIANS * math.sqrt(quantile(squares, 0.5)) + 1e-12
         weights = np.tile(1.0 / (1.0 + squares / scale**2), 2)
         np.multiply(flat, weights, out=weighted)
         hessian, before = weighted @ flat.T + _weak(size), values
