@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
-from calibgraph.solver.pnp import magsac, normalized
+from calibgraph.solver.pnp import magsac, view_plane
 
 Shape = Literal["line", "plane", "space"]
 
@@ -23,7 +23,6 @@ MIN_PAIRS = 4
 MIN_PAIRS_LINEAR = 6
 """From which OpenCV's iterative solver finds its own start."""
 
-_MAX_ANGLE_RAD = np.radians(80.0)  # PnP works on a plane: wider rays would dominate it
 _INLIER_SIGMAS = 3.0
 _ITERATIONS = 2000  # of samples of 4: with half of the pairs wrong, all but 1e-56 of runs have one
 
@@ -63,8 +62,8 @@ def poses_by_solver(
     Returns:
         Sorted by the median error; IPPE with both of its solutions. Empty under MIN_PAIRS.
     """
-    plane = normalized(camera, pixels_px)
-    usable = np.hypot(plane[:, 0], plane[:, 1]) < np.tan(_MAX_ANGLE_RAD)
+    turn, plane = view_plane(camera, pixels_px)
+    usable = np.isfinite(plane[:, 0])
     if np.count_nonzero(usable) < MIN_PAIRS:
         return []
     focal = camera.intrinsics_px.fx
@@ -87,6 +86,7 @@ def poses_by_solver(
     found = []
     for name, solver in solvers.items():
         for T in _transforms(solver, problem):
+            T[:3] = turn.T @ T[:3]
             error = _median_error(camera, T, points_lidar_m, pixels_px)
             found.append(SolverPose(name, T, error))
     return sorted(found, key=lambda pose: pose.median_px)
