@@ -20,7 +20,7 @@ from calibgraph.model.geometry import pose_difference
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver import stage1
 from calibgraph.solver.geodesic_median import geodesic_median
-from calibgraph.solver.pnp import frame_pose
+from calibgraph.solver.pnp import frame_pose, view_plane
 from calibgraph.solver.stage1 import (
     T_hat,
     aggregate,
