@@ -108,11 +108,30 @@ def ransac_pnp(
     if np.count_nonzero(usable) < MIN_MATCHES:
         return None
     parameters = magsac(config.pnp_threshold_px, iterations=iterations, seed=config.seed)
-    focal = camera.lens.pixels_per_rad
-    ideal = np.diag([focal, focal, 1.0])
+    points, focal = matches.points_lidar_m[usable], camera.lens.pixels_per_rad
+    found = ransac_on_plane(points, plane[usable], focal, parameters, turn=turn)
+    return None if found is None else found[0]
+
+
+def ransac_on_plane(
+    points_m: Array, plane: Array, focal_px: float, parameters: cv2.UsacParams, *, turn: Array
+) -> tuple[Array, int] | None:
+    """(4, 4) pose of a camera from points and where it sees them, and how many points agree.
+
+    Args:
+        points_m: (n, 3).
+        plane: (n, 2) where, on the plane z = 1 of the turned camera frame.
+        focal_px: in whose pixels the threshold of the parameters is.
+        parameters: of RANSAC.
+        turn: (3, 3) from the camera frame to the turned one.
+
+    Returns:
+        None where the points determine no pose.
+    """
+    ideal = np.diag([focal_px, focal_px, 1.0])
     try:
-        found, _, rotation, translation, _ = cv2.solvePnPRansac(
-            matches.points_lidar_m[usable], plane[usable] * focal, ideal, None, params=parameters
+        found, _, rotation, translation, inliers = cv2.solvePnPRansac(
+            points_m, focal_px * plane, ideal, None, params=parameters
         )
     except cv2.error:  # degenerate samples: all points in one place, or on one line
         return None
@@ -120,7 +139,7 @@ def ransac_pnp(
         return None
     T = transform(cv2.Rodrigues(rotation)[0], translation.ravel())
     T[:3] = turn.T @ T[:3]
-    return T
+    return T, 0 if inliers is None else len(inliers)
 
 
 def pose_near_guess(
