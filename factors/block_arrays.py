@@ -101,3 +101,10 @@ def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     runs = np.empty((len(edges) - 1, 2), dtype=np.int64)
     runs[:, 0], runs[:, 1] = edges[:-1], edges[1:]
     return read_only(runs)
+
+
+def rotate_each(R: Array, vectors: Array) -> Array:
+    """Rotate (n, 3) vectors, each by its own of (n, 3, 3), or all by one of (1, 3, 3)."""
+    if len(R) == 1:
+        return np.asarray(vectors @ R[0].T)
+    return np.asarray(np.einsum("nij,nj->ni", R, vectors))
