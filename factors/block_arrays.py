@@ -108,3 +108,14 @@ def rotate_each(R: Array, vectors: Array) -> Array:
     if len(R) == 1:
         return np.asarray(vectors @ R[0].T)
     return np.asarray(np.einsum("nij,nj->ni", R, vectors))
+
+
+def whiten(columns: Array, root: Array | None) -> None:
+    """Multiply (k, 2, n) derivatives or residuals in place by (n, 3) whitening matrices, if any."""
+    if root is not None:
+        s00, s01, s11 = root.T
+        if s01.any():
+            columns[:, 0] = s00 * columns[:, 0] + s01 * columns[:, 1]
+        else:
+            columns[:, 0] *= s00
+        columns[:, 1] *= s11

@@ -21,6 +21,7 @@ from calibgraph.solver.residual_scale import quantile
 from calibgraph.solver.whitening import upper_root
 from calibgraph.solver.within_place import WEAK
 from factors import ProjectionBlock, unit_diagonal
+from factors.block_arrays import whiten
 
 MIN_ROWS = 30  # fewer correspondences do not determine further unknowns
 _MAX_ITERATIONS = 20
@@ -146,13 +147,7 @@ def _linearize(camera: Camera, block: ProjectionBlock, fields_px: Array) -> Arra
     pixels = fill_twist_columns(camera, block.points_lidar_m, columns[:6])
     columns[6:-1] = fields_px
     columns[-1] = camera.lens.subtract(block.pixels_px, pixels.T).T
-    if block.sqrt_information is not None:
-        s00, s01, s11 = block.sqrt_information.T
-        if not s01.any() and np.array_equal(s00, s11):
-            columns *= s00
-            return columns
-        columns[:, 0] = s00 * columns[:, 0] + s01 * columns[:, 1]
-        columns[:, 1] *= s11
+    whiten(columns, block.sqrt_information)
     return columns
 
 
