@@ -78,18 +78,26 @@ def predict_variances(errors: ErrorFit) -> dict[int, Array]:
     The information of places is repeated; that of what they all share is not.
     """
     linear = errors.fit.linear
-    model = linear.model
-    summary = linear.placed.eliminatePartialSequential(to_ordering(model.place_keys))[1]
-    found = {}
+    model, found = linear.model, {}
     for times in TIMES:
         shown = times * model.components.distortion_information
         vector = times * model.components.distortion_vector
         parts = replace(model.components, distortion_information=shown, distortion_vector=vector)
         shared = replace(model, components=parts).shared_graph.linearize(linear.values)
-        graph = join_linear(shared, *times * [summary])
+        graph = join_linear(shared, _repeated(linear.left_by_places, times))
         found[times] = np.diag(
             np.linalg.inv(marginal_information(graph, model.shared_keys, model.reported_keys))
         )
+    return found
+
+
+def _repeated(graph: gtsam.GaussianFactorGraph, times: int) -> gtsam.GaussianFactorGraph:
+    """The factors of a graph so many times, added up to one factor."""
+    if times == 1:
+        return graph
+    half, found = _repeated(graph, times // 2), gtsam.GaussianFactorGraph()
+    odd = [graph] if times % 2 else []
+    found.push_back(gtsam.HessianFactor(join_linear(half, half, *odd)))
     return found
 
 
@@ -104,12 +112,11 @@ def _of_shared(linear: Linearization) -> Variances:
     A factor with the whitened Jacobian A adds C A^T A C.
     """
     model = linear.model
-    summary = linear.placed.eliminatePartialSequential(to_ordering(model.place_keys))[1]
     keys = model.reported_keys + model.shared_keys[: -len(model.cameras)]
     dims = linear.values.dims()
     sizes = [dims[key] for key in keys]
     ends = dict(zip(keys, np.cumsum(sizes), strict=True))
-    hessian = join_linear(linear.shared, summary).hessian(to_ordering(keys))[0]
+    hessian = join_linear(linear.shared, linear.left_by_places).hessian(to_ordering(keys))[0]
     covariance = np.linalg.inv(hessian)[: 6 * len(model.cameras)]
     found = dict.fromkeys((COMMON, PAIRS, LENSES, *_DISTORTIONS, PRIORS), np.zeros(len(covariance)))
     for number in range(linear.shared.size()):
