@@ -41,7 +41,7 @@ and keeps from a PASS, since the same posterior cannot vouch for it."""
 FLAT_EVIDENCE = "flat_evidence"
 """Kind of the check that compares the error bars by images and by matches. The wider one is in the
 result, so that the check itself changes no verdict."""
-_SURE = 0.99
+_SURE, _LEAST = 0.99, 0.001  # beyond these, probabilities are not known
 
 
 @dataclass(frozen=True)
@@ -146,6 +146,8 @@ class ErrorProbability:
         """The probability in percent, with its unit."""
         if self.probability > _SURE:
             return f"over {_SURE:.0%}"
+        if self.probability < _LEAST:
+            return f"<{_LEAST:.1%}"
         if self.probability < 1 - _SURE:
             return f"{100 * self.probability:.1f}%"
         return f"{100 * self.probability:.2g}%"
@@ -208,6 +210,13 @@ class Verdict:
         if self.error_probability.status == "PASS" and (unmeasured or worst == "FAIL"):
             return "WARN"
         return self.error_probability.status
+
+    @property
+    def percent(self) -> str:
+        """The probability that it is off; "-" without one, or where data for one are missing."""
+        found = self.error_probability
+        known = found is not None and (found.status, self.status) != ("PASS", "WARN")
+        return found.percent if found and known else "-"
 
     @property
     def _kinds_beyond(self) -> set[str]:

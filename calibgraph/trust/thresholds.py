@@ -130,8 +130,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "its matches are left out; look at its frames"),
     Threshold("repeated_frames", "share of frames that repeat another one", "at most", 0.5,
               math.inf, "share", "How many frames are of the same place, or of the same content?",
-              _CHOSEN, "the vehicle stood, or frames are copies: they count as one frame each; "
-              "take frames while it drives"),
+              _CHOSEN, "the vehicle stood, a camera or the LiDAR was stuck, or frames are "
+              "copies: they count as one frame each; take frames while it drives"),
     Threshold("assumed_spread", "residual spread over the assumed one", "at most", 2.0, 4.0,
               "times", "Does the configured loss scale suit the residuals?", _COUNTED,
               "the matches are worse than loss_scale_px (delta) assumes"),
