@@ -46,8 +46,8 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     console.print(error_bar_table(result))
     console.print(
         f"one standard deviation of the {config.of}: scatter between frames, and the error that "
-        f"the matcher reports as common to its frames; {result.not_included}; A->B: of the "
-        "transform from A to B, in B's axes"
+        f"the matcher reports as common to its frames; {result.not_included}"
+        f"{result.verdict.images_note}; A->B: of the transform from A to B, in B's axes"
     )
     if result.lens:
         console.print(lens_table(result))

@@ -19,6 +19,7 @@ COMMON_ERROR = "common_error"
 ABOUT_THE_DATA = frozenset(
     {
         COMMON_ERROR,
+        "beyond_tolerance",
         "correspondences",
         "correspondences_used",
         "difference between even and odd frames",  # too few frames to split
@@ -201,15 +202,21 @@ class Verdict:
 
         Without a probability, the worst status of the checks; PASS without any.
         """
-        worst: Status = max(
-            (check.status for check in self.checks), key=_ORDER.index, default="PASS"
-        )
+        statuses = (c.status for c in self.checks if c.kind != FLAT_EVIDENCE)
+        worst: Status = max(statuses, key=_ORDER.index, default="PASS")
         if self.error_probability is None:
             return worst
         unmeasured = not self._kinds_beyond.isdisjoint(ABOUT_THE_DATA)
         if self.error_probability.status == "PASS" and (unmeasured or worst == "FAIL"):
             return "WARN"
         return self.error_probability.status
+
+    @property
+    def images_note(self) -> str:
+        """A clause on error bars that no images have tested; empty if they have."""
+        if any(check.kind == FLAT_EVIDENCE for check in self.checks):
+            return ""
+        return "; no images tested it: where they are flat, as over grass, errors can be larger"
 
     @property
     def percent(self) -> str:

@@ -195,6 +195,11 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "KITTI 00: own clouds +0.4 and more, clouds one frame off -0.4 and less; about zero "
               "where the vehicle stands, which is no fault."),
     # while driving
+    Threshold("beyond_tolerance", "probability of an error beyond the tolerance", "at most",
+              PASS_BELOW, math.inf, "share",
+              "How much of the posterior by the images and the matches is beyond the tolerance?",
+              "The verdict's own cut, at the end of `track --matcher structure`.",
+              "the images leave the pose more open than the matches"),
     Threshold("disagreeing_frames", "share of the last frames that disagree with the estimate",
               "at most", 0.5, 1.0, "share", "Do recent frames agree with the tracked estimate?",
               "Above half, most new measurements contradict the estimate."),
