@@ -14,6 +14,8 @@ _FINITE = ("z_score", "found", "missed", "chance")
 _OF_ONE_SEARCH = ("found", "missed", "chance")
 _PER_CAMERA = (*_FINITE, "start_dependence", "memorization", "failed_share")
 _FORMER_KEYS = {"contrast": "z_score", "recall": "memorization"}
+IMAGES = "images"
+"""Key of what the images said of a result; its content is of ``calibgraph.trust.image_record``."""
 STAGE1, _SOURCES = "stage1", ("pnp", "rig")
 _NUMBERS = {
     "range_rotation_deg": 180.0,
@@ -142,7 +144,10 @@ def joined_metadata(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The metadata of joined tables, by theirs: the first, with what all searches found.
 
     Where searches differ, only the cameras that one has missed remain of them, at their lowest.
+    What images said is of one result, and of tables that share it.
     """
+    if any(one.get(IMAGES) != tables[0].get(IMAGES) for one in tables):
+        tables = [{key: one[key] for key in one if key != IMAGES} for one in tables]
     searches = [{key: one.get(key) or {} for key in _OF_ONE_SEARCH} for one in tables]
     if all(one == searches[0] for one in searches):
         return dict(tables[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 Status = Literal["PASS", "WARN", "FAIL"]
@@ -196,15 +197,14 @@ class Verdict:
     error_probability: ErrorProbability | None = None
     cameras: tuple[Verdict, ...] = ()
 
-    @property
+    @cached_property
     def status(self) -> Status:
         """That of the probability; a check that data are missing, or a FAIL, turns PASS into WARN.
 
         Without a probability, the worst status of the checks; PASS without any.
         """
-        worst: Status = max(
-            (check.status for check in self.checks), key=_ORDER.index, default="PASS"
-        )
+        found = {check.status for check in self.checks}
+        worst: Status = "FAIL" if "FAIL" in found else "WARN" if "WARN" in found else "PASS"
         if self.error_probability is None:
             return worst
         unmeasured = not self._kinds_beyond.isdisjoint(ABOUT_THE_DATA)
@@ -255,10 +255,15 @@ class Verdict:
         }
 
 
-def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
-    """The verdict of a rig: its worst camera's, with the checks of all, by their names."""
+def rig_verdict(cameras: Mapping[str, Verdict], *, named: bool = True) -> Verdict:
+    """The verdict of a rig: its worst camera's, with the checks of all, by their names.
+
+    Args:
+        cameras: the verdicts of its cameras.
+        named: let the text of a check begin with the name of its camera.
+    """
     checks = tuple(
-        replace(check, text=f"{name}: {check.text}")
+        replace(check, text=f"{name}: {check.text}") if named else check
         for name, verdict in cameras.items()
         for check in verdict.checks
     )

@@ -16,7 +16,7 @@ from calibgraph.model.lens_estimate import LensEstimate, with_sigmas
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
-from calibgraph.solver.covariance import ENOUGH_FRAMES, sigmas_of_hessian
+from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.lens_estimates import estimates_of
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.closed_places import ClosedPlaces
@@ -30,6 +30,7 @@ from calibgraph.tracking.window import Window
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
+from factors.conditioning import sigmas_of_hessian
 
 
 @dataclass(frozen=True, eq=False)

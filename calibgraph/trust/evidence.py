@@ -45,7 +45,6 @@ _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unk
 Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
 
-
 MeasurePosteriors = Callable[
     [Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
 ]
@@ -125,9 +124,8 @@ class Evidence:
     @cached_property
     def posteriors(self) -> Mapping[str, PosePosterior]:
         """Per free camera, its posterior by the images' evidence."""
-        if self.covariance_of_matches is None:
+        if (known := self.covariance_of_matches) is None:
             return {}
-        known = self.covariance_of_matches
         own = {name: self._rows_of(known, name) for group in self.tied for name in group}
         return self.measure_posteriors(own, self.tied)
 
@@ -158,10 +156,9 @@ class Evidence:
 
     def probability_beyond(self, camera: str) -> float:
         """The probability that its error is beyond the tolerance, by its posterior."""
-        known = None if camera in self.solution.held else self.covariance_of_matches
-        if known is None:
+        own, tolerance = self.covariance_by_matches(camera), self.solution.config.tolerance
+        if own is None:
             return 0.0
-        tolerance, own = self.solution.config.tolerance, self._rows_of(known, camera)
         if camera not in self.posteriors:
             return probability_beyond(own, tolerance)
         return self.posteriors[camera].probability_beyond(own, tolerance)
@@ -185,12 +182,16 @@ class Evidence:
 
     def scatter_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, by the scatter between frames."""
-        return self._block(self.solution.marginals.scatter, camera)
+        scatter = self.solution.marginals.scatter
+        return None if scatter is None else self._rows_of(scatter, camera)
 
     def covariance_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, with the error that all the matcher's frames share."""
-        joint = None if camera in self.solution.held else self.joint_covariance
-        return self._block(joint, camera)
+        return self._block(self.joint_covariance, camera)
+
+    def covariance_by_matches(self, camera: str) -> Array | None:
+        """(6, 6) of one camera, not widened by what the images leave open."""
+        return self._block(self.covariance_of_matches, camera)
 
     @property
     def lens_covariance(self) -> dict[str, Array]:
@@ -205,7 +206,8 @@ class Evidence:
         return found
 
     def _block(self, joint: Array | None, camera: str) -> Array | None:
-        return None if joint is None else self._rows_of(joint, camera)
+        held = camera in self.solution.held
+        return None if joint is None or held else self._rows_of(joint, camera)
 
     def _rows_of(self, joint: Array, camera: str) -> Array:
         """(6, 6) of one camera, of the (6 N, 6 N) of all."""
@@ -274,20 +276,19 @@ class Evidence:
         """
         solution, block = self.solution, self.solution.inliers.blocks.get(camera)
         sigmas, conflicts = solution.marginals.data_sigmas, solution.marginals.conflicts
-        held = camera in solution.held
         return Estimate(
             camera=solution.rig.cameras[camera],
             residuals=self.residuals.get(camera),
             used=0 if block is None else len(block.frame),
             frames=0 if block is None else len(block.frame_edges) - 1,
-            covariance=None if held else self._block(self.covariance_of_matches, camera),
+            covariance=self.covariance_by_matches(camera),
             data_sigmas=None if sigmas is None else sigmas[self.cameras.index(camera)],
             halves=self.halves.get(camera),
             conflicts=tuple(c for c in conflicts if camera in (c.pair.a, c.pair.b)),
             pull=self.pull_of(camera),
             converged=solution.optimum.converged,
             terms=solution.terms,
-            held=held,
+            held=camera in solution.held,
             scatter_only=not self.findings.states_common_error,
             tolerance=solution.config.tolerance,
             lens=solution.lens.get(camera, ()),

@@ -23,7 +23,7 @@ from scipy.special import expit
 
 from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.matching.structure.likelihood import FAR, log_likelihood
+from calibgraph.matching.structure.consensus import FAR, log_likelihood
 from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
