@@ -126,17 +126,20 @@ class ErrorProbability:
         by_error_bar: that its error bar allows more than the tolerance.
         tolerance_deg: of the rotation.
         tolerance_cm: of the position.
+        bar_reliability: by which the second counts: it held so far in cases with a known truth.
     """
 
     by_checks: float
     by_error_bar: float = 0.0
     tolerance_deg: float = TOLERANCE[0]
     tolerance_cm: float = TOLERANCE[1]
+    bar_reliability: float = 1.0
 
     @property
     def probability(self) -> float:
         """The probability of either."""
-        return 1.0 - (1.0 - self.by_checks) * (1.0 - self.by_error_bar)
+        of_bar = self.bar_reliability * self.by_error_bar
+        return 1.0 - (1.0 - self.by_checks) * (1.0 - of_bar)
 
     @property
     def status(self) -> Status:

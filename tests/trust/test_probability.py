@@ -74,15 +74,28 @@ def test_without_a_doubt_a_result_passes_and_a_check_nobody_has_seen_fails_it(mo
     assert judge([], 0.0, (0.5, 10.0), model).status == "PASS"
     new = Check("new", "FAIL", "", 3.5, 1.0, 2.0)
     assert judge([new], 0.0, (0.5, 10.0), model).status == "FAIL"
-    assert judge(
-        [Check("search", "FAIL", "not found")], 0.0, (0.5, 10.0), model
-    ).error_probability == ErrorProbability(1)
+    not_found = judge([Check("search", "FAIL", "not found")], 0.0, (0.5, 10.0), model)
+    assert not_found.error_probability is not None
+    assert not_found.error_probability.by_checks == 1
 
 
-def test_several_doubts_are_worse_than_one() -> None:
-    one = probability_of_checks([Check("first", "WARN", "")], STRUCTURE)
+def test_several_doubts_are_worse_than_one_in_tables_and_as_the_worst_in_runs() -> None:
+    one = [Check("first", "WARN", "")]
     four = [Check(f"doubt {k}", "WARN", "") for k in range(4)]
-    assert probability_of_checks(four, STRUCTURE) > max(FAIL_ABOVE, 10 * one)
+    of_tables, of_runs = (
+        [probability_of_checks(checks, model) for checks in (one, four)]
+        for model in (TABLES, STRUCTURE)
+    )
+    assert of_tables[1] > max(FAIL_ABOVE, 10 * of_tables[0])
+    assert PASS_BELOW < of_runs[1] == of_runs[0] < FAIL_ABOVE
+
+
+def test_a_wide_error_bar_counts_as_far_as_it_is_reliable() -> None:
+    verdict = judge([], 0.9, (0.5, 10.0), STRUCTURE)
+    found = verdict.error_probability
+    assert found is not None and found.by_error_bar == 0.9
+    assert 0.7 < found.probability < 0.9
+    assert judge([], 0.9, (0.5, 10.0), TABLES).error_probability.probability > 0.9  # type: ignore[union-attr]
 
 
 def test_a_wide_error_bar_is_as_probably_off_as_draws_from_it() -> None:
