@@ -19,8 +19,13 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.repeats import hash_numbers
-from calibgraph.solver.residual_scale import MIN_SIGMA_PX, ResidualScale, robust_spread, scale_from
-from calibgraph.solver.spread_kernel import quantiles
+from calibgraph.solver.residual_scale import (
+    MIN_SIGMA_PX,
+    ResidualScale,
+    quantiles,
+    robust_spread,
+    scale_from,
+)
 from calibgraph.solver.whitening import (
     IDENTITY,
     constrained_error_px,

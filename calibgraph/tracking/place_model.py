@@ -26,14 +26,14 @@ from calibgraph.graph.variables import cloud_at_key, matched_at_key, seen_lens_k
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.curvature import convex_hessian
-from calibgraph.solver.data_by_place import block_by_place
 from calibgraph.solver.elimination import LatentPoseFit, join_linear
-from calibgraph.solver.prior_components import variance_components
 from calibgraph.solver.scan_distortion import DistortionEvidence
+from calibgraph.solver.variance_components import variance_components
 from calibgraph.solver.within_place import (
     WEAK,
     WithinPlace,
     allow_for_few_frames,
+    block_by_place,
     relative_covariance,
     split_excess,
 )
