@@ -94,8 +94,7 @@ class ProjectionBlock(RobustBlock):
 
     def _initialize(self, columns: Array, root: Array | None, rows: int) -> None:
         """Set the arrays of a block that is being made: held once, as columns, and read-only."""
-        columns = read_only(columns)  # and so are its views
-        root = None if root is None else read_only(root)
+        columns, root = read_only(columns), root if root is None else read_only(root)
         self.__dict__.update(
             _columns=columns,
             _whitening=columns[:0] if root is None else root[:rows],
@@ -123,8 +122,7 @@ class ProjectionBlock(RobustBlock):
             rows = rows.nonzero()[0]
             if len(rows) == len(self):
                 return self
-        root = self.sqrt_information
-        other = self._copy()
+        root, other = self.sqrt_information, self._copy()
         other._initialize(
             self._columns.take(rows, axis=1),
             None if root is None else root.T.take(rows, axis=1),

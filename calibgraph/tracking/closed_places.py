@@ -15,11 +15,7 @@ import numpy as np
 
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import join
-from calibgraph.solver.elimination import (
-    LatentPoseFit,
-    Linearization,
-    start_values,
-)
+from calibgraph.solver.elimination import LatentPoseFit, Linearization, start_values
 from calibgraph.solver.variance_components import estimate_variance_ratios
 from calibgraph.tracking.contradictions import (
     Conflicts,
@@ -32,7 +28,7 @@ from calibgraph.tracking.contradictions import (
 )
 from calibgraph.tracking.epoch_sums import split_halves, sum_closed_epochs
 from calibgraph.tracking.frozen import changed
-from calibgraph.tracking.offset_walk import add_epoch, times_of, times_with, to_present
+from calibgraph.tracking.offset_walk import sums_in_time, times_of, times_with, to_present
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
@@ -42,7 +38,12 @@ from calibgraph.tracking.place_model import (
     summary_factor,
 )
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
-from calibgraph.tracking.quadratics import Quadratics, linearized, quadratics_of
+from calibgraph.tracking.quadratics import (
+    Quadratics,
+    earlier_quadratics,
+    linearized,
+    quadratics_of,
+)
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, equation_5
 from calibgraph.tracking.window import Window
@@ -81,11 +82,11 @@ class ClosedPlaces:
         if state.offsets is None:
             sums = state.places.add(sums_by_place(frames))
         else:  # a match of an earlier epoch is of another offset
-            sums, frames = _sums_in_time(state), []
+            sums, frames = sums_in_time(state), []
         for camera in state.drifting:
             sums = sums.without(camera)
         rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
-        data = PlaceData.of(state, _earlier_quadratics(state, sums), frames, rows)
+        data = PlaceData.of(state, earlier_quadratics(state, sums), frames, rows)
         seen = FrameSpread.of(state, sums)
         return ClosedPlaces._of_data(state, sums, seen, data, fitted=fitted)
 
@@ -107,7 +108,7 @@ class ClosedPlaces:
 
     def at_optimum(self, state: State) -> ClosedPlaces:
         """The same epochs at another optimum, and with other variance ratios."""
-        data = self.data.with_quadratics(state, _earlier_quadratics(state, self.sums))
+        data = self.data.with_quadratics(state, earlier_quadratics(state, self.sums))
         return ClosedPlaces._of_data(state, self.sums, self.seen, data, fitted=False)
 
     def fitted(self, state: State) -> ClosedPlaces:
@@ -248,27 +249,6 @@ class ClosedPlaces:
         others = {names[row] for row in rows}
         kept = tuple(i for i, name in enumerate(self.data.names) if name not in others)
         return kept, sorted(rows)
-
-
-def _sums_in_time(state: State) -> PlaceSums:
-    """The sums of closed epochs, each place at the time offset that it was left with."""
-    assert state.offsets is not None
-    sums, times = state.places, state.offsets.times
-    for epoch in state.epochs[:-1]:
-        parts, frames = sums_by_place(epoch.frames), len(epoch.frames)
-        sums, times = add_epoch(state, sums, times, parts=parts, frames=frames)
-    return sums
-
-
-def _earlier_quadratics(state: State, sums: PlaceSums) -> Quadratics:
-    """Of the frames whose matches are not kept, or at an offset that is not the present one."""
-    if state.offsets is not None:
-        return quadratics_of(state, sums)
-    return quadratics_of(state, state.places, _steady(state))
-
-
-def _steady(state: State) -> list[int]:
-    return [camera for camera, one in enumerate(state.cameras) if not one.summary.walk]
 
 
 def settle(state: State, *, together: bool) -> tuple[State, ClosedPlaces]:

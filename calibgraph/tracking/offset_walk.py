@@ -21,7 +21,7 @@ from calibgraph.graph.by_place import LateQuadraticByPlace
 from calibgraph.graph.lens import LensTerm, walk_graph
 from calibgraph.graph.variables import MOST_CAMERAS, seen_lens_at_key, seen_lens_key
 from calibgraph.tracking.offset_sums import after_offset_walk
-from calibgraph.tracking.place_sums import MOST_PLACES, PlaceSums
+from calibgraph.tracking.place_sums import MOST_PLACES, PlaceSums, sums_by_place
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums
 
@@ -134,3 +134,13 @@ def walks_at(
         graph.push_back(walk_graph(number, walk))
         keys += [key for key, _ in walk]
     return graph, keys
+
+
+def sums_in_time(state: State) -> PlaceSums:
+    """The sums of closed epochs, each place at the time offset that it was left with."""
+    assert state.offsets is not None
+    sums, times = state.places, state.offsets.times
+    for epoch in state.epochs[:-1]:
+        parts, frames = sums_by_place(epoch.frames), len(epoch.frames)
+        sums, times = add_epoch(state, sums, times, parts=parts, frames=frames)
+    return sums

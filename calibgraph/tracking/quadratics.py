@@ -71,6 +71,14 @@ def quadratics_of(
     }
 
 
+def earlier_quadratics(state: State, sums: PlaceSums) -> Quadratics:
+    """Those of frames whose matches are not kept; with time offsets, of all frames of ``sums``."""
+    if state.offsets is not None:  # a match of an earlier epoch is of another offset
+        return quadratics_of(state, sums)
+    steady = [camera for camera, one in enumerate(state.cameras) if not one.summary.walk]
+    return quadratics_of(state, state.places, steady)
+
+
 def _quadratic(
     state: State, own: Sums, place: str, camera: int
 ) -> tuple[gtsam.Pose3, float, Array]:

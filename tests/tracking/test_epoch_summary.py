@@ -33,4 +33,5 @@ def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
 
 
 def inverse_sandwich(memory: EpochSummary, walk: int) -> Array:
-    return memory.walks.covariance(walk)
+    inverse = np.linalg.inv(memory.walks.hessian[walk])
+    return np.asarray(inverse @ memory.walks.scatter[walk] @ inverse)
