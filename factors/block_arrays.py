@@ -24,7 +24,7 @@ class RobustBlock:
     def rescale(self, *, scale: float, sigma: float = 1.0) -> Self:
         """The same correspondences, not copied, with another scale of the loss, and sigma."""
         other = self._copy()  # not checked again: its correspondences are of a good block
-        other._replace(scale=scale, sigma=sigma)
+        other.__dict__.update(scale=scale, sigma=sigma)
         other._check_scale()
         return other
 
@@ -59,6 +59,9 @@ def contiguous(array: NDArray[_Number]) -> NDArray[_Number]:
     Every array that a kernel only reads is given to it in this form: for arrays that can be
     written, it would be compiled a second time.
     """
+    flags = array.flags
+    if flags.c_contiguous and not flags.writeable:
+        return array
     return read_only(np.ascontiguousarray(array))
 
 

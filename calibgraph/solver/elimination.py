@@ -70,6 +70,11 @@ class Linearization:
         """The linear factors of all places, data included."""
         return join_linear(self.model.place_graph.linearize(self.values), self.data.graph)
 
+    @cached_property
+    def left_by_places(self) -> gtsam.GaussianFactorGraph:
+        """The same factors without the variables of places, which are eliminated."""
+        return self.placed.eliminatePartialSequential(to_ordering(self.model.place_keys))[1]
+
     @property
     def graph(self) -> gtsam.GaussianFactorGraph:
         """All linear factors."""
@@ -96,8 +101,8 @@ class Linearization:
         return np.asarray(np.linalg.inv(self._information_of(keys)))
 
     def _information_of(self, keys: Sequence[int]) -> Array:
-        every = self.model.place_keys + self.model.shared_keys
-        return marginal_information(self.graph, every, keys)
+        graph = join_linear(self.shared, self.left_by_places)
+        return marginal_information(graph, self.model.shared_keys, keys)
 
     @cached_property
     def distances(self) -> Array:

@@ -253,12 +253,14 @@ class Marginals:
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:
         """The factors of relative poses between cameras that both have correspondences."""
-        free, cameras = self.data_only, tuple(self.at.objective.blocks)
+        cameras = tuple(self.at.objective.blocks)
+        measured = self.at.objective.rig.relative_poses
+        pairs = [pair for pair in measured if pair.a in cameras and pair.b in cameras]
+        free = self.data_only if pairs else None
         if free is None:
             return ()
         mount = free.mount
         return tuple(
             relative_pose_conflict(pair, cameras, mount.T_camera_lidar, mount.covariance)
-            for pair in self.at.objective.rig.relative_poses
-            if pair.a in cameras and pair.b in cameras
+            for pair in pairs
         )

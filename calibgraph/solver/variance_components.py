@@ -139,13 +139,12 @@ def undetermined(linear: Linearization) -> dict[Component, float]:
         linear: with quadratic losses of places.
     """
     model, values = linear.model, linear.values
-    summary = linear.placed.eliminatePartialSequential(to_ordering(model.place_keys))[1]
 
     def shared(ratio: float) -> float:
         parts = VarianceRatios(shared=ratio).scale(model.components)
         parts = replace(parts, distortion_weight=parts.distortion_weight / ratio)
         scaled = replace(model, components=parts)
-        graph = join_linear(scaled.shared_graph.linearize(values), summary)
+        graph = join_linear(scaled.shared_graph.linearize(values), linear.left_by_places)
         return log_determinant(graph, to_ordering(model.shared_keys))
 
     def placed(**ratio: float) -> float:

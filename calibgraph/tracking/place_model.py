@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
+    BlockByPlace,
     LateQuadraticByPlace,
     SummarizedByPlace,
 )
@@ -36,6 +37,7 @@ from calibgraph.solver.within_place import (
     relative_covariance,
     split_excess,
 )
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
 from calibgraph.tracking.offset_terms import offset_term, walk_in_graph, with_shared_errors
 from calibgraph.tracking.offset_walk import (
@@ -150,6 +152,16 @@ class PlaceData:
             elif len(quadratic.places):
                 cameras[camera] = quadratic
         return PlaceData([*places], np.array([*places.values()], dtype=np.int64), cameras)
+
+    def with_quadratics(self, state: State, earlier: Quadratics) -> PlaceData:
+        """The same matches with other quadratics of earlier ones."""
+        cameras = dict(self.cameras)
+        for camera, own in self.cameras.items():
+            if not isinstance(own, BlockByPlace):
+                quadratic = by_place(state, camera, earlier[camera], self.names)
+                several = isinstance(own, SummarizedByPlace)
+                cameras[camera] = changed(own, earlier=quadratic) if several else quadratic
+        return replace(self, cameras=cameras)
 
     def at_own_times(self, times: Times) -> PlaceData:
         """The same of closed places, each at the time offset of its own time."""

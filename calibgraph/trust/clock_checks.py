@@ -132,7 +132,7 @@ def fit_offset(
     of_place = place_variance * places.frames_per_place(block.frame_numbers)
     shared = max(of_place, limit("lens_match_share") * len(block))
     fit = fit_camera(camera, block, fields, shared_variance=shared)
-    return None if fit is None else LensParameter.of(TIME, [sigma_s], fit.free(0))
+    return None if fit is None else LensParameter.of(TIME, np.array([sigma_s]), fit.free(0))
 
 
 def _without_times(rig: Rig) -> Rig:

@@ -42,11 +42,15 @@ def compare_with_guess(guess: Array, result: Array, findings: MatcherFindings) -
     range_m = math.sqrt(3) * (findings.range_translation_m or 0.0)
     degrees = angle_deg(guess[:3, :3] @ result[:3, :3].T)
     metres = float(np.linalg.norm(guess[:3, 3] - result[:3, 3]))
-    error = convention_error_between(guess, result)
+    rows = (
+        (replace(rotation, warn=max(rotation.warn, range_deg)), degrees),
+        (replace(translation, warn=max(translation.warn, range_m)), metres),
+    )
+    is_far = any(row.grade(value) != "PASS" for row, value in rows)
+    error = convention_error_between(guess, result) if is_far else None
     advice = "" if error is None else f"it seems that {error}"
     return [
-        replace(rotation, warn=max(rotation.warn, range_deg)).check(degrees, advice=advice),
-        replace(translation, warn=max(translation.warn, range_m)).check(metres, advice=advice),
+        *(row.check(value, advice=advice) for row, value in rows),
         threshold("guess_length").check(float(np.linalg.norm(guess[:3, 3]))),
     ]
 

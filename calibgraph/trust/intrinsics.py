@@ -14,7 +14,6 @@ from calibgraph.trust.lens_parameter import (
     LensParameter,
     check_parameter,
     lens_fields_px,
-    lens_variable,
     units_of,
 )
 from calibgraph.trust.thresholds import limit, threshold
@@ -58,13 +57,12 @@ def _check_camera(evidence: Evidence, name: str) -> list[Check]:
     )
     if fit is None:
         return []
-    found = (
-        LensParameter.of(each, units_of(camera, *numbers), fit.free(*numbers))
-        for each, numbers in _NUMBERS.items()
-    )
+    units = units_of(camera)
+    freed = {each: fit.free(*numbers) for each, numbers in _NUMBERS.items()}
+    found = (LensParameter.of(n, units[[*_NUMBERS[n]]], each) for n, each in freed.items())
     checks = [check_parameter(each, RESIDUALS, solution.config.tolerance) for each in found]
     # A focal length that is wrong by one percent is easily overlooked.
-    percents = 100 * lens_variable(camera).free.sigmas[Free.FOCAL]
-    moved_m = float(np.linalg.norm(fit.free(Free.FOCAL).compensating[3:, 0])) / percents
+    compensating = freed["focal length"].compensating
+    moved_m = float(np.linalg.norm(compensating[3:, 0])) / (100 * units[Free.FOCAL])
     row = threshold("focal_sensitivity", solution.config.tolerance)
     return [*checks, row.check(100 * moved_m)]

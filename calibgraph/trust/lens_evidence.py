@@ -84,10 +84,10 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     rest = _fit_at_peaks(scorer, refined, again, np.zeros(len(best)), places=places)
     if rest is None:
         return ()
-    fine, parameters = rest.counted_from(moved), []
+    fine, units, parameters = rest.counted_from(moved), units_of(camera), []
     for name, number in zip(NAMES, (*searched, Free.SKEW), strict=True):
         fit, others = fine if number in finer else rough, [n for n in finer if n != number]
-        of = LensParameter.of(name, units_of(camera, number), fit.free(*others, number))
+        of = LensParameter.of(name, units[[number]], fit.free(*others, number))
         parameters.append(of)
     return tuple(parameters)
 

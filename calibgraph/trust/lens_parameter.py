@@ -79,10 +79,9 @@ def lens_variable(camera: Camera) -> LensVariable:
     return LensVariable(camera, free, np.zeros(len(free)))
 
 
-def units_of(camera: Camera, *numbers: int) -> list[float]:
-    """Standard deviations of a calibrated lens: relative, pixels, or of k1."""
-    units = *lens_variable(camera).free.sigmas, _SKEW_SIGMA
-    return [units[number] for number in numbers]
+def units_of(camera: Camera) -> Array:
+    """(6,) standard deviations of what is free in a calibrated lens: relative, pixels, or of k1."""
+    return np.array([*lens_variable(camera).free.sigmas, _SKEW_SIGMA])
 
 
 def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
@@ -115,12 +114,12 @@ class LensParameter:
     units: Array
 
     @staticmethod
-    def of(name: str, units: Sequence[float], freed: Freed) -> LensParameter:
+    def of(name: str, units: Array, freed: Freed) -> LensParameter:
         """Of a fit whose last unknowns have these units; others may be free before them."""
         count = len(units)
         values, covariance = _beside_others(name, freed, len(freed.values) - count)
         twist = freed.compensating[:, -count:] @ values
-        return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, np.array(units))
+        return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, units)
 
     @property
     def moved(self) -> tuple[float, float]:
