@@ -20,6 +20,7 @@ COMMON_ERROR = "common_error"
 ABOUT_THE_DATA = frozenset(
     {
         COMMON_ERROR,
+        "beyond_tolerance",
         "correspondences",
         "correspondences_used",
         "difference between even and odd frames",  # too few frames to split
@@ -42,7 +43,7 @@ and keeps from a PASS, since the same posterior cannot vouch for it."""
 FLAT_EVIDENCE = "flat_evidence"
 """Kind of the check that compares the error bars by images and by matches. The wider one is in the
 result, so that the check itself changes no verdict."""
-_SURE = 0.99
+_SURE, _LEAST = 0.99, 0.001  # beyond these, probabilities are not known
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,8 @@ class ErrorProbability:
         """The probability in percent, with its unit."""
         if self.probability > _SURE:
             return f"over {_SURE:.0%}"
+        if self.probability < _LEAST:
+            return f"<{_LEAST:.1%}"
         if self.probability < 1 - _SURE:
             return f"{100 * self.probability:.1f}%"
         return f"{100 * self.probability:.2g}%"
@@ -203,14 +206,28 @@ class Verdict:
 
         Without a probability, the worst status of the checks; PASS without any.
         """
-        found = {check.status for check in self.checks}
-        worst: Status = "FAIL" if "FAIL" in found else "WARN" if "WARN" in found else "PASS"
+        statuses = (c.status for c in self.checks if c.kind != FLAT_EVIDENCE)
+        worst: Status = max(statuses, key=_ORDER.index, default="PASS")
         if self.error_probability is None:
             return worst
         unmeasured = not self._kinds_beyond.isdisjoint(ABOUT_THE_DATA)
         if self.error_probability.status == "PASS" and (unmeasured or worst == "FAIL"):
             return "WARN"
         return self.error_probability.status
+
+    @property
+    def images_note(self) -> str:
+        """A clause on error bars that no images have tested; empty if they have."""
+        if any(check.kind == FLAT_EVIDENCE for check in self.checks):
+            return ""
+        return "; no images tested it: where they are flat, as over grass, errors can be larger"
+
+    @property
+    def percent(self) -> str:
+        """The probability that it is off; "-" without one, or where data for one are missing."""
+        found = self.error_probability
+        known = found is not None and (found.status, self.status) != ("PASS", "WARN")
+        return found.percent if found and known else "-"
 
     @property
     def _kinds_beyond(self) -> set[str]:

@@ -145,7 +145,14 @@ def test_a_wide_error_bar_is_no_fail_but_named() -> None:
 
 def test_probabilities_are_printed_without_digits_that_mean_nothing() -> None:
     printed = [ErrorProbability(p).percent for p in (1e-6, 0.0023, 0.0456, 0.5, 0.999)]
-    assert printed == ["0.0%", "0.2%", "4.6%", "50%", "over 99%"]
+    assert printed == ["<0.1%", "0.2%", "4.6%", "50%", "over 99%"]
+
+
+def test_a_probability_is_not_printed_where_data_for_it_are_missing() -> None:
+    few = threshold("frames").check(3)
+    assert (few.status, Verdict((few,), ErrorProbability(1e-5)).percent) == ("WARN", "-")
+    assert Verdict((few,), ErrorProbability(0.0, 0.1)).percent == "10%"
+    assert (Verdict((), ErrorProbability(1e-5)).percent, Verdict().percent) == ("<0.1%", "-")
 
 
 def test_a_rig_is_as_doubtful_as_its_worst_camera() -> None:
