@@ -13,6 +13,7 @@ from factors.conditioning import (
     smallest_scaled_eigenvalues,
     unit_diagonal,
 )
+from factors.custom import linear_factor
 from factors.epipolar import EpipolarBlock
 from factors.free_lens import (
     FreeLens,
@@ -21,7 +22,6 @@ from factors.free_lens import (
     free_lens_sums_factor,
 )
 from factors.lens import Lens, LensModel
-from factors.linear import linear_factor
 from factors.loss import LOSSES, LossName, robust_noise
 from factors.pair import (
     PairBlock,

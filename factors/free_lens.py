@@ -20,6 +20,7 @@ from factors.block import ProjectionBlock
 from factors.block_arrays import whiten
 from factors.block_sums import BlockSums, square_root
 from factors.clock import Clock, displace
+from factors.custom import custom_factor
 from factors.lens import Lens
 from factors.lens_kernels import EQUIRECTANGULAR, FISHEYE, OMNIDIRECTIONAL, PINHOLE
 from factors.loss import loss_id, losses_and_weights
@@ -273,19 +274,12 @@ def free_lens_sums_factor(
         parameters: k.
     """
 
-    def error(
-        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
         *clouds, pose = (values.atPose3(key) for key in keys[:-1])
         seen = clouds[0].between(pose) if clouds else pose
-        T_camera_cloud = seen.inverse().matrix()
-        found, jacobian = square_root(sums(T_camera_cloud, values.atVector(keys[-1])))
-        if jacobians is not None:
-            parts = [jacobian[:, :6], jacobian[:, 6:]]
-            if clouds:
-                parts.insert(0, -jacobian[:, :6] @ seen.inverse().AdjointMap())
-            for number, part in enumerate(parts):
-                jacobians[number] = np.asfortranarray(part)
-        return found
+        found, jacobian = square_root(sums(seen.inverse().matrix(), values.atVector(keys[-1])))
+        by_pose = jacobian[:, :6]
+        by_cloud = [-by_pose @ seen.inverse().AdjointMap()] if clouds else []
+        return found, [*by_cloud, by_pose, jacobian[:, 6:]]
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7 + parameters), list(keys), error)
+    return custom_factor(gtsam.noiseModel.Unit.Create(7 + parameters), keys, linearize)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from factors.block import ProjectionBlock
 from factors.block_arrays import to_runs
 from factors.block_sums import BlockSums, square_root
+from factors.custom import custom_factor
 from factors.epipolar import EpipolarBlock
 from factors.surface import SurfaceBlock
 
@@ -71,21 +72,15 @@ def placed_pair_factor(
         block: of features of camera A, seen in camera B.
     """
 
-    def error(
-        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
         cloud, *cameras = (values.atPose3(key) for key in (key_cloud, key_a, key_b))
         found, jacobian = _error_and_jacobian(block, *(cloud.between(pose) for pose in cameras))
-        if jacobians is not None:
-            chain = np.vstack([-pose.between(cloud).AdjointMap() for pose in cameras])
-            jacobians[0] = np.asfortranarray(jacobian @ chain)
-            jacobians[1] = np.asfortranarray(jacobian[:, :6])
-            jacobians[2] = np.asfortranarray(jacobian[:, 6:])
-        return found
+        chain = np.vstack([-pose.between(cloud).AdjointMap() for pose in cameras])
+        return found, [jacobian @ chain, jacobian[:, :6], jacobian[:, 6:]]
 
     rows = 13 if isinstance(block, SurfaceBlock) else 7
     noise = gtsam.noiseModel.Unit.Create(rows)
-    return gtsam.CustomFactor(noise, [key_cloud, key_a, key_b], error)
+    return custom_factor(noise, [key_cloud, key_a, key_b], linearize)
 
 
 def _error_and_jacobian(
@@ -150,13 +145,8 @@ def factor_on_two_poses(
 ) -> gtsam.CustomFactor:
     """A factor of (m,) residuals with (m, 12) Jacobians, in the tangents of both poses."""
 
-    def error(
-        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
         found, jacobian = residual(values.atPose3(key_a), values.atPose3(key_b))
-        if jacobians is not None:
-            jacobians[0] = np.asfortranarray(jacobian[:, :6])
-            jacobians[1] = np.asfortranarray(jacobian[:, 6:])
-        return found
+        return found, [jacobian[:, :6], jacobian[:, 6:]]
 
-    return gtsam.CustomFactor(noise, [key_a, key_b], error)
+    return custom_factor(noise, [key_a, key_b], linearize)

@@ -10,6 +10,8 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factors.custom import custom_factor
+
 Array = NDArray[np.float64]
 
 
@@ -90,16 +92,12 @@ def displaced_between_factor(
         noise: of the six rows.
     """
 
-    def error(
-        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
         step = values.atPose3(key_1).between(values.atPose3(key_2))
         twist = gtsam.Pose3.Logmap(step)
-        if jacobians is not None:
-            by_step = gtsam.Pose3.LogmapDerivative(twist)
-            by_first = -by_step @ step.inverse().AdjointMap()
-            for number, jacobian in enumerate([by_first, *(-s for s in shifts.values()), by_step]):
-                jacobians[number] = np.asfortranarray(jacobian)
-        return np.asarray(twist - sum(s @ values.atVector(key) for key, s in shifts.items()))
+        by_step = gtsam.Pose3.LogmapDerivative(twist)
+        by_first = -by_step @ step.inverse().AdjointMap()
+        left = np.asarray(twist - sum(s @ values.atVector(key) for key, s in shifts.items()))
+        return left, [by_first, *(-s for s in shifts.values()), by_step]
 
-    return gtsam.CustomFactor(noise, [key_1, *shifts, key_2], error)
+    return custom_factor(noise, [key_1, *shifts, key_2], linearize)

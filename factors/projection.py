@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factors.custom import custom_factor
 from factors.lens import Lens
 from factors.loss import robust_noise
 
@@ -59,13 +60,9 @@ def projection_factor(
     pixel = np.asarray(pixel_px, dtype=np.float64)
     whitening = np.eye(2) if sqrt_information is None else np.asarray(sqrt_information)
 
-    def error(
-        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
         residual, jacobian = projection_residual(lens, values.atPose3(key), point, pixel)
-        if jacobians is not None:
-            jacobians[0] = np.asfortranarray(jacobian)
-        return residual
+        return residual, [jacobian]
 
     base = gtsam.noiseModel.Gaussian.SqrtInformation(whitening)
-    return gtsam.CustomFactor(robust_noise(base, loss=loss, scale=scale), [key], error)
+    return custom_factor(robust_noise(base, loss=loss, scale=scale), [key], linearize)

@@ -90,6 +90,17 @@ def test_several_doubts_are_worse_than_one_in_tables_and_as_the_worst_in_runs() 
     assert PASS_BELOW < of_runs[1] == of_runs[0] < FAIL_ABOVE
 
 
+@pytest.mark.parametrize("model", [TABLES, STRUCTURE])
+def test_a_known_check_just_beyond_its_limit_keeps_from_no_pass_and_an_unknown_one_does(
+    model: str,
+) -> None:
+    known, new = (
+        probability_of_checks([Check(kind, "WARN", "", 1.02, 1.0, 2.0)], model)
+        for kind in ("relative_pose", "new")
+    )
+    assert known < PASS_BELOW <= new
+
+
 def test_a_wide_error_bar_counts_as_far_as_it_is_reliable() -> None:
     verdict = judge([], 0.9, (0.5, 10.0), STRUCTURE)
     found = verdict.error_probability
