@@ -130,6 +130,7 @@ CAUSES: dict[str, Cause] = {
          "difference between even and odd frames": "Record at least 5 frames, 10 s apart.",
          "repeated_frames": "Take frames while the vehicle drives.",
          "image evidence": _STRUCTURE,
+         "images": "Calibrate again from images and clouds.",
          "common_error": "State the error that all frames share (0 if none): common_deg and "
          "common_cm in the config (of solve also as options), or systematic_rotation_rad and "
          "systematic_translation_m in the metadata.",
@@ -138,7 +139,8 @@ CAUSES: dict[str, Cause] = {
     ),
     "error bar": Cause(
         "an error bar that is wide beside the tolerance", "",
-        {"sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE},
+        {"sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE,
+         "beyond_tolerance": _STRUCTURE},
     ),
     "other": Cause("a check of another version", ""),
 }

@@ -22,8 +22,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert, local_coordinates, retract_all
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.frame_fits import DAMPING, FrameFits, fit_each_frame
-from calibgraph.solver.frame_poses import solve_damped
+from calibgraph.solver.frame_poses import DAMPING, FrameFits, fit_each_frame, solve_damped
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread, robust_spreads
 from calibgraph.solver.stage1 import Stage1
 from factors import to_runs

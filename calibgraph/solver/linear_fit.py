@@ -17,10 +17,11 @@ from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_twist import fill_twist_columns
 from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.spread_kernel import median
+from calibgraph.solver.residual_scale import quantile
 from calibgraph.solver.whitening import upper_root
 from calibgraph.solver.within_place import WEAK
 from factors import ProjectionBlock, unit_diagonal
+from factors.block_arrays import whiten
 
 MIN_ROWS = 30  # fewer correspondences do not determine further unknowns
 _MAX_ITERATIONS = 20
@@ -124,7 +125,7 @@ def fit_camera(
     weighted = np.empty_like(flat)
     for _ in range(_MAX_ITERATIONS):
         squares = np.square(left.reshape(2, -1)).sum(axis=0)
-        scale = loss_scale or _LOSS_MEDIANS * math.sqrt(median(squares)) + 1e-12
+        scale = loss_scale or _LOSS_MEDIANS * math.sqrt(quantile(squares, 0.5)) + 1e-12
         weights = np.tile(1.0 / (1.0 + squares / scale**2), 2)
         np.multiply(flat, weights, out=weighted)
         hessian, before = weighted @ flat.T + _weak(size), values
@@ -147,13 +148,7 @@ def _linearize(camera: Camera, block: ProjectionBlock, fields_px: Array) -> Arra
     pixels = fill_twist_columns(camera, block.points_lidar_m, columns[:6])
     columns[6:-1] = fields_px
     columns[-1] = camera.lens.subtract(block.pixels_px, pixels.T).T
-    if block.sqrt_information is not None:
-        s00, s01, s11 = block.sqrt_information.T
-        if not s01.any() and np.array_equal(s00, s11):
-            columns *= s00
-            return columns
-        columns[:, 0] = s00 * columns[:, 0] + s01 * columns[:, 1]
-        columns[:, 1] *= s11
+    whiten(columns, block.sqrt_information)
     return columns
 
 

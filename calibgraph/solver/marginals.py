@@ -21,7 +21,7 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
-from calibgraph.solver.curvature import Curvature
+from calibgraph.solver.curvature import Curvature, FittedObjective
 from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
 from calibgraph.solver.error_shares import (
@@ -29,7 +29,6 @@ from calibgraph.solver.error_shares import (
     sources_of_error,
     variances_by_source,
 )
-from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
 from calibgraph.solver.shared_error import error_between, shared_scatter, shared_variance_ratio

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -29,25 +29,19 @@ from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Estimate
-from calibgraph.trust.observability import prior_shares, shares_of_marginal
-from calibgraph.trust.pose_posterior import (
-    PosePosterior,
-    group_tied,
-    no_posteriors,
-    widen,
+from calibgraph.trust.image_posteriors import (
+    ImagePosteriors,
+    MeasurePosteriors,
+    measured_pairs,
 )
-from calibgraph.trust.probability import probability_beyond
+from calibgraph.trust.observability import prior_shares, shares_of_marginal
+from calibgraph.trust.pose_posterior import PosePosterior, group_tied, no_posteriors
 from calibgraph.trust.thresholds import limit
-from factors import pose_sigmas
 
 _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unknown
 
 Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
-
-MeasurePosteriors = Callable[
-    [Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +97,8 @@ class Evidence:
 
         Cameras that are held are unknown by a radian and a metre.
         """
-        return self._widened(self.covariance_of_matches)
+        known = self.covariance_of_matches
+        return None if known is None else self._beside_images.widen(known)
 
     @property
     def mount_covariance(self) -> Array | None:
@@ -113,13 +108,18 @@ class Evidence:
             return None
         of, T = mount.T_camera_lidar, self.solution.T_camera_lidar
         away = np.concatenate([twist_between(of[name], T[name]) for name in T])
-        return self._widened(mount.covariance + np.outer(away, away))
+        return self._beside_images.widen(mount.covariance + np.outer(away, away))
 
-    def _widened(self, joint: Array | None) -> Array | None:
-        if joint is None or not self.posteriors:
-            return joint
-        posteriors = self.posteriors.items()
-        return widen(joint, {self.cameras.index(name): of.moments for name, of in posteriors})
+    @property
+    def _beside_images(self) -> ImagePosteriors:
+        known = self.covariance_of_matches
+        assert known is not None  # asked by those who have one
+        return ImagePosteriors(self.cameras, known, self.posteriors)
+
+    @property
+    def flatness(self) -> dict[str, Check]:
+        """Per camera with a posterior, the check whether the images leave its pose more open."""
+        return self._beside_images.check_flatness() if self.posteriors else {}
 
     @cached_property
     def posteriors(self) -> Mapping[str, PosePosterior]:
@@ -146,22 +146,13 @@ class Evidence:
         wrong = {(one.pair.a, one.pair.b) for one in conflicts if one.largest > limit}
         for fit in self.solution.marginals.pair_fits:
             yield fit.a, fit.b, fit.covariance
-        for pose in self.solution.inliers.rig.relative_poses:
-            if (pose.a, pose.b) in wrong:
-                continue
-            sigmas = pose_sigmas(
-                rotation_rad=pose.rotation_sigma_rad, translation_m=pose.translation_sigma_m
-            )
-            yield pose.a, pose.b, np.diag(sigmas**2)
+        yield from measured_pairs(self.solution.inliers.rig.relative_poses, wrong)
 
     def probability_beyond(self, camera: str) -> float:
         """The probability that its error is beyond the tolerance, by its posterior."""
-        own, tolerance = self.covariance_by_matches(camera), self.solution.config.tolerance
-        if own is None:
+        if camera in self.solution.held or self.covariance_of_matches is None:
             return 0.0
-        if camera not in self.posteriors:
-            return probability_beyond(own, tolerance)
-        return self.posteriors[camera].probability_beyond(own, tolerance)
+        return self._beside_images.probability_beyond(camera, self.solution.config.tolerance)
 
     @property
     def covariance_of_matches(self) -> Array | None:

@@ -13,7 +13,6 @@ from calibgraph.arrays import Array
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import angle_deg, pose_difference, relative_transform
 from calibgraph.model.verdict import Check
-from calibgraph.solver.spread_kernel import median
 from calibgraph.trust.conventions import convention_error_between
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.run_evidence import RunEvidence
@@ -106,7 +105,7 @@ def point_distance_checks(evidence: Evidence) -> Checks:
     """Whether the points can be in metres."""
     row = threshold("point_distance")
     return {
-        name: [row.check(median(_lengths(block.block.points_lidar_m)))]
+        name: [row.check(float(np.median(_lengths(block.block.points_lidar_m))))]
         for name, block in evidence.solution.objective.blocks.items()
     }
 

@@ -25,7 +25,8 @@ from calibgraph.model.geometry import pose_difference, twist_between
 from calibgraph.model.lens_difference import corner_distance_px, has_other_lens
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Check
-from calibgraph.trust.evidence import Checks, Evidence, MeasurePosteriors
+from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.trust.image_posteriors import MeasurePosteriors
 from calibgraph.trust.pose_posterior import PosePosterior
 
 _SAME_SIGMAS = 1.0  # along every axis: at such a pose the images say the same
@@ -169,7 +170,7 @@ class ImageRecord:
         camera, seen = evidence.solution.solved_rig.cameras.get(name), self.cameras[name].camera
         if camera is None:
             return ""
-        advice = "was compared with its images; calibrate again from images and clouds"
+        advice = "was compared with its images"
         if not _same_lens(seen, camera):
             return f"another lens {advice}"
         covariance = evidence.covariance_by_matches(name)

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.matching.structure.window_features_kernel import FEATURES, fill_features
-from calibgraph.matching.structure.window_kernel import describe_windows
+from calibgraph.matching.structure.window_kernels import FEATURES, describe_windows, fill_features
 from calibgraph.matching.structure.window_weights import WindowNetwork
 
 Rows = NDArray[np.intp]
