@@ -13,7 +13,7 @@ from benchmarks.accuracy import data_cases, table_cases
 from benchmarks.accuracy.ledger import Record
 from benchmarks.accuracy.verdicts import STATUSES, class_of
 from calibgraph.model.verdict import TOLERANCE, ErrorProbability
-from calibgraph.trust.lens_parameter import probability_of_lens
+from calibgraph.trust.lens_checks import probability_of_lens
 from calibgraph.trust.probability import (
     CHANCE,
     contributions,
