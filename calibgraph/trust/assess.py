@@ -24,7 +24,6 @@ from calibgraph.trust.guess import (
 )
 from calibgraph.trust.image_checks import image_checks
 from calibgraph.trust.intrinsics import intrinsics_checks
-from calibgraph.trust.lens_checks import advise_together
 from calibgraph.trust.matcher_checks import matcher_checks
 from calibgraph.trust.pair_agreement import pair_agreement_checks
 from calibgraph.trust.place_checks import place_checks
@@ -80,8 +79,7 @@ RUN_CHECKS: tuple[Callable[[RunEvidence], Checks], ...] = (
 
 def assess(evidence: Evidence) -> dict[str, list[Check]]:
     """Per camera, the checks of a solution."""
-    checks = concatenate([check(evidence) for check in SOLUTION_CHECKS], evidence.cameras)
-    return {name: advise_together(each) for name, each in checks.items()}
+    return concatenate([check(evidence) for check in SOLUTION_CHECKS], evidence.cameras)
 
 
 def assess_run(evidence: RunEvidence) -> dict[str, list[Check]]:
@@ -91,8 +89,7 @@ def assess_run(evidence: RunEvidence) -> dict[str, list[Check]]:
     checks = concatenate([assess(evidence.solution), *of_run], cameras)
     convention = _intended_guess_checks(evidence, checks)
     implausible = implausible_checks(evidence.run.guess, checks)
-    checks = concatenate([convention, implausible, checks], cameras)
-    return {name: advise_together(each) for name, each in checks.items()}
+    return concatenate([convention, implausible, checks], cameras)
 
 
 def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:

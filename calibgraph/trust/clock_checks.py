@@ -27,7 +27,7 @@ from calibgraph.model.verdict import Check
 from calibgraph.solver.linear_fit import block_of
 from calibgraph.trust.evidence import Checks
 from calibgraph.trust.intrinsics import MIN_FRAMES, fit_lens
-from calibgraph.trust.lens_checks import IMAGES, check_parameter
+from calibgraph.trust.lens_checks import IMAGES, KINDS, check_lens
 from calibgraph.trust.lens_posterior import TIME
 from calibgraph.trust.run_evidence import RunEvidence
 from factors.free_lens import CLOCK
@@ -80,8 +80,8 @@ def _check_offset(
     found = fit_lens(camera, block, place_variance=of_place)
     if found is None:
         return []
-    parameters = found.parameters(config.tolerance)
-    return [check_parameter(each, IMAGES) for each in parameters if each.name == TIME]
+    checks = check_lens(found, IMAGES, config.tolerance, config.estimate)
+    return [check for check in checks if check.kind == KINDS[IMAGES][TIME]]
 
 
 def _without_times(rig: Rig) -> Rig:

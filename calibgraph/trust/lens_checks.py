@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 
@@ -40,13 +39,6 @@ KINDS = {
 }
 """Kinds of the checks."""
 LENS_KINDS = frozenset(kind for kinds in KINDS.values() for kind in kinds.values())
-_PART_OF = {
-    kind: part
-    for kinds in KINDS.values()
-    for name, kind in kinds.items()
-    if (part := _WORDS[name][0]) is not None
-}
-_ESTIMATE = re.compile(r"(run with --estimate )\S+$")
 _TOLD_S, _TOLD_CM = 0.01, 0.1  # of an offset that is not determined: whose effect is told
 
 
@@ -58,39 +50,45 @@ def check_lens(
 ) -> list[Check]:
     """Whether parameters of a lens are wrong: the value of a check is the probability.
 
+    Of several that look wrong, the advice is to estimate all.
+
     Args:
         found: the posterior.
         by: RESIDUALS or IMAGES.
         tolerance: of the user [deg, cm].
         estimated: parts that the result has estimated, as ``--estimate`` calls them.
     """
-    return [check_parameter(each, by, estimated) for each in found.parameters(tolerance)]
+    parameters, row = found.parameters(tolerance), threshold("lens")
+    wrong = [each.name for each in parameters if row.grade(each.probability) != "PASS"]
+    return [_check(each, by, _advice(wrong, each.name, estimated)) for each in parameters]
 
 
-def check_parameter(found: LensParameter, by: str, estimated: Collection[str] = ()) -> Check:
+def _check(found: LensParameter, by: str, advice: str) -> Check:
     """The check of one of them; of one that is not determined, it tells how much depends on it."""
-    row, (deg, cm), (part, *_) = threshold("lens"), found.moved, _WORDS[found.name]
+    row, (deg, cm) = threshold("lens"), found.moved
     status = row.grade(found.probability)
     text = f"by the {by}, {describe(found)}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
     if status != "PASS":
-        text += f": {_advice(found.name, part, estimated)}"
+        text += f": {advice}"
     elif found.name == TIME and not found.is_determined:
         text = "the time of the images is not determined by these data, and taken for right"
-        by_told_cm = 100 * float(np.linalg.norm(found.by_unit[3:, 0])) * _TOLD_S / found.units[0]
-        if by_told_cm > _TOLD_CM:
-            told = f"{1e3 * _TOLD_S:.0f} ms would move the camera by {by_told_cm:.2g} cm"
-            text = f"{text}; {told}"
+        told_cm = 100 * float(np.linalg.norm(found.by_unit[3:, 0])) * _TOLD_S / found.units[0]
+        if told_cm > _TOLD_CM:
+            text += f"; {1e3 * _TOLD_S:.0f} ms would move the camera by {told_cm:.2g} cm"
     name = f"{found.name} by the {by}: {row.name}"
     check = row.describe(found.probability, status, text, name=name)
     return replace(check, kind=KINDS[by][found.name])
 
 
-def _advice(name: str, part: str | None, estimated: Collection[str]) -> str:
+def _advice(wrong: Sequence[str], name: str, estimated: Collection[str]) -> str:
+    """What to do about a parameter that looks wrong, as others may."""
+    part = _WORDS[name][0]
     if part in estimated:
         prior = f"{_PRIORS[part]} in the rig" if part in _PRIORS else "how well it is known"
         return f"it has been estimated, and its prior holds it back: state {prior} wider"
     advice = "correct the time stamps" if name == TIME else threshold("lens").advice
-    return advice + (f"; or run with --estimate {part}" if part else "")
+    parts = [known for each in wrong if (known := _WORDS[each][0])]
+    return advice + (f"; or run with --estimate {','.join(parts)}" if part else "")
 
 
 def describe(found: LensParameter) -> str:
@@ -106,25 +104,6 @@ def _with_sigma(value: float, sigma: float) -> str:
     """A number with its standard deviation, in two digits of that."""
     decimals = max(0, 1 - math.floor(math.log10(max(sigma, 1e-12))))
     return f"{value:.{decimals}f} +- {sigma:.{decimals}f}"
-
-
-def advise_together(checks: Sequence[Check]) -> list[Check]:
-    """The checks of a camera; of several parameters that look wrong, the advice is one.
-
-    A wrong parameter makes others look wrong, since matches follow it. To estimate one of those
-    alone would leave the camera where it is, with an error bar that does not hold.
-    """
-    look_wrong = {check.kind for check in checks if check.status != "PASS"}
-    parts = {_PART_OF[kind] for kind in look_wrong & _PART_OF.keys()}
-    if len(parts) < 2:  # noqa: PLR2004
-        return list(checks)
-    all_parts = ",".join(["lens", *sorted(parts & {"aspect", "offset"})])
-    return [
-        replace(check, text=_ESTIMATE.sub(rf"\1{all_parts}", check.text))
-        if check.kind in _PART_OF
-        else check
-        for check in checks
-    ]
 
 
 def probability_of_lens(values: Iterable[tuple[str, Status, float | None]]) -> float:

@@ -9,9 +9,7 @@ from calibgraph.model.verdict import FAIL_ABOVE, TOLERANCE, Check
 from calibgraph.trust.lens_checks import (
     IMAGES,
     RESIDUALS,
-    advise_together,
     check_lens,
-    check_parameter,
     probability_of_lens,
 )
 from calibgraph.trust.lens_posterior import Free, LensParameter, LensPosterior
@@ -135,10 +133,12 @@ def test_a_single_frame_leaves_the_significance_unknown() -> None:
     assert not found.is_known and check_lens(found, IMAGES) == []
 
 
-def check(
-    number: Free, value: float, *, by: str = RESIDUALS, estimated: tuple[str, ...] = ()
-) -> Check:
-    return check_parameter(one(number, value, abs(value) / 8, 31.2), by, estimated)
+def check(number: Free, value: float, estimated: tuple[str, ...] = ()) -> Check:
+    found = check_lens(
+        posterior({number: value}, {number: abs(value) / 8}, 31.2), RESIDUALS, TOLERANCE, estimated
+    )
+    (wrong,) = (each for each in found if each.status != "PASS")
+    return wrong
 
 
 def test_a_check_states_the_value_its_sigma_the_motion_and_what_to_run() -> None:
@@ -173,13 +173,8 @@ def test_the_worst_lens_parameter_counts_and_a_warning_as_one() -> None:
 
 
 def test_of_several_parameters_that_look_wrong_all_are_estimated_together() -> None:
-    focal, radial = check(Free.FOCAL, 0.02, by=IMAGES), check(Free.RADIAL, 0.04)
-    aspect, right = check(Free.ASPECT, 0.03, by=IMAGES), check(Free.RADIAL, 1e-6, by=IMAGES)
-    assert focal.text.endswith("run with --estimate focal")
-    assert advise_together([focal, right]) == [focal, right]
-    texts = [check.text for check in advise_together([focal, right, radial])]
-    assert [text.rpartition(" ")[2] for text in (texts[0], texts[2])] == ["lens", "lens"]
-    assert texts[1] == right.text
-    of_shape = advise_together([focal, aspect])
-    assert all(check.text.endswith("run with --estimate lens,aspect") for check in of_shape)
-    assert [check.value for check in of_shape] == [focal.value, aspect.value]
+    values = {Free.FOCAL: 0.02, Free.RADIAL: 0.04, Free.SKEW: 0.02}
+    checks = check_lens(posterior(values, dict.fromkeys(values, 0.002)), IMAGES)
+    assert [check.status for check in checks] == ["FAIL", "FAIL", "PASS", "PASS", "FAIL"]
+    assert all(c.text.endswith("run with --estimate focal,distortion") for c in checks[:2])
+    assert "--estimate" not in checks[4].text
