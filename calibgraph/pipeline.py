@@ -27,8 +27,9 @@ from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds
 from calibgraph.solver.joint import solve_joint
-from calibgraph.trust.assess import assess, assess_run
-from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.trust.assess import assess, assess_run, in_order
+from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.image_record import ImageRecord, RunChecks, to_metadata
 from calibgraph.trust.observability import weaknesses
 from calibgraph.trust.probability import TABLES, judge, model_of
 from calibgraph.trust.run_evidence import RunEvidence
@@ -76,10 +77,12 @@ def calibrate(
     run = evidence.run
     with run.watch("checks"):
         checks = assess_run(evidence)
+        record = to_metadata(evidence.solution, checks)
     report("done", 1, 1)
+    table = run.correspondences
     return replace(
-        to_calibration(evidence.solution, checks, model_of(run.correspondences.matcher)),
-        correspondences=run.correspondences,
+        to_calibration(evidence.solution, checks),
+        correspondences=table.with_metadata({**table.metadata, **record}),
         frames=tuple(frame.entry() for frame in run.dataset.frames),
         rounds=run.rounds,
         warnings=run.warnings,
@@ -110,7 +113,8 @@ def solve(
         camera_matches: what cameras see in common, with the LiDAR's surfaces.
 
     Returns:
-        The calibration, with its verdict and the preprocessed correspondences.
+        The calibration, with its verdict and the preprocessed correspondences. Of a table that
+        ``calibrate`` left, the verdict counts what the images said then, if it is of this pose.
 
     Raises:
         FileError: if the file cannot be read, or holds wrong values.
@@ -119,9 +123,11 @@ def solve(
         ValueError: if ``terms`` is unknown.
     """
     solution = solve_joint(rig, table, config, terms, camera_matches=camera_matches)
-    evidence, watch = Evidence(solution, guess=rig), Stopwatch()
+    record = ImageRecord.from_metadata(solution.correspondences.metadata)
+    evidence = Evidence(solution, rig, record.posteriors_of(solution.solved_rig.cameras))
+    watch = Stopwatch()
     with watch("checks"):
-        checks = assess(evidence)
+        checks = record.checks(evidence, assess(evidence))
     result = to_calibration(evidence, checks)
     motion = solution.correspondences
     unused = unused_times(rig, is_known=motion.twist_per_s is not None)
@@ -129,23 +135,19 @@ def solve(
     return replace(result, warnings=warnings, timings_s={**result.timings_s, **watch.seconds})
 
 
-def to_calibration(evidence: Evidence, checks: Checks, model: str = TABLES) -> Calibration:
+def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
     """A solution with its error bar and its verdict.
 
     Args:
         evidence: the solution, and what its checks computed.
-        checks: per camera, all of them.
-        model: by which their probability of being off is computed.
+        checks: all of them.
     """
     solution, cameras = evidence.solution, evidence.cameras
+    model = model_of(solution.correspondences.matcher) if checks.with_images else TABLES
+    tolerance = solution.config.tolerance
     verdicts = {
-        name: judge(
-            checks.get(name, ()),
-            evidence.probability_beyond(name),
-            solution.config.tolerance,
-            model,
-        )
-        for name in cameras
+        name: judge(each, evidence.probability_beyond(name), tolerance, model)
+        for name, each in in_order(checks, cameras).items()
     }
     result = Calibration(
         rig=with_sigmas(solution.solved_rig, solution.lens),

@@ -39,9 +39,12 @@ def parse_yaml_documents(text: str, path: Path | str) -> list[dict[str, Any]]:
         expanded = sum(_expanded_size(each, {}) for each in documents)
     except (yaml.YAMLError, ValueError, IndexError) as error:
         why = str(error).replace('in "<unicode string>", ', "")
+        why += "" if text.endswith("\n") else f"; {_CUT_OFF}"
         raise FileError(path, f"is not valid YAML: {why}") from error
     except RecursionError:
         raise FileError(path, _TOO_DEEP) from None
+    if not text.strip():
+        raise FileError(path, "is empty; if the disk was full, write or copy it again")
     for content in documents or [None]:
         if not isinstance(content, dict):
             raise FileError(
@@ -57,6 +60,7 @@ def parse_yaml_documents(text: str, path: Path | str) -> list[dict[str, Any]]:
 _SEPARATORS = (",", "\n", ": ", "- ", "? ", "[", "{")
 """One of these is before every value but the first."""
 
+_CUT_OFF = "it ends within a line: if it was cut off, write or copy it again"
 _TOO_DEEP = "is nested too deeply; expected a mapping of keys to values"
 
 

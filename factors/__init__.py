@@ -32,7 +32,6 @@ from factors.pair import (
     placed_pair_factor,
 )
 from factors.pose import (
-    biased_between_factor,
     camera_prior_factor,
     displaced_between_factor,
     pose_sigmas,
@@ -72,7 +71,6 @@ __all__ = [
     "projection_factor",
     "projection_residual",
     "ray_spreads",
-    "biased_between_factor",
     "relative_pose_factor",
     "relative_prior_factor",
     "robust_noise",

@@ -26,6 +26,7 @@ from factors.block_arrays import (
     check_shape,
     contiguous,
     join_roots,
+    read_only,
     rows_of_root,
     to_runs,
 )
@@ -93,9 +94,11 @@ class ProjectionBlock(RobustBlock):
 
     def _initialize(self, columns: Array, root: Array | None, rows: int) -> None:
         """Set the arrays of a block that is being made: held once, as columns, and read-only."""
-        self._replace(
+        columns = read_only(columns)  # and so are its views
+        root = None if root is None else read_only(root)
+        self.__dict__.update(
             _columns=columns,
-            _whitening=np.empty((0, columns.shape[1])) if root is None else root[:rows],
+            _whitening=columns[:0] if root is None else root[:rows],
             _chunks=_cut(columns.shape[1]),
             points_lidar_m=columns[:3].T,
             pixels_px=columns[3:5].T,
@@ -117,7 +120,7 @@ class ProjectionBlock(RobustBlock):
     def select(self, rows: NDArray[Any]) -> ProjectionBlock:
         """The block with only some correspondences: a mask or an index array."""
         if rows.dtype == np.bool_:
-            rows = np.flatnonzero(rows)
+            rows = rows.nonzero()[0]
             if len(rows) == len(self):
                 return self
         root = self.sqrt_information
@@ -133,7 +136,7 @@ class ProjectionBlock(RobustBlock):
     def join(parts: Sequence[ProjectionBlock]) -> ProjectionBlock:
         """The correspondences of blocks of one lens under each other; loss as of the first."""
         roots = join_roots([part.sqrt_information for part in parts], [*map(len, parts)])
-        joined, columns = parts[0]._copy(), np.hstack([part._columns for part in parts])
+        joined, columns = parts[0]._copy(), np.concatenate([p._columns for p in parts], axis=1)
         joined._initialize(columns, *rows_of_root(roots))
         return joined
 

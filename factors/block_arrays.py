@@ -24,7 +24,7 @@ class RobustBlock:
     def rescale(self, *, scale: float, sigma: float = 1.0) -> Self:
         """The same correspondences, not copied, with another scale of the loss, and sigma."""
         other = self._copy()  # not checked again: its correspondences are of a good block
-        other._replace(scale=scale, sigma=sigma)
+        other.__dict__.update(scale=scale, sigma=sigma)
         other._check_scale()
         return other
 
@@ -59,6 +59,9 @@ def contiguous(array: NDArray[_Number]) -> NDArray[_Number]:
     Every array that a kernel only reads is given to it in this form: for arrays that can be
     written, it would be compiled a second time.
     """
+    flags = array.flags
+    if flags.c_contiguous and not flags.writeable:
+        return array
     return read_only(np.ascontiguousarray(array))
 
 
@@ -101,3 +104,21 @@ def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     runs = np.empty((len(edges) - 1, 2), dtype=np.int64)
     runs[:, 0], runs[:, 1] = edges[:-1], edges[1:]
     return read_only(runs)
+
+
+def rotate_each(R: Array, vectors: Array) -> Array:
+    """Rotate (n, 3) vectors, each by its own of (n, 3, 3), or all by one of (1, 3, 3)."""
+    if len(R) == 1:
+        return np.asarray(vectors @ R[0].T)
+    return np.asarray(np.einsum("nij,nj->ni", R, vectors))
+
+
+def whiten(columns: Array, root: Array | None) -> None:
+    """Multiply (k, 2, n) derivatives or residuals in place by (n, 3) whitening matrices, if any."""
+    if root is not None:
+        s00, s01, s11 = root.T
+        if s01.any():
+            columns[:, 0] = s00 * columns[:, 0] + s01 * columns[:, 1]
+        else:
+            columns[:, 0] *= s00
+        columns[:, 1] *= s11

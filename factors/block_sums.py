@@ -60,6 +60,21 @@ def _triangular_root(scaled: Array) -> Array | None:
     return root if (np.diag(root) ** 2 > REGULAR).all() else None
 
 
+def sums_of_runs(rows: Array, losses: Array, edges: NDArray[np.int64]) -> BlockSums:
+    """H, b and c of runs of linearized residuals, stacked.
+
+    Args:
+        rows: (m n, k + 1) Jacobians and residuals, times the root of the loss' weight; m rows of
+            each of n features.
+        losses: (n,).
+        edges: (r + 1,) where the runs of features begin, and the end.
+    """
+    starts, each = (edges - edges[0])[1:-1], len(rows) // max(len(losses), 1)
+    sums = np.array([part.T @ part for part in np.split(rows, each * starts)])
+    costs = np.array([part.sum() for part in np.split(losses, starts)])
+    return BlockSums(sums[:, :-1, :-1], sums[:, :-1, -1], costs)
+
+
 _PLACES = np.array([[min(i, j) * (11 - min(i, j)) // 2 + max(i, j) for j in range(6)]
                     for i in range(6)])  # fmt: skip
 

@@ -9,6 +9,8 @@ from factors.compiled import compiled
 
 Array = NDArray[np.float64]
 
+SINGULAR = 1e-12
+"""Smallest over largest eigenvalue, of a unit diagonal: rounding noise."""
 REGULAR = 1e-10
 """Least share of an unknown that those before it leave, for a triangular root."""
 
@@ -45,6 +47,29 @@ def smallest_scaled_eigenvalues(hessians: Array) -> Array:
     units = np.sqrt(np.where(known[:, None], diagonals, 1.0))
     values = np.linalg.eigvalsh(hessians / (units[:, :, None] * units[:, None, :]))
     return np.where(known, values[:, 0], 0.0)
+
+
+def invert_or_none(hessian: Array, *, least: float = SINGULAR) -> Array | None:
+    """The inverse of a positive semidefinite matrix, None where a direction is not determined.
+
+    ``least`` is the smallest eigenvalue, of a unit diagonal, over the largest.
+    """
+    scaled, units = unit_diagonal(hessian)
+    values, vectors = np.linalg.eigh(scaled)
+    if values[0] <= least * values[-1]:
+        return None
+    inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
+    return inverse
+
+
+def sigmas_of_hessian(hessian: Array) -> Array:
+    """(n,) standard deviations by an (n, n) Hessian; infinite in undetermined directions."""
+    scaled, units = unit_diagonal(hessian)
+    values, vectors = np.linalg.eigh(scaled)
+    free = values < SINGULAR
+    variances = (vectors**2 / np.where(free, np.inf, values)).sum(axis=1) / units**2
+    loose = (vectors[:, free] ** 2).sum(axis=1) > SINGULAR
+    return np.asarray(np.sqrt(np.where(loose, np.inf, variances)))
 
 
 @compiled()

@@ -15,7 +15,6 @@ It does not depend on the length of t, which epipolar geometry does not determin
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,14 +22,15 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.block_arrays import RobustBlock, contiguous
-from factors.block_sums import BlockSums, unpack_sums
-from factors.compiled import compiled
+from factors.block_arrays import RobustBlock, rotate_each
+from factors.block_sums import BlockSums, sums_of_runs
 from factors.lens import Lens
-from factors.loss import loss_and_weight, loss_id
+from factors.loss import loss_id, losses_and_weights
 from factors.rays import ray_spreads, unproject
 
 Array = NDArray[np.float64]
+
+_LEAST_SQUARE = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class EpipolarBlock(RobustBlock):
     loss: str = "cauchy"
     scale: float = 4.0
     sigma: float = 1.0
-    _rays: Array = field(init=False, repr=False)  # (n, 18), see _COLUMNS
+    _rays: Array = field(init=False, repr=False)  # (n, 18) f_a, F_a, f_b, F_b
 
     def __post_init__(self) -> None:
         n = len(self.pixels_a_px)
@@ -101,87 +101,40 @@ class EpipolarBlock(RobustBlock):
 
     def run_sums(self, T_a_b: Array, edges: NDArray[np.int64]) -> BlockSums:
         """Like :meth:`frame_sums`, with an (r, 4, 4) pose per run, or one (1, 4, 4) for all."""
-        # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
-        packed = _accumulate(
-            contiguous(T_a_b), self._rays, loss_id(self.loss), self.scale * self.sigma, edges
-        )
-        return unpack_sums(packed / self.sigma**2)
+        run = np.repeat(np.arange(len(edges) - 1), np.diff(edges))
+        T, rays = T_a_b if len(T_a_b) == 1 else T_a_b[run], self._rays[edges[0] : edges[-1]]
+        columns = _linearize(T, rays) / self.sigma
+        losses, weights = losses_and_weights(loss_id(self.loss), self.scale, columns[:, 6] ** 2)
+        return sums_of_runs(columns * np.sqrt(weights)[:, None], losses, edges)
 
     def residuals(self, T_a_b: gtsam.Pose3) -> Array:
         """(n,) signed epipolar residuals [px], not divided by sigma."""
-        R, t = np.ascontiguousarray(T_a_b.rotation().matrix()), np.asarray(T_a_b.translation())
-        residuals: Array = _residuals(R, t, self._rays)
-        return residuals
+        return np.asarray(_linearize(T_a_b.matrix()[None], self._rays)[:, 6])
 
 
-@compiled(part=True)
-def _form(R, t, x, y, derivative):  # type: ignore[no-untyped-def]
-    """C(x, y); its derivative goes into ``derivative``, (6,)."""
-    p0 = R[0, 0] * y[0] + R[0, 1] * y[1] + R[0, 2] * y[2]
-    p1 = R[1, 0] * y[0] + R[1, 1] * y[1] + R[1, 2] * y[2]
-    p2 = R[2, 0] * y[0] + R[2, 1] * y[1] + R[2, 2] * y[2]
-    m0, m1, m2 = x[1] * t[2] - x[2] * t[1], x[2] * t[0] - x[0] * t[2], x[0] * t[1] - x[1] * t[0]
-    n0 = R[0, 0] * m0 + R[1, 0] * m1 + R[2, 0] * m2
-    n1 = R[0, 1] * m0 + R[1, 1] * m1 + R[2, 1] * m2
-    n2 = R[0, 2] * m0 + R[1, 2] * m1 + R[2, 2] * m2
-    derivative[0] = y[1] * n2 - y[2] * n1
-    derivative[1] = y[2] * n0 - y[0] * n2
-    derivative[2] = y[0] * n1 - y[1] * n0
-    q0, q1, q2 = p1 * x[2] - p2 * x[1], p2 * x[0] - p0 * x[2], p0 * x[1] - p1 * x[0]
-    for i in range(3):
-        derivative[3 + i] = R[0, i] * q0 + R[1, i] * q1 + R[2, i] * q2
-    return m0 * p0 + m1 * p1 + m2 * p2
+def _linearize(T_a_b: Array, rows: Array) -> Array:
+    """(n, 7) derivatives of the residuals in the tangent of T_a_b, and last the residuals [px].
+
+    Args:
+        T_a_b: (n, 4, 4) or (1, 4, 4).
+        rows: (n, 18) f_a, F_a, f_b, F_b.
+    """
+    ray_a, *spread_a, ray_b, spread_b, other_b = np.split(rows, 6, axis=1)
+    value = _form(T_a_b, ray_a, ray_b)
+    sides = [_form(T_a_b, spread, ray_b) for spread in spread_a]
+    sides += [_form(T_a_b, ray_a, spread) for spread in (spread_b, other_b)]
+    square = np.sum([side[:, 6] ** 2 for side in sides], axis=0)
+    known = square > _LEAST_SQUARE  # else no baseline, or both rays along it: no constraint
+    square = np.where(known, square, 1.0)[:, None]
+    half = np.sum([side[:, :6] * side[:, 6:] for side in sides], axis=0)
+    value[:, :6] -= value[:, 6:] / square * half
+    return np.asarray(np.where(known[:, None], value / np.sqrt(square), 0.0))
 
 
-@compiled(part=True)
-def _sampson(R, t, row, jacobian, scratch):  # type: ignore[no-untyped-def]
-    """The residual of a feature; its derivative goes into ``jacobian``; ``scratch`` is (2, 6)."""
-    ray_a, ray_b = row[0:3], row[9:12]
-    value = _form(R, t, ray_a, ray_b, jacobian)
-    square = 0.0
-    half, side = scratch
-    half[:] = 0.0
-    for k in range(4):
-        at = 3 + 3 * k if k < 2 else 6 + 3 * k  # noqa: PLR2004
-        x, y = (row[at : at + 3], ray_b) if k < 2 else (ray_a, row[at : at + 3])  # noqa: PLR2004
-        c = _form(R, t, x, y, side)
-        square += c * c
-        for i in range(6):
-            half[i] += c * side[i]
-    if square < 1e-300:  # noqa: PLR2004 - no baseline, or both rays along it: no constraint
-        jacobian[:] = 0.0
-        return 0.0
-    over = 1.0 / math.sqrt(square)
-    for i in range(6):
-        jacobian[i] = over * (jacobian[i] - value / square * half[i])
-    return value * over
-
-
-@compiled()
-def _accumulate(T_a_b, rays, loss, scale, edges):  # type: ignore[no-untyped-def]
-    """(segments, 28) sums: 21 of the upper triangle of H, 6 of b, 1 of c."""
-    out = np.zeros((len(edges) - 1, 28))
-    jacobian, scratch = np.empty(6), np.empty((2, 6))
-    for segment in range(len(edges) - 1):
-        T = T_a_b[min(np.int64(segment), len(T_a_b) - 1)]
-        R, t, sums = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), out[segment]
-        for k in range(edges[segment], edges[segment + 1]):
-            r = _sampson(R, t, rays[k], jacobian, scratch)
-            rho, psi = loss_and_weight(loss, scale, r * r)
-            sums[27] += rho
-            place = 0
-            for i in range(6):
-                sums[21 + i] += psi * jacobian[i] * r
-                for j in range(i, 6):
-                    sums[place] += psi * jacobian[i] * jacobian[j]
-                    place += 1
-    return out
-
-
-@compiled()
-def _residuals(R, t, rays):  # type: ignore[no-untyped-def]
-    out = np.empty(len(rays))
-    jacobian, scratch = np.empty(6), np.empty((2, 6))
-    for k in range(len(rays)):
-        out[k] = _sampson(R, t, rays[k], jacobian, scratch)
-    return out
+def _form(T_a_b: Array, x: Array, y: Array) -> Array:
+    """(n, 7) derivatives of C(x, y), and last C itself."""
+    R, back = T_a_b[:, :3, :3], T_a_b[:, :3, :3].transpose(0, 2, 1)
+    turned, across = rotate_each(R, y), np.cross(x, T_a_b[:, :3, 3])
+    by_rotation = np.cross(y, rotate_each(back, across))
+    by_translation = rotate_each(back, np.cross(turned, x))
+    return np.column_stack([by_rotation, by_translation, (across * turned).sum(axis=1)])

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.block import ProjectionBlock
+from factors.block_arrays import whiten
 from factors.block_sums import BlockSums, square_root
 from factors.clock import Clock, displace
 from factors.lens import Lens
@@ -214,10 +215,7 @@ class FreeLensBlock:
         self.lens.fill_columns(lens, points, columns[6:-1])
         self._fill_clock_columns(T_camera_lidar, columns)
         columns[-1] = lens.subtract(pixels.T, block.pixels_px).T
-        if block.sqrt_information is not None:
-            s00, s01, s11 = block.sqrt_information.T
-            columns[:, 0] = s00 * columns[:, 0] + s01 * columns[:, 1]
-            columns[:, 1] *= s11
+        whiten(columns, block.sqrt_information)
         return np.asarray(columns / block.sigma)
 
     def _points_lidar_m(self, values: Array) -> Array:

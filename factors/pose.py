@@ -78,25 +78,10 @@ def relative_pose_factor(
     )
 
 
-def biased_between_factor(
-    key_1: int, key_bend: int, key_2: int, shifts: ArrayLike, noise: gtsam.noiseModel.Base
-) -> gtsam.CustomFactor:
-    """Two poses that differ by some numbers' effect: error ``log(X_1^-1 X_2) - shifts b``.
-
-    Args:
-        key_1: variable X_1.
-        key_bend: variable b, a vector of B numbers.
-        key_2: variable X_2.
-        shifts: (6, B) twist of X_2 in X_1's frame by each of the numbers.
-        noise: of the six rows.
-    """
-    return displaced_between_factor(key_1, key_2, {key_bend: np.asarray(shifts)}, noise)
-
-
 def displaced_between_factor(
     key_1: int, key_2: int, shifts: Mapping[int, Array], noise: gtsam.noiseModel.Base
 ) -> gtsam.CustomFactor:
-    """The same with several vectors: error ``log(X_1^-1 X_2) - sum shifts b``.
+    """Two poses that differ by some vectors' effect: error ``log(X_1^-1 X_2) - sum shifts b``.
 
     Args:
         key_1: variable X_1.

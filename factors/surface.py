@@ -21,8 +21,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.block_arrays import RobustBlock
-from factors.block_sums import BlockSums
+from factors.block_arrays import RobustBlock, rotate_each
+from factors.block_sums import BlockSums, sums_of_runs
 from factors.lens import Lens
 from factors.loss import loss_id, losses_and_weights
 
@@ -92,11 +92,7 @@ class SurfaceBlock(RobustBlock):
         run = np.repeat(np.arange(len(edges) - 1), np.diff(edges))
         poses = [T if len(T) == 1 else T[run] for T in (T_lidar_a, T_lidar_b)]
         some = self if len(run) == len(self) else self.select(np.arange(edges[0], edges[-1]))
-        rows, cost = some._linearize(*poses)
-        starts = edges - edges[0]
-        sums = np.array([part.T @ part for part in np.split(rows, 2 * starts[1:-1])])
-        costs = np.array([part.sum() for part in np.split(cost, starts[1:-1])])
-        return BlockSums(sums[:, :12, :12], sums[:, :12, 12], costs)
+        return sums_of_runs(*some._linearize(*poses), edges)
 
     def _linearize(self, T_lidar_a: Array, T_lidar_b: Array) -> tuple[Array, Array]:
         """(2 n, 13) Jacobian and residuals, times the root of the loss' weight; (n,) losses.
@@ -150,12 +146,12 @@ class _Prediction:
     def of(T_lidar_a: Array, T_lidar_b: Array, rays_a: Array, planes: Array) -> _Prediction:
         """At (n, 4, 4) poses of each feature, or (1, 4, 4)."""
         R_a, c_a, to_b = T_lidar_a[:, :3, :3], T_lidar_a[:, :3, 3], _transpose(T_lidar_b)
-        g = _apply(_transpose(T_lidar_a), planes)
+        g = rotate_each(_transpose(T_lidar_a), planes)
         k = 1.0 - (planes * c_a).sum(axis=1)
         k = np.where(np.abs(k) < _LEAST_K, _LEAST_K, k)
         w = (g * rays_a).sum(axis=1) / k
-        R_b_a, t = to_b @ R_a, _apply(to_b, c_a - T_lidar_b[:, :3, 3])
-        return _Prediction(rays_a, _apply(R_b_a, rays_a) + w[:, None] * t, g, t, R_b_a, w, k)
+        R_b_a, t = to_b @ R_a, rotate_each(to_b, c_a - T_lidar_b[:, :3, 3])
+        return _Prediction(rays_a, rotate_each(R_b_a, rays_a) + w[:, None] * t, g, t, R_b_a, w, k)
 
     def by_poses(self, by_point: Array) -> Array:
         """(n, 2, 12) derivatives of pixels by both poses, from (n, 2, 3) by y."""
@@ -170,10 +166,3 @@ class _Prediction:
 
 def _transpose(T: Array) -> Array:
     return T[:, :3, :3].transpose(0, 2, 1)
-
-
-def _apply(R: Array, vectors: Array) -> Array:
-    """Rotate (n, 3) vectors, each by its own of (n, 3, 3), or all by one of (1, 3, 3)."""
-    if len(R) == 1:
-        return np.asarray(vectors @ R[0].T)
-    return np.asarray(np.einsum("nij,nj->ni", R, vectors))

@@ -84,6 +84,10 @@ def require_same(saved: Calibration, again: Calibration) -> None:
         assert np.abs(xi / sigma).max() < 1e-3, name
         scaled = (other - covariance) / np.outer(sigma, sigma)
         assert np.abs(scaled).max() < 1e-3, name
+        mine, other_verdict = saved.camera_verdicts[name], again.camera_verdicts[name]
+        assert mine.status == other_verdict.status
+        kinds = [[(c.kind, c.status) for c in v.checks] for v in (mine, other_verdict)]
+        assert kinds[0] == kinds[1]
     assert again.counts == saved.counts
 
 

@@ -29,7 +29,7 @@ from benchmarks.accuracy.verdict_samples import (
     shares,
 )
 from benchmarks.tables import Table, add_record_option
-from calibgraph.trust.probability import STRUCTURE, TABLES
+from calibgraph.trust.probability import STRUCTURE, TABLES, WORST
 
 
 def main() -> None:
@@ -59,12 +59,12 @@ def additions(
     name: str, tuned: Sequence[Sample], kept_out: Sequence[Sample], *, jobs: int
 ) -> Table:
     """Per kind of check, what the kept-out likelihood loses where it is left out of the fit."""
-    fitted, kinds = ({k for s in of for k in s.severities} for of in (tuned, kept_out))
+    fitted, kinds = ({k for s in of for k in s.severities} - {WORST} for of in (tuned, kept_out))
     tuned = [drop(sample, fitted - kinds) for sample in tuned]
     kinds &= fitted
-    whole = log_likelihood(fit(tuned), kept_out)
+    whole = log_likelihood(fit(tuned, name), kept_out)
     with ProcessPoolExecutor(jobs) as pool:
-        lost = [*pool.map(partial(_without, tuned, kept_out), sorted(kinds))]
+        lost = [*pool.map(partial(_without, name, tuned, kept_out), sorted(kinds))]
     rows = sorted(((whole - found, kind) for found, kind in zip(lost, sorted(kinds), strict=True)))
     return Table(
         f"{name}, kept out: log likelihood {whole:.4f} a result, and what a kind of check adds",
@@ -72,9 +72,9 @@ def additions(
     )  # fmt: skip
 
 
-def _without(tuned: Sequence[Sample], kept_out: Sequence[Sample], kind: str) -> float:
+def _without(name: str, tuned: Sequence[Sample], kept_out: Sequence[Sample], kind: str) -> float:
     left = [[drop(sample, {kind}) for sample in samples] for samples in (tuned, kept_out)]
-    return log_likelihood(fit(left[0]), left[1])
+    return log_likelihood(fit(left[0], name), left[1])
 
 
 def log_likelihood(model: dict[str, Any], samples: Sequence[Sample]) -> float:

@@ -7,8 +7,9 @@ A group is a rig with errors of its own, and five streets that it drove through,
 one place. Rigs and beams change from group to group; errors of the LiDAR are those of ``simulate
 street --sensor-errors SIZE --vary-layout``, those of the lenses of half the size. Groups 100 to 115
 are to choose by, 116 to 179 are kept out. The second table solves again with the correspondences of
-one, two, five, ten and twenty of a group's streets, as far as it has as many; the third with those
-of five, changed: a relative pose is known, a camera has no matches or few, frames are repeated.
+one, two, five, ten and twenty of a group's streets, as far as it has as many, and has the verdicts
+of those tables, without images; the third with those of five, changed: a relative pose is known, a
+camera has no matches or few, frames are repeated.
 Errors of cameras are of their alignment, those of pairs of their mounts.
 NEES is the squared error in the metric of its covariance; its mean over 6 should be 1.
 """
@@ -126,24 +127,39 @@ def group_of(seed: int) -> int:
     return (seed - _FURTHER) // 100 if seed >= _FURTHER else (seed - 2000) // STREETS
 
 
-def run_case(case: Key, scenes: Path) -> Record:
-    """Render one street, calibrate from near the truth, keep the tables beside it."""
-    group = group_of(case.seed)
+def render_street(
+    folder: Path,
+    group: int,
+    seed: int,
+    *,
+    size: float,
+    frames: int = FRAMES,
+    step_m: float = STEP_M,
+) -> tuple[Rig, Rig]:
+    """Render one street of a group's sensor, if the folder does not have it yet.
+
+    Returns:
+        The rig as its owner states it, and with every camera at its alignment; the folder has both.
+    """
     _, make_rig, beams = RIGS[group % len(RIGS)]
-    folder, truth = scenes / f"scene_{case.seed}", make_rig()
-    size, rng = float(case.data), np.random.default_rng([7, group])
-    errors = draw_scan_errors(beams, size, rng)
+    truth, errors = make_rig(), draw_scan_errors(beams, size, np.random.default_rng([7, group]))
     if not (folder / "rig.yaml").exists():
         shutil.rmtree(folder, ignore_errors=True)
         simulate_street(
-            folder, truth, beams=beams, frames=FRAMES, step_m=STEP_M, seed=case.seed,
+            folder, truth, beams=beams, frames=frames, step_m=step_m, seed=seed,
             sensor_errors=errors, vary_layout=True,
         )  # fmt: skip
     stated = draw_lens_errors(truth, size / 2, np.random.default_rng([13, group]))  # of all streets
     aligned = aligned_rig(truth, stated, folder, beams, errors)
     aligned.save(folder / ALIGNMENT)
-    truth = stated
-    truth.save(folder / "reference.yaml")
+    stated.save(folder / "reference.yaml")
+    return stated, aligned
+
+
+def run_case(case: Key, scenes: Path) -> Record:
+    """Render one street, calibrate from near the truth, keep the tables beside it."""
+    folder = scenes / f"scene_{case.seed}"
+    truth, aligned = render_street(folder, group_of(case.seed), case.seed, size=float(case.data))
     guess = perturb(truth, rotation_deg=GUESS_DEG, translation_m=GUESS_M, seed=case.seed)
     guess.save(folder / "rig.yaml")
     result = calibrate(load_dataset(folder), guess)
@@ -173,7 +189,7 @@ def report(records: Sequence[Record]) -> Table:
         cameras = [c for r in done if size in (r["data"], "all") for c in r["cameras"].values()]
         deg, cm = (np.array([c[f"error_{unit}"] for c in cameras]) for unit in ("deg", "cm"))
         nees = np.array([c["normalised_squared"] for c in cameras if c["normalised_squared"]])
-        counts = [sum(c["status"] == s for c in cameras) for s in ("PASS", "WARN", "FAIL")]
+        counts = [sum(c["status"] == s for c in cameras) for s in STATUSES]
         rows.append(
             (size, str(len(cameras)), f"{np.median(deg):.3f}", f"{deg.max():.2f}",
              f"{np.median(cm):.2f}", f"{cm.max():.1f}", *_calibration(nees),
@@ -183,6 +199,7 @@ def report(records: Sequence[Record]) -> Table:
 
 
 OFF = (0.5, 10.0)  # deg, cm
+STATUSES = ("PASS", "WARN", "FAIL")
 
 
 def _calibration(nees_over_6: Iterable[float]) -> tuple[str, str]:
@@ -222,14 +239,23 @@ def report_changes(records: Sequence[Record], scenes: Path) -> Table:
     return Table("Streets of one sensor solved together, changed", columns, tuple(rows))
 
 
-_CELLS = ("results", "mean NEES / 6", "in the 95 % region", "error, median [deg]", "[cm]")
+_CELLS = (
+    "results", "mean NEES / 6", "in the 95 % region", "error, median [deg]", "[cm]",
+    "PASS, WARN, FAIL", "of these off",
+)  # fmt: skip
 
 
 def _cells(values: Sequence[Found]) -> tuple[str, ...]:
     deg, cm = (np.median([getattr(one, unit) for one in values])
                for unit in ("degrees", "centimetres"))  # fmt: skip
     nees = _calibration(one.nees_over_6 for one in values)
-    return str(len(values)), *nees, f"{deg:.3f}", f"{cm:.2f}"
+    judged = [one for one in values if one.status]
+    off = [one for one in judged if one.degrees > OFF[0] or one.centimetres > OFF[1]]
+    counts = (
+        ", ".join(str(sum(one.status == status for one in of)) for status in STATUSES)
+        for of in (judged, off)
+    )
+    return str(len(values)), *nees, f"{deg:.3f}", f"{cm:.2f}", *counts
 
 
 def streets_of_groups(records: Sequence[Record], scenes: Path) -> Iterator[tuple[str, list[Path]]]:

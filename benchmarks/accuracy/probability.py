@@ -10,8 +10,8 @@ model without cases keeps its own. Without ``--tune`` the package's weights are 
 or those of another version: ``--weights probability.json``.
 
 A result counts as off beyond 0.5 deg or 10 cm. Results that are off, and the others, count alike in
-the fit; the intercept is then moved, and the tables are weighted, to where one result in ten is
-off: as if users made so many mistakes. Weights are the most probable ones under a normal prior
+the fit; the intercept is that of one result in ten that is off, as if users made so many mistakes,
+and the tables are weighted so. Weights are the most probable ones under a normal prior
 about values that are the same for all checks: one that has seen too little keeps nearly those.
 A kind of check that no case had makes a FAIL by itself from its limit of WARN on.
 """
@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
-from scipy.special import logit
+from scipy.special import expit, logit
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.probability_tables import judged
@@ -40,53 +40,84 @@ from benchmarks.accuracy.verdict_samples import (
 )
 from benchmarks.tables import ROOT, add_record_option
 from calibgraph.model.verdict import FAIL_ABOVE
-from calibgraph.trust.probability import STRUCTURE, TABLES, steps
+from calibgraph.trust.probability import STRUCTURE, TABLES, WORST, steps
 
 Array = np.ndarray
 
 USUAL = np.array([0.3, 6.5, 3.0])
 """Prior means: log odds by a check that goes through PASS, WARN and FAIL."""
 SPREAD = np.array([1.0, 3.0, 3.0])
+OF_WORST = (WORST, "swapped_cameras")
+"""What the model of runs has a weight of: 120 cases tell those of 40 kinds of checks too badly. A
+recording left out is foretold better by the worst check alone; a swap is a likelihood ratio."""
+LAST_OF_WORST = 1.0  # its spread: where it is 0, a FAIL would be no more probable than its limit
+RELIABLE, RELIABLE_SPREAD = 2.0, 1.0  # log odds
 INTERCEPT, INTERCEPT_SPREAD = -6.0, 1.0
 FILE = ROOT / "calibgraph" / "trust" / "probability.json"
 
 
-def fit(samples: Sequence[Sample]) -> dict[str, Any]:
-    """The most probable intercept and weights."""
-    kinds = sorted({kind for sample in samples for kind in sample.severities})
-    rows = np.array(
-        [[steps(sample.severities.get(kind, 0.0)) for kind in kinds] for sample in samples]
-    ).reshape(len(samples), -1)
-    off = np.array([sample.off for sample in samples])
-    given = np.array([sample.given for sample in samples])
-    share = off.mean()
-    counts = np.where(off, 0.5 / share, 0.5 / (1 - share))
-    mean, spread = np.tile(USUAL, len(kinds)), np.tile(SPREAD, len(kinds))
+def fit(samples: Sequence[Sample], level: str = TABLES) -> dict[str, Any]:
+    """The most probable intercept and weights.
 
-    def loss(values: Array) -> tuple[float, Array]:
-        z = values[0] + rows @ values[1:]
-        right = 1 / (1 + np.exp(z))  # not grossly wrong
-        p = np.clip(1 - right * (1 - given), 1e-12, 1 - 1e-12)
-        likelihood = counts * np.where(off, np.log(p), np.log(1 - p))
-        slope = counts * np.where(off, (1 - p) * (1 - right) / p, right - 1)
-        away = np.append((values[0] - INTERCEPT) / INTERCEPT_SPREAD, (values[1:] - mean) / spread)
-        gradient = -np.append(slope.sum(), slope @ rows)
-        gradient += away / np.append(INTERCEPT_SPREAD, spread)
-        return float(-likelihood.sum() + (away**2).sum() / 2), gradient
-
-    start = np.append(INTERCEPT, mean)
-    bounds = [(None, None), *[(0.0, None)] * len(mean)]
-    found = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B",
-                     options={"maxiter": 5000, "maxfun": 20000}).x  # fmt: skip
-    weights = found[1:].reshape(-1, 3).round(3)
-    intercept = round(float(found[0] + logit(SHARE_OFF)), 3)
+    Of tables every kind of check has weights. Of runs the worst check has, and how far error bars
+    and the checks whose value is a probability are to be relied on. A check that is at its limit of
+    FAIL is one by itself, for runs, and for tables if no case had its kind.
+    """
+    seen = sorted({kind for sample in samples for kind in sample.severities} - {WORST})
+    of_worst = level == STRUCTURE
+    kinds = OF_WORST if of_worst else seen
+    spread = np.tile(SPREAD, len(kinds))
+    spread[2] = LAST_OF_WORST if of_worst else SPREAD[2]
+    found = _most_probable(samples, kinds, spread, of_worst=of_worst)
+    intercept, weights = round(float(found[0]), 3), found[1:-2].reshape(-1, 3).round(3)
     first, _, last = USUAL.tolist()
     to_fail = round(float(logit(FAIL_ABOVE)) - intercept - first, 3)  # at the limit of WARN
     return {
         "intercept": intercept,
-        "weights": {kind: weights[i].tolist() for i, kind in enumerate(kinds)},
-        "other": [first, to_fail, last],
+        "weights": {WORST: [0.0] * 3} | {kind: weights[i].tolist() for i, kind in enumerate(kinds)},
+        "other": [0.0] * 3 if of_worst else [first, to_fail, last],
+        "seen": seen,
+        "value_reliability": round(float(expit(found[-2])), 3) if of_worst else 1.0,
+        "bar_reliability": round(float(expit(found[-1])), 3) if of_worst else 1.0,
     }
+
+
+def _most_probable(
+    samples: Sequence[Sample], kinds: Sequence[str], spread: Array, *, of_worst: bool
+) -> Array:
+    """Intercept where one result in ten is off, weights of the kinds, log odds of reliability."""
+    rows = np.array(
+        [[steps(sample.severities.get(kind, 0.0)) for kind in kinds] for sample in samples]
+    ).reshape(len(samples), -1)
+    off, by_bar, by_values = (
+        np.array([getattr(sample, name) for sample in samples])
+        for name in ("off", "by_bar", "by_values")
+    )
+    counts = np.where(off, 0.5 / off.mean(), 0.5 / (1 - off.mean()))
+    one_in_ten = float(logit(SHARE_OFF))
+    usual = np.concatenate([[INTERCEPT + one_in_ten], np.tile(USUAL, len(kinds)), [RELIABLE] * 2])
+    spreads = np.concatenate([[INTERCEPT_SPREAD], spread, [RELIABLE_SPREAD] * 2])
+
+    def complete(values: Array) -> Array:
+        """With the weight that the limit of FAIL gives; tables rely on values and bars."""
+        values = values.copy()
+        if of_worst:
+            values[2] = max(float(logit(FAIL_ABOVE)) - values[0] - values[1], 0.0)
+        else:
+            values[-2:] = np.inf
+        return values
+
+    def loss(values: Array) -> float:
+        z, (of_values, of_bar) = complete(values), expit(complete(values)[-2:])
+        right = expit(-(z[0] - one_in_ten + rows @ z[1:-2]))  # not grossly wrong
+        p = 1 - right * (1 - of_values * by_values) * (1 - of_bar * by_bar)
+        likelihood = counts * np.log(np.clip(np.where(off, p, 1 - p), 1e-12, 1.0))
+        return float(-likelihood.sum() + (((values - usual) / spreads) ** 2).sum() / 2)
+
+    bounds = [(None, None), *[(0.0, None)] * (3 * len(kinds)), *[(None, None)] * 2]
+    found = minimize(loss, usual, bounds=bounds, method="L-BFGS-B",
+                     options={"maxiter": 5000, "maxfun": 200_000}).x  # fmt: skip
+    return complete(found)
 
 
 def with_intercept(model: dict[str, Any], samples: Sequence[Sample]) -> dict[str, Any]:
@@ -133,13 +164,15 @@ def main() -> None:
         if not clear:
             models[name] = present
         else:
-            models[name] = with_intercept(present, clear) if options.keep_weights else fit(clear)
+            models[name] = (
+                with_intercept(present, clear) if options.keep_weights else fit(clear, name)
+            )
         for which, samples in of_level.items():
             if samples:
                 tables += judged(f"{name}, {which}", models[name], samples)
     ledger.publish_cases("accuracy.probability", tables, records, record=options.record)
     if options.write:
-        text = {"format": "calibgraph-probability/1", "fitted_by": ledger.code(),
+        text = {"format": "calibgraph-probability/2", "fitted_by": ledger.code(),
                 "results": {n: len(samples_of(each)) for n, each in sets.items()},
                 "models": models}  # fmt: skip
         FILE.write_text(json.dumps(text, indent=1) + "\n", "utf-8")

@@ -24,19 +24,23 @@ from calibgraph.model.camera_matches import CameraMatches, concatenate_camera_ma
 from calibgraph.model.correspondences import concatenate
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
+from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.assess import assess
+from calibgraph.trust.evidence import Evidence
 
 FRAMES = 3  # of a street
 
 
 @dataclass(frozen=True)
 class Found:
-    """The error of one camera, or of one next to the one before it."""
+    """The error of one camera, with its verdict, or of one next to the one before it."""
 
     of: str
     nees_over_6: float
     degrees: float
     centimetres: float
+    status: str = ""
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,10 @@ def solve_streets(streets: Streets) -> Iterator[Found]:
         streets.start, streets.table, Config(stage1="rig", learnt_weights=False),
         camera_matches=streets.matches,
     )  # fmt: skip
+    evidence = Evidence(solved, guess=streets.start)
+    statuses = {
+        n: v.status for n, v in to_calibration(evidence, assess(evidence)).camera_verdicts.items()
+    }
     joint, mount = solved.covariance, solved.marginals.mount
     assert joint is not None and mount.covariance is not None
     errors, T = [], mount.T_camera_lidar
@@ -90,7 +98,7 @@ def solve_streets(streets: Streets) -> Iterator[Found]:
         errors.append(twist_between(T[name], truth.cameras[name].T_camera_lidar))
         rows = slice(6 * place, 6 * place + 6)
         error = twist_between(solved.T_camera_lidar[name], streets.aligned[name])
-        yield _found("camera", error, joint[rows, rows])
+        yield replace(_found("camera", error, joint[rows, rows]), status=statuses[name])
         if place:
             T_b_a = relative_transform(T[name], T[list(T)[place - 1]])
             between = errors[place] - gtsam.Pose3(T_b_a).AdjointMap() @ errors[place - 1]

@@ -13,11 +13,11 @@ from benchmarks.accuracy import data_cases, table_cases
 from benchmarks.accuracy.ledger import Record
 from benchmarks.accuracy.verdicts import STATUSES, class_of
 from calibgraph.model.verdict import TOLERANCE, ErrorProbability
-from calibgraph.trust.lens_checks import probability_of_lens
 from calibgraph.trust.probability import (
-    CHANCE,
+    WORST,
     contributions,
     probability_beyond,
+    probability_by_values,
     worst_severities,
 )
 
@@ -38,7 +38,7 @@ class Sample:
     Attributes:
         level: "table" or "data".
         kind: of the case.
-        severities: per kind of check.
+        severities: per kind of check, and of the worst.
         by_bar: the probability that its error bar alone allows.
         by_values: that of checks whose value is one: a wrong lens, a pose found by chance.
         off: whether it is off.
@@ -62,11 +62,6 @@ class Sample:
         """The worst status of its checks, as verdicts were made before there was a probability."""
         return max(self.statuses.values(), key=STATUSES.index, default="PASS")
 
-    @property
-    def given(self) -> float:
-        """The probability by its error bar and such checks."""
-        return 1 - (1 - self.by_bar) * (1 - self.by_values)
-
 
 def samples_of(records: Iterable[Record]) -> list[Sample]:
     """The results of cases that data can tell from right ones, without those decided anyway."""
@@ -85,7 +80,7 @@ def _sample(record: Record, camera: Record) -> Sample:
         kind=record["kind"],
         severities=worst_severities((kind, severity) for kind, _, _, severity, _ in checks),
         by_bar=_beyond(camera),
-        by_values=_by_values(checks),
+        by_values=probability_by_values([(kind, of, value) for kind, of, value, *_ in checks]),
         off=which == "off",
         right=which == "right",
         statuses=_worst_statuses(checks),
@@ -101,12 +96,6 @@ def _beyond(camera: Record) -> float:
     return probability_beyond(None if rows is None else np.array(rows), TOLERANCE)
 
 
-def _by_values(checks: Sequence[Sequence[Any]]) -> float:
-    values = [(kind, status, value) for kind, status, value, *_ in checks]
-    by_chance = max((value or 0.0 for kind, _, value in values if kind == CHANCE), default=0.0)
-    return 1 - (1 - probability_of_lens(values)) * (1 - by_chance)
-
-
 def _worst_statuses(checks: Sequence[Sequence[Any]]) -> dict[str, str]:
     ordered = sorted(checks, key=lambda check: STATUSES.index(check[1]))
     return {kind: status for kind, status, *_ in ordered}
@@ -114,8 +103,9 @@ def _worst_statuses(checks: Sequence[Sequence[Any]]) -> dict[str, str]:
 
 def drop(sample: Sample, kinds: Collection[str]) -> Sample:
     """The sample without some kinds of checks."""
-    kept = {kind: value for kind, value in sample.severities.items() if kind not in kinds}
-    return replace(sample, severities=kept)
+    left_out = {*kinds, WORST}
+    kept = {kind: value for kind, value in sample.severities.items() if kind not in left_out}
+    return replace(sample, severities={**kept, WORST: max(kept.values(), default=0.0)})
 
 
 def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[ErrorProbability]:
@@ -125,8 +115,11 @@ def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[ErrorProbab
         expit(model["intercept"] + sum(contributions(s.severities, weights, other).values()))
         for s in samples
     ]
+    of_values, of_bar = model["value_reliability"], model["bar_reliability"]
     return [
-        ErrorProbability(1 - (1 - p) * (1 - s.by_values), s.by_bar)
+        ErrorProbability(
+            1 - (1 - p) * (1 - of_values * s.by_values), s.by_bar, bar_reliability=of_bar
+        )
         for p, s in zip(grossly, samples, strict=True)
     ]
 

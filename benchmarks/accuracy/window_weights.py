@@ -36,7 +36,7 @@ from calibgraph.matching.structure.training.loss import damped
 from calibgraph.matching.structure.training.samples import score_each
 from calibgraph.matching.structure.training.trainee import Trainee
 from calibgraph.matching.structure.visibility import find_places
-from calibgraph.matching.structure.window_features_kernel import FEATURES
+from calibgraph.matching.structure.window_kernels import FEATURES
 from calibgraph.matching.structure.window_weights import (
     PACKAGE_FILE,
     WindowNetwork,

@@ -4,10 +4,10 @@
     python -m benchmarks.speed.gate --against FILE    fail where one is over 1.25 times that of FILE
     python -m benchmarks.speed.gate --write           keep them as those of this release
 
-A ratio is of the shortest processor times of a call and of its baseline, in turns, on one thread:
-so slower machines change it little, and other load less than times. Baselines: a matrix product
-(sgemm, 1024 rows), SciPy's TRF, a GTSAM factor per correspondence, a copy of memory as large as the
-table.
+A ratio is the median over pairs of a call and its baseline, which run one after the other on one
+thread: so slower machines change it little, and other load, which both meet, less than times. What
+fails is measured again, by itself. Baselines: a matrix product (sgemm, 1024 rows), SciPy's TRF, a
+GTSAM factor per correspondence, a copy of memory as large as the table.
 """
 
 from __future__ import annotations
@@ -17,35 +17,63 @@ import json
 import os
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 
 from benchmarks.speed.incremental import GUESS, frames
-from benchmarks.speed.kernel import MATRIX, ONE_THREAD, matcher_calls, shortest
+from benchmarks.speed.kernel import MATRIX, ONE_THREAD, matcher_calls
 from benchmarks.speed.solvers import Problem, solve_gtsam_python, solve_ours_once, solve_trf_once
 from benchmarks.tables import ROOT, Table
 from calibgraph import (
     IncrementalCalibrator,
+    Rig,
     calibrate,
     load_correspondences,
     load_dataset,
     solve,
 )
+from calibgraph.parallel import THREADS_VARIABLE
 from calibgraph.tracking import warm_up_tracker
 
 RELEASE = ROOT / "benchmarks" / "ratios.json"
 SAMPLE = ROOT / "data" / "sample"
 WORST = 1.25
-_TRIES = 3  # other work takes the caches of both, but not equally
-_SMALL, _LARGE, _FACTORS = (10, 2), (100, 2), (10, 2)  # frames and cameras
-_UPDATES = 120  # of a tracker, the first half of which is not timed
-_ROWS_OF_COPY = 20  # copies of the table per run: one is too short to time
+_TRIES = 3  # of a ratio that fails
+_ENVIRONMENT = {**ONE_THREAD, "NUMBA_NUM_THREADS": "1", THREADS_VARIABLE: "1"}
+_FRAMES, _CAMERAS = 2, 2  # of the sample, that are calibrated
+_UPDATES = 40  # of a tracker
 
 Ratios = dict[str, float]
+Run = Callable[[], object]
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A call and its baseline.
+
+    Attributes:
+        name: of the ratio.
+        run, baseline: each is run many times at a stroke, so that both take long enough to time.
+        pairs: how many; the first also warms up.
+        unit: what the ratio of their times is divided by.
+    """
+
+    name: str
+    run: Run
+    baseline: Run
+    pairs: int = 3
+    unit: float = 1.0
+
+    def ratio(self) -> float:
+        """The median over the pairs."""
+        found = [_seconds(self.run) / _seconds(self.baseline) for _ in range(self.pairs)]
+        return median(found) / self.unit
 
 
 def main() -> int:
@@ -53,16 +81,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--against", type=Path, help="ratios of a release")
     parser.add_argument("--write", action="store_true", help=f"to {RELEASE.relative_to(ROOT)}")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "ratios.json")
     options = parser.parse_args()
-    if any(os.environ.get(name) != value for name, value in ONE_THREAD.items()):
-        environment = {**os.environ, **ONE_THREAD, "NUMBA_NUM_THREADS": "1"}
-        os.execve(sys.executable, [sys.executable, "-m", __spec__.name, *sys.argv[1:]], environment)
+    if not _ENVIRONMENT.items() <= os.environ.items():
+        command = [sys.executable, "-m", __spec__.name, *sys.argv[1:]]
+        os.execve(sys.executable, command, {**os.environ, **_ENVIRONMENT})
     former = json.loads(options.against.read_text("utf-8")) if options.against else {}
-    found = measure(options.repeats, former)
+    with tempfile.TemporaryDirectory() as folder:
+        found = {pair.name: measure(pair, former) for pair in all_pairs(Path(folder))}
     for path in (options.out, *([RELEASE] if options.write else [])):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
@@ -73,50 +101,61 @@ def main() -> int:
     return 1 if worse else 0
 
 
-def measure(repeats: int, former: Ratios) -> Ratios:
-    """All ratios: smaller is faster. Those that fail are measured again, and the smaller counts."""
-    found: Ratios = {}
-    for part in (kernel, solves, updates, reading, whole):
-        ratios = dict(part(repeats))
-        for _ in range(_TRIES - 1):
-            if slower(ratios, former):
-                ratios = {name: min(ratios[name], again) for name, again in part(repeats)}
-        found |= ratios
+def measure(pair: Pair, former: Ratios) -> float:
+    """A ratio: smaller is faster. One that fails is measured again, and the smallest counts."""
+    found = pair.ratio()
+    for _ in range(_TRIES - 1):
+        if slower({pair.name: found}, former):
+            found = min(found, pair.ratio())
     return found
 
 
-def kernel(repeats: int) -> Iterator[tuple[str, float]]:
+def all_pairs(folder: Path) -> Iterator[Pair]:
+    """All that is measured, each put together when it is its turn.
+
+    Args:
+        folder: for a table.
+    """
+    yield kernel()
+    small, large = Problem.draw(10, 2), Problem.draw(100, 2)
+    yield solve_of(small, "2 x 10 x 1000", times=2, pairs=9)
+    yield solve_of(large, "2 x 100 x 1000", times=3, pairs=3)
+    yield one_pass(Problem.draw(3, 2))
+    yield update(small)
+    yield reading(large, folder / "correspondences.parquet")
+    yield whole()
+
+
+def kernel() -> Pair:
     """Window scores, per multiply-add of their definition, over those of sgemm."""
-    calls = matcher_calls(load_dataset(SAMPLE))
+    calls, times = matcher_calls(load_dataset(SAMPLE)), 4
+    work = sum(call.multiply_adds() for call in calls)
 
     def run() -> None:
         for call in calls:
             call.run()
 
-    seconds, product = shortest(run, _sgemm(), repeats=repeats)
-    work = sum(call.multiply_adds() for call in calls)
-    yield "window scores / sgemm, per multiply-add", seconds / work / (product / MATRIX**3)
+    unit = work / (times * MATRIX**3)
+    return Pair("window scores / sgemm, per multiply-add", run, _sgemm(times), 5, unit)
 
 
-def solves(repeats: int) -> Iterator[tuple[str, float]]:
-    """Whole calls over one pass of TRF; one pass over one with a factor per correspondence."""
-    for size in (_SMALL, _LARGE):
-        problem = Problem.draw(*size)
-        ours, trf = shortest(
-            partial(solve, problem.rig, problem.table),
-            partial(solve_trf_once, problem),
-            repeats=repeats,
-        )
-        yield f"solve / one pass of TRF, {size[1]} x {size[0]} x 1000", ours / trf
-    problem = Problem.draw(*_FACTORS)
-    ours, gtsam = shortest(
-        partial(solve_ours_once, problem), partial(solve_gtsam_python, problem), repeats=repeats
-    )
-    yield "one pass / GTSAM, a factor per correspondence", ours / gtsam
+def solve_of(problem: Problem, size: str, *, times: int, pairs: int) -> Pair:
+    """A whole call over one pass of TRF."""
+    run = _repeated(partial(solve, problem.rig, problem.table), times)
+    baseline = partial(solve_trf_once, problem)
+    return Pair(f"solve / one pass of TRF, {size}", run, baseline, pairs, times)
 
 
-def updates(repeats: int) -> Iterator[tuple[str, float]]:
-    """A tracker's frames over a matrix product."""
+def one_pass(problem: Problem) -> Pair:
+    """One pass over one with a factor per correspondence."""
+    times = 50
+    run, baseline = partial(solve_ours_once, problem), partial(solve_gtsam_python, problem)
+    name = "one pass / GTSAM, a factor per correspondence"
+    return Pair(name, _repeated(run, times), baseline, unit=times)
+
+
+def update(problem: Problem) -> Pair:
+    """A tracker's frames over one pass of TRF, which like them is Python and small arrays."""
     warm_up_tracker()
     tables = list(frames(_UPDATES))
 
@@ -125,38 +164,52 @@ def updates(repeats: int) -> Iterator[tuple[str, float]]:
         for table in tables:
             tracker.update(table)
 
-    seconds, product = shortest(track, _sgemm(), repeats=repeats)
-    yield "update of two cameras / sgemm", seconds / _UPDATES / product
+    name, baseline = "update of two cameras / one pass of TRF", partial(solve_trf_once, problem)
+    return Pair(name, track, baseline, 5, _UPDATES)
 
 
-def reading(repeats: int) -> Iterator[tuple[str, float]]:
+def reading(problem: Problem, path: Path) -> Pair:
     """A table from Parquet over a copy of its columns."""
-    problem = Problem.draw(*_LARGE)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "correspondences.parquet"
-        problem.table.save(path)
-        columns = [problem.table.pixels_px, problem.table.points_lidar_m]
+    problem.table.save(path)
+    columns = [problem.table.pixels_px, problem.table.points_lidar_m]
 
-        def copy() -> None:
-            for _ in range(_ROWS_OF_COPY):
-                for column in columns:
-                    column.copy()
+    def copy() -> None:
+        for column in columns:
+            column.copy()
 
-        seconds, copies = shortest(partial(load_correspondences, path), copy, repeats=repeats)
-    yield "table from Parquet / copy of memory", seconds / (copies / _ROWS_OF_COPY)
+    times, copies = 3, 100
+    run = _repeated(partial(load_correspondences, path), times)
+    name = "table from Parquet / copy of memory"
+    return Pair(name, run, _repeated(copy, copies), 9, times / copies)
 
 
-def whole(repeats: int) -> Iterator[tuple[str, float]]:
-    """`calibrate` of the sample over a matrix product."""
-    dataset = load_dataset(SAMPLE)
-    dataset = replace(dataset, frames=dataset.frames[:2])
-    seconds, product = shortest(partial(calibrate, dataset), _sgemm(), repeats=min(repeats, 2))
-    yield "calibrate of two frames of the sample / sgemm", seconds / product
+def whole() -> Pair:
+    """`calibrate` of a part of the sample over a matrix product."""
+    sample, times = load_dataset(SAMPLE), 20
+    rig = Rig(cameras=dict(list(sample.rig.cameras.items())[:_CAMERAS]))
+    part = replace(sample, rig=rig, frames=sample.frames[:_FRAMES])
+    name = f"calibrate of {_CAMERAS} cameras, {_FRAMES} frames / sgemm"
+    return Pair(name, partial(calibrate, part), _sgemm(times), unit=1 / times)
 
 
-def _sgemm() -> Callable[[], object]:
+def _sgemm(times: int) -> Run:
     matrix = np.random.default_rng(0).random((MATRIX, MATRIX), np.float32)
-    return partial(np.matmul, matrix, matrix, np.empty_like(matrix))
+    return _repeated(partial(np.matmul, matrix, matrix, np.empty_like(matrix)), times)
+
+
+def _repeated(run: Run, times: int) -> Run:
+    def repeat() -> None:
+        for _ in range(times):
+            run()
+
+    return repeat
+
+
+def _seconds(run: Run) -> float:
+    """Processor seconds of a call."""
+    start = time.process_time()
+    run()
+    return time.process_time() - start
 
 
 def slower(found: Ratios, former: Ratios) -> list[str]:

@@ -133,10 +133,13 @@ class Audit:
 
     @property
     def same_recording_note(self) -> str:
-        """A clause on what the recording that made the result cannot show; empty for another."""
+        """Sentences on what the recording of the result itself cannot show; empty for another."""
         if not self.same_recording:
             return ""
-        return "this recording made it, and errors that it repeats are not seen: check another one"
+        return (
+            "It was made from this recording, which repeats its own errors and cannot show them. "
+            "Check it on another one."
+        )
 
     @property
     def deployed_verdict_note(self) -> str:

@@ -8,7 +8,6 @@ CHANGED (``drift``), 2 bad input (one line), 3 the data cannot tell (both), 130 
 from __future__ import annotations
 
 import gc
-import inspect
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -18,14 +17,15 @@ from typing import Annotated, Any, TextIO
 
 import typer
 
-from calibgraph.cli import outputs
 from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve
+from calibgraph.cli.declaration import declare, help_of
 from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
 from calibgraph.cli.guess import bag, guess, init
 from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
 from calibgraph.cli.learned import train, train_windows, weights
+from calibgraph.cli.outputs import keep_files
 from calibgraph.cli.serve import pick, serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
@@ -69,46 +69,15 @@ def _options(
     """Options before the command; ``--debug`` is read by :func:`main`."""
 
 
-COMMANDS: dict[Callable[..., None], outputs.Outputs] = {
-    calibrate: outputs.result,
-    check: outputs.page_of_audit,
-    drift: outputs.plot_of_drift,
-    match: outputs.table,
-    solve: outputs.solved,
-    report: outputs.page,
-    view: outputs.recordings,
-    evaluate: outputs.nothing,
-    perturb: outputs.rig_of("perturb"),
-    bag: outputs.rig_of("bag"),
-    doctor: outputs.pictures,
-    init: outputs.nothing,
-    guess: outputs.rig_of("guess"),
-    export: outputs.exported,
-    import_: outputs.rig_of("import"),
-    simulate: outputs.nothing,
-    weights: outputs.weights,
-    train: outputs.training,
-    train_windows: outputs.window_weights,
-    track: outputs.result,
-    pick: outputs.picked,
-    fleet: outputs.nothing,
-    fleet_model: outputs.fleet_model,
-    fleet_report: outputs.fleet_page,
-    serve: outputs.nothing,
-    token: outputs.nothing,
-}
-"""Every command, and the files that it writes."""
-
-
-def _help_of(command: Callable[..., Any]) -> str:
-    """Its docstring, a line per paragraph: typer keeps the line breaks of all but the first."""
-    paragraphs = (inspect.getdoc(command) or "").split("\n\n")
-    return "\n\n".join(" ".join(text.split()) for text in paragraphs)
-
-
-for _command, _outputs in COMMANDS.items():
-    app.command(_command.__name__.rstrip("_").replace("_", "-"), help=_help_of(_command))(
-        outputs.keep_files(_command, _outputs)
+COMMANDS: tuple[Callable[..., None], ...] = (
+    calibrate, check, drift, match, solve, report, view, evaluate, perturb, bag, doctor, init,
+    guess, export, import_, simulate, weights, train, train_windows, track, pick, fleet,
+    fleet_model, fleet_report, serve, token,
+)  # fmt: skip
+"""In the order of the help."""
+for _command in COMMANDS:
+    app.command(_command.__name__.rstrip("_").replace("_", "-"), help=help_of(_command))(
+        keep_files(declare(_command))
     )
 
 

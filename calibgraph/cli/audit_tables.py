@@ -17,15 +17,13 @@ _LETTERS = 13  # of a result's name in a table; reasons have all of it
 
 def print_audit(console: Console, audit: Audit, page: Path | None = None) -> None:
     """Print the status with its reasons, the deviations per axis, and what was written."""
-    same = audit.same_recording_note
-    question = f"check: is the deployed calibration still right?{'; ' if same else ''}{same}"
-    _print_status(console, audit.status, question)
+    _print_status(console, audit.status, "check: is the deployed calibration still right?")
     if audit.lidar is not None:
         print_plain(console, f"  WRONG LiDAR: {audit.lidar.reason}; all cameras agree on it")
     for name, camera in audit.cameras.items():
         print_plain(console, f"  {camera.status} {name}: {camera.reason}")
-    if audit.deployed_verdict_note:
-        print_plain(console, f"  {audit.deployed_verdict_note}")
+    for note in filter(None, (audit.same_recording_note, audit.deployed_verdict_note)):
+        print_plain(console, f"  {note}")
     console.print(audit_table(audit))
     console.print(
         "deviation: motion of the camera from where it is deployed, about and along its own axes; "

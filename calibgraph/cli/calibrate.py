@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibgraph.cli import options
+from calibgraph.cli import options, outputs
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.option_groups import MatchingOptions, SolveOptions, expand_groups
+from calibgraph.cli.option_groups import MatchingOptions, SolveOptions
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 if TYPE_CHECKING:
@@ -20,11 +20,10 @@ if TYPE_CHECKING:
     from calibgraph.model.correspondences import Correspondences
 
 
-@expand_groups
 def calibrate(
-    dataset: options.DatasetArgument,
+    dataset: list[Path],
     matching: MatchingOptions,
-    out: options.OutOption = Path("calibration"),
+    out: Annotated[Path, outputs.RESULT] = Path("calibration"),
     *,
     solving: SolveOptions,
     as_json: options.JsonOption = False,
@@ -52,17 +51,18 @@ def calibrate(
     _print_and_exit(result, written, as_json=as_json)
 
 
-@expand_groups
 def match(
-    dataset: options.DatasetArgument,
+    dataset: list[Path],
     matching: MatchingOptions,
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="Table to write, .parquet or .csv.")
-    ] = Path("correspondences.parquet"),
+    out: Annotated[Path, outputs.TABLE] = Path("correspondences.parquet"),
     seed: options.SeedOption = 0,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Find correspondences and write them as a table; exit 1 if a camera was not found."""
+    """Find correspondences and write them as a table; exit 1 if a camera was not found.
+
+    Args:
+        out (FILE): Table to write, .parquet or .csv.
+    """
     from calibgraph.model.result_files import MATCH, WRITTEN_KEY
     from calibgraph.rounds import match_in_rounds
 
@@ -79,27 +79,34 @@ def match(
     _print_table_and_exit(run.correspondences, out, as_json=as_json)
 
 
-@expand_groups
 def solve(
-    rig: options.RigArgument,
-    correspondences: Annotated[
-        Path,
-        typer.Argument(
-            metavar="CORRESPONDENCES",
-            help="Table, .parquet or .csv, or a folder of .parquet files; larger than memory too.",
-        ),
-    ],
-    out: options.OutOption = Path("calibration"),
+    rig: Path,
+    correspondences: Path,
+    out: Annotated[Path, outputs.RESULT] = Path("calibration"),
     *,
     solving: SolveOptions,
-    camera_matches: options.CameraMatchesOption = None,
-    common_deg: options.CommonDegOption = None,
-    common_cm: options.CommonCmOption = None,
-    print_graph: options.PrintGraphOption = False,
-    graph: options.GraphOption = None,
+    camera_matches: Path | None = None,
+    common_deg: Annotated[float | None, typer.Option(min=0)] = None,
+    common_cm: Annotated[float | None, typer.Option(min=0)] = None,
+    print_graph: Annotated[bool, typer.Option(callback=options.require_stdout)] = False,
+    graph: Annotated[Path | None, outputs.GRAPH] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Calibrate all cameras jointly from a table of correspondences, with a report."""
+    """Calibrate all cameras jointly from a table of correspondences, with a report.
+
+    Args:
+        rig (RIG): Rig with the initial guess.
+        correspondences (CORRESPONDENCES): Table, .parquet or .csv, or a folder of .parquet files;
+            larger than memory too.
+        camera_matches (FILE): Features that cameras have in common: camera_matches.parquet of a
+            result.
+        common_deg (DEG): Error per axis that all frames share, 1 sigma; 0 if none. (default: as
+            the table states)
+        common_cm (CM): Likewise, of the position.
+        print_graph: Print every factor of the graph whose optimum is the result, in place of
+            tables.
+        graph (FILE.dot): Write the graph in Graphviz's language to FILE.dot.
+    """
     from calibgraph.files import sha256, write_text
     from calibgraph.graph.variables import to_dot
     from calibgraph.io.camera_match_tables import load_camera_matches

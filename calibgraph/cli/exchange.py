@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibgraph.cli import outputs
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.option_groups import expand_groups
 from calibgraph.cli.terminal import print_plain, terminal
 from calibgraph.io.formats.names import EXPORT_FORMATS, IMPORT_FORMATS
 
@@ -28,7 +28,16 @@ _LIST = "list"
 
 @dataclass(frozen=True, kw_only=True)
 class RigFilesOptions:
-    """The files of other programs that hold a rig together."""
+    """The files of other programs that hold a rig together.
+
+    Attributes:
+        rename (OLD=NEW): Another name of a camera, as its folder in the dataset; may be repeated.
+        lidar_frame (FRAME): The LiDAR's frame. (default: the one named so)
+        camera_frame (NAME=FRAME): Frame of a camera, where the names differ; may be repeated. A
+            frame with 'optical' in its name is x right, y down, z forward, others are x forward, z
+            up.
+        size (WIDTHxHEIGHT): Image size, for files that have none.
+    """
 
     files: Annotated[
         list[str],
@@ -37,29 +46,10 @@ class RigFilesOptions:
             help=f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
         ),
     ]
-    rename: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="OLD=NEW",
-            help="Another name of a camera, as its folder in the dataset; may be repeated.",
-        ),
-    ] = None
-    lidar_frame: Annotated[
-        str | None,
-        typer.Option(metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"),
-    ] = None
-    camera_frame: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=FRAME",
-            help="Frame of a camera, where the names differ; may be repeated. A frame with "
-            "'optical' in its name is x right, y down, z forward, others are x forward, z up.",
-        ),
-    ] = None
-    size: Annotated[
-        str | None,
-        typer.Option(metavar="WIDTHxHEIGHT", help="Image size, for files that have none."),
-    ] = None
+    rename: list[str] | None = None
+    lidar_frame: str | None = None
+    camera_frame: list[str] | None = None
+    size: str | None = None
 
     def read(self) -> RigParts:
         """What the files hold."""
@@ -96,9 +86,7 @@ def _list_formats(format: str) -> str:
 
 
 def export(
-    source: Annotated[
-        Path, typer.Argument(metavar="RESULT|RIG", help="Result (its folder or file), or a rig.")
-    ],
+    source: Path,
     format: Annotated[
         str,
         typer.Option(
@@ -108,38 +96,26 @@ def export(
             help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
         ),
     ],
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="File to write; of camera_info a folder.")
-    ],
-    camera: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Only this camera; may be repeated. (default: all)"),
-    ] = None,
-    lidar_frame: Annotated[
-        str | None,
-        typer.Option(metavar="FRAME", help="Frame id of the LiDAR. (default: its name in the rig)"),
-    ] = None,
-    camera_frame: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TEXT",
-            help="Frame id of optical frames; {camera} is the name. (default: the bag's, kept in "
-            "the rig, or {camera}_optical_frame)",
-        ),
-    ] = None,
-    lidar_pose: Annotated[
-        str | None,
-        typer.Option(
-            metavar='"X Y Z ROLL PITCH YAW"',
-            help="Of autoware and nuscenes: where the LiDAR is mounted, in sensor_kit_base_link or "
-            "ego, metres and radians as in URDF. (default: at its origin)",
-        ),
-    ] = None,
-    even_if_failed: Annotated[
-        bool, typer.Option("--even-if-failed", help="Export although the verdict is FAIL.")
-    ] = False,
+    out: Annotated[Path, typer.Option(), outputs.EXPORTED],
+    camera: list[str] | None = None,
+    lidar_frame: str | None = None,
+    camera_frame: str | None = None,
+    lidar_pose: str | None = None,
+    even_if_failed: bool = False,
 ) -> None:
-    """Write a calibration in the format of another program, with its direction as a comment."""
+    """Write a calibration in the format of another program, with its direction as a comment.
+
+    Args:
+        source (RESULT|RIG): Result (its folder or file), or a rig.
+        out (FILE): File to write; of camera_info a folder.
+        camera (NAME): Only this camera; may be repeated. (default: all)
+        lidar_frame (FRAME): Frame id of the LiDAR. (default: its name in the rig)
+        camera_frame (TEXT): Frame id of optical frames; {camera} is the name. (default: the bag's,
+            kept in the rig, or {camera}_optical_frame)
+        lidar_pose ("X Y Z ROLL PITCH YAW"): Of autoware and nuscenes: where the LiDAR is mounted,
+            in sensor_kit_base_link or ego, metres and radians as in URDF. (default: at its origin)
+        even_if_failed: Export although the verdict is FAIL.
+    """
     import numpy as np
 
     from calibgraph.io.formats.export import export_calibration
@@ -185,21 +161,19 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
         raise ValueError(f"--lidar-pose {text!r}: {error}") from error
 
 
-@expand_groups
 def import_(
     files: RigFilesOptions,
-    out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Rig file to write.")],
-    tie_deg: Annotated[
-        float,
-        typer.Option(
-            min=0.001, metavar="DEG", help="Sigma per axis of relative poses (Kalibr's T_cn_cnm1)."
-        ),
-    ] = 0.1,
-    tie_m: Annotated[
-        float, typer.Option(min=1e-5, metavar="M", help="The sigma in translation, per axis.")
-    ] = 0.005,
+    out: Annotated[Path, typer.Option(), outputs.rig_of("import")],
+    tie_deg: Annotated[float, typer.Option(min=0.001)] = 0.1,
+    tie_m: Annotated[float, typer.Option(min=1e-5)] = 0.005,
 ) -> None:
-    """Build a rig file from files of others, and print where each camera looks and sits."""
+    """Build a rig file from files of others, and print where each camera looks and sits.
+
+    Args:
+        out (FILE.yaml): Rig file to write.
+        tie_deg (DEG): Sigma per axis of relative poses (Kalibr's T_cn_cnm1).
+        tie_m (M): The sigma in translation, per axis.
+    """
     from calibgraph.io.formats.describe import describe_rig
     from calibgraph.outputs import yaml_mark
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from calibgraph.cli import outputs
 from calibgraph.cli.options import JsonOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
@@ -20,55 +21,37 @@ if TYPE_CHECKING:
 
 
 def fleet(
-    manifest: Annotated[
-        str,
-        typer.Argument(
-            metavar="MANIFEST",
-            help="Table of the vehicles: .parquet, .csv or .yaml, a path or URI. Columns: vehicle, "
-            "recording (folders, or a table of correspondences), rig, settings.",
-        ),
-    ],
-    out: Annotated[str, typer.Option(metavar="URI", help="Folder or URI for the rows.")] = "fleet",
-    engine: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME[:ADDRESS]",
-            help="Where jobs run: processes (here), ray, ray:ADDRESS, dask or dask:ADDRESS.",
-        ),
-    ] = "processes",
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Jobs at once. (default: one per core)")
-    ] = None,
-    shard: Annotated[
-        str | None,
-        typer.Option(
-            metavar="I/N",
-            help="Only part I of N, from 0; auto/N: the index of a Kubernetes, AWS Batch or Slurm "
-            "array. (default: such an array's part, else all)",
-        ),
-    ] = None,
-    timeout_s: Annotated[
-        float, typer.Option(min=0.001, metavar="SECONDS", help="Longest time of a job.")
-    ] = 3600.0,
-    memory_gb: Annotated[
-        float | None,
-        typer.Option(min=0.1, metavar="GB", help="Most memory of a job. (default: no limit)"),
-    ] = None,
-    fetch_gb: Annotated[
-        float, typer.Option(min=0.0, metavar="GB", help="Most bytes of a remote recording.")
-    ] = 50.0,
-    allow_missing: Annotated[
-        bool, typer.Option("--allow-missing", help="Missing recordings become failed rows.")
-    ] = False,
-    logs: Annotated[
-        bool, typer.Option("--logs/--no-logs", help="Keep a log per vehicle below URI/_logs.")
-    ] = True,
+    manifest: str,
+    out: str = "fleet",
+    engine: str = "processes",
+    jobs: Annotated[int | None, typer.Option(min=1)] = None,
+    shard: str | None = None,
+    timeout_s: Annotated[float, typer.Option(min=0.001)] = 3600.0,
+    memory_gb: Annotated[float | None, typer.Option(min=0.1)] = None,
+    fetch_gb: Annotated[float, typer.Option(min=0.0)] = 50.0,
+    allow_missing: bool = False,
+    logs: Annotated[bool, typer.Option("--logs/--no-logs")] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate many vehicles, each alone: a row per camera. What is finished is not done again.
 
     Exit 1 if a job failed or a camera's verdict is FAIL. Ctrl-C, a crash or a lost machine loses no
     published row: the same command goes on from there.
+
+    Args:
+        manifest (MANIFEST): Table of the vehicles: .parquet, .csv or .yaml, a path or URI. Columns:
+            vehicle, recording (folders, or a table of correspondences), rig, settings.
+        out (URI): Folder or URI for the rows.
+        engine (NAME[:ADDRESS]): Where jobs run: processes (here), ray, ray:ADDRESS, dask or
+            dask:ADDRESS.
+        jobs: Jobs at once. (default: one per core)
+        shard (I/N): Only part I of N, from 0; auto/N: the index of a Kubernetes, AWS Batch or Slurm
+            array. (default: such an array's part, else all)
+        timeout_s (SECONDS): Longest time of a job.
+        memory_gb (GB): Most memory of a job. (default: no limit)
+        fetch_gb (GB): Most bytes of a remote recording.
+        allow_missing: Missing recordings become failed rows.
+        logs: Keep a log per vehicle below URI/_logs.
     """
     import os
 
@@ -124,31 +107,19 @@ def _print(summary: Summary, out: str, *, as_json: bool) -> None:
         print_plain(terminal(), f"failed: {count} ({kind}); see the column error, and _logs")
 
 
-RowsArgument = Annotated[
-    str, typer.Argument(metavar="URI", help="What calibgraph fleet wrote: a folder or a URI.")
-]
-
-
 def fleet_report(
-    rows: RowsArgument,
-    out: Annotated[Path, typer.Option(metavar="PAGE", help="Page to write, .html.")] = Path(
-        "fleet.html"
-    ),
-    before: Annotated[
-        str | None,
-        typer.Option(
-            metavar="URI",
-            help="Earlier rows to compare with. (default: those of a week before the newest)",
-        ),
-    ] = None,
-    link: Annotated[
-        str,
-        typer.Option(
-            metavar="TEMPLATE", help="Of a vehicle's own report: vehicles/{vehicle}/report.html"
-        ),
-    ] = "",
+    rows: str,
+    out: Annotated[Path, outputs.FLEET_PAGE] = Path("fleet.html"),
+    before: str | None = None,
+    link: str = "",
 ) -> None:
-    """One page for a whole fleet: which cameras deviate, what changed, how poses are spread."""
+    """One page for a whole fleet: which cameras deviate, what changed, how poses are spread.
+
+    Args:
+        out (PAGE): Page to write, .html.
+        before (URI): Earlier rows to compare with. (default: those of a week before the newest)
+        link (TEMPLATE): Of a vehicle's own report: vehicles/{vehicle}/report.html
+    """
     from calibgraph.fleet.page import write_fleet_report
     from calibgraph.fleet.rows import read_rows
 
@@ -158,22 +129,18 @@ def fleet_report(
 
 
 def fleet_model(
-    rows: RowsArgument,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path(
-        "fleet_model"
-    ),
-    rig: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="[MODEL=]RIG",
-            help="A rig of a model of vehicle, for its lenses: a prior for its next vehicle is "
-            "written. Repeat it for further models.",
-        ),
-    ] = None,
+    rows: str,
+    out: Annotated[Path, outputs.FLEET_MODEL] = Path("fleet_model"),
+    rig: list[str] | None = None,
 ) -> None:
     """What a fleet knows: nominal rigs with spreads, improved estimates, priors for new vehicles.
 
     Writes fleet_model.json, estimates.parquet and, with --rig, prior_MODEL.yaml and one per batch.
+
+    Args:
+        out (DIR): Folder to write.
+        rig ([MODEL=]RIG): A rig of a model of vehicle, for its lenses: a prior for its next vehicle
+            is written. Repeat it for further models.
     """
     from calibgraph.fleet.model import fit_fleet
     from calibgraph.fleet.model_files import write_fleet_model

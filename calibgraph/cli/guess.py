@@ -7,54 +7,34 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calibgraph.cli import outputs
 from calibgraph.cli.arguments import bag_options_from, checked_arguments
 from calibgraph.cli.exchange import RigFilesOptions, parse_names, print_doubts
-from calibgraph.cli.option_groups import expand_groups
 from calibgraph.cli.options import JsonOption, SeedOption, TopicOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.model.rig import Rig
 
-MountOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=WORDS",
-        help="How a camera is mounted: front, front-left, left, rear-left, rear, ...; then "
-        "NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, "
-        "NUMBER m|cm ahead|behind|left|right|above|below of the LiDAR. May be repeated.",
-    ),
-]
-ForwardOption = Annotated[
-    str,
-    typer.Option(metavar="+x|-x|+y|-y", help="Axis of the LiDAR frame that points ahead; z is up."),
-]
 
-
-@expand_groups
 def guess(
     files: RigFilesOptions,
-    out: Annotated[Path, typer.Option(metavar="FILE.yaml", help="Rig file to write.")],
-    mount: MountOption = None,
-    dataset: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="DATASET",
-            help="Images and clouds: cameras without words or an extrinsic in a file are searched "
-            "for over all headings. Slower, and less sure. May be repeated.",
-        ),
-    ] = None,
-    search: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME", help="Search for this camera although a file has an extrinsic."
-        ),
-    ] = None,
-    forward: ForwardOption = "+x",
+    out: Annotated[Path, typer.Option(), outputs.rig_of("guess")],
+    mount: list[str] | None = None,
+    dataset: list[Path] | None = None,
+    search: list[str] | None = None,
+    forward: str = "+x",
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a rig to begin a calibration with, by words, a URDF or a search, and how good it is."""
+    """Write a rig to begin a calibration with, by words, a URDF or a search, and how good it is.
+
+    Args:
+        out (FILE.yaml): Rig file to write.
+        dataset (DATASET): Images and clouds: cameras without words or an extrinsic in a file are
+            searched for over all headings. Slower, and less sure. May be repeated.
+        search (NAME): Search for this camera although a file has an extrinsic.
+    """
     from calibgraph.guessing.guess import guess_rig
     from calibgraph.outputs import yaml_mark
 
@@ -80,21 +60,19 @@ def guess(
 
 
 def init(
-    dataset: Annotated[
-        Path, typer.Argument(metavar="DATASET", help="Folder with lidar/ and cameras/NAME/.")
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.yaml", help="Rig file to write. (default: DATASET/rig.yaml)"),
-    ] = None,
-    mount: MountOption = None,
-    forward: ForwardOption = "+x",
-    force: Annotated[
-        bool,
-        typer.Option("--force", help="Replace the file, and the values in it."),
-    ] = False,
+    dataset: Path,
+    out: Path | None = None,
+    mount: list[str] | None = None,
+    forward: str = "+x",
+    force: bool = False,
 ) -> None:
-    """Write a rig.yaml to fill in: the cameras and image sizes of a folder, each key explained."""
+    """Write a rig.yaml to fill in: the cameras and image sizes of a folder, each key explained.
+
+    Args:
+        dataset (DATASET): Folder with lidar/ and cameras/NAME/.
+        out (FILE.yaml): Rig file to write. (default: DATASET/rig.yaml)
+        force: Replace the file, and the values in it.
+    """
     from calibgraph.guessing.template import write_rig_template
     from calibgraph.outputs import require_outside_dataset
 
@@ -107,30 +85,22 @@ def init(
 
 
 def bag(
-    path: Annotated[
-        Path, typer.Argument(metavar="BAG", help="ROS 1 bag, or ROS 2 bag: its folder or file.")
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.yaml", help="Rig file to write: the lenses and the guess."),
-    ] = None,
+    path: Path,
+    out: Annotated[Path | None, outputs.rig_of("bag")] = None,
     topic: TopicOption = None,
-    tie_deg: Annotated[
-        float | None,
-        typer.Option(
-            min=0.001,
-            metavar="DEG",
-            help="Take the cameras' relative poses in /tf_static as measured, with this sigma per "
-            "axis; with --tie-m. (default: they are only a guess)",
-        ),
-    ] = None,
-    tie_m: Annotated[
-        float | None,
-        typer.Option(min=1e-5, metavar="M", help="The sigma in translation, per axis."),
-    ] = None,
+    tie_deg: Annotated[float | None, typer.Option(min=0.001)] = None,
+    tie_m: Annotated[float | None, typer.Option(min=1e-5)] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the topics of a ROS bag, and write its rig: camera_info and /tf_static."""
+    """List the topics of a ROS bag, and write its rig: camera_info and /tf_static.
+
+    Args:
+        path (BAG): ROS 1 bag, or ROS 2 bag: its folder or file.
+        out (FILE.yaml): Rig file to write: the lenses and the guess.
+        tie_deg (DEG): Take the cameras' relative poses in /tf_static as measured, with this sigma
+            per axis; with --tie-m. (default: they are only a guess)
+        tie_m (M): The sigma in translation, per axis.
+    """
     from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
     from calibgraph.io.formats.describe import describe_rig
     from calibgraph.model.plausibility import find_implausible

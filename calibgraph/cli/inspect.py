@@ -8,27 +8,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibgraph.cli import options
+from calibgraph.cli import options, outputs
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.option_groups import DatasetOptions, expand_groups
+from calibgraph.cli.option_groups import DatasetOptions
 from calibgraph.cli.options import JsonOption, SeedOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.model.calibration import Calibration
 
-ResultArgument = Annotated[
-    Path, typer.Argument(metavar="DIR", help="Result: its folder, or its calibration.yaml.")
-]
-MovedOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--dataset",
-        metavar="DATASET",
-        help="Where the images and clouds are now, if they have moved; repeat it for several "
-        "folders, in the order in which they were calibrated.",
-    ),
-]
+
+_MOVED = typer.Option(
+    metavar="DATASET",
+    help="Where the images and clouds are now, if they have moved; repeat it for several folders, "
+    "in the order in which they were calibrated.",
+)
 
 
 def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
@@ -45,14 +39,15 @@ def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
 
 
 def report(
-    result: ResultArgument,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Page to write. (default: DIR/report.html)"),
-    ] = None,
-    dataset: MovedOption = None,
+    result: Path,
+    out: Annotated[Path | None, outputs.PAGE] = None,
+    dataset: Annotated[list[Path] | None, _MOVED] = None,
 ) -> None:
-    """Write a result as one HTML page that opens without a network."""
+    """Write a result as one HTML page that opens without a network.
+
+    Args:
+        out (FILE): Page to write. (default: DIR/report.html)
+    """
     from calibgraph.model.result_files import REPORT_FILE
     from calibgraph.report import write_report
 
@@ -63,13 +58,17 @@ def report(
 
 
 def evaluate(
-    estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help="Rig to evaluate.")],
-    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="Rig to compare with.")],
+    estimate: Path,
+    reference: Path,
     as_json: JsonOption = False,
 ) -> None:
     """Compare an estimate with a reference: the paper's metrics, per camera and per pair.
 
     Of a reference with error bars, as `calibgraph pick` writes it, in standard deviations as well.
+
+    Args:
+        estimate (ESTIMATE): Rig to evaluate.
+        reference (REFERENCE): Rig to compare with.
     """
     from calibgraph.io.calibrations import error_bars
     from calibgraph.io.rigs import load_rig, rig_file
@@ -86,22 +85,22 @@ def evaluate(
 
 
 def perturb(
-    rig: Annotated[
-        Path, typer.Argument(metavar="RIG", help="Rig to displace, usually a reference.")
-    ],
-    out: Annotated[
-        Path, typer.Option(metavar="FILE.yaml", help="Rig file to write: the displaced guess.")
-    ],
-    rotation_deg: Annotated[float, typer.Option(min=0, help="Angle, about a random axis.")] = 20.0,
-    translation_m: Annotated[
-        float, typer.Option(min=0, help="Length, in a random direction.")
-    ] = 1.5,
+    rig: Path,
+    out: Annotated[Path, typer.Option(), outputs.rig_of("perturb")],
+    rotation_deg: Annotated[float, typer.Option(min=0)] = 20.0,
+    translation_m: Annotated[float, typer.Option(min=0)] = 1.5,
     seed: SeedOption = 0,
-    uniform: Annotated[
-        bool, typer.Option("--uniform", help="Per axis, uniform within +- the values.")
-    ] = False,
+    uniform: bool = False,
 ) -> None:
-    """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses."""
+    """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses.
+
+    Args:
+        rig (RIG): Rig to displace, usually a reference.
+        out (FILE.yaml): Rig file to write: the displaced guess.
+        rotation_deg: Angle, about a random axis.
+        translation_m: Length, in a random direction.
+        uniform: Per axis, uniform within +- the values.
+    """
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.perturbation import perturb
     from calibgraph.outputs import yaml_mark
@@ -120,17 +119,17 @@ def perturb(
 
 
 def view(
-    result: ResultArgument,
-    rerun: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.rrd", help="Recording for Rerun: `rerun FILE.rrd` shows it."),
-    ] = None,
-    mcap: Annotated[
-        Path | None, typer.Option(metavar="FILE.mcap", help="Recording for Foxglove.")
-    ] = None,
-    dataset: MovedOption = None,
+    result: Path,
+    rerun: Annotated[Path | None, outputs.RERUN] = None,
+    mcap: Annotated[Path | None, outputs.MCAP] = None,
+    dataset: Annotated[list[Path] | None, _MOVED] = None,
 ) -> None:
-    """Write a result for viewers: clouds, images and projected points, before and after."""
+    """Write a result for viewers: clouds, images and projected points, before and after.
+
+    Args:
+        rerun (FILE.rrd): Recording for Rerun: `rerun FILE.rrd` shows it.
+        mcap (FILE.mcap): Recording for Foxglove.
+    """
     from calibgraph.errors import CalibrationError
     from calibgraph.view.mcap_file import write_mcap
     from calibgraph.view.rerun_file import write_rerun
@@ -149,19 +148,17 @@ def view(
         print_plain(terminal(), f"{path}: written; the verdict is {loaded.verdict.status}")
 
 
-@expand_groups
 def doctor(
-    dataset: options.DatasetArgument,
+    dataset: list[Path],
     chosen: DatasetOptions,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", help="Folder for guess_CAMERA.png: the guess on an image of each camera."
-        ),
-    ] = None,
+    out: Annotated[Path | None, outputs.PICTURES] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""
+    """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything.
+
+    Args:
+        out (DIR): Folder for guess_CAMERA.png: the guess on an image of each camera.
+    """
     from calibgraph.doctor import diagnose
     from calibgraph.files import require_place_for_folder
     from calibgraph.io.rigs import load_rig

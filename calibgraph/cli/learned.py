@@ -5,19 +5,23 @@ from typing import Annotated, Any
 
 import typer
 
+from calibgraph.cli import outputs
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.options import ConfigSeedOption, JsonOption
 from calibgraph.cli.terminal import print_json, progress_bar, terminal
 
 
 def weights(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Weights, .tar or .safetensors.")],
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Convert to this .safetensors file.")
-    ] = None,
+    file: Path,
+    out: Annotated[Path | None, outputs.WEIGHTS] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a file of CMRNext weights, print what is in it, and convert it to safetensors."""
+    """Check a file of CMRNext weights, print what is in it, and convert it to safetensors.
+
+    Args:
+        file (FILE): Weights, .tar or .safetensors.
+        out (FILE): Convert to this .safetensors file.
+    """
     from calibgraph.matching.cmrnext import load_checkpoint
 
     checkpoint = load_checkpoint(file)
@@ -52,59 +56,36 @@ def _print_settings_option(module: str, settings: str) -> Any:
 
 
 def train(
-    dataset: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="DATASET...",
-            help="Folders with a trusted extrinsic: KITTI sequences, datasets with a "
-            "reference.yaml, or results, whose PASS cameras count; they may be of different "
-            "rigs.",
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(metavar="FILE", help="Weights to write; their settings are written beside."),
-    ],
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Settings of the training, YAML. (default: the published training's)",
-        ),
-    ] = None,
+    dataset: list[Path],
+    out: Annotated[Path, typer.Option(), outputs.TRAINING],
+    config: Path | None = None,
     print_settings: Annotated[
         bool, _print_settings_option("calibgraph.matching.cmrnext", "TrainSettings")
     ] = False,
-    held_out: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="DATASET",
-            help="Folder to validate on (up to 100 images); may be repeated. "
-            "(default: the last fifth of each DATASET)",
-        ),
-    ] = None,
-    rig: Annotated[
-        Path | None, typer.Option(metavar="RIG", help="Trusted extrinsic, instead of the folders'.")
-    ] = None,
-    start: Annotated[
-        Path | None,
-        typer.Option(
-            "--from", metavar="FILE", help="Fine-tune these weights; the network is theirs."
-        ),
-    ] = None,
-    validate_every: Annotated[
-        int, typer.Option(min=1, help="Steps between validations; each writes the weights.")
-    ] = 500,
-    device: Annotated[str, typer.Option(metavar="auto|cpu|cuda", help="Torch device.")] = "auto",
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed, instead of the settings' one.")
-    ] = None,
-    resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Continue the training that wrote FILE, with its settings."),
-    ] = False,
+    held_out: list[Path] | None = None,
+    rig: Path | None = None,
+    start: Annotated[Path | None, typer.Option("--from")] = None,
+    validate_every: Annotated[int, typer.Option(min=1)] = 500,
+    device: str = "auto",
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    resume: bool = False,
 ) -> None:
-    """Train a CMRNext network by perturbing trusted extrinsics."""
+    """Train a CMRNext network by perturbing trusted extrinsics.
+
+    Args:
+        dataset (DATASET...): Folders with a trusted extrinsic: KITTI sequences, datasets with a
+            reference.yaml, or results, whose PASS cameras count; they may be of different rigs.
+        out (FILE): Weights to write; their settings are written beside.
+        config (FILE): Settings of the training, YAML. (default: the published training's)
+        held_out (DATASET): Folder to validate on (up to 100 images); may be repeated. (default: the
+            last fifth of each DATASET)
+        rig (RIG): Trusted extrinsic, instead of the folders'.
+        start (FILE): Fine-tune these weights; the network is theirs.
+        validate_every: Steps between validations; each writes the weights.
+        device (auto|cpu|cuda): Torch device.
+        seed: Seed, instead of the settings' one.
+        resume: Continue the training that wrote FILE, with its settings.
+    """
     from calibgraph.cli.tables import print_validation
     from calibgraph.files import load_model
     from calibgraph.io.rigs import load_rig
@@ -144,44 +125,29 @@ def train(
 
 
 def train_windows(
-    recording: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RESULT...",
-            help="Results of calibrate, whose frames and PASS cameras are learned from; or KITTI "
-            "sequences or datasets with a reference.yaml.",
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="FILE.json", help="Weights to write, if recordings held out get better."
-        ),
-    ],
-    config: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Settings of the training, YAML.")
-    ] = None,
+    recording: list[Path],
+    out: Annotated[Path, typer.Option(), outputs.WINDOW_WEIGHTS],
+    config: Path | None = None,
     print_settings: Annotated[
         bool,
         _print_settings_option("calibgraph.matching.structure.training", "WindowSettings"),
     ] = False,
-    held_out: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="RESULT",
-            help="Recording that only measures whether the weights are better; may be repeated. "
-            "(default: the last fifth of each RESULT)",
-        ),
-    ] = None,
-    start: Annotated[
-        Path | None,
-        typer.Option("--from", metavar="FILE", help="Weights to begin with. (default: shipped)"),
-    ] = None,
+    held_out: list[Path] | None = None,
+    start: Annotated[Path | None, typer.Option("--from")] = None,
     seed: ConfigSeedOption = None,
 ) -> None:
     """Train the weights of the matcher structure's windows on the poses of your own recordings.
 
     If recordings held out get no better, nothing is written, and the exit code is 2.
+
+    Args:
+        recording (RESULT...): Results of calibrate, whose frames and PASS cameras are learned from;
+            or KITTI sequences or datasets with a reference.yaml.
+        out (FILE.json): Weights to write, if recordings held out get better.
+        config (FILE): Settings of the training, YAML.
+        held_out (RESULT): Recording that only measures whether the weights are better; may be
+            repeated. (default: the last fifth of each RESULT)
+        start (FILE): Weights to begin with. (default: shipped)
     """
     from calibgraph.errors import CalibrationError
     from calibgraph.files import load_model

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
-from dataclasses import MISSING, dataclass, fields, is_dataclass
-from functools import partial, wraps
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -36,34 +34,22 @@ _OF_BAGS = ("topic", "every_s", "tolerance_s", "stamps", "motion")
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetOptions:
-    """Which frames of a dataset are taken, with which rig, and how bags are read."""
+    """Which frames of a dataset are taken, with which rig, and how bags are read.
 
-    rig: options.RigOption = None
-    frames: options.FramesOption = None
+    Attributes:
+        every_s (SECONDS): One frame in this time; only its surroundings are read. (default: all
+            frames)
+        tolerance_s (SECONDS): Largest difference of the stamps of a cloud and its images. (default:
+            0.05)
+        stamps (header|record): Stamps of the sensors, or of recording. (default: header)
+    """
+
+    rig: Path | None = None
+    frames: str | None = None
     topic: options.TopicOption = None
-    every_s: Annotated[
-        float | None,
-        _bag_option(
-            min=0.001,
-            metavar="SECONDS",
-            help="One frame in this time; only its surroundings are read. (default: all frames)",
-        ),
-    ] = None
-    tolerance_s: Annotated[
-        float | None,
-        _bag_option(
-            min=0,
-            metavar="SECONDS",
-            help="Largest difference of the stamps of a cloud and its images. (default: 0.05)",
-        ),
-    ] = None
-    stamps: Annotated[
-        str | None,
-        _bag_option(
-            metavar="header|record",
-            help="Stamps of the sensors, or of recording. (default: header)",
-        ),
-    ] = None
+    every_s: Annotated[float | None, _bag_option(min=0.001)] = None
+    tolerance_s: Annotated[float | None, _bag_option(min=0)] = None
+    stamps: Annotated[str | None, _bag_option()] = None
     motion: options.MotionOption = None
 
     @property
@@ -74,89 +60,43 @@ class DatasetOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class MatchingOptions(DatasetOptions):
-    """Which frames are matched from which guess, and how."""
+    """Which frames are matched from which guess, and how.
 
-    matcher: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences."
-        ),
-    ] = "structure"
-    interval_s: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            help="Time between neighbouring clouds of a folder: the motion of the LiDAR is found "
-            "by their registration. For --estimate offset or readout. (default: unknown)",
-        ),
-    ] = None
-    time_limit_s: Annotated[
-        float | None,
-        typer.Option(
-            min=0.001,
-            metavar="SECONDS",
-            help="Stop matching after this time; a result of fewer rounds is marked as partial. "
-            "[default: 1800 with structure, else none; inf for none]",
-        ),
-    ] = None
-    search_deg: Annotated[
-        str | None,
-        _structure_option(
-            metavar="DEG|none",
-            help="Largest rotation error of the guess, per axis; none: no search, for a guess "
-            "within about 2.5 deg and 25 cm. The guess itself is tried first. (default: 20)",
-        ),
-    ] = None
-    search_m: Annotated[
-        str | None,
-        _structure_option(
-            "--search-m",
-            metavar="M|none",
-            help="Largest translation error of the guess, per axis; or none. (default: 1.5)",
-        ),
-    ] = None
-    window_weights: Annotated[
-        str | None,
-        _structure_option(
-            metavar="FILE|none",
-            help="Weights of windows of train-windows, in place of the package's; none: all "
-            "windows count alike.",
-        ),
-    ] = None
+    Attributes:
+        matcher (NAME|FILE): structure, cmrnext, or a table of correspondences.
+        interval_s (SECONDS): Time between neighbouring clouds of a folder: the motion of the LiDAR
+            is found by their registration. For --estimate offset or readout. (default: unknown)
+        time_limit_s (SECONDS): Stop matching after this time; a result of fewer rounds is marked as
+            partial. [default: 1800 with structure, else none; inf for none]
+        search_deg (DEG|none): Largest rotation error of the guess, per axis; none: no search, for a
+            guess within about 2.5 deg and 25 cm. The guess itself is tried first. (default: 20)
+        search_m (M|none): Largest translation error of the guess, per axis; or none. (default: 1.5)
+        window_weights (FILE|none): Weights of windows of train-windows, in place of the package's;
+            none: all windows count alike.
+        start_from (frame|joint): Where a network starts: at each frame's own pose by the network
+            before, or at the joint solve. (default: frame)
+        iterations: Iterations of each network's recurrent update (default: 12).
+        half_resolution: Halve the images or not (default: as stored with the weights, else from
+            1400 px width on).
+        occlusion_filter: Leave out points that nearer surfaces occlude.
+        batch: Images per batch (default: 1 on a CPU, 4 on a GPU).
+    """
+
+    matcher: str = "structure"
+    interval_s: float | None = None
+    time_limit_s: Annotated[float | None, typer.Option(min=0.001)] = None
+    search_deg: Annotated[str | None, _structure_option()] = None
+    search_m: Annotated[str | None, _structure_option()] = None
+    window_weights: Annotated[str | None, _structure_option()] = None
     weights: options.WeightsOption = None
-    start_from: Annotated[
-        str | None,
-        _cmrnext_option(
-            metavar="frame|joint",
-            help="Where a network starts: at each frame's own pose by the network before, or at "
-            "the joint solve. (default: frame)",
-        ),
-    ] = None
+    start_from: Annotated[str | None, _cmrnext_option()] = None
     device: options.DeviceOption = None
-    iterations: Annotated[
-        int | None,
-        _cmrnext_option(
-            min=1, max=1000, help="Iterations of each network's recurrent update (default: 12)."
-        ),
-    ] = None
+    iterations: Annotated[int | None, _cmrnext_option(min=1, max=1000)] = None
     half_resolution: Annotated[
-        bool | None,
-        _cmrnext_option(
-            "--half-resolution/--full-resolution",
-            help="Halve the images or not (default: as stored with the weights, else from 1400 px "
-            "width on).",
-        ),
+        bool | None, _cmrnext_option("--half-resolution/--full-resolution")
     ] = None
-    occlusion_filter: Annotated[
-        bool | None,
-        _cmrnext_option(
-            "--occlusion-filter", help="Leave out points that nearer surfaces occlude."
-        ),
-    ] = None
-    batch: Annotated[
-        int | None,
-        _cmrnext_option(min=1, help="Images per batch (default: 1 on a CPU, 4 on a GPU)."),
-    ] = None
+    occlusion_filter: Annotated[bool | None, _cmrnext_option()] = None
+    batch: Annotated[int | None, _cmrnext_option(min=1)] = None
 
     @property
     def limit_s(self) -> float | None:
@@ -178,87 +118,32 @@ class MatchingOptions(DatasetOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class SolveOptions:
-    """The settings of a solve."""
+    """The settings of a solve.
 
-    terms: Annotated[
-        str,
-        typer.Option(metavar="full|reprojection|priors|stage1", help="Terms of the objective."),
-    ] = "full"
-    preset: options.PresetOption = None
-    config: options.ConfigOption = None
+    Attributes:
+        terms (full|reprojection|priors|stage1): Terms of the objective.
+        bootstrap: Check the covariance: solve N times with frames drawn with replacement.
+        tolerance_deg (DEG): Rotation by which a PASS may be off; by default 0.5.
+        tolerance_cm (CM): Distance by which a PASS may be off; by default 10.
+        of (alignment|mount): Poses to report: where the LiDAR's points meet the images, or where
+            the sensors are mounted, less certain. (default: alignment)
+        estimate (PART,...): Estimate each camera's lens and clock too: focal, aspect, centre,
+            distortion, or lens for all but aspect; offset, readout, or clock for both. The rig may
+            state how well they are known.
+    """
+
+    terms: str = "full"
+    preset: str | None = None
+    config: Path | None = None
     seed: options.ConfigSeedOption = None
-    bootstrap: Annotated[
-        int | None,
-        typer.Option(
-            min=2,
-            max=100_000,
-            help="Check the covariance: solve N times with frames drawn with replacement.",
-        ),
-    ] = None
-    tolerance_deg: Annotated[
-        float | None,
-        typer.Option(metavar="DEG", help="Rotation by which a PASS may be off; by default 0.5."),
-    ] = None
-    tolerance_cm: Annotated[
-        float | None,
-        typer.Option(metavar="CM", help="Distance by which a PASS may be off; by default 10."),
-    ] = None
-    of: Annotated[
-        str | None,
-        typer.Option(
-            "--of",
-            metavar="alignment|mount",
-            help="Poses to report: where the LiDAR's points meet the images, or where the sensors "
-            "are mounted, less certain. (default: alignment)",
-        ),
-    ] = None
-    estimate: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PART,...",
-            help="Estimate each camera's lens and clock too: focal, aspect, centre, distortion, or "
-            "lens for all but aspect; offset, readout, or clock for both. The rig may state how "
-            "well they are known.",
-        ),
-    ] = None
+    bootstrap: Annotated[int | None, typer.Option(min=2, max=100_000)] = None
+    tolerance_deg: float | None = None
+    tolerance_cm: float | None = None
+    of: str | None = None
+    estimate: str | None = None
 
     def checked(self, **further: float | None) -> tuple[Config, Terms]:
         """The settings, with further ones of a command, and the terms of the objective."""
         given = {name: value for name, value in vars(self).items() if name != "terms"}
         config, preset = given.pop("config"), given.pop("preset")
         return config_from(config, preset, **given, **further), terms_from(self.terms)
-
-
-def expand_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """A command with the options of its groups in the place of each parameter of such a class."""
-    hints = get_type_hints(command, include_extras=True)
-    groups = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
-
-    @wraps(command)
-    def run(**values: Any) -> None:
-        for name, group in groups.items():
-            own = {field.name: values.pop(field.name) for field in fields(group)}
-            values[name] = group(**own)  # type: ignore[operator]
-        command(**values)
-
-    parameters: list[inspect.Parameter] = []
-    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
-        keyword = parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-        parameters += _options_of(groups[name]) if name in groups else [keyword]
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {each.name: each.annotation for each in parameters}
-    return run
-
-
-def _options_of(group: Any) -> list[inspect.Parameter]:
-    """A parameter per field."""
-    hints = get_type_hints(group, include_extras=True)
-    return [
-        inspect.Parameter(
-            field.name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if field.default is MISSING else field.default,
-            annotation=hints[field.name],
-        )
-        for field in fields(group)
-    ]

@@ -1,96 +1,46 @@
-"""Arguments and options that commands share, and the options of the matchers."""
+"""Options that several commands share.
+
+Args:
+    as_json: Print JSON on stdout.
+    config (FILE): Settings of the solve, YAML.
+    dataset (DATASET...): Dataset folder (rig.yaml, lidar/, cameras/NAME/), KITTI odometry sequence
+        or raw drive, nuScenes folder or scene, or ROS bag; several of one rig are calibrated
+        together.
+    device (auto|cpu|cuda): Torch device. (default: auto)
+    forward (+x|-x|+y|-y): Axis of the LiDAR frame that points ahead; z is up.
+    frames (A:B:STEP): Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7.
+        (default: all; of more than 30 the matcher structure takes 30: spread, clear ones)
+    motion (none|odometry|tf|scans): Correct clouds for the motion of the vehicle, to the stamps of
+        the images: by Odometry, /tf, or registration of neighbouring scans. (default: none)
+    mount (NAME=WORDS): How a camera is mounted: front, front-left, left, rear-left, rear, ...; then
+        NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, NUMBER
+        m|cm ahead|behind|left|right|above|below of the LiDAR. May be repeated.
+    out (DIR): Folder for the result.
+    preset (auto|kitti|walkley): Settings of the solve by name.
+    result (DIR): Result: its folder, or its calibration.yaml.
+    rig (RIG): Initial guess, instead of the dataset's own.
+    rows (URI): What calibgraph fleet wrote: a folder or a URI.
+    seed: Seed of everything random.
+    tolerance_cm (CM): Largest deviation along an axis that is OK.
+    tolerance_deg (DEG): Largest deviation about an axis that is OK.
+    topic (NAME=/TOPIC): Topic of a camera's images, of the clouds as lidar=/TOPIC, or of
+        odometry=/TOPIC; may be repeated. (default: found by the messages' types)
+    weights (FILE...): Weights of the networks, .tar or .safetensors, in the order in which they
+        run; a file may be repeated: --weights iter1.tar iter5.tar iter5.tar iter6.tar.
+"""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-RigArgument = Annotated[Path, typer.Argument(metavar="RIG", help="Rig with the initial guess.")]
-DatasetArgument = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="DATASET...",
-        help="Dataset folder (rig.yaml, lidar/, cameras/NAME/), KITTI odometry sequence or raw "
-        "drive, nuScenes folder or scene, or ROS bag; several of one rig are calibrated together.",
-    ),
-]
-RigOption = Annotated[
-    Path | None, typer.Option(metavar="RIG", help="Initial guess, instead of the dataset's own.")
-]
-CameraMatchesOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Features that cameras have in common: camera_matches.parquet of a result.",
-    ),
-]
-CMRNEXT = "Matcher cmrnext"
-WeightsOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        metavar="FILE...",
-        help="Weights of the networks, .tar or .safetensors, in the order in which they run; a "
-        "file may be repeated: --weights iter1.tar iter5.tar iter5.tar iter6.tar.",
-        rich_help_panel=CMRNEXT,
-    ),
-]
-DeviceOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="auto|cpu|cuda", help="Torch device. (default: auto)", rich_help_panel=CMRNEXT
-    ),
-]
-FramesOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="A:B:STEP",
-        help="Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7. (default: "
-        "all; of more than 30 the matcher structure takes 30: spread, clear ones)",
-    ),
-]
-BAGS = "ROS bags"
-TopicOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME=/TOPIC",
-        help="Topic of a camera's images, of the clouds as lidar=/TOPIC, or of odometry=/TOPIC; "
-        "may be repeated. "
-        "(default: found by the messages' types)",
-        rich_help_panel=BAGS,
-    ),
-]
-MotionOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="none|odometry|tf|scans",
-        help="Correct clouds for the motion of the vehicle, to the stamps of the images: by "
-        "Odometry, /tf, or registration of neighbouring scans. (default: none)",
-        rich_help_panel=BAGS,
-    ),
-]
-ConfigOption = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="Settings of the solve, YAML.")
-]
-PresetOption = Annotated[
-    str | None,
-    typer.Option(metavar="auto|kitti|walkley", help="Settings of the solve by name."),
-]
-OutOption = Annotated[Path, typer.Option(metavar="DIR", help="Folder for the result.")]
-CommonDegOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="DEG",
-        min=0,
-        help="Error per axis that all frames share, 1 sigma; 0 if none. (default: as the table "
-        "states)",
-    ),
-]
-CommonCmOption = Annotated[
-    float | None,
-    typer.Option(metavar="CM", min=0, help="Likewise, of the position."),
-]
+CMRNEXT, BAGS = "Matcher cmrnext", "ROS bags"
 _MAX_SEED = 2**31 - 1
-SeedOption = Annotated[int, typer.Option(min=0, max=_MAX_SEED, help="Seed of everything random.")]
+WeightsOption = Annotated[list[Path] | None, typer.Option(rich_help_panel=CMRNEXT)]
+DeviceOption = Annotated[str | None, typer.Option(rich_help_panel=CMRNEXT)]
+TopicOption = Annotated[list[str] | None, typer.Option(rich_help_panel=BAGS)]
+MotionOption = Annotated[str | None, typer.Option(rich_help_panel=BAGS)]
+SeedOption = Annotated[int, typer.Option(min=0, max=_MAX_SEED)]
 ConfigSeedOption = Annotated[
     int | None,
     typer.Option(
@@ -101,7 +51,7 @@ ConfigSeedOption = Annotated[
 ]
 
 
-def _require_stdout(as_json: bool) -> bool:
+def require_stdout(as_json: bool) -> bool:
     """Refuse ``--json`` to a closed stdout before the work, not after it."""
     if as_json:
         from calibgraph.report.as_json import require_stdout
@@ -110,18 +60,4 @@ def _require_stdout(as_json: bool) -> bool:
     return as_json
 
 
-PrintGraphOption = Annotated[
-    bool,
-    typer.Option(
-        "--print-graph",
-        callback=_require_stdout,
-        help="Print every factor of the graph whose optimum is the result, in place of tables.",
-    ),
-]
-GraphOption = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.dot", help="Write the graph in Graphviz's language to FILE.dot."),
-]
-JsonOption = Annotated[
-    bool, typer.Option("--json", callback=_require_stdout, help="Print JSON on stdout.")
-]
+JsonOption = Annotated[bool, typer.Option("--json", callback=require_stdout)]

@@ -1,9 +1,10 @@
 """What each command writes, and what it reads: checked before any work, in one place."""
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from calibgraph.model.result_files import MATCH, REPORT_FILE, outputs_of_result, table_mark
 from calibgraph.outputs import (
@@ -22,114 +23,100 @@ from calibgraph.outputs import (
 
 Given = Mapping[str, Any]
 """The arguments and options of a command, by name."""
-Outputs = Callable[[Given], list[Output]]
-"""The files that a command writes with given arguments."""
-
 TABLE_SUFFIXES, PAGE_SUFFIXES = (".parquet", ".csv"), (".html", ".htm")
-WRITTEN = ("out", "rerun", "mcap", "plot", "page", "graph")
-"""The options that name what a command writes."""
 
 
-def named(option: str, command: str, mark: bytes | str, *suffixes: str) -> Outputs:
-    """The file that an option of a command names, if it is given."""
+@dataclass(frozen=True)
+class Writes:
+    """In the annotation of an option: the files that the command writes by its value."""
+
+    outputs: Callable[[Any, Given], list[Output]]
+
+
+def _named(command: str, mark: bytes | str, *suffixes: str) -> Writes:
+    """The file that the option names, if it is given."""
     marks = (mark if isinstance(mark, bytes) else mark.encode(),)
-
-    def outputs(given: Given) -> list[Output]:
-        path = given[option]
-        return [] if path is None else [Output(path, command, marks, suffixes)]
-
-    return outputs
+    return Writes(lambda path, _: [] if path is None else [Output(path, command, marks, suffixes)])
 
 
-table = named("out", "match", table_mark(MATCH), *TABLE_SUFFIXES)
+def rig_of(command: str) -> Writes:
+    """The rig file of a command, if it is wanted."""
+    return Writes(lambda path, _: [] if path is None else [marked_yaml(path, command)])
+
+
+TABLE = _named("match", table_mark(MATCH), *TABLE_SUFFIXES)
 """A table of correspondences; a CSV file has no place for a mark."""
-plot_of_drift = named("plot", "drift", png_mark("drift"), ".png")
-page_of_audit = named("page", "check", AUDIT_PAGE_MARK, *PAGE_SUFFIXES)
-fleet_page = named("out", "fleet-report", PAGE_MARK, *PAGE_SUFFIXES)
-weights = named("out", "weights", WEIGHTS_MARK, ".safetensors")
-window_weights = named("out", "train-windows", WINDOW_WEIGHTS_MARK, ".json")
-_graph = named("graph", "solve --graph", DOT_MARK, ".dot")
-_rerun = named("rerun", "view", VIEW_MARK, ".rrd")
-_mcap = named("mcap", "view", VIEW_MARK, ".mcap")
+PLOT_OF_DRIFT = _named("drift", png_mark("drift"), ".png")
+PAGE_OF_AUDIT = _named("check", AUDIT_PAGE_MARK, *PAGE_SUFFIXES)
+FLEET_PAGE = _named("fleet-report", PAGE_MARK, *PAGE_SUFFIXES)
+WEIGHTS = _named("weights", WEIGHTS_MARK, ".safetensors")
+WINDOW_WEIGHTS = _named("train-windows", WINDOW_WEIGHTS_MARK, ".json")
+GRAPH = _named("solve --graph", DOT_MARK, ".dot")
+RERUN, MCAP = (_named("view", VIEW_MARK, suffix) for suffix in (".rrd", ".mcap"))
+RESULT = Writes(lambda folder, _: outputs_of_result(folder))
 
 
-def result(given: Given) -> list[Output]:
-    """The files of a result in the folder of ``--out``."""
-    return outputs_of_result(given["out"])
-
-
-def solved(given: Given) -> list[Output]:
-    """The files of a result, and its graph if that is wanted."""
-    return result(given) + _graph(given)
-
-
-def page(given: Given) -> list[Output]:
+def _page(path: Path | None, given: Given) -> list[Output]:
     """The page of a report, in the folder of the result if it is not named."""
     folder = given["result"] if given["result"].is_dir() else given["result"].parent
-    marks = (PAGE_MARK,)
-    return [Output(given["out"] or folder / REPORT_FILE, "report", marks, PAGE_SUFFIXES)]
+    return [Output(path or folder / REPORT_FILE, "report", (PAGE_MARK,), PAGE_SUFFIXES)]
 
 
-def recordings(given: Given) -> list[Output]:
-    """A result for viewers."""
-    return _rerun(given) + _mcap(given)
-
-
-def fleet_model(given: Given) -> list[Output]:
-    """The files of a fleet's model, in the folder of ``--out``."""
+def _fleet_model(folder: Path, _: Given) -> list[Output]:
     from calibgraph.fleet.model_files import outputs_of_fleet_model
 
-    return outputs_of_fleet_model(given["out"])
+    return outputs_of_fleet_model(folder)
 
 
-def exported(given: Given) -> list[Output]:
-    """A calibration in the format of another program."""
+def _exported(path: Path, given: Given) -> list[Output]:
     from calibgraph.io.formats.export import outputs_of_export
 
-    return outputs_of_export(given["out"], given["format"])
+    return outputs_of_export(path, given["format"])
 
 
-def rig_of(command: str) -> Outputs:
-    """The rig file of a command, if it is wanted."""
-    return lambda given: [] if given["out"] is None else [marked_yaml(given["out"], command)]
-
-
-def pictures(given: Given) -> list[Output]:
+def _pictures(folder: Path | None, _: Given) -> list[Output]:
     """The guess on images."""
-    found = [] if given["out"] is None else sorted(given["out"].glob("guess_*.png"))
+    found = [] if folder is None else sorted(folder.glob("guess_*.png"))
     return [Output(path, "doctor", (png_mark("doctor"),)) for path in found]
 
 
-def training(given: Given) -> list[Output]:
+def _training(path: Path, given: Given) -> list[Output]:
     """Settings beside the weights, which the library refuses to replace but with ``--resume``."""
-    path = given["out"].with_suffix(".settings.yaml")
-    return [] if given["resume"] else [marked_yaml(path, "train")]
+    beside = path.with_suffix(".settings.yaml")
+    return [] if given["resume"] else [marked_yaml(beside, "train")]
 
 
-def picked(given: Given) -> list[Output]:
-    """The session of picking and its files, in the folder of ``--out``."""
+def _picked(folder: Path, _: Given) -> list[Output]:
     from calibgraph.service.pick.reference import outputs_of_pick
 
-    return outputs_of_pick(given["out"])
+    return outputs_of_pick(folder)
 
 
-def nothing(given: Given) -> list[Output]:
-    """No file; or a new folder, which the library refuses if it holds data."""
-    return []
+PAGE, FLEET_MODEL, EXPORTED = Writes(_page), Writes(_fleet_model), Writes(_exported)
+PICTURES, TRAINING, PICKED = Writes(_pictures), Writes(_training), Writes(_picked)
 
 
-def keep_files(command: Callable[..., None], outputs: Outputs) -> Callable[..., None]:
+def writes_of(command: Callable[..., None]) -> dict[str, Writes]:
+    """By the name of an option, what it makes the command write."""
+    return {
+        name: each
+        for name, hint in get_type_hints(command, include_extras=True).items()
+        for each in getattr(hint, "__metadata__", ())
+        if isinstance(each, Writes)
+    }
+
+
+def keep_files(command: Callable[..., None]) -> Callable[..., None]:
     """A command that refuses, before any work, to replace what it reads or did not write.
 
-    Args:
-        command: a function for typer. What it reads is every path among its arguments but those in
-            ``WRITTEN``.
-        outputs: the files that it writes with given arguments.
+    What it reads is every path among its arguments but those that name what it writes.
     """
+    writes = writes_of(command)
 
     @wraps(command)
     def run(**given: Any) -> None:
-        files, read = outputs(given), [given[name] for name in given if name not in WRITTEN]
+        files = [file for name, each in writes.items() for file in each.outputs(given[name], given)]
+        read = [value for name, value in given.items() if files and name not in writes]
         require_writable(files, [path for each in read for path in _files_at(each)])
         for output in files:
             require_outside_dataset(

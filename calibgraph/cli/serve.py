@@ -6,8 +6,8 @@ from typing import Annotated, TypeVar
 
 import typer
 
+from calibgraph.cli import outputs
 from calibgraph.cli.arguments import dataset_from, require_service
-from calibgraph.cli.options import DatasetArgument, FramesOption, RigOption
 from calibgraph.cli.terminal import print_plain, terminal
 from calibgraph.errors import CalibrationError
 
@@ -16,82 +16,58 @@ _GB = 10**9
 
 
 def serve(
-    data: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder for jobs, results and trackers.")
-    ] = Path("calibgraph-service"),
-    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on.")] = 8080,
-    tokens: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Who may call, see calibgraph token. (default: anyone on this machine)",
-        ),
-    ] = None,
-    host_name: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Name the server is called by; may be repeated."),
-    ] = None,
-    root: Annotated[
-        list[str] | None,
-        typer.Option(metavar="URI", help="Folder that jobs may read from; may be repeated."),
-    ] = None,
-    database: Annotated[
-        str | None,
-        typer.Option(metavar="URL", help="postgresql+psycopg://... (default: SQLite in DIR)"),
-    ] = None,
-    jobs: Annotated[
-        int | None, typer.Option(min=0, help="Jobs at once. (default: one per core)")
-    ] = None,
-    jobs_per_tenant: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="Jobs at once of one tenant. (default: all but one, if there are several tenants)",
-        ),
-    ] = None,
-    queue: Annotated[int, typer.Option(min=0, help="Most jobs of a tenant that wait.")] = 1000,
-    timeout_s: Annotated[
-        float, typer.Option(min=0.001, metavar="SECONDS", help="Longest time of a job.")
-    ] = 3600.0,
-    memory_gb: Annotated[
-        float, typer.Option(min=0.1, metavar="GB", help="Most memory of a job.")
-    ] = 8.0,
-    upload_gb: Annotated[
-        float, typer.Option(min=0.001, metavar="GB", help="Largest upload, unpacked too.")
-    ] = 20.0,
-    fetch_gb: Annotated[
-        float, typer.Option(min=0.001, metavar="GB", help="Most bytes of a remote recording.")
-    ] = 50.0,
-    free_gb: Annotated[
-        float, typer.Option(min=0.0, metavar="GB", help="With less on the disk, refuse jobs.")
-    ] = 1.0,
-    keep_days: Annotated[
-        float, typer.Option(min=0.001, metavar="DAYS", help="How long results are kept.")
-    ] = 30.0,
-    tracker_processes: Annotated[
-        int, typer.Option(min=0, help="Processes that hold the trackers.")
-    ] = 2,
-    trackers: Annotated[int, typer.Option(min=0, help="Most trackers of a tenant.")] = 200,
-    api_docs: Annotated[
-        str,
-        typer.Option(
-            metavar="token|open|off",
-            help="Who may read /docs and /openapi.json: whoever has a token, anyone, no one.",
-        ),
-    ] = "token",
-    grace_s: Annotated[
-        float, typer.Option(min=0.001, metavar="SECONDS", help="For running jobs, at the end.")
-    ] = 10.0,
-    certificate: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="TLS certificate chain, PEM.")
-    ] = None,
-    key: Annotated[Path | None, typer.Option(metavar="FILE", help="Its private key.")] = None,
+    data: Path = Path("calibgraph-service"),
+    host: str = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535)] = 8080,
+    tokens: Path | None = None,
+    host_name: list[str] | None = None,
+    root: list[str] | None = None,
+    database: str | None = None,
+    jobs: Annotated[int | None, typer.Option(min=0)] = None,
+    jobs_per_tenant: Annotated[int | None, typer.Option(min=1)] = None,
+    queue: Annotated[int, typer.Option(min=0)] = 1000,
+    timeout_s: Annotated[float, typer.Option(min=0.001)] = 3600.0,
+    memory_gb: Annotated[float, typer.Option(min=0.1)] = 8.0,
+    upload_gb: Annotated[float, typer.Option(min=0.001)] = 20.0,
+    fetch_gb: Annotated[float, typer.Option(min=0.001)] = 50.0,
+    free_gb: Annotated[float, typer.Option(min=0.0)] = 1.0,
+    keep_days: Annotated[float, typer.Option(min=0.001)] = 30.0,
+    tracker_processes: Annotated[int, typer.Option(min=0)] = 2,
+    trackers: Annotated[int, typer.Option(min=0)] = 200,
+    api_docs: str = "token",
+    grace_s: Annotated[float, typer.Option(min=0.001)] = 10.0,
+    certificate: Path | None = None,
+    key: Path | None = None,
 ) -> None:
     """Calibrate, check and track for others, over HTTP, until stopped.
 
     Ctrl-C and SIGTERM lose nothing: jobs that run wait for the next start, as after a crash.
+
+    Args:
+        data (DIR): Folder for jobs, results and trackers.
+        host: Address to listen on.
+        port: Port to listen on.
+        tokens (FILE): Who may call, see calibgraph token. (default: anyone on this machine)
+        host_name (NAME): Name the server is called by; may be repeated.
+        root (URI): Folder that jobs may read from; may be repeated.
+        database (URL): postgresql+psycopg://... (default: SQLite in DIR)
+        jobs: Jobs at once. (default: one per core)
+        jobs_per_tenant (N): Jobs at once of one tenant. (default: all but one, if there are several
+            tenants)
+        queue: Most jobs of a tenant that wait.
+        timeout_s (SECONDS): Longest time of a job.
+        memory_gb (GB): Most memory of a job.
+        upload_gb (GB): Largest upload, unpacked too.
+        fetch_gb (GB): Most bytes of a remote recording.
+        free_gb (GB): With less on the disk, refuse jobs.
+        keep_days (DAYS): How long results are kept.
+        tracker_processes: Processes that hold the trackers.
+        trackers: Most trackers of a tenant.
+        api_docs (token|open|off): Who may read /docs and /openapi.json: whoever has a token,
+            anyone, no one.
+        grace_s (SECONDS): For running jobs, at the end.
+        certificate (FILE): TLS certificate chain, PEM.
+        key (FILE): Its private key.
     """
     require_service()
     from calibgraph.service.app import create_app
@@ -138,19 +114,17 @@ def _announce(url: str, tokens: Path | None) -> None:
 
 
 def token(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Token file; made if it is not there.")
-    ],
-    tenant: Annotated[str, typer.Option(metavar="NAME", help="Whose jobs the token sees.")],
-    scope: Annotated[
-        str,
-        typer.Option(
-            metavar="read|submit|admin",
-            help="Look; ask and cancel too; or all of it, of all tenants.",
-        ),
-    ] = "submit",
+    file: Path,
+    tenant: Annotated[str, typer.Option()],
+    scope: str = "submit",
 ) -> None:
-    """Make a token for the service and print it: the file keeps its hash only."""
+    """Make a token for the service and print it: the file keeps its hash only.
+
+    Args:
+        file (FILE): Token file; made if it is not there.
+        tenant (NAME): Whose jobs the token sees.
+        scope (read|submit|admin): Look; ask and cancel too; or all of it, of all tenants.
+    """
     from calibgraph.service.access import SCOPES, add_token
 
     print(add_token(file, tenant, _one_of(SCOPES, "--scope", scope)))
@@ -169,27 +143,22 @@ PORT = 8765
 
 
 def pick(
-    dataset: DatasetArgument,
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="DIR",
-            help="Folder of the session, which is continued if it is there, and of what it gives: "
-            "reference.yaml and picked.parquet.",
-        ),
-    ],
-    rig: RigOption = None,
-    frames: FramesOption = None,
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Of this machine; 0 for any that is free.")
-    ] = PORT,
-    show: Annotated[
-        bool, typer.Option("--show/--no-show", help="Open the page in the browser.")
-    ] = True,
+    dataset: list[Path],
+    out: Annotated[Path, typer.Option(), outputs.PICKED],
+    rig: Path | None = None,
+    frames: str | None = None,
+    port: Annotated[int, typer.Option(min=0, max=65535)] = PORT,
+    show: Annotated[bool, typer.Option("--show/--no-show")] = True,
 ) -> None:
     """Pick a reference by hand: a page on which pixels and LiDAR points are paired.
 
     The server answers this machine only. Ends with Ctrl-C; every change is saved at once.
+
+    Args:
+        out (DIR): Folder of the session, which is continued if it is there, and of what it gives:
+            reference.yaml and picked.parquet.
+        port: Of this machine; 0 for any that is free.
+        show: Open the page in the browser.
     """
     require_service()
     from calibgraph.files import require_place_for_folder

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.option_groups import expand_groups
 from calibgraph.cli.options import SeedOption
 from calibgraph.cli.terminal import progress_bar, terminal
 
@@ -26,7 +25,16 @@ _street_option = partial(typer.Option, rich_help_panel="Scenario street")
 
 @dataclass(frozen=True, kw_only=True)
 class StreetOptions:
-    """What only the scenario street has."""
+    """What only the scenario street has.
+
+    Attributes:
+        sensor_errors: Of the LiDAR: 0 for an ideal one, 1 for errors as real ones have them: beam
+            angles and widths, motion during a turn, ranges on dark surfaces. (default: 0)
+        lens_errors: Of the lenses in the rig files: 0 for exact ones, 1 for errors that a good
+            calibration with a target leaves. (default: 0)
+        vary_layout: Draw also the street's width, curves, gardens and heights by the seed;
+            otherwise all streets are laid out alike.
+    """
 
     rig: Annotated[
         str | None,
@@ -50,28 +58,9 @@ class StreetOptions:
             help=f"Mean distance between frames. (default: {STEP_M:g})",
         ),
     ] = None
-    sensor_errors: Annotated[
-        float | None,
-        _street_option(
-            help="Of the LiDAR: 0 for an ideal one, 1 for errors as real ones have them: beam "
-            "angles and widths, motion during a turn, ranges on dark surfaces. (default: 0)",
-        ),
-    ] = None
-    lens_errors: Annotated[
-        float | None,
-        _street_option(
-            help="Of the lenses in the rig files: 0 for exact ones, 1 for errors that a good "
-            "calibration with a target leaves. (default: 0)",
-        ),
-    ] = None
-    vary_layout: Annotated[
-        bool,
-        _street_option(
-            "--vary-layout",
-            help="Draw also the street's width, curves, gardens and heights by the seed; "
-            "otherwise all streets are laid out alike.",
-        ),
-    ] = False
+    sensor_errors: Annotated[float | None, _street_option()] = None
+    lens_errors: Annotated[float | None, _street_option()] = None
+    vary_layout: Annotated[bool, _street_option()] = False
     surroundings: Annotated[
         str | None,
         _street_option(
@@ -88,30 +77,27 @@ class StreetOptions:
         return {name: value for name, value in values if value is not None and value is not False}
 
 
-@expand_groups
 def simulate(
-    scenario: Annotated[
-        str,
-        typer.Argument(
-            metavar="SCENARIO",
-            help="street: a dataset of scans and images of a drive along a procedural street. "
-            "kitti, walkley, surround, fisheye: a table of correspondences, with the errors of the "
-            "paper's matcher (kitti, walkley) or in between.",
-        ),
-    ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
+    scenario: str,
+    out: Annotated[Path, typer.Option()],
     *,
-    frames: Annotated[int, typer.Option(help="Number of frames.")] = 10,
-    rotation_deg: Annotated[
-        float, typer.Option(min=0, help="Rotation error of the guess, rig.yaml.")
-    ] = 5.0,
-    translation_m: Annotated[
-        float, typer.Option(min=0, help="Translation error of the guess.")
-    ] = 0.3,
+    frames: int = 10,
+    rotation_deg: Annotated[float, typer.Option(min=0)] = 5.0,
+    translation_m: Annotated[float, typer.Option(min=0)] = 0.3,
     seed: SeedOption = 0,
     street: StreetOptions,
 ) -> None:
-    """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
+    """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml.
+
+    Args:
+        scenario (SCENARIO): street: a dataset of scans and images of a drive along a procedural
+            street. kitti, walkley, surround, fisheye: a table of correspondences, with the errors
+            of the paper's matcher (kitti, walkley) or in between.
+        out (DIR): Folder to write.
+        frames: Number of frames.
+        rotation_deg: Rotation error of the guess, rig.yaml.
+        translation_m: Translation error of the guess.
+    """
     from calibgraph.simulation.recording import simulate_street
     from calibgraph.simulation.scenarios import simulate_table
 

@@ -37,16 +37,17 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     config = result.config
     console.print(
         "off: probability of an error over "
-        f"{config.tolerance_deg:g} deg or {config.tolerance_cm:g} cm; moved: from the "
-        "guess; median: error of all matches, in pixels; inliers, matches: within the gate"
+        f"{config.tolerance_deg:g} deg or {config.tolerance_cm:g} cm, - where data for it are "
+        "missing; moved: from the guess; median: error of all matches, in pixels; inliers, "
+        "matches: within the gate"
     )
     if result.places:
         print_plain(console, describe_places(result.places))
     console.print(error_bar_table(result))
     console.print(
         f"one standard deviation of the {config.of}: scatter between frames, and the error that "
-        f"the matcher reports as common to its frames; {result.not_included}; A->B: of the "
-        "transform from A to B, in B's axes"
+        f"the matcher reports as common to its frames; {result.not_included}"
+        f"{result.verdict.images_note}; A->B: of the transform from A to B, in B's axes"
     )
     if result.lens:
         console.print(lens_table(result))
@@ -112,7 +113,7 @@ def result_table(result: Calibration) -> Table:
         table.add_row(
             escape(name),
             f"[{_COLOURS[verdict.status]}]{verdict.status}[/]",
-            "-" if verdict.error_probability is None else verdict.error_probability.percent,
+            verdict.percent,
             f"{moved.rotation_error_deg:.2f}",
             f"{moved.translation_error_cm:.1f}",
             "-" if residuals is None else f"{residuals.median_px:.2f}",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibgraph.cli import options
+from calibgraph.cli import options, outputs
 from calibgraph.cli.arguments import bag_options_from, checked_arguments, config_from, matcher_from
 from calibgraph.cli.terminal import print_plain, terminal
 
@@ -16,50 +16,17 @@ if TYPE_CHECKING:
 
 
 def track(
-    rig: options.RigArgument,
-    source: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SOURCE...",
-            help="Table of correspondences (.parquet, .csv), a growing folder of them, or - for "
-            "standard input (an Arrow IPC stream, or a JSON line per frame). With --matcher: "
-            "dataset folders, KITTI sequences or ROS bags of one rig, as one drive.",
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="DIR",
-            help="Folder for the state, the result and a picture. A state in it is resumed.",
-        ),
-    ] = Path("tracking"),
-    every: Annotated[int, typer.Option(min=1, help="Take every N-th frame only.")] = 1,
-    follow: Annotated[
-        bool, typer.Option("--follow", help="Wait for new files in the folder, until stopped.")
-    ] = False,
-    matcher: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Match the frames of a dataset: structure or cmrnext."),
-    ] = None,
-    estimate: Annotated[
-        str | None,
-        typer.Option(
-            metavar="offset",
-            help="Follow the time offset of each camera: how long after its points an image is "
-            "taken. The motion of the LiDAR must be known.",
-        ),
-    ] = None,
-    interval_s: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            help="Time between neighbouring clouds of a folder, with --matcher: the motion of the "
-            "LiDAR is found by their registration. For --estimate offset. (default: unknown)",
-        ),
-    ] = None,
+    rig: Path,
+    source: list[Path],
+    out: Annotated[Path, outputs.RESULT] = Path("tracking"),
+    every: Annotated[int, typer.Option(min=1)] = 1,
+    follow: bool = False,
+    matcher: str | None = None,
+    estimate: str | None = None,
+    interval_s: float | None = None,
     motion: options.MotionOption = None,
-    config: options.ConfigOption = None,
-    preset: options.PresetOption = None,
+    config: Path | None = None,
+    preset: str | None = None,
     seed: options.ConfigSeedOption = None,
     weights: options.WeightsOption = None,
     device: options.DeviceOption = None,
@@ -74,6 +41,21 @@ def track(
     Frames of one place (within some 20 m) share errors: name it in each line ("place") or list the
     frames of each in the table ("places"). Otherwise all are of one place, and the error bar stays
     as wide. With --matcher structure places are found from the images.
+
+    Args:
+        rig (RIG): Rig with the initial guess.
+        source (SOURCE...): Table of correspondences (.parquet, .csv), a growing folder of them, or
+            - for standard input (an Arrow IPC stream, or a JSON line per frame). With --matcher:
+            dataset folders, KITTI sequences or ROS bags of one rig, as one drive.
+        out (DIR): Folder for the state, the result and a picture. A state in it is resumed.
+        every: Take every N-th frame only.
+        follow: Wait for new files in the folder, until stopped.
+        matcher (NAME): Match the frames of a dataset: structure or cmrnext.
+        estimate (offset): Follow the time offset of each camera: how long after its points an image
+            is taken. The motion of the LiDAR must be known.
+        interval_s (SECONDS): Time between neighbouring clouds of a folder, with --matcher: the
+            motion of the LiDAR is found by their registration. For --estimate offset. (default:
+            unknown)
     """
     from calibgraph.cli.tables import print_result
     from calibgraph.io.rigs import load_rig

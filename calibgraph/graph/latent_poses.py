@@ -53,7 +53,6 @@ from calibgraph.graph.variables import (
 )
 from calibgraph.model.config import Reported
 from factors import (
-    biased_between_factor,
     displaced_between_factor,
     placed_pair_factor,
     robust_noise,
@@ -258,7 +257,7 @@ def _displaced(
     noise = _noise(covariance)
     if not model.is_distorted:
         return gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), noise)
-    return biased_between_factor(edge[0], DISTORTION, edge[1], jacobian, noise)
+    return displaced_between_factor(*edge, {DISTORTION: jacobian}, noise)
 
 
 def _distortion_graph(parts: VarianceComponents) -> gtsam.NonlinearFactorGraph:

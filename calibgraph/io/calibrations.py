@@ -46,6 +46,7 @@ def load_calibration(path: Path | str) -> Calibration:
         raise FileError(
             path, f"has format {content.get('format')!r}, expected {CALIBRATION_FORMAT}"
         )
+    _require_whole(content, path)
     parts = checked_model(_Parts, content, path)
     found = Calibration(
         rig=checked_model(Rig, parts.rig, path),
@@ -277,8 +278,19 @@ def error_bars(path: Path) -> dict[str, Array | None] | None:
     }
 
 
+def _require_whole(content: Mapping[str, Any], path: Path) -> None:
+    """Refuse a result of which the last keys are missing."""
+    missing = [key for key in ("rig", "versions") if key not in content]
+    if missing:
+        raise FileError(
+            path,
+            f"is a part of a result: it ends with the key {list(content)[-1]!r}, and "
+            f"{' and '.join(map(repr, missing))} should follow; if it was cut off, copy it again, "
+            "else calibrate again",
+        )
+
+
 def rig_of_calibration(content: Mapping[str, Any], path: Path) -> Rig:
     """The calibrated rig in the content of a result file."""
-    if "rig" not in content:
-        raise FileError(path, "is a result without a rig; write it again")
+    _require_whole(content, path)
     return checked_model(Rig, content["rig"], path)

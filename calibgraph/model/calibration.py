@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.files import sha256, write_yaml
+from calibgraph.files import sha256, write_yaml, written_together
 from calibgraph.model import geometry, result_files
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
@@ -216,7 +216,7 @@ class Calibration:
     def save(self, folder: Path | str) -> Path:
         """Write ``calibration.yaml``, and tables of the matches if there are any, into a folder.
 
-        Each file appears whole or not at all. Returns the path of the YAML file.
+        They appear together or not at all. Returns the path of the YAML file.
 
         Raises:
             FileError: if a file of these names is there that is not of a result.
@@ -227,21 +227,22 @@ class Calibration:
             result_files.CORRESPONDENCES_FILE: self.correspondences,
             result_files.CAMERA_MATCHES_FILE: self.camera_matches,
         }
-        hashes = {
-            f"{Path(name).stem}_sha256": self._save_table(table, path.with_name(name))
-            for name, table in tables.items()
-        }
-        write_yaml(path, {**self._to_mapping(), **hashes})
+        with written_together(path.parent) as new:
+            content = self._to_mapping()
+            for name, table in tables.items():
+                content[f"{Path(name).stem}_sha256"] = self._save_table(table, new / name)
+            write_yaml(new / path.name, content)
+        for name in (name for name, table in tables.items() if table is None):
+            path.with_name(name).unlink(missing_ok=True)  # of an older result
         return path
 
     def _save_table(self, table: Correspondences | CameraMatches | None, path: Path) -> str | None:
-        """Write a table, marked with the verdict, or remove an older result's; its SHA-256."""
+        """Write a table, marked with the verdict; its SHA-256."""
         if table is None:
-            path.unlink(missing_ok=True)
             return None
         status, written = result_files.VERDICT_KEY, result_files.WRITTEN_KEY
-        marks: dict[str, str] = {status: self.verdict.status, written: result_files.RESULT}
-        replace(table, metadata={**table.metadata, **marks}).save(path)
+        marks = {status: self.verdict.status, written: result_files.RESULT}
+        replace(table, metadata=table.metadata | marks).save(path)
         return sha256(path)
 
     def __repr__(self) -> str:

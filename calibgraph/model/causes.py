@@ -138,7 +138,8 @@ CAUSES: dict[str, Cause] = {
     ),
     "error bar": Cause(
         "an error bar that is wide beside the tolerance", "",
-        {"sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE},
+        {"sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE,
+         "beyond_tolerance": _STRUCTURE},
     ),
     "other": Cause("a check of another version", ""),
 }

@@ -274,7 +274,7 @@ def _optional(values: ArrayLike | None, dtype: type) -> Any:
 
 
 def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
-    """Concatenate tables; the first gives the metadata, but for findings of different searches.
+    """Concatenate tables; the first gives the metadata, but for findings that differ.
 
     Raises:
         ValueError: if there are none.
@@ -296,5 +296,5 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
         given = [getattr(table, name) for table in tables if len(table)]
         if given and all(column is not None for column in given):
             columns[name] = np.concatenate(given)
-    metadata = joined_metadata([table.metadata for table in tables])
-    return Correspondences(cameras=names, metadata=metadata, **columns)
+    known = [table.metadata for table in tables if len(table) or table.metadata] or [{}]
+    return Correspondences(cameras=names, metadata=joined_metadata(known), **columns)

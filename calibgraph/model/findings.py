@@ -14,6 +14,8 @@ _FINITE = ("z_score", "found", "missed", "chance")
 _OF_ONE_SEARCH = ("found", "missed", "chance")
 _PER_CAMERA = (*_FINITE, "start_dependence", "memorization", "failed_share")
 _FORMER_KEYS = {"contrast": "z_score", "recall": "memorization"}
+IMAGES = "images"
+"""Key of what the images said of a result; its content is of ``calibgraph.trust.image_record``."""
 STAGE1, _SOURCES = "stage1", ("pnp", "rig")
 _NUMBERS = {
     "range_rotation_deg": 180.0,
@@ -139,18 +141,35 @@ class MatcherFindings:
 
 
 def joined_metadata(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The metadata of joined tables, by theirs: the first, with what all searches found.
+    """The metadata of joined tables, by theirs: the first, with what holds for all.
 
-    Where searches differ, only the cameras that one has missed remain of them, at their lowest.
+    A common error is stated if all tables state it, as the largest. Where searches differ, only the
+    cameras that one has missed remain of them, at their lowest. What images said is of one result,
+    and of tables that share it.
     """
+    joined = dict(tables[0])
+    if any(one.get(IMAGES) != joined.get(IMAGES) for one in tables):
+        joined.pop(IMAGES, None)
+    for key in _COMMON:
+        stated = [one.get(key) for one in tables]
+        if None in stated:
+            joined.pop(key, None)
+        else:
+            joined[key] = max(stated, key=_size)
     searches = [{key: one.get(key) or {} for key in _OF_ONE_SEARCH} for one in tables]
     if all(one == searches[0] for one in searches):
-        return dict(tables[0])
+        return joined
     missed: dict[str, float] = {}
     for camera, z_score in (item for one in searches for item in one["missed"].items()):
         missed[camera] = min(z_score, missed.get(camera, z_score))
-    kept = {key: value for key, value in tables[0].items() if key not in _OF_ONE_SEARCH}
+    kept = {key: value for key, value in joined.items() if key not in _OF_ONE_SEARCH}
     return kept | ({"missed": missed} if missed else {})
+
+
+def _size(value: Any) -> float:
+    """Infinite for what is no number, so that it is kept, and refused when it is read."""
+    number = _to_float(value)
+    return number if isinstance(number, float) else math.inf
 
 
 def _prior_of(matcher: object) -> dict[str, float]:

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from calibgraph.arrays import Array
 from calibgraph.model.rig import Camera
-
-_DIRECTIONS = 20_000  # of a sphere, 2 degrees apart, to begin with
-_STEPS, _CONVERGED_PX = 20, 1e-3
-_GOLDEN = (1.0 + 5.0**0.5) / 2.0
+from factors import unproject
 
 
 def has_other_lens(camera: Camera, other: Camera) -> bool:
@@ -44,41 +40,13 @@ def lens_difference(camera: Camera, other: Camera, pixels_px: Array) -> Array:
     Returns:
         (n, 2) pixels of the other lens less these; NaN where a lens has no such ray.
     """
-    seen, valid = other.lens.project(np.nan_to_num(rays := rays_of(camera, pixels_px)))
-    known = valid & np.isfinite(rays).all(axis=1)
+    rays, known = unproject(camera.lens, pixels_px)
+    seen, valid = other.lens.project(rays)
+    known &= valid
     return np.asarray(np.where(known[:, None], other.lens.subtract(seen, pixels_px), np.nan))
-
-
-def rays_of(camera: Camera, pixels_px: Array) -> Array:
-    """(n, 3) unit vectors in the camera frame of (n, 2) pixels; NaN where the lens has none.
-
-    Gauss-Newton from the nearest of many directions, so any model of a lens will do.
-    """
-    lens, directions = camera.lens, _sphere()
-    starts, valid = lens.project(directions)
-    if not valid.any():
-        return np.full((len(pixels_px), 3), np.nan)
-    rays = directions[valid][KDTree(starts[valid]).query(pixels_px)[1]]
-    for _ in range(_STEPS):
-        seen, by_point = lens.project_with_jacobian(rays)
-        # The derivative along a ray is zero, so the least squares step is across it.
-        step = np.linalg.pinv(by_point) @ lens.subtract(pixels_px.copy(), seen)[:, :, None]
-        rays = rays + step[:, :, 0]
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    seen, valid = lens.project(rays)
-    found = valid & (np.abs(lens.subtract(seen, pixels_px)).max(axis=1) < _CONVERGED_PX)
-    return np.asarray(np.where(found[:, None], rays, np.nan))
 
 
 def corners_of(camera: Camera) -> Array:
     """(4, 2) the pixels in the corners of the image."""
     right, bottom = camera.width_px - 1.0, camera.height_px - 1.0
     return np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
-
-
-def _sphere() -> Array:
-    """(n, 3) unit vectors, evenly spread along a spiral."""
-    number = np.arange(_DIRECTIONS) + 0.5
-    z, angle = 1.0 - 2.0 * number / _DIRECTIONS, 2.0 * np.pi * number / _GOLDEN
-    across = np.sqrt(1.0 - z * z)
-    return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])

@@ -82,7 +82,7 @@ def summarize(
     sources: Mapping[str, ErrorSources] | None = None,
 ) -> Summary:
     """The verdict of a rig, or of one camera, in few words."""
-    of_rig, known = rig_verdict(verdicts), sources or {}
+    of_rig, known = rig_verdict(verdicts, named=False), sources or {}
     tolerance = (
         TOLERANCE if of_rig.error_probability is None else of_rig.error_probability.tolerance
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 Status = Literal["PASS", "WARN", "FAIL"]
@@ -19,6 +20,7 @@ COMMON_ERROR = "common_error"
 ABOUT_THE_DATA = frozenset(
     {
         COMMON_ERROR,
+        "beyond_tolerance",
         "correspondences",
         "correspondences_used",
         "difference between even and odd frames",  # too few frames to split
@@ -41,7 +43,7 @@ and keeps from a PASS, since the same posterior cannot vouch for it."""
 FLAT_EVIDENCE = "flat_evidence"
 """Kind of the check that compares the error bars by images and by matches. The wider one is in the
 result, so that the check itself changes no verdict."""
-_SURE = 0.99
+_SURE, _LEAST = 0.99, 0.001  # beyond these, probabilities are not known
 
 
 @dataclass(frozen=True)
@@ -124,17 +126,20 @@ class ErrorProbability:
         by_error_bar: that its error bar allows more than the tolerance.
         tolerance_deg: of the rotation.
         tolerance_cm: of the position.
+        bar_reliability: by which the second counts: it held so far in cases with a known truth.
     """
 
     by_checks: float
     by_error_bar: float = 0.0
     tolerance_deg: float = TOLERANCE[0]
     tolerance_cm: float = TOLERANCE[1]
+    bar_reliability: float = 1.0
 
     @property
     def probability(self) -> float:
         """The probability of either."""
-        return 1.0 - (1.0 - self.by_checks) * (1.0 - self.by_error_bar)
+        of_bar = self.bar_reliability * self.by_error_bar
+        return 1.0 - (1.0 - self.by_checks) * (1.0 - of_bar)
 
     @property
     def status(self) -> Status:
@@ -146,6 +151,8 @@ class ErrorProbability:
         """The probability in percent, with its unit."""
         if self.probability > _SURE:
             return f"over {_SURE:.0%}"
+        if self.probability < _LEAST:
+            return f"<{_LEAST:.1%}"
         if self.probability < 1 - _SURE:
             return f"{100 * self.probability:.1f}%"
         return f"{100 * self.probability:.2g}%"
@@ -193,21 +200,34 @@ class Verdict:
     error_probability: ErrorProbability | None = None
     cameras: tuple[Verdict, ...] = ()
 
-    @property
+    @cached_property
     def status(self) -> Status:
         """That of the probability; a check that data are missing, or a FAIL, turns PASS into WARN.
 
         Without a probability, the worst status of the checks; PASS without any.
         """
-        worst: Status = max(
-            (check.status for check in self.checks), key=_ORDER.index, default="PASS"
-        )
+        statuses = (c.status for c in self.checks if c.kind != FLAT_EVIDENCE)
+        worst: Status = max(statuses, key=_ORDER.index, default="PASS")
         if self.error_probability is None:
             return worst
         unmeasured = not self._kinds_beyond.isdisjoint(ABOUT_THE_DATA)
         if self.error_probability.status == "PASS" and (unmeasured or worst == "FAIL"):
             return "WARN"
         return self.error_probability.status
+
+    @property
+    def images_note(self) -> str:
+        """A clause on error bars that no images have tested; empty if they have."""
+        if any(check.kind == FLAT_EVIDENCE for check in self.checks):
+            return ""
+        return "; no images tested it: where they are flat, as over grass, errors can be larger"
+
+    @property
+    def percent(self) -> str:
+        """The probability that it is off; "-" without one, or where data for one are missing."""
+        found = self.error_probability
+        known = found is not None and (found.status, self.status) != ("PASS", "WARN")
+        return found.percent if found and known else "-"
 
     @property
     def _kinds_beyond(self) -> set[str]:
@@ -252,10 +272,15 @@ class Verdict:
         }
 
 
-def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
-    """The verdict of a rig: its worst camera's, with the checks of all, by their names."""
+def rig_verdict(cameras: Mapping[str, Verdict], *, named: bool = True) -> Verdict:
+    """The verdict of a rig: its worst camera's, with the checks of all, by their names.
+
+    Args:
+        cameras: the verdicts of its cameras.
+        named: let the text of a check begin with the name of its camera.
+    """
     checks = tuple(
-        replace(check, text=f"{name}: {check.text}")
+        replace(check, text=f"{name}: {check.text}") if named else check
         for name, verdict in cameras.items()
         for check in verdict.checks
     )

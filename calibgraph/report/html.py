@@ -5,7 +5,7 @@ from pathlib import Path
 
 import yaml
 
-from calibgraph.files import write_text
+from calibgraph.files import write_text, written_together
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
@@ -14,10 +14,10 @@ from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
     CAMERA_MATCHES_FILE,
     CORRESPONDENCES_FILE,
-    OVERLAYS,
     REPORT_FILE,
     outputs_of_result,
 )
+from calibgraph.outputs import require_writable
 from calibgraph.report.camera_section import camera_section
 from calibgraph.report.frames import recording_name
 from calibgraph.report.kit import load_template
@@ -102,22 +102,28 @@ def _export_command(result: Calibration) -> str:
 def write_result(
     result: Calibration, folder: Path, data: Dataset | None = None, *, with_report: bool = True
 ) -> list[Path]:
-    """Write a result: of images with an overlay picture per camera.
+    """Write a result in place of an older one: of images with an overlay picture per camera.
+
+    All files appear together or, after an error, none.
 
     Returns:
         The files to name to the user.
     """
-    stale = [output.path for output in outputs_of_result(folder) if output.is_ours]
-    written = [result.save(folder)]
-    if data is not None:
-        middle = data.frames[len(data.frames) // 2]
-        mark = "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
-        if result.camera_matches is not None:
-            written.append(folder / CAMERA_MATCHES_FILE)
-        written.insert(1, folder / CORRESPONDENCES_FILE)
-        written += write_overlays(middle, result.initial_rig, result.rig, folder, mark=mark)
-    if with_report:
-        written.append(write_report(result, folder / REPORT_FILE))
-    for path in {path for path in stale if path.match(OVERLAYS)} - {*written}:
-        path.unlink()  # of a camera that this result does not have
-    return written
+    outputs = outputs_of_result(folder)
+    require_writable(outputs)
+    stale = [output.path for output in outputs if output.is_ours]
+    with written_together(folder) as new:
+        written = [result.save(new)]
+        if data is not None:
+            middle = data.frames[len(data.frames) // 2]
+            mark = "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
+            if result.camera_matches is not None:
+                written.append(new / CAMERA_MATCHES_FILE)
+            written.insert(1, new / CORRESPONDENCES_FILE)
+            written += write_overlays(middle, result.initial_rig, result.rig, new, mark=mark)
+        if with_report:
+            written.append(write_report(result, new / REPORT_FILE))
+        names = {path.name for path in new.iterdir()}
+    for path in (path for path in stale if path.name not in names):
+        path.unlink(missing_ok=True)  # of the result that this one replaces
+    return [folder / path.name for path in written]

@@ -3,15 +3,16 @@
 import secrets
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Engine, RowMapping, bindparam, func, select
+import sqlalchemy as sa
+from sqlalchemy import func, select
 from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Mapped, mapped_column, sessionmaker
 
 from calibgraph.fleet.task import ErrorKind
 from calibgraph.service.access import Caller
-from calibgraph.service.database import jobs
+from calibgraph.service.database import NUMBER, Base
 from calibgraph.service.requests import Job, JobKind
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
@@ -19,49 +20,35 @@ FINISHED: tuple[JobState, ...] = ("succeeded", "failed", "cancelled")
 MOST_STARTS = 20
 """A job during which the process or the server ended so often is not started again."""
 
-_SHORT = [c for c in jobs.c if c.name not in ("request", "digest")]
 
-# Statements of every job, built once: building one takes as long as running it.
-_ADD = jobs.insert().returning(*_SHORT)
-_BY_ID = select(*_SHORT).where(jobs.c.id == bindparam("id"))
-_COUNT = select(func.count()).select_from(jobs).where(jobs.c.state == bindparam("wanted"))
-_COUNT_OF_TENANT = _COUNT.where(jobs.c.tenant == bindparam("whose"))
-_RUNNING = (
-    select(jobs.c.tenant, func.count()).where(jobs.c.state == "running").group_by(jobs.c.tenant)
-)
-_WAIT_LONGEST = (
-    select(jobs.c.tenant, func.min(jobs.c.number))
-    .where(jobs.c.state == "queued")
-    .group_by(jobs.c.tenant)
-)
-_START = (
-    jobs.update()
-    .where((jobs.c.number == bindparam("next")) & (jobs.c.state == "queued"))
-    .values(state="running", started_s=bindparam("now_s"), starts=jobs.c.starts + 1)
-    .returning(*_SHORT)
-)
+class JobRecord(Base):
+    """A job; times are seconds since 1970, None if not yet."""
 
+    __tablename__ = "jobs"
+    __table_args__ = (
+        sa.UniqueConstraint("tenant", "idempotency_key"),
+        sa.Index("jobs_by_state", "state", "tenant", "number"),
+        sa.Index("jobs_by_tenant", "tenant", "number"),
+    )
 
-@dataclass(frozen=True)
-class JobRecord:
-    """A job, as the table holds it; times are seconds since 1970, None if not yet."""
-
-    number: int
-    id: str
-    tenant: str
-    kind: JobKind
-    state: JobState
-    created_s: float
-    started_s: float | None
-    finished_s: float | None
-    starts: int
-    verdict: str | None
-    cannot_tell: bool | None
-    error_kind: ErrorKind | None
-    error: str | None
-    idempotency_key: str | None = None
-    name: str | None = None
-    note: str | None = None
+    number: Mapped[int] = mapped_column(NUMBER, primary_key=True)
+    id: Mapped[str] = mapped_column(sa.String(64), unique=True)
+    tenant: Mapped[str] = mapped_column(sa.String(64))
+    kind: Mapped[JobKind] = mapped_column(sa.String(16))
+    state: Mapped[JobState] = mapped_column(sa.String(16))
+    request: Mapped[str] = mapped_column(sa.Text, deferred=True)
+    digest: Mapped[str] = mapped_column(sa.String(64), deferred=True)
+    idempotency_key: Mapped[str | None] = mapped_column(sa.String(255))
+    created_s: Mapped[float]
+    started_s: Mapped[float | None]
+    finished_s: Mapped[float | None]
+    starts: Mapped[int]
+    verdict: Mapped[str | None] = mapped_column(sa.String(16))
+    cannot_tell: Mapped[bool | None]
+    error_kind: Mapped[ErrorKind | None] = mapped_column(sa.String(16))
+    error: Mapped[str | None] = mapped_column(sa.Text)
+    name: Mapped[str | None] = mapped_column(sa.String(100))
+    note: Mapped[str | None] = mapped_column(sa.Text)
 
     @property
     def title(self) -> str:
@@ -86,8 +73,11 @@ class JobRecord:
         return self.state in FINISHED
 
 
-def _record(row: RowMapping) -> JobRecord:
-    return JobRecord(**{name: row[name] for name in JobRecord.__dataclass_fields__})
+_BY_TENANT = select(JobRecord.tenant).group_by(JobRecord.tenant)
+_RUNNING = _BY_TENANT.add_columns(func.count()).where(JobRecord.state == "running")
+_WAIT_LONGEST = _BY_TENANT.add_columns(func.min(JobRecord.number)).where(
+    JobRecord.state == "queued"
+)
 
 
 def new_id() -> str:
@@ -102,67 +92,68 @@ class OtherRequestError(Exception):
 class JobTable:
     """The jobs of a server."""
 
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
+    def __init__(self, engine: sa.Engine) -> None:
+        self._engine, self._sessions = engine, sessionmaker(engine, expire_on_commit=False)
         self._last_start: dict[str, int] = {}  # of each tenant, in the order of all starts
 
     def add(self, id: str, tenant: str, job: Job, digest: str, *, key: str | None) -> JobRecord:
         """Add a job; it is durable when this returns. A known idempotency key returns its job."""
-        values = {
-            "id": id, "tenant": tenant, "kind": job.kind, "state": "queued",
-            "request": job.model_dump_json(), "digest": digest, "idempotency_key": key,
-            "created_s": time.time(), "starts": 0, "name": job.name, "note": job.note,
-        }  # fmt: skip
+        record = JobRecord(
+            id=id, tenant=tenant, kind=job.kind, state="queued", request=job.model_dump_json(),
+            digest=digest, idempotency_key=key, created_s=time.time(), starts=0, name=job.name,
+            note=job.note,
+        )  # fmt: skip
         try:
-            with self._engine.begin() as connection:
-                return _record(connection.execute(_ADD, values).mappings().one())
+            with self._sessions.begin() as session:
+                session.add(record)
         except IntegrityError:
             known = self.known(tenant, key, digest)
             if known is None:
                 raise
             return known
+        return record
 
     def known(self, tenant: str, key: str | None, digest: str | None = None) -> JobRecord | None:
         """The job that a request with an idempotency key made before."""
         if key is None:
             return None
-        where = (jobs.c.tenant == tenant) & (jobs.c.idempotency_key == key)
-        with self._engine.connect() as connection:
-            row = connection.execute(select(jobs).where(where)).mappings().first()
-        if row is not None and digest is not None and row["digest"] != digest:
-            raise OtherRequestError
-        return None if row is None else _record(row)
+        with self._sessions() as session:
+            query = select(JobRecord).filter_by(tenant=tenant, idempotency_key=key)
+            found = session.scalar(query)
+            if found is not None and digest is not None and found.digest != digest:
+                raise OtherRequestError
+        return found
 
     def get(self, id: str, caller: Caller | None = None) -> JobRecord | None:
         """A job; None if there is none that the caller sees."""
-        with self._engine.connect() as connection:
-            row = connection.execute(_BY_ID, {"id": id}).mappings().first()
-        if row is None or (caller is not None and not caller.sees(row["tenant"])):
-            return None
-        return _record(row)
+        with self._sessions() as session:
+            found = session.scalar(select(JobRecord).filter_by(id=id))
+        sees = found is None or caller is None or caller.sees(found.tenant)
+        return found if sees else None
 
     def request(self, id: str) -> Job:
         """What a job was asked for."""
-        with self._engine.connect() as connection:
-            text = connection.execute(select(jobs.c.request).where(jobs.c.id == id)).scalar_one()
+        with self._sessions() as session:
+            text = session.scalars(select(JobRecord.request).filter_by(id=id)).one()
         return Job.model_validate_json(text)
 
     def newest(self, caller: Caller, most: int, before: int | None = None) -> list[JobRecord]:
         """The newest jobs that a caller sees, before a number."""
-        query = select(*_SHORT).order_by(jobs.c.number.desc()).limit(most)
+        query = select(JobRecord).order_by(JobRecord.number.desc()).limit(most)
         if caller.scope != "admin":
-            query = query.where(jobs.c.tenant == caller.tenant)
+            query = query.filter_by(tenant=caller.tenant)
         if before is not None:
-            query = query.where(jobs.c.number < before)
-        with self._engine.connect() as connection:
-            return [_record(row) for row in connection.execute(query).mappings()]
+            query = query.where(JobRecord.number < before)
+        with self._sessions() as session:
+            return [*session.scalars(query)]
 
     def count(self, state: JobState, tenant: str | None = None) -> int:
         """How many jobs, of all tenants or of one, are in a state."""
-        query = _COUNT if tenant is None else _COUNT_OF_TENANT
-        values = {"wanted": state} | ({} if tenant is None else {"whose": tenant})
-        with self._engine.connect() as connection:
-            return int(connection.execute(query, values).scalar_one())
+        query = select(func.count(JobRecord.number)).where(JobRecord.state == state)
+        if tenant is not None:
+            query = query.where(JobRecord.tenant == tenant)
+        with self._sessions() as session:
+            return session.scalar(query) or 0
 
     def start_next(self, most_running: int | None = None) -> JobRecord | None:
         """Take the next job; None if there is none. One thread at a time.
@@ -171,24 +162,30 @@ class JobTable:
         start is the longest ago. Of a tenant the job that has waited longest is next.
         """
         while (number := self._next(most_running)) is not None:
-            with self._engine.begin() as connection:
-                values = {"next": number, "now_s": time.time()}
-                row = connection.execute(_START, values).mappings().first()
-            if row is not None:  # it was not cancelled meanwhile
+            start = (
+                sa.update(JobRecord)
+                .where((JobRecord.number == number) & (JobRecord.state == "queued"))
+                .values(state="running", started_s=time.time(), starts=JobRecord.starts + 1)
+                .returning(JobRecord)
+                .execution_options(synchronize_session=False)
+            )
+            with self._sessions.begin() as session:
+                record = session.scalar(start)
+            if record is not None:  # it was not cancelled meanwhile
                 starts = max(self._last_start.values(), default=0)
-                self._last_start[row["tenant"]] = starts + 1
-                return _record(row)
+                self._last_start[record.tenant] = starts + 1
+                return record
         return None
 
     def _next(self, most_running: int | None) -> int | None:
         """The number of the next job."""
         with self._engine.connect() as connection:
-            running = {tenant: count for tenant, count in connection.execute(_RUNNING)}
-            waiting = [(tenant, number) for tenant, number in connection.execute(_WAIT_LONGEST)]
+            running = {each: count for each, count in connection.execute(_RUNNING)}
+            waiting = [(each, number) for each, number in connection.execute(_WAIT_LONGEST)]
         turns = [
-            (running.get(tenant, 0), self._last_start.get(tenant, 0), number)
-            for tenant, number in waiting
-            if most_running is None or running.get(tenant, 0) < most_running
+            (running.get(each, 0), self._last_start.get(each, 0), number)
+            for each, number in waiting
+            if most_running is None or running.get(each, 0) < most_running
         ]
         return min(turns)[-1] if turns else None
 
@@ -216,10 +213,10 @@ class JobTable:
 
     def put_back(self, id: str | None = None) -> int:
         """Let a running job, or all, wait again, and count them; those started too often fail."""
-        which = jobs.c.state == "running" if id is None else _is(id, "running")
+        which = JobRecord.state == "running" if id is None else _is(id, "running")
         text = f"its process or the server ended {MOST_STARTS} times while it ran"
         self._change(
-            which & (jobs.c.starts >= MOST_STARTS),
+            which & (JobRecord.starts >= MOST_STARTS),
             {"state": "failed", "error_kind": "worker died", "error": text,
              "finished_s": time.time()},
         )  # fmt: skip
@@ -227,26 +224,27 @@ class JobTable:
 
     def finished_before(self, time_s: float) -> list[str]:
         """Ids of the jobs that ended before a time."""
-        where = jobs.c.state.in_(FINISHED) & (jobs.c.finished_s < time_s)
-        with self._engine.connect() as connection:
-            return list(connection.execute(select(jobs.c.id).where(where)).scalars())
+        ended = JobRecord.state.in_(FINISHED) & (JobRecord.finished_s < time_s)
+        with self._sessions() as session:
+            return [*session.scalars(select(JobRecord.id).where(ended))]
 
     def remove(self, ids: Iterable[str]) -> None:
         """Forget jobs."""
-        with self._engine.begin() as connection:
+        with self._sessions.begin() as session:
             for id in ids:
-                connection.execute(jobs.delete().where(jobs.c.id == id))
+                session.execute(sa.delete(JobRecord).filter_by(id=id))
 
     def states(self) -> dict[str, JobState]:
         """The states of all jobs, by their ids."""
-        with self._engine.connect() as connection:
-            rows = connection.execute(select(jobs.c.id, jobs.c.state))
-            return {id: state for id, state in rows}
+        with self._sessions() as session:
+            return {
+                id: state for id, state in session.execute(select(JobRecord.id, JobRecord.state))
+            }
 
-    def _change(self, where: ColumnElement[bool], values: dict[str, Any]) -> int:
+    def _change(self, where: sa.ColumnElement[bool], values: dict[str, Any]) -> int:
         with self._engine.begin() as connection:
-            return connection.execute(jobs.update().where(where).values(values)).rowcount
+            return connection.execute(sa.update(JobRecord).where(where).values(values)).rowcount
 
 
-def _is(id: str, *states: JobState) -> ColumnElement[bool]:
-    return (jobs.c.id == id) & jobs.c.state.in_(states)
+def _is(id: str, *states: JobState) -> sa.ColumnElement[bool]:
+    return (JobRecord.id == id) & JobRecord.state.in_(states)

@@ -13,7 +13,6 @@ from calibgraph.service.places import Root
 from calibgraph.service.settings import Settings
 
 JobKind = Literal["calibration", "solve", "check"]
-KINDS: tuple[JobKind, ...] = ("calibration", "solve", "check")
 
 MAX_RECORDINGS = 100
 Uri = Annotated[str, StringConstraints(min_length=1, max_length=2000)]
@@ -155,22 +154,18 @@ RIG, TABLE, RECORDING = "rig", "correspondences", "recording"
 ABOUT = ("name", "note")
 """Names of texts for people."""
 
+_INPUTS = {"recordings": RECORDING, "rig": RIG, "correspondences": TABLE}
 ALLOWED: Mapping[JobKind, tuple[str, ...]] = {
-    "calibration": (RECORDING, RIG, TABLE),
-    "solve": (RIG, TABLE),
-    "check": (RIG, RECORDING),
+    kind: tuple(_INPUTS[name] for name in model.model_fields if name in _INPUTS)
+    for kind, model in REQUESTS.items()
 }
 REQUIRED: Mapping[JobKind, tuple[str, ...]] = {
-    "calibration": (RECORDING,),
-    "solve": (RIG, TABLE),
-    "check": (RIG, RECORDING),
-}
-
-
+    kind: tuple(_INPUTS[name] for name, field in model.model_fields.items()
+                if name in _INPUTS and field.is_required())
+    for kind, model in REQUESTS.items()
+}  # fmt: skip
 SETTINGS_OF: Mapping[JobKind, type[SolveSettings] | type[CheckSettings]] = {
-    "calibration": CalibrationSettings,
-    "solve": SolveSettings,
-    "check": CheckSettings,
+    kind: type(model.model_fields["settings"].default) for kind, model in REQUESTS.items()
 }
 """The models of the settings."""
 

@@ -18,7 +18,6 @@ from calibgraph.service.problems import Problem, documented, reference
 from calibgraph.service.requests import (
     ABOUT,
     ALLOWED,
-    KINDS,
     LOG,
     REQUESTS,
     REQUIRED,
@@ -155,7 +154,7 @@ def _submit_route(kind: JobKind) -> Callable[..., Awaitable[Response]]:
     return route
 
 
-for _kind in KINDS:
+for _kind in REQUESTS:
     router.post(
         _PATHS[_kind],
         status_code=202,

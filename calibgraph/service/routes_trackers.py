@@ -114,12 +114,10 @@ def find_tracker(state: Service, caller: Caller, id: str) -> TrackerRecord:
     return record
 
 
-async def ask_tracker(
-    state: Service, caller: Caller, id: str, action: Action, *, body: bytes = b"", media: str = ""
-) -> Any:
+async def ask_tracker(state: Service, caller: Caller, id: str, action: Action) -> Any:
     """The answer of a tracker that the caller sees."""
     await run_in_threadpool(find_tracker, state, caller, id)
-    request = TrackerRequest(action, str(state.folder.of_tracker(id)), body, media)
+    request = TrackerRequest(action, str(state.folder.of_tracker(id)))
     return await state.trackers.answer(id, caller.tenant, request)
 
 
@@ -188,7 +186,8 @@ async def add_frames(id: TrackerId, request: Request, state: State, caller: Subm
     if media not in (*_LINES, ARROW):
         raise Problem(415, f"send {_LINES[0]}, a frame a line, or {ARROW}")
     body = await state.memory.read(request, caller.tenant, state.settings.frames_bytes)
-    taken = await ask_tracker(state, caller, id, "frames", body=body, media=media)
+    frames = TrackerRequest("frames", str(state.folder.of_tracker(id)), body, media)
+    taken = await state.trackers.answer(id, caller.tenant, frames)
     state.metrics.frames.inc(taken.count)
     return Response(taken.body, media_type="application/json")
 

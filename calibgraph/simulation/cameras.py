@@ -22,7 +22,6 @@ SAMPLES_PX = np.array([[-0.375, 0.125], [-0.125, -0.375], [0.125, 0.375], [0.375
 MAX_FIELD_RAD = math.radians(95.0)
 _GAMMA = 1 / 2.2
 _BLOCK_PX = 2**17
-_MISS_PX = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,17 +76,10 @@ def pixel_directions(camera: Camera, pixels_px: Array) -> Array:
         (n, 3) unit vectors in the camera's frame; 0 where the lens projects no direction to the
         pixel, or, as a fisheye, one more than 95 degrees off its axis.
     """
-    if camera.model in ("omnidirectional", "equirectangular"):
-        directions, valid = unproject(camera.lens, pixels_px)
-        return np.asarray(np.where(valid[:, None], directions, 0.0))
-    undistort = {"fisheye": _fisheye_directions, "pinhole": _pinhole_directions}
-    directions = undistort[camera.model](camera, pixels_px)
-    back, valid = camera.lens.project(directions)
-    with np.errstate(invalid="ignore"):
-        valid &= np.abs(back - pixels_px).max(axis=1) < _MISS_PX
-    valid &= directions[:, 2] >= math.cos(MAX_FIELD_RAD)
-    directions[~valid] = 0
-    return directions
+    directions, valid = unproject(camera.lens, pixels_px)
+    if camera.model == "fisheye":
+        valid &= directions[:, 2] >= math.cos(MAX_FIELD_RAD)
+    return np.asarray(np.where(valid[:, None], directions, 0.0))
 
 
 def render(
@@ -144,35 +136,3 @@ def _trace_block(
     light = shade(world, origin, outwards, hits, pixel_rad=pixel_rad).reshape(directions.shape)
     total = light[:, :, 0] + light[:, :, 1] + light[:, :, 2] + light[:, :, 3]  # as mean() is slow
     return np.asarray(total / len(SAMPLES_PX))
-
-
-def _pinhole_directions(camera: Camera, pixels_px: Array) -> Array:
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
-    lens = np.array(camera.distortion or (0.0,) * 4)
-    plane = cv2.undistortPoints(pixels_px[:, None], camera.matrix_px, lens, criteria=criteria)
-    directions = np.insert(np.asarray(plane[:, 0], np.float64), 2, 1.0, axis=1)
-    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
-
-
-def _fisheye_directions(camera: Camera, pixels_px: Array) -> Array:
-    """OpenCV's inverse is limited to 90 degrees; this one to the monotonic range of the lens."""
-    k = camera.intrinsics_px
-    x, y = (pixels_px[:, 0] - k.cx) / k.fx, (pixels_px[:, 1] - k.cy) / k.fy
-    distorted = np.hypot(x, y)
-    angle = _undistorted_angle(np.asarray(camera.distortion), distorted, camera.lens.packed[-1])
-    sideways = np.sin(angle) / np.maximum(distorted, 1e-12)
-    return np.column_stack([x * sideways, y * sideways, np.cos(angle)])
-
-
-def _undistorted_angle(distortion: Array, distorted: Array, limit_rad: float) -> Array:
-    """Angles [rad] off the axis, up to the limit of the monotonic range."""
-    powers = np.array([3, 5, 7, 9])
-    table = np.linspace(0, min(limit_rad, MAX_FIELD_RAD + 0.1), 2000)
-    bent = table + (table[:, None] ** powers) @ distortion
-    angle = np.interp(distorted, bent, table)
-    for _ in range(3):  # Newton
-        square = angle * angle
-        series = np.polynomial.polynomial.polyval(square, np.array([1, *distortion]))
-        slope = np.polynomial.polynomial.polyval(square, np.array([1, *((powers) * distortion)]))
-        angle = angle - (angle * series - distorted) / np.maximum(slope, 1e-3)
-    return np.asarray(angle.clip(0, table[-1]))

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -12,9 +11,9 @@ from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import (
     require_place_for_folder,
-    sync_folder,
     write_atomically,
     write_bytes,
+    written_together,
 )
 from calibgraph.io.rigs import REFERENCE_FILE, RIG_FILE
 from calibgraph.model.geometry import relative_transform
@@ -122,16 +121,11 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     drive = build_drive(
         frames=frames, step_m=step_m, seed=seed, vary_layout=vary_layout, surroundings=surroundings
     )
-    out.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=out, prefix=".writing-") as folder:
-        made = Path(folder)
+    with written_together(out) as made:
         _write_scans(made / "lidar", lidar, drive, seed, progress=progress)
         _write_images(made / "cameras", rig, drive, seed, progress=progress)
         stated.save(made / REFERENCE_FILE)
         guess.save(made / RIG_FILE)
-        for name in _WRITTEN:
-            (made / name).rename(out / name)
-    sync_folder(out)
     return [out / name for name in reversed(_WRITTEN)]
 
 

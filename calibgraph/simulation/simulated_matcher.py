@@ -13,7 +13,6 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
 from calibgraph.simulation.matcher_errors import MatcherErrors
-from calibgraph.solver.pnp import normalized
 from factors import unproject
 
 Rng = np.random.Generator
@@ -185,11 +184,8 @@ def _draw_scattered(rng: Rng, camera: Camera, count: int, depth_m: tuple[float, 
 def _draw_rays(rng: Rng, camera: Camera, count: int) -> Array:
     """(at most count, 3) unit rays of pixels all over the image."""
     pixels = rng.random((count, 2)) * [camera.width_px, camera.height_px] - 0.5
-    if camera.model in ("omnidirectional", "equirectangular"):
-        rays, valid = unproject(camera.lens, pixels)
-        return np.asarray(rays[valid])
-    plane = np.column_stack([normalized(camera, pixels), np.ones(count)])
-    return np.asarray(plane / np.linalg.norm(plane, axis=1)[:, None])
+    rays, valid = unproject(camera.lens, pixels)
+    return np.asarray(rays[valid])
 
 
 def _draw_on_street(rng: Rng, camera: Camera, count: int) -> Array:

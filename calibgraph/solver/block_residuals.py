@@ -13,8 +13,7 @@ from calibgraph.arrays import Array
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.residual_scale import ResidualScale, robust_spread
-from calibgraph.solver.spread_kernel import median
+from calibgraph.solver.residual_scale import ResidualScale, quantile, robust_spread
 from calibgraph.solver.whitening import (
     constrained_error_px,
     error_gradient,
@@ -94,7 +93,7 @@ class BlockResiduals:
     def summary(self, scale: ResidualScale) -> Residuals:
         """What the result reports of them."""
         return Residuals(
-            median_px=median(self.errors_px),
+            median_px=quantile(self.errors_px, 0.5),
             inlier_share=float(np.mean(self.inliers(scale))),
             sigma_px=robust_spread(self.sizes[0]),
             loss_scale_px=scale.loss_scale,

@@ -18,8 +18,14 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.residual_scale import MIN_SIGMA_PX, ResidualScale, robust_spread, scale_from
-from calibgraph.solver.spread_kernel import quantiles
+from calibgraph.solver.repeats import hash_numbers
+from calibgraph.solver.residual_scale import (
+    MIN_SIGMA_PX,
+    ResidualScale,
+    quantiles,
+    robust_spread,
+    scale_from,
+)
 from calibgraph.solver.whitening import (
     IDENTITY,
     constrained_error_px,
@@ -54,10 +60,11 @@ class CameraBlock:
     @cached_property
     def frame_edges(self) -> NDArray[np.int64]:
         """(f + 1,) where the frames begin, and the end."""
-        if not len(self.frame):
-            return np.zeros(1, dtype=np.int64)
-        new = np.flatnonzero(np.diff(self.frame)) + 1
-        return np.concatenate([[0], new, [len(self.frame)]])
+        frame, count = self.frame, len(self.frame)
+        if not count or frame[0] == frame[-1]:
+            return np.arange(0, count + 1, max(count, 1))
+        new = (frame[1:] != frame[:-1]).nonzero()[0] + 1
+        return np.concatenate([[0], new, [count]])
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -75,7 +82,12 @@ class CameraBlock:
     @property
     def frame_counts(self) -> NDArray[np.int64]:
         """(f,) of the correspondences of each frame."""
-        return np.diff(self.frame_edges)
+        return self.frame_edges[1:] - self.frame_edges[:-1]
+
+    @cached_property
+    def point_hashes(self) -> list[int]:
+        """(n,) of the bits of each point."""
+        return hash_numbers(self.block.points_lidar_m)
 
     def in_frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(n,) which correspondences belong to frames of some numbers."""
@@ -108,7 +120,7 @@ class CameraBlock:
     def select(self, rows: NDArray[Any]) -> CameraBlock:
         """Some rows: a mask or an index array."""
         if rows.dtype == np.bool_:
-            rows = np.flatnonzero(rows)
+            rows = rows.nonzero()[0]
             if len(rows) == len(self.frame):
                 return self
         information = None if self.information is None else self.information[rows]

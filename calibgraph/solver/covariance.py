@@ -9,14 +9,14 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.camera_pairs import usual_excess
 from calibgraph.solver.curvature import (
     Curvature,
+    FittedObjective,
     add_pair_hessians,
     pose_hessian,
     rows_of_pair,
     unknown,
 )
-from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.objective import Objective
-from factors import unit_diagonal
+from factors.conditioning import sigmas_of_hessian
 
 ENOUGH_FRAMES = 5
 """From so many on, the scatter between frames decides about the error bar; with fewer, mostly what
@@ -26,8 +26,6 @@ PSEUDO_FRAMES = error_components().pseudo_frames
 """Frames that are added with the scatter along each principal direction. A covariance of six
 numbers from few frames is too small for their joint error (its inverse, by (F - 1) / (F - 8) for F
 frames)."""
-
-_FREE = 1e-12  # eigenvalue of a unit-diagonal Hessian that is rounding noise
 
 
 def cluster_robust_covariance(at: FittedObjective, curvature: Curvature) -> Array | None:
@@ -164,13 +162,3 @@ def data_sigmas(at: FittedObjective) -> Array:
         hessian[rows, rows] += block.sums(at.pose(name)).hessian
     add_pair_hessians(hessian, objective.pairs, T_camera_lidar)
     return sigmas_of_hessian(hessian).reshape(-1, 6)
-
-
-def sigmas_of_hessian(hessian: Array) -> Array:
-    """(n,) standard deviations by an (n, n) Hessian; infinite in undetermined directions."""
-    scaled, units = unit_diagonal(hessian)
-    values, vectors = np.linalg.eigh(scaled)
-    free = values < _FREE
-    variances = (vectors**2 / np.where(free, np.inf, values)).sum(axis=1) / units**2
-    loose = (vectors[:, free] ** 2).sum(axis=1) > _FREE
-    return np.asarray(np.sqrt(np.where(loose, np.inf, variances)))

@@ -1,4 +1,9 @@
-"""Second derivatives of the cost at a solution: of the correspondences, and of all terms."""
+"""An objective at extrinsics that fit it, and the second derivatives of its cost there.
+
+Covariances and error models are computed from these: of the correspondences, and of all terms.
+"""
+
+from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,12 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import retract_all, to_T_camera_lidar
+from calibgraph.graph.objective import relative_pose_graph
+from calibgraph.model.geometry import pose_rows, retract_all, to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_pairs import PairTerm
+from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import to_values
-from factors import ProjectionBlock, unit_diagonal
+from factors import ProjectionBlock
+from factors.conditioning import invert_or_none
 
-_SINGULAR = 1e-12  # smallest over largest eigenvalue: rounding noise
 _STEP = 1e-5  # rad and m: of the central differences of the gradient
 _STEPS = _STEP * np.vstack([np.eye(6), -np.eye(6)])
 
@@ -51,19 +59,6 @@ class Curvature:
         root = self.inverse @ (vectors * np.sqrt(np.maximum(values, 0.0)))
         covariance: Array = root @ root.T
         return covariance
-
-
-def invert_or_none(hessian: Array, *, least: float = _SINGULAR) -> Array | None:
-    """The inverse of a positive semidefinite matrix, None where a direction is not determined.
-
-    ``least`` is the smallest eigenvalue, of a unit diagonal, over the largest.
-    """
-    scaled, units = unit_diagonal(hessian)
-    values, vectors = np.linalg.eigh(scaled)
-    if values[0] <= least * values[-1]:
-        return None
-    inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
-    return inverse
 
 
 def convex_hessian(hessian: Array, otherwise: Array) -> Array:
@@ -156,3 +151,69 @@ def _convex(gradients: Array, reweighted: Callable[[], Array]) -> Array:
     if not _is_positive_definite(hessians):
         return np.array([*map(convex_hessian, hessians, reweighted())])
     return hessians
+
+
+@dataclass(frozen=True, eq=False)
+class FittedObjective:
+    """An objective, its scales, and the extrinsics where it is examined.
+
+    Attributes:
+        objective: after the gate.
+        scales: of the residuals.
+        T_camera_lidar: (4, 4) of all cameras: its minimum.
+        held: cameras that nothing determines; they are known to a radian and a metre.
+    """
+
+    objective: Objective
+    scales: Scales
+    T_camera_lidar: Transforms
+    held: tuple[str, ...] = ()
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Their names, in the order of the extrinsics."""
+        return tuple(self.T_camera_lidar)
+
+    def pose(self, camera: str) -> gtsam.Pose3:
+        """T_lidar_camera of a camera, the variable of the graph."""
+        return to_T_lidar_camera(self.T_camera_lidar[camera])
+
+    @cached_property
+    def projections(self) -> Mapping[str, ProjectionBlock]:
+        """Per camera with correspondences, these with their scale."""
+        return {n: b.with_scale(self.scales[n]) for n, b in self.objective.blocks.items()}
+
+    @cached_property
+    def robust_hessians(self) -> Mapping[str, Array]:
+        """Per camera with correspondences, their (6, 6) `robust_hessian`; empty without terms."""
+        if not self.objective.uses_correspondences:
+            return {}
+        blocks = self.projections
+        hessians = map_on_cores(robust_hessian, [*blocks.values()], [self.pose(n) for n in blocks])
+        return dict(zip(blocks, hessians, strict=True))
+
+    @cached_property
+    def frame_gradients(self) -> Mapping[str, Array]:
+        """Per camera with correspondences, (f, 6) gradients of half the cost of its frames."""
+        blocks = self.objective.blocks
+        return {n: b.frame_gradients(self.pose(n), self.scales[n]) for n, b in blocks.items()}
+
+    @cached_property
+    def curvature(self) -> Curvature:
+        """The curvature of all terms, the gate's own among them."""
+        inliers, cameras, T_camera_lidar = self.objective, self.cameras, self.T_camera_lidar
+        own = np.zeros((6 * len(cameras), 6 * len(cameras)))
+        for name, hessian in self.robust_hessians.items():
+            rows = pose_rows(cameras.index(name))
+            own[rows, rows] = convex_hessian(hessian + inliers.gate_hessian.get(name, 0.0), hessian)
+        measured = relative_pose_graph(cameras, inliers.rig.relative_poses)
+        whole = own + pose_hessian(inliers.pose_graph, cameras, T_camera_lidar)
+        add_pair_hessians(whole, inliers.pairs, T_camera_lidar)
+        whole += unknown([name in self.held for name in cameras])
+        return Curvature(own, pose_hessian(measured, cameras, T_camera_lidar), whole)
+
+    def data_only(self) -> FittedObjective:
+        """The correspondences alone, at their minimum near here."""
+        free = self.objective.data_only()
+        start = {name: self.T_camera_lidar[name] for name in free.cameras}
+        return FittedObjective(free, self.scales, free.minimize(start, self.scales).T_camera_lidar)

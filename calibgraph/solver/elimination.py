@@ -31,12 +31,11 @@ from calibgraph.graph.variables import (
 )
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.solver.optimizer import MAX_ITERATIONS
-from factors import unit_diagonal
+from factors.conditioning import SINGULAR, unit_diagonal
 
 TOLERANCE = 1e-6
 """Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""
 
-_SINGULAR = 1e-12  # smallest over largest eigenvalue: rounding noise
 _ROUNDING = 2e-15  # smallest part of a sum that a difference may leave
 _SHARES = 0.5 ** np.arange(12)
 """Of a step: the first that descends; mostly the whole step."""
@@ -71,6 +70,11 @@ class Linearization:
         """The linear factors of all places, data included."""
         return join_linear(self.model.place_graph.linearize(self.values), self.data.graph)
 
+    @cached_property
+    def left_by_places(self) -> gtsam.GaussianFactorGraph:
+        """The same factors without the variables of places, which are eliminated."""
+        return self.placed.eliminatePartialSequential(to_ordering(self.model.place_keys))[1]
+
     @property
     def graph(self) -> gtsam.GaussianFactorGraph:
         """All linear factors."""
@@ -97,8 +101,8 @@ class Linearization:
         return np.asarray(np.linalg.inv(self._information_of(keys)))
 
     def _information_of(self, keys: Sequence[int]) -> Array:
-        every = self.model.place_keys + self.model.shared_keys
-        return marginal_information(self.graph, every, keys)
+        graph = join_linear(self.shared, self.left_by_places)
+        return marginal_information(graph, self.model.shared_keys, keys)
 
     @cached_property
     def distances(self) -> Array:
@@ -145,7 +149,7 @@ class Linearization:
         keys = to_ordering(self.model.shared_keys)
         before = np.sqrt(np.diag(self.shared.hessian(keys)[0])[-len(diagonal) :])
         left = np.linalg.eigvalsh(information / np.outer(before, before))[0]
-        return bool(values[0] > _SINGULAR * values[-1] and left > _ROUNDING)
+        return bool(values[0] > SINGULAR * values[-1] and left > _ROUNDING)
 
 
 @dataclass(frozen=True, eq=False)

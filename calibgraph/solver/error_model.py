@@ -20,16 +20,19 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.model.places import Places
 from calibgraph.solver.conflicts import relative_pose_conflict
-from calibgraph.solver.data_by_place import block_by_place, pairs_by_place
+from calibgraph.solver.curvature import FittedObjective
 from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
-from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.lens import lens_errors, lens_term, weak_information
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum
-from calibgraph.solver.prior_components import common_error, variance_components
 from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
-from calibgraph.solver.variance_components import VarianceRatios, estimate_variance_ratios
-from calibgraph.solver.within_place import within_place
+from calibgraph.solver.variance_components import (
+    VarianceRatios,
+    common_error,
+    estimate_variance_ratios,
+    variance_components,
+)
+from calibgraph.solver.within_place import block_by_place, pairs_by_place, within_place
 
 Numbers = NDArray[np.int64]
 

@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.latent_poses import to_ordering
+from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.model.error_sources import (
     COMMON,
     ELEVATION,
@@ -78,18 +78,34 @@ def predict_variances(errors: ErrorFit) -> dict[int, Array]:
     The information of places is repeated; that of what they all share is not.
     """
     linear = errors.fit.linear
-    model = linear.model
-    summary = linear.placed.eliminatePartialSequential(to_ordering(model.place_keys))[1]
-    found = {}
+    model, found = linear.model, {}
     for times in TIMES:
-        shown = times * model.components.distortion_information
-        vector = times * model.components.distortion_vector
-        parts = replace(model.components, distortion_information=shown, distortion_vector=vector)
-        shared = replace(model, components=parts).shared_graph.linearize(linear.values)
-        graph = join_linear(shared, *times * [summary])
-        found[times] = np.diag(
-            np.linalg.inv(marginal_information(graph, model.shared_keys, model.reported_keys))
-        )
+        shared = _distorted_repeatedly(linear, times) if model.is_distorted else linear.shared
+        found[times] = _variances(model, shared, _repeated(linear.left_by_places, times))
+    return found
+
+
+def _variances(model: LatentPoseModel, *graphs: gtsam.GaussianFactorGraph) -> Array:
+    """(6 N,) of the reported poses, by linear factors of what all places share."""
+    information = marginal_information(join_linear(*graphs), model.shared_keys, model.reported_keys)
+    return np.diag(np.linalg.inv(information))
+
+
+def _distorted_repeatedly(linear: Linearization, times: int) -> gtsam.GaussianFactorGraph:
+    """The linear factors of what all places share; the distortion is shown so many times."""
+    parts = linear.model.components
+    shown, vector = times * parts.distortion_information, times * parts.distortion_vector
+    parts = replace(parts, distortion_information=shown, distortion_vector=vector)
+    return replace(linear.model, components=parts).shared_graph.linearize(linear.values)
+
+
+def _repeated(graph: gtsam.GaussianFactorGraph, times: int) -> gtsam.GaussianFactorGraph:
+    """The factors of a graph so many times, added up to one factor."""
+    if times == 1:
+        return graph
+    half, found = _repeated(graph, times // 2), gtsam.GaussianFactorGraph()
+    odd = [graph] if times % 2 else []
+    found.push_back(gtsam.HessianFactor(join_linear(half, half, *odd)))
     return found
 
 
@@ -104,12 +120,11 @@ def _of_shared(linear: Linearization) -> Variances:
     A factor with the whitened Jacobian A adds C A^T A C.
     """
     model = linear.model
-    summary = linear.placed.eliminatePartialSequential(to_ordering(model.place_keys))[1]
     keys = model.reported_keys + model.shared_keys[: -len(model.cameras)]
     dims = linear.values.dims()
     sizes = [dims[key] for key in keys]
     ends = dict(zip(keys, np.cumsum(sizes), strict=True))
-    hessian = join_linear(linear.shared, summary).hessian(to_ordering(keys))[0]
+    hessian = join_linear(linear.shared, linear.left_by_places).hessian(to_ordering(keys))[0]
     covariance = np.linalg.inv(hessian)[: 6 * len(model.cameras)]
     found = dict.fromkeys((COMMON, PAIRS, LENSES, *_DISTORTIONS, PRIORS), np.zeros(len(covariance)))
     for number in range(linear.shared.size()):
@@ -135,8 +150,8 @@ def _of_places(errors: ErrorFit) -> Array:
 
     The derivative of the variances by the log of its covariance, from two differences.
     """
-    linear = errors.fit.linear
-    parts, scale = linear.model.components, linear.model.components.robust_scale
+    linear, model = errors.fit.linear, errors.fit.linear.model
+    parts, scale = model.components, model.components.robust_scale
     if np.isfinite(scale):
         parts = parts.with_fixed_weights(errors.fit.place_weights(scale))
 
@@ -144,7 +159,10 @@ def _of_places(errors: ErrorFit) -> Array:
         factor = float(np.exp(step))
         place = factor * (parts.at_place - parts.scatter_at_place) + parts.scatter_at_place
         other = replace(parts, cloud_at_place=factor * parts.cloud_at_place, at_place=place)
-        return np.diag(replace(linear, model=replace(linear.model, components=other)).covariance)
+        placed = replace(model, components=other).place_graph.linearize(linear.values)
+        every = join_linear(placed, linear.data.graph)
+        left = every.eliminatePartialSequential(to_ordering(model.place_keys))[1]
+        return _variances(model, linear.shared, left)
 
     near, far = (
         (variances(step) - variances(-step)) / (2 * step) for step in (_DIFFERENCE, 2 * _DIFFERENCE)

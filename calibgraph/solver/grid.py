@@ -10,8 +10,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from factors.compiled import compiled
 
-_MOST_CELLS = 1 << 20  # 8 MB of places; of more cells, a hash table holds those that are taken
-_ROWS_OF_RUN = 4  # of one camera and frame, at least, in a table that is worth taking run by run
+_MOST_CELLS = 1 << 20  # 8 MB of places; of more cells, those that are taken are numbered
 
 
 def best_in_cell(
@@ -21,7 +20,7 @@ def best_in_cell(
     config: Config,
     *,
     among: NDArray[np.bool_] | None = None,
-) -> NDArray[np.bool_]:
+) -> NDArray[np.int64]:
     """The most confident match of each cell of the image grid, per camera and frame.
 
     Of equally confident ones the first in the table is kept. So the best of two tables, one after
@@ -35,38 +34,31 @@ def best_in_cell(
         among: (n,) which of them take part; None: all.
 
     Returns:
-        (n,) which are kept.
+        (k,) the rows that are kept, sorted by camera and frame.
     """
     sizes = np.array([[c.width_px, c.height_px] for c in rig.cameras.values()], dtype=np.float64)
     shape = np.array([config.grid_columns, config.grid_rows], dtype=np.float64)
     among = np.ones(len(table), dtype=np.bool_) if among is None else among
-    cell = _cells(camera, table.pixels_px, sizes, shape)
-    cells = config.grid_columns * config.grid_rows
-    keep: NDArray[np.bool_]
-    edges = frame_edges(camera, table.frame)
-    first = edges[:-1]
-    if cells <= _MOST_CELLS and _all_differ(camera[first], table.frame[first], len(table)):
-        keep = _best_of_runs(edges, cells, cell, table.confidence, among)
-    else:
-        keep = _best_of_equal_keys(camera, table.frame, cell, table.confidence, among)
-    return keep
+    cell, cells = (
+        _cells(camera, table.pixels_px, sizes, shape),
+        config.grid_columns * config.grid_rows,
+    )
+    if cells > _MOST_CELLS:
+        taken, cell = np.unique(cell, return_inverse=True)
+        cells = len(taken)
+    if _are_sorted(camera, table.frame):
+        edges = frame_edges(camera, table.frame)
+        return np.flatnonzero(_best_of_runs(edges, cells, cell, table.confidence, among))
+    order = np.lexsort((table.frame, camera))
+    edges = frame_edges(camera[order], table.frame[order])
+    return np.asarray(
+        order[_best_of_runs(edges, cells, cell[order], table.confidence[order], among[order])]
+    )
 
 
-def frame_order(camera: NDArray[np.int64], frame: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """(n,) stable order of rows by camera and frame; None if they are in it already."""
+def _are_sorted(camera: NDArray[np.int64], frame: NDArray[np.int64]) -> bool:
     same, later = camera[1:] == camera[:-1], camera[1:] > camera[:-1]
-    if (later | (same & (frame[1:] >= frame[:-1]))).all():
-        return None
-    return np.lexsort((frame, camera))
-
-
-def _all_differ(camera: NDArray[np.int64], frame: NDArray[np.int64], rows: int) -> bool:
-    """Whether no two runs of so many rows are of the same camera and frame."""
-    if rows < _ROWS_OF_RUN * len(frame):  # rows in any order: their runs cost more to compare
-        return False
-    order = np.lexsort((frame, camera))
-    camera, frame = camera[order], frame[order]
-    return not ((camera[1:] == camera[:-1]) & (frame[1:] == frame[:-1])).any()
+    return bool((later | (same & (frame[1:] >= frame[:-1]))).all())
 
 
 def frame_edges(camera: NDArray[np.integer[Any]], frame: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -91,7 +83,7 @@ def _cells(camera, pixels, sizes, shape):  # type: ignore[no-untyped-def]
 
 @compiled()
 def _best_of_runs(edges, cells, cell, confidence, among):  # type: ignore[no-untyped-def]
-    """As ``_best_of_equal_keys``, where the rows of each run differ by their cell alone.
+    """(n,) which rows have the largest confidence, the first of them, of their run and cell.
 
     A place per cell holds the best row so far; one of an earlier run counts as none.
     """
@@ -106,33 +98,4 @@ def _best_of_runs(edges, cells, cell, confidence, among):  # type: ignore[no-unt
                 best[cell[row]], keep[row] = row, True
             elif confidence[row] > confidence[other]:
                 best[cell[row]], keep[row], keep[other] = row, True, False
-    return keep
-
-
-@compiled()
-def _best_of_equal_keys(camera, frame, cell, confidence, among):  # type: ignore[no-untyped-def]
-    """(n,) which rows have the largest confidence, the first of them, among those of equal keys.
-
-    A hash table with open addressing, at most half full, holds the best row of every key so far.
-    """
-    keep = np.zeros(len(frame), dtype=np.bool_)
-    size = 2
-    while size < 2 * len(frame):
-        size *= 2
-    best = np.full(size, -1)
-    for row in range(len(frame)):
-        if not among[row]:
-            continue
-        mixed = (frame[row] * 1_000_003 + camera[row]) * 10_000_000_019 + cell[row]
-        slot = (mixed ^ (mixed >> 29)) & (size - 1)
-        other = best[slot]
-        while other >= 0 and not (
-            cell[other] == cell[row] and frame[other] == frame[row] and camera[other] == camera[row]
-        ):
-            slot = (slot + 1) & (size - 1)
-            other = best[slot]
-        if other < 0:
-            best[slot], keep[row] = row, True
-        elif confidence[row] > confidence[other]:
-            best[slot], keep[row], keep[other] = row, True, False
     return keep

@@ -17,8 +17,8 @@ from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.camera_block import CameraBlock, camera_blocks
 from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
+from calibgraph.solver.curvature import FittedObjective
 from calibgraph.solver.error_model import refine_with_error_model
-from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.frame_weights import weigh_all_frames
 from calibgraph.solver.lens import Lenses, moved_lenses, put_into
 from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective, Transforms

@@ -23,8 +23,8 @@ from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
+from calibgraph.solver.curvature import FittedObjective
 from calibgraph.solver.elimination import LatentPoseFit
-from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import FreeLensBlock
 

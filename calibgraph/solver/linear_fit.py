@@ -18,10 +18,11 @@ from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_twist import fill_twist_columns
 from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.spread_kernel import median
+from calibgraph.solver.residual_scale import quantile
 from calibgraph.solver.whitening import upper_root
 from calibgraph.solver.within_place import WEAK
 from factors import ProjectionBlock, unit_diagonal
+from factors.block_arrays import whiten
 
 MIN_ROWS = 30  # fewer correspondences do not determine further unknowns
 _MAX_ITERATIONS = 20
@@ -121,20 +122,21 @@ def fit_camera(
         return None
     columns = _linearize(camera, block.block, fields_px)
     size, errors = len(columns) - 1, columns[-1].ravel()
-    flat, values = columns[:-1].reshape(size, -1), np.zeros(size)
+    flat, values, left = columns[:-1].reshape(size, -1), np.zeros(size), errors.copy()
     weighted = np.empty_like(flat)
     for _ in range(_MAX_ITERATIONS):
-        squares = np.square((errors - values @ flat).reshape(2, -1)).sum(axis=0)
-        scale = loss_scale or _LOSS_MEDIANS * math.sqrt(median(squares)) + 1e-12
+        squares = np.square(left.reshape(2, -1)).sum(axis=0)
+        scale = loss_scale or _LOSS_MEDIANS * math.sqrt(quantile(squares, 0.5)) + 1e-12
         weights = np.tile(1.0 / (1.0 + squares / scale**2), 2)
         np.multiply(flat, weights, out=weighted)
         hessian, before = weighted @ flat.T + _weak(size), values
         values = np.linalg.solve(hessian, weighted @ errors)
-        if np.abs((values - before) @ flat).max() < _CONVERGED * scale:
+        change = (values - before) @ flat
+        left -= change
+        if np.abs(change).max() < _CONVERGED * scale:
             break
     if not np.isfinite(values).all():  # points where no derivative exists
         return None
-    left = errors - values @ flat
     pulls = (weighted * left).reshape(size, 2, -1).sum(axis=1)
     gradients = np.add.reduceat(pulls, block.frame_edges[:-1], axis=1).T
     variance = float(weights @ left**2 / weights.sum())
@@ -147,13 +149,7 @@ def _linearize(camera: Camera, block: ProjectionBlock, fields_px: Array) -> Arra
     pixels = fill_twist_columns(camera, block.points_lidar_m, columns[:6])
     columns[6:-1] = fields_px
     columns[-1] = camera.lens.subtract(block.pixels_px, pixels.T).T
-    if block.sqrt_information is not None:
-        s00, s01, s11 = block.sqrt_information.T
-        if not s01.any() and np.array_equal(s00, s11):
-            columns *= s00
-            return columns
-        columns[:, 0] = s00 * columns[:, 0] + s01 * columns[:, 1]
-        columns[:, 1] *= s11
+    whiten(columns, block.sqrt_information)
     return columns
 
 

@@ -21,7 +21,7 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
-from calibgraph.solver.curvature import Curvature
+from calibgraph.solver.curvature import Curvature, FittedObjective
 from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
 from calibgraph.solver.error_shares import (
@@ -29,7 +29,6 @@ from calibgraph.solver.error_shares import (
     sources_of_error,
     variances_by_source,
 )
-from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.objective import Objective, Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
 from calibgraph.solver.shared_error import error_between, shared_scatter, shared_variance_ratio
@@ -254,12 +253,14 @@ class Marginals:
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:
         """The factors of relative poses between cameras that both have correspondences."""
-        free, cameras = self.data_only, tuple(self.at.objective.blocks)
+        cameras = tuple(self.at.objective.blocks)
+        measured = self.at.objective.rig.relative_poses
+        pairs = [pair for pair in measured if pair.a in cameras and pair.b in cameras]
+        free = self.data_only if pairs else None
         if free is None:
             return ()
         mount = free.mount
         return tuple(
             relative_pose_conflict(pair, cameras, mount.T_camera_lidar, mount.covariance)
-            for pair in self.at.objective.rig.relative_poses
-            if pair.a in cameras and pair.b in cameras
+            for pair in pairs
         )

@@ -19,7 +19,7 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_pairs import PairTerm, pair_graph, pair_terms, usual_excess
-from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.curvature import FittedObjective
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum, optimize
 from factors import EpipolarBlock, pose_sigmas

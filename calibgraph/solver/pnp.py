@@ -1,9 +1,7 @@
 """One camera's extrinsic from its correspondences in single frames: robust PnP."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import cv2
 import numpy as np
@@ -95,21 +93,6 @@ def select_evenly(matches: Correspondences, most: int) -> Correspondences:
     return matches.select(slice(None, None, -(-len(matches) // most) or None))
 
 
-def normalized(camera: Camera, pixels_px: Array) -> Array:
-    """(n, 2) pixels to the plane z = 1 of the camera frame, lens distortion removed."""
-    if len(pixels_px) == 0:
-        return np.empty((0, 2))
-    pixels = np.ascontiguousarray(pixels_px[:, None, :])
-    distortion = np.array(camera.distortion, dtype=np.float64)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-    undistort: dict[str, Callable[..., Any]] = {
-        "fisheye": cv2.fisheye.undistortPoints,
-        "pinhole": cv2.undistortPoints,
-    }
-    plane = undistort[camera.model](pixels, camera.matrix_px, distortion, criteria=criteria)
-    return np.asarray(plane, dtype=np.float64).reshape(-1, 2)
-
-
 def ransac_pnp(
     camera: Camera,
     matches: Correspondences | ProjectionBlock,
@@ -120,16 +103,35 @@ def ransac_pnp(
     """(4, 4) T_camera_lidar by MAGSAC, None if there is no pose. Arguments as of `frame_pose`."""
     if len(matches) < MIN_MATCHES:
         return None
-    turn, plane = _plane_of_most(camera, matches.pixels_px)
-    usable = np.hypot(plane[:, 0], plane[:, 1]) < np.tan(_MAX_ANGLE_RAD)
+    turn, plane = view_plane(camera, matches.pixels_px)
+    usable = np.isfinite(plane[:, 0])
     if np.count_nonzero(usable) < MIN_MATCHES:
         return None
     parameters = magsac(config.pnp_threshold_px, iterations=iterations, seed=config.seed)
-    focal = camera.lens.pixels_per_rad
-    ideal = np.diag([focal, focal, 1.0])
+    points, focal = matches.points_lidar_m[usable], camera.lens.pixels_per_rad
+    found = ransac_on_plane(points, plane[usable], focal, parameters, turn=turn)
+    return None if found is None else found[0]
+
+
+def ransac_on_plane(
+    points_m: Array, plane: Array, focal_px: float, parameters: cv2.UsacParams, *, turn: Array
+) -> tuple[Array, int] | None:
+    """(4, 4) pose of a camera from points and where it sees them, and how many points agree.
+
+    Args:
+        points_m: (n, 3).
+        plane: (n, 2) where, on the plane z = 1 of the turned camera frame.
+        focal_px: in whose pixels the threshold of the parameters is.
+        parameters: of RANSAC.
+        turn: (3, 3) from the camera frame to the turned one.
+
+    Returns:
+        None where the points determine no pose.
+    """
+    ideal = np.diag([focal_px, focal_px, 1.0])
     try:
-        found, _, rotation, translation, _ = cv2.solvePnPRansac(
-            matches.points_lidar_m[usable], plane[usable] * focal, ideal, None, params=parameters
+        found, _, rotation, translation, inliers = cv2.solvePnPRansac(
+            points_m, focal_px * plane, ideal, None, params=parameters
         )
     except cv2.error:  # degenerate samples: all points in one place, or on one line
         return None
@@ -137,7 +139,7 @@ def ransac_pnp(
         return None
     T = transform(cv2.Rodrigues(rotation)[0], translation.ravel())
     T[:3] = turn.T @ T[:3]
-    return T
+    return T, 0 if inliers is None else len(inliers)
 
 
 def pose_near_guess(
@@ -156,23 +158,23 @@ def pose_near_guess(
     return T_camera_lidar
 
 
-def _plane_of_most(camera: Camera, pixels_px: Array) -> tuple[Array, Array]:
+def view_plane(camera: Camera, pixels_px: Array) -> tuple[Array, Array]:
     """A turn of the camera, and its pixels on the plane z = 1 of the turned frame.
 
     The turn (3, 3) is the identity for lenses that look ahead. Of those that see all round, it is
-    to the direction with most of the pixels about it; pixels behind have NaN.
+    to the direction with most of the pixels about it. Pixels (n, 2) too far from there, and those
+    that the lens has no ray for, are NaN.
     """
-    if camera.model in ("pinhole", "fisheye"):
-        return np.eye(3), normalized(camera, pixels_px)
     rays, valid = unproject(camera.lens, pixels_px)
-    cosines = _DIRECTIONS @ rays[valid].T
-    about = (cosines > np.cos(_CONE_RAD)).sum(axis=1)
-    turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], _DIRECTIONS[[about.argmax()]])[0].as_matrix()
+    turn, most_rad = np.eye(3), _MAX_ANGLE_RAD
+    if camera.model not in ("pinhole", "fisheye"):
+        cosines, ahead, most_rad = _DIRECTIONS @ rays[valid].T, [[0.0, 0.0, 1.0]], _CONE_RAD
+        about = (cosines > np.cos(_CONE_RAD)).sum(axis=1)
+        turn = Rotation.align_vectors(ahead, _DIRECTIONS[[about.argmax()]])[0].as_matrix()
     turned = rays @ turn.T
-    ahead = valid & (turned[:, 2] > np.cos(_CONE_RAD))
+    usable = valid & (turned[:, 2] > np.cos(most_rad))
     with np.errstate(divide="ignore", invalid="ignore"):
-        plane = turned[:, :2] / turned[:, 2:]
-    return turn, np.where(ahead[:, None], plane, np.nan)
+        return turn, np.where(usable[:, None], turned[:, :2] / turned[:, 2:], np.nan)
 
 
 def refine_frames(

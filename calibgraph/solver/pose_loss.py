@@ -17,9 +17,10 @@ from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.graph.objective import join, projection_graph
 from calibgraph.model.geometry import pose_rows, retract_all, to_T_lidar_camera
-from calibgraph.solver.curvature import invert_or_none, pose_hessian, robust_hessian
+from calibgraph.solver.curvature import pose_hessian, robust_hessian
 from calibgraph.solver.optimizer import optimize
 from factors import ProjectionBlock
+from factors.conditioning import invert_or_none
 
 DEGREES = 6.0
 """Of freedom, of the errors' distribution: matches are not independent, as the Hessian takes them

@@ -13,7 +13,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.rig import Rig
 from calibgraph.model.table_columns import rows_where
-from calibgraph.solver.grid import best_in_cell, frame_edges, frame_order
+from calibgraph.solver.grid import best_in_cell, frame_edges
 from calibgraph.solver.repeats import number_repeats
 from calibgraph.solver.shared_error import with_common_error
 
@@ -70,9 +70,6 @@ def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config)
     table = _merge(rig, kept, config)
     camera = _camera_numbers(rig, table)
     counts[3] = np.bincount(camera, minlength=len(rig.cameras))
-    order = frame_order(camera, table.frame)
-    if order is not None:
-        table, camera = table.select(order), camera[order]
     table, camera, repeated = _count_repeats_once(rig, table, camera, config)
     rows = _within_cap(table, camera, config)
     if rows is not None:
@@ -103,9 +100,7 @@ def _count_repeats_once(
     if np.array_equal(frame, table.frame):
         return table, camera, dict.fromkeys(rig.cameras, 0)
     before = _frames_by_camera(rig, table, camera)
-    table, order = replace(table, frame=frame), frame_order(camera, frame)
-    if order is not None:
-        table, camera = table.select(order), camera[order]
+    table = replace(table, frame=frame)
     best = best_in_cell(rig, table, camera, config)
     table, camera = table.select(best), camera[best]
     after = _frames_by_camera(rig, table, camera)
@@ -124,7 +119,10 @@ def _frames_by_camera(
 def _filter(
     rig: Rig, table: Correspondences, config: Config
 ) -> tuple[Correspondences, NDArray[np.int64]]:
-    """The best rows of a part; (3, N) per camera, how many are given, projectable, confident."""
+    """The best rows of a part, by camera and frame.
+
+    And (3, N) per camera, how many are given, projectable, confident.
+    """
     camera = _camera_numbers(rig, table)
     projectable = _projectable(rig, table, camera)
     confident = projectable & (table.confidence >= config.confidence_min)
@@ -135,7 +133,7 @@ def _filter(
 
 
 def _merge(rig: Rig, kept: Sequence[Correspondences], config: Config) -> Correspondences:
-    """The best matches of the parts' best matches, in the order of the table."""
+    """The best matches of the parts' best matches, sorted by camera and frame."""
     if len(kept) == 1:
         return kept[0]
     table = concatenate(kept)

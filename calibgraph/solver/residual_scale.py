@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.model.config import Config
-from calibgraph.solver.spread_kernel import spreads
-from factors.compiled import one_at_a_time
+from factors.block_arrays import contiguous
+from factors.compiled import compiled
 
 CAUCHY_SCALE_SIGMAS = 2.385
 """Robust scale in standard deviations: 95 % efficiency on Gaussian noise with Cauchy's loss."""
@@ -24,9 +24,8 @@ MIN_SIGMA_PX = 0.05
 """Least spread of the scale `auto`: noise-free data would have none, and a loss of zero width."""
 
 _START_QUANTILE, _START_FACTOR = 0.2, 1.762  # median of a Rayleigh distribution over that quantile
-_HALF = 0.5
-_WORTH_SHARING = 2_000_000  # values (6 ms): below, waiting for busy cores costs more
 _CUT = 4.0  # medians, 4.7 sigma in two dimensions: inliers lie below
+_ROUNDS = 100
 
 
 @dataclass(frozen=True)
@@ -80,11 +79,28 @@ def robust_spread(values: Array) -> float:
 
 
 def robust_spreads(values: Array, runs: NDArray[np.int64]) -> Array:
-    """(r,) :func:`robust_spread` of the finite values in each of (r, 2) runs of (n,) values."""
-    shared = len(values) >= _WORTH_SHARING
-    run = one_at_a_time(spreads) if shared else spreads
-    found: Array = run(values, runs, (_START_QUANTILE, _START_FACTOR), _CUT, shared=shared)
-    return found
+    """(r,) :func:`robust_spread` of the finite values in each of (r, 2) runs of (n,) values.
+
+    Infinite where a run has no finite value.
+    """
+    found: Array = _spreads(*_sort_runs(values, runs), (_START_QUANTILE, _START_FACTOR), _ROUNDS)
+    return np.where(np.isnan(found), math.inf, found)
+
+
+def quantiles(values: Array, runs: NDArray[np.int64], share: float) -> Array:
+    """(r,) quantiles, interpolated, of the finite values in each of (r, 2) runs; NaN without any.
+
+    Args:
+        values: (n,).
+        runs: (r, 2).
+        share: of the values below.
+    """
+    return np.asarray(_spreads(*_sort_runs(values, runs), (share, 1.0), 0))
+
+
+def quantile(values: Array, share: float) -> float:
+    """The :func:`quantiles` of one run."""
+    return float(quantiles(values, np.array([[0, len(values)]]), share)[0])
 
 
 def iterate_spread(quantile_below: Callable[[float, float], float]) -> float:
@@ -94,10 +110,50 @@ def iterate_spread(quantile_below: Callable[[float, float], float]) -> float:
         quantile_below: quantile, of a given share, of the values up to a limit; NaN without any.
     """
     spread = _START_FACTOR * quantile_below(math.inf, _START_QUANTILE)
-    for _ in range(100):
-        before, spread = spread, quantile_below(_CUT * spread, _HALF)
+    for _ in range(_ROUNDS):
+        before, spread = spread, quantile_below(_CUT * spread, 0.5)
         if math.isnan(spread):
             return before
         if abs(spread - before) <= 1e-6 * before:
             break
     return spread
+
+
+def _sort_runs(values: Array, runs: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """The sorted values of each run one behind the other, and (r + 1,) where they begin and end."""
+    ordered = [np.sort(values[first:end]) for first, end in runs.tolist()]
+    edges = np.cumsum([0, *map(len, ordered)])
+    return contiguous(np.concatenate([*ordered, values[:0]])), contiguous(edges)
+
+
+@compiled()
+def _spreads(ordered, edges, start, rounds):  # type: ignore[no-untyped-def]
+    """Per run the start's quantile times its factor, then :func:`iterate_spread`."""
+    found = np.empty(len(edges) - 1)
+    for i in range(len(found)):
+        values = ordered[edges[i] : edges[i + 1]]
+        spread = start[1] * _quantile_below(values, math.inf, start[0])
+        for _ in range(rounds):
+            before, spread = spread, _quantile_below(values, _CUT * spread, 0.5)
+            if math.isnan(spread):
+                spread = before
+                break
+            if abs(spread - before) <= 1e-6 * before:
+                break
+        found[i] = spread
+    return found
+
+
+@compiled(part=True)
+def _quantile_below(ordered, limit, share):  # type: ignore[no-untyped-def]
+    """The quantile of the finite values up to a limit, interpolated; NaN without any."""
+    count, end = 0, len(ordered)
+    while count < end:
+        middle = (count + end) // 2
+        below = ordered[middle] <= limit and ordered[middle] < math.inf
+        count, end = (middle + 1, end) if below else (count, middle)
+    if count == 0:
+        return math.nan
+    place = share * (count - 1)
+    k = int(place)
+    return ordered[k] + (place - k) * (ordered[min(k + 1, count - 1)] - ordered[k])

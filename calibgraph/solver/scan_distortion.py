@@ -25,6 +25,7 @@ from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import ResidualScale
 from factors import FreeLensBlock, ProjectionBlock
+from factors.block_arrays import whiten
 
 Numbers = NDArray[np.int64]
 
@@ -199,23 +200,12 @@ def _jacobians(
     block: ProjectionBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3
 ) -> tuple[Array, Array, Array]:
     """(2 n, 6) and (2 n, 3) Jacobians of the whitened residuals, and (2 n,) the residuals."""
-    T = to_T_camera_lidar(T_lidar_camera)
-    points = block.points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    _, by_point = block.lens.project_with_jacobian(points)
-    residuals, _ = block.residuals(T_lidar_camera)
-    moved = (distortions_at(block.points_lidar_m) @ T[:3, :3].T).transpose(0, 2, 1)
-    gradient, (x, y, z) = by_point.transpose(2, 1, 0).copy(), points.T
-    across, down, ahead = gradient
-    by_rotation = np.stack(  # of a point q and the gradient g: g x q
-        [down * z - ahead * y, ahead * x - across * z, across * y - down * x]
-    )
-    by_distortion = np.einsum("jin,kjn->kin", gradient, moved)
-    values = np.concatenate(
-        [by_rotation, -gradient, by_distortion, residuals.T[None]]
-    )  # (10, 2, n)
-    root = block.sqrt_information
-    if root is not None:  # upper triangular
-        s00, s01, s11 = root.T
-        values = np.stack([s00 * values[:, 0] + s01 * values[:, 1], s11 * values[:, 1]], axis=1)
-    whitened = values.transpose(2, 1, 0).reshape(-1, len(values)) / scale.sigma
+    T, columns = to_T_camera_lidar(T_lidar_camera), np.empty((10, 2, len(block)))
+    pixels = block.lens.fill_twist_columns(T, block.points_lidar_m, columns[:6])
+    moved = distortions_at(block.points_lidar_m) @ T[:3, :3].T
+    columns[6:9] = np.einsum("jin,knj->kin", columns[3:6], moved)
+    columns[:6] *= -1.0  # T_lidar_camera exp(xi) is exp(-xi) T_camera_lidar
+    columns[9] = block.lens.subtract(pixels.T, block.pixels_px).T
+    whiten(columns, block.sqrt_information)
+    whitened = columns.transpose(2, 1, 0).reshape(-1, 10) / scale.sigma
     return whitened[:, :6], whitened[:, 6:-1], whitened[:, -1]

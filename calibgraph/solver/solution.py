@@ -14,8 +14,8 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import Rig
+from calibgraph.solver.curvature import FittedObjective
 from calibgraph.solver.error_model import ErrorFit
-from calibgraph.solver.fitted import FittedObjective
 from calibgraph.solver.lens import moved_lenses, put_into
 from calibgraph.solver.lens_estimates import lens_covariances, lens_estimates
 from calibgraph.solver.marginals import Marginals

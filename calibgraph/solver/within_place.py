@@ -12,17 +12,20 @@ to the pose a_cp, together with what the frames of a place share by the matcher'
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import BlockByPlace
+from calibgraph.graph.by_place import BlockByPlace, PairByPlace, place_of
 from calibgraph.model.error_components import error_components
 from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_pairs import PairTerm, usual_excess
 from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.curvature import convex_hessian
-from calibgraph.solver.fitted import FittedObjective
+from calibgraph.solver.curvature import FittedObjective, convex_hessian
+from calibgraph.solver.residual_scale import ResidualScale
 from factors import pose_sigmas
 
 _LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with
@@ -146,3 +149,39 @@ def relative_covariance(scatter: Array, root: Array, true: Array) -> tuple[Array
     inverse = np.linalg.inv(true)
     covariance: Array = root.T @ inverse @ scatter @ inverse @ root
     return covariance, float(np.trace(root.T @ inverse @ root)) / 6
+
+
+Numbers = NDArray[np.int64]
+
+
+def block_by_place(
+    camera: CameraBlock, scale: ResidualScale, places: Sequence[Numbers]
+) -> BlockByPlace:
+    """The correspondences of a camera, sorted by place.
+
+    Args:
+        camera: its correspondences.
+        scale: of their residuals.
+        places: the frame numbers of each place.
+    """
+    of_frame, counts = place_of(camera.frame_numbers, places), camera.frame_counts
+    if len(places) == 1:
+        return BlockByPlace(camera.with_scale(scale), np.array([0, len(camera)]), of_frame, counts)
+    edges = np.zeros(len(places) + 1, dtype=np.int64)
+    np.add.at(edges[1:], of_frame, counts)
+    block = camera.sorted_by(of_frame).with_scale(scale)
+    return BlockByPlace(block, edges.cumsum(), of_frame, counts)
+
+
+def pairs_by_place(pairs: Sequence[PairTerm], places: Sequence[Numbers]) -> list[PairByPlace]:
+    """Each term with the information of features that err as usual in a frame."""
+    found = []
+    for pair in pairs:
+        own = [one for one in pairs if {one.a, one.b} == {pair.a, pair.b}]
+        term = pair.deflate(usual_excess(own))
+        of_row = place_of(term.frame, places)
+        rows = np.argsort(of_row, kind="stable")
+        present, first = np.unique(of_row[rows], return_index=True)
+        edges = np.append(first, len(rows))
+        found.append(PairByPlace(term.a, term.b, term.block.select(rows), present, edges))
+    return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -13,13 +13,14 @@ from calibgraph.graph.variables import lens_key
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
 from calibgraph.model.lens_estimate import LensEstimate, with_sigmas
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import RelativePose, Rig
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.solver.conflicts import Conflict
-from calibgraph.solver.covariance import ENOUGH_FRAMES, sigmas_of_hessian
+from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.lens_estimates import estimates_of
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.closed_places import ClosedPlaces
+from calibgraph.tracking.contradictions import contradicting, pairs_without
 from calibgraph.tracking.epoch_sums import estimates_of_halves, in_its_half
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.offsets import Offsets
@@ -28,8 +29,21 @@ from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
 from calibgraph.tracking.window import Window
 from calibgraph.trust.estimate import Estimate
+from calibgraph.trust.image_posteriors import ImagePosteriors, measured_pairs
+from calibgraph.trust.pose_posterior import (
+    MAX_FRAMES,
+    PosePosterior,
+    group_tied,
+    no_posteriors,
+)
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
+from factors.conditioning import sigmas_of_hessian
+
+MeasureOnFrames = Callable[
+    [Sequence[int], Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
+]
+"""As ``MeasurePosteriors``, on the frames of some numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +57,7 @@ class Assessment:
         verdicts: per camera.
         window: the graph at its optimum, until the next frame.
         lens: per camera whose time offset is estimated, its estimate.
+        pairs: the relative poses that take part.
     """
 
     T_lidar_camera: tuple[gtsam.Pose3, ...]
@@ -50,6 +65,7 @@ class Assessment:
     verdicts: dict[str, Verdict]
     window: Window
     lens: dict[str, tuple[LensEstimate, ...]]
+    pairs: tuple[RelativePose, ...] = ()
 
     def offsets(self, state: State) -> Offsets | None:
         """The time offsets with those of the graph; None if they are not estimated."""
@@ -92,7 +108,35 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
         verdicts[name] = _verdict(
             state, sums, camera, covariance, conflicts=own, halves=apart.get(camera), lens=known
         )
-    return Assessment(estimates, covariance, verdicts, window, lens)
+    pairs = pairs_without(state, contradicting(conflicts))
+    return Assessment(estimates, covariance, verdicts, window, lens, pairs)
+
+
+def with_images(
+    state: State, assessment: Assessment, measure: MeasureOnFrames
+) -> tuple[Assessment, ImagePosteriors]:
+    """The assessment with error bars and verdicts by the posteriors of cameras with error bars."""
+    own = covariance_by_camera(assessment, state.names)
+    known = {name: covariance for name, covariance in own.items() if covariance is not None}
+    groups = group_tied(tuple(known), measured_pairs(assessment.pairs))
+    posteriors = measure(_frames_of(state, known), known, groups)
+    images = ImagePosteriors(state.names, assessment.joint_covariance, posteriors)
+    row, flatness, verdicts = threshold("beyond_tolerance"), images.check_flatness(), {}
+    for name, verdict in assessment.verdicts.items():
+        more = []
+        if name in flatness:
+            beyond = images.probability_beyond(name, state.config.tolerance)
+            more = [flatness[name], row.check(beyond)]
+        verdicts[name] = Verdict((*verdict.checks, *more))
+    joint = images.widen(assessment.joint_covariance)
+    return replace(assessment, joint_covariance=joint, verdicts=verdicts), images
+
+
+def _frames_of(state: State, cameras: Collection[str]) -> list[int]:
+    """Numbers of the frames that show cameras at their present poses, as of a drift the last."""
+    numbers = {state.names.index(name) for name in cameras}
+    frames = [frame.number for frame in state.live_frames if numbers <= frame.raw.keys()]
+    return frames[-MAX_FRAMES:] if numbers & {*state.drifting} else frames
 
 
 def _lens_estimates(window: Window) -> dict[str, tuple[LensEstimate, ...]]:
@@ -211,11 +255,14 @@ def second_moments(assessment: Assessment) -> Array:
     return np.asarray(window.covariance(keys) + np.outer(away, away))
 
 
-def to_calibration(state: State, assessment: Assessment) -> Calibration:
+def to_calibration(
+    state: State, assessment: Assessment, measure: MeasureOnFrames = no_posteriors
+) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
+    assessment, images = with_images(state, assessment, measure)
     joint = assessment.joint_covariance
     known = None if np.isnan(joint).any() else joint
-    mounts = None if known is None else second_moments(assessment)
+    mounts = None if known is None else images.widen(second_moments(assessment))
     newest = replace(state, offsets=assessment.offsets(state))
     rig = rig_at(newest, assessment.T_lidar_camera)
     return Calibration(

@@ -75,31 +75,40 @@ class ClosedPlaces:
     )
 
     @staticmethod
-    def of(state: State) -> ClosedPlaces:
+    def of(state: State, *, fitted: bool = False) -> ClosedPlaces:
         """Of a state's closed epochs, at the optimum that the state has, or else fitted."""
         frames = [frame for epoch in state.epochs[:-1] for frame in epoch.frames]
         if state.offsets is None:
-            sums, earlier = state.places.add(sums_by_place(frames)), state.places
+            sums = state.places.add(sums_by_place(frames))
         else:  # a match of an earlier epoch is of another offset
-            sums, earlier, frames = *2 * (_sums_in_time(state),), []
+            sums, frames = _sums_in_time(state), []
         for camera in state.drifting:
-            sums, earlier = sums.without(camera), earlier.without(camera)
-        seen = FrameSpread.of(state, sums)
+            sums = sums.without(camera)
         rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
-        data, times = (
-            PlaceData.of(state, quadratics_of(state, earlier), frames, rows),
-            times_of(state),
-        )
+        data = PlaceData.of(state, _earlier_quadratics(state, sums), frames, rows)
+        seen = FrameSpread.of(state, sums)
+        return ClosedPlaces._of_data(state, sums, seen, data, fitted=fitted)
+
+    @staticmethod
+    def _of_data(
+        state: State, sums: PlaceSums, seen: FrameSpread, data: PlaceData, *, fitted: bool
+    ) -> ClosedPlaces:
+        times = times_of(state)
         data = data.at_own_times(times)
         model = place_model(state, sums, seen, data, times=times)
         values = _start(state, model, data.names)
-        if state.optimum is None:
+        if state.optimum is None or fitted:
             fit, dropped = fit_without_contradictions(state, sums, model, values)
         else:
             dropped = state.optimum.contradicting
             model = changed(model, pose_graph=pose_priors(state, dropped))
             fit = LatentPoseFit(Linearization.at(model, values), 0, True)
         return ClosedPlaces(state, sums, seen, data, fit, dropped)
+
+    def at_optimum(self, state: State) -> ClosedPlaces:
+        """The same epochs at another optimum, and with other variance ratios."""
+        data = self.data.with_quadratics(state, _earlier_quadratics(state, self.sums))
+        return ClosedPlaces._of_data(state, self.sums, self.seen, data, fitted=False)
 
     def fitted(self, state: State) -> ClosedPlaces:
         """At the optimum for the variance ratios of the state."""
@@ -251,18 +260,33 @@ def _sums_in_time(state: State) -> PlaceSums:
     return sums
 
 
+def _earlier_quadratics(state: State, sums: PlaceSums) -> Quadratics:
+    """Of the frames whose matches are not kept, or at an offset that is not the present one."""
+    if state.offsets is not None:
+        return quadratics_of(state, sums)
+    return quadratics_of(state, state.places, _steady(state))
+
+
+def _steady(state: State) -> list[int]:
+    return [camera for camera, one in enumerate(state.cameras) if not one.summary.walk]
+
+
 def settle(state: State, *, together: bool) -> tuple[State, ClosedPlaces]:
     """The state with optimum and variance ratios of its closed epochs.
 
     When these are many an epoch changes little, and the frames after it do the work step by step;
     but not if they come together.
     """
-    closed, state = ClosedPlaces.of(state), changed(state, is_refined=together)
-    if closed.is_settled and not together:
+    at_once = together and state.optimum is not None
+    closed = ClosedPlaces.of(state, fitted=at_once)
+    state = changed(state, is_refined=together)
+    if at_once:  # this is where the first step leads
+        state = changed(state, optimum=closed.optimum)
+    elif closed.is_settled and not together:
         return state, closed
-    for step in range(1, STEPS + 1):
+    for step in range(2 if at_once else 1, STEPS + 1):
         state, closed = refine(state, closed, step)
-    return state, ClosedPlaces.of(state)
+    return state, closed.at_optimum(state)
 
 
 def refine(state: State, closed: ClosedPlaces, step: int) -> tuple[State, ClosedPlaces]:

@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -27,6 +28,7 @@ from calibgraph.tracking.history import History
 from calibgraph.tracking.preload import warm_up_tracker
 from calibgraph.tracking.run import Notify, Run
 from calibgraph.tracking.streams import Item, frames_of
+from calibgraph.tracking.tracker import IncrementalCalibrator
 
 STATE_FOLDER, PICTURE = "state", "track.png"
 _TOGETHER = 50  # frames of a table that are read before they are taken in
@@ -79,7 +81,7 @@ def track(
     with _stopped_by_signals() as stop:
         if waits:
             warm_up_tracker()
-        items, calibrator = _opened(settings, source, stop, notify)
+        items, calibrator, result_of = _opened(settings, source, stop, notify)
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
         together = 1 if waits or settings.matcher is not None else _TOGETHER
         run = Run(calibrator, history, print_line, notify, together)
@@ -88,7 +90,7 @@ def track(
             if calibrator.tracker.frame is None and not stop():
                 held = f"held no frame that could be used ({run.refused} left out); check it"
                 raise FileError("standard input" if str(source[0]) == "-" else source[0], held)
-            result = calibrator.tracker.calibration()
+            result = result_of(calibrator.tracker)
     run.report_counts()
     result = replace(result, initial_rig=settings.rig)  # not where the first batch has located it
     return result, _write_results(settings.out, result, history if run.updates else None)
@@ -107,8 +109,9 @@ def _write_results(folder: Path, result: Calibration, history: History | None) -
 
 def _opened(
     settings: Tracking, source: Sequence[Path], stop: Callable[[], bool], notify: Notify
-) -> tuple[Iterator[Item], DurableCalibrator]:
-    """The frames of the source, and the durable tracker."""
+) -> tuple[Iterator[Item], DurableCalibrator, Callable[[IncrementalCalibrator], Calibration]]:
+    """The frames of the source, the durable tracker, and the function that gives its result."""
+    result_of: Callable[[IncrementalCalibrator], Calibration] = IncrementalCalibrator.calibration
     folder = settings.out / STATE_FOLDER
     if settings.matcher is None:
         items = frames_of(str(source[0]), follow=settings.follow, stop=stop)
@@ -122,11 +125,12 @@ def _opened(
             begin=lambda: _first_rig(drive, settings.rig, notify),
         )
         items = drive.items(calibrator.tracker)
+        result_of = partial(drive.result, notify=notify)
     for damage in calibrator.damages:
         notify(f"warning: {damage}")
     if calibrator.resumed:
         notify(f"going on after frame {calibrator.tracker.frame}")
-    return items, calibrator
+    return items, calibrator, result_of
 
 
 def _drive(settings: Tracking, matcher: Matcher, source: Sequence[Path]) -> DatasetDrive:

@@ -15,6 +15,7 @@ from calibgraph.graph.objective import join, objective_graph
 from calibgraph.graph.variables import camera_key
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import to_T_camera_lidar
+from calibgraph.model.rig import RelativePose
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.elimination import LatentPoseFit, Linearization, fit_latent_poses
@@ -51,6 +52,12 @@ def contradicting(conflicts: Conflicts) -> Rows:
     return tuple(place for place, one in conflicts.items() if one.largest > limit)
 
 
+def pairs_without(state: State, dropped: Rows = ()) -> tuple[RelativePose, ...]:
+    """The relative poses that no move has invalidated, but for some, by their places in the rig."""
+    pairs = enumerate(state.rig.relative_poses)
+    return tuple(pair for place, pair in pairs if place not in (*state.dropped_pairs, *dropped))
+
+
 def pose_priors(state: State, dropped: Rows = ()) -> gtsam.NonlinearFactorGraph:
     """Priors about the references, and the relative poses that no move has invalidated.
 
@@ -58,9 +65,7 @@ def pose_priors(state: State, dropped: Rows = ()) -> gtsam.NonlinearFactorGraph:
         state: of the tracker.
         dropped: further relative poses that take no part.
     """
-    pairs = enumerate(state.rig.relative_poses)
-    kept = tuple(pair for place, pair in pairs if place not in (*state.dropped_pairs, *dropped))
-    rig = state.rig.model_copy(update={"relative_poses": kept})
+    rig = state.rig.model_copy(update={"relative_poses": pairs_without(state, dropped)})
     return objective_graph(rig, {}, poses_by_name(state), state.config, terms="full")
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, CorrespondenceError, MotionError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
@@ -25,6 +26,7 @@ from calibgraph.tracking.frame_order import with_place
 from calibgraph.tracking.place_sums import MOST_PLACES
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
 from calibgraph.tracking.tracker import IncrementalCalibrator
+from calibgraph.trust.pose_posterior import PosePosterior, measure_posteriors
 
 MOST_AGAIN = 200
 """Frames that a restart looks at again, at 0.1 s each, to find where the vehicle is."""
@@ -63,6 +65,34 @@ class DatasetDrive:
         seed = self.config.seed
         finder = PlaceFinder(tracker.initial_rig, most_places=MOST_PLACES, seed=seed)
         return with_places(self._frames(tracker), self.dataset, finder, tracker.places)
+
+    def result(self, tracker: IncrementalCalibrator, notify: Callable[[str], None]) -> Calibration:
+        """The estimate, with its error bar and verdict by the images of its last frames, too.
+
+        Args:
+            tracker: at the end of the drive.
+            notify: called with a warning if they cannot be read any longer.
+        """
+        if not self.matcher.image_checks_can_fail:  # may use what the scores do not
+            return tracker.calibration()
+        try:
+            return tracker.calibration(partial(self._measure, tracker.rig))
+        except (CalibrationError, OSError) as error:
+            notify(f"warning: the images could not be checked: {error}")
+            return tracker.calibration()
+
+    def _measure(
+        self,
+        rig: Rig,
+        numbers: Sequence[int],
+        covariances: Mapping[str, Array],
+        groups: Sequence[Sequence[str]],
+    ) -> Mapping[str, PosePosterior]:
+        frames = tuple(frame for frame in self.dataset.frames if frame.index in {*numbers})
+        if not frames:
+            return {}
+        data = replace(self.dataset, frames=frames)
+        return measure_posteriors(data, rig, covariances, groups, seed=self.config.seed)
 
     def _frames(self, tracker: IncrementalCalibrator) -> Iterator[Item]:
         head, taken = self._head, tracker.frame

@@ -83,7 +83,7 @@ def in_groups(items: Iterable[Item], most: int) -> Iterator[list[StreamFrame] | 
         yield held
 
 
-def usual_frames(state: State, frames: Iterable[StreamFrame]) -> tuple[list[Incoming], Blocks]:
+def usual_frames(state: State, frames: Sequence[StreamFrame]) -> tuple[list[Incoming], Blocks]:
     """The first frames that can be taken in at once, none if that is fewer than two.
 
     Args:
@@ -93,7 +93,7 @@ def usual_frames(state: State, frames: Iterable[StreamFrame]) -> tuple[list[Inco
     Returns:
         The frames; per camera the preprocessed matches of all.
     """
-    if state.offsets is not None or may_have_moved(state):
+    if len(frames) < 2 or state.offsets is not None or may_have_moved(state):  # noqa: PLR2004
         return [], {}
     group = _alike(state, frames)
     if len(group) < 2:  # noqa: PLR2004

@@ -11,7 +11,7 @@ import numpy as np
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import PLACES
-from calibgraph.solver.repeats import REPEATED_SHARE, point_hashes
+from calibgraph.solver.repeats import REPEATED_SHARE, hash_numbers
 from calibgraph.solver.shared_error import with_common_error
 from calibgraph.tracking.offsets import with_motion_in_use
 from calibgraph.tracking.state import State
@@ -240,18 +240,16 @@ def _repeats(state: State, camera: int, table: Correspondences) -> bool:
     points = table.points_lidar_m[table.camera_index == own]
     if last is None or not len(points):
         return False
-    new = {*point_hashes(points).tolist()}  # faster than arrays, of some hundred
-    return sum(map(new.__contains__, last.tolist())) > REPEATED_SHARE * len(last)
+    return sum(map({*hash_numbers(points)}.__contains__, last)) > REPEATED_SHARE * len(last)
 
 
-def _last_hashes(state: State, camera: int) -> np.ndarray | None:
+def _last_hashes(state: State, camera: int) -> list[int] | None:
     """Of the last frame's matches, absorbed ones or, before the camera has started, waiting."""
     waiting = state.cameras[camera].waiting
     if waiting:
         rows = waiting[-1].of_camera(state.names[camera])
-        return point_hashes(rows.points_lidar_m)
+        return hash_numbers(rows.points_lidar_m)
     for frame in reversed(state.live_frames):
         if camera in frame.raw:
-            block = frame.raw[camera].block
-            return point_hashes(block.points_lidar_m)
+            return frame.raw[camera].point_hashes
     return None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
+    BlockByPlace,
     LateQuadraticByPlace,
     SummarizedByPlace,
 )
@@ -25,17 +26,18 @@ from calibgraph.graph.variables import cloud_at_key, matched_at_key, seen_lens_k
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.curvature import convex_hessian
-from calibgraph.solver.data_by_place import block_by_place
 from calibgraph.solver.elimination import LatentPoseFit, join_linear
-from calibgraph.solver.prior_components import variance_components
 from calibgraph.solver.scan_distortion import DistortionEvidence
+from calibgraph.solver.variance_components import variance_components
 from calibgraph.solver.within_place import (
     WEAK,
     WithinPlace,
     allow_for_few_frames,
+    block_by_place,
     relative_covariance,
     split_excess,
 )
+from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
 from calibgraph.tracking.offset_terms import offset_term, walk_in_graph, with_shared_errors
 from calibgraph.tracking.offset_walk import (
@@ -150,6 +152,16 @@ class PlaceData:
             elif len(quadratic.places):
                 cameras[camera] = quadratic
         return PlaceData([*places], np.array([*places.values()], dtype=np.int64), cameras)
+
+    def with_quadratics(self, state: State, earlier: Quadratics) -> PlaceData:
+        """The same matches with other quadratics of earlier ones."""
+        cameras = dict(self.cameras)
+        for camera, own in self.cameras.items():
+            if not isinstance(own, BlockByPlace):
+                quadratic = by_place(state, camera, earlier[camera], self.names)
+                several = isinstance(own, SummarizedByPlace)
+                cameras[camera] = changed(own, earlier=quadratic) if several else quadratic
+        return replace(self, cameras=cameras)
 
     def at_own_times(self, times: Times) -> PlaceData:
         """The same of closed places, each at the time offset of its own time."""

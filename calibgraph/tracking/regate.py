@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import islice
+from itertools import islice, pairwise
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
@@ -30,16 +31,17 @@ def regate(state: State) -> State:
     inliers, sums = [dict(frame.inliers) for frame in live], Sums.stack([f.sums for f in live])
     for camera in range(len(state.cameras)):
         for own, pose in _linearized_together(state, camera):
-            found, shown = _regate_camera(state, camera, [live[row] for row in own], pose)
+            frames, before = [live[row] for row in own], sums.hessian[own, camera]
+            found, shown = _regate_camera(state, camera, frames, pose, hessian=before)
             sums.packed[own, camera] = shown.packed
             for row, rows in zip(own, found, strict=True):
                 inliers[row][camera] = rows
-    frames = iter(
+    gated = iter(
         LiveFrame(f.number, f.raw, inliers[row], sums[row], f.place, f.twists_per_s)
         for row, f in enumerate(live)
     )
     epochs = tuple(
-        changed(epoch, frames=tuple(islice(frames, len(epoch.frames)))) for epoch in state.epochs
+        changed(epoch, frames=tuple(islice(gated, len(epoch.frames)))) for epoch in state.epochs
     )
     return changed(state, epochs=epochs)
 
@@ -58,26 +60,31 @@ def _linearized_together(state: State, camera: int) -> Iterator[tuple[list[int],
 
 
 def _regate_camera(
-    state: State, camera: int, frames: Sequence[LiveFrame], T_lidar_camera: gtsam.Pose3
+    state: State,
+    camera: int,
+    frames: Sequence[LiveFrame],
+    T_lidar_camera: gtsam.Pose3,
+    *,
+    hessian: Array,
 ) -> tuple[list[NDArray[np.bool_]], Sums]:
     """A camera's inliers of (f) frames, and (f,) their sums at an estimate.
 
-    Hessians of frames are as they were, but for a share of what their sum is now.
+    Hessians of frames are as they were, (f, 6, 6), but for a share of what their sum is now.
     """
     scale, raw = state.cameras[camera].scale, merge([frame.raw[camera] for frame in frames])
     gate = _gate_pose(state, camera, raw, T_lidar_camera)
     rows = raw.within_gate(to_T_camera_lidar(gate), scale.gate_px)
-    found = [
-        new if np.count_nonzero(new) >= MIN_MATCHES else frame.inliers[camera]
-        for frame, new in zip(frames, np.split(rows, raw.frame_edges[1:-1]), strict=True)
-    ]
+    edges = raw.frame_edges
+    counts = np.add.reduceat(rows, edges[:-1], dtype=np.int64)
+    found = [rows[first:end] for first, end in pairwise(edges.tolist())]
+    for frame in np.flatnonzero(counts < MIN_MATCHES).tolist():
+        found[frame] = frames[frame].inliers[camera]
     inliers = raw.select(np.concatenate(found))
     block = inliers.with_scale(scale)
     here = block.frame_sums(T_lidar_camera, inliers.frame_edges)
     robust = robust_hessian(block, T_lidar_camera)
     residuals = BlockResiduals.at(to_T_camera_lidar(gate), raw)
     true = convex_hessian(robust + residuals.gate_hessians(scale)[0], robust)
-    hessian = Sums.stack([frame.sums[camera] for frame in frames]).hessian
     if state.offsets is not None:
         hessian = np.zeros_like(hessian)
     missing = true - hessian.sum(axis=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -152,10 +153,12 @@ def count_residuals(
     camera_state: CameraState, residuals: BlockResiduals, inliers: NDArray[np.bool_]
 ) -> CameraState:
     """The camera with the residuals of frames counted, and which of them are within the gate."""
-    inner = residuals.block.frame_edges[1:-1]
-    shares = [np.count_nonzero(own) / len(own) for own in np.split(inliers, inner)]
-    medians = [*map(median, np.split(residuals.errors_px, inner))]
-    recent = np.vstack([camera_state.recent, np.column_stack([shares, medians])])[-HISTORY:]
+    ends, errors_px = pairwise(residuals.block.frame_edges.tolist()), residuals.errors_px
+    new = [
+        (np.count_nonzero(inliers[first:end]) / (end - first), median(errors_px[first:end]))
+        for first, end in ends
+    ]
+    recent = np.concatenate([camera_state.recent, new])[-HISTORY:]
     return changed(camera_state, recent=recent, residuals=camera_state.residuals.add(residuals))
 
 

@@ -134,7 +134,7 @@ class State:
     @property
     def live_frames(self) -> tuple[LiveFrame, ...]:
         """The frames of all live epochs."""
-        return tuple(frame for epoch in self.epochs for frame in epoch.frames)
+        return tuple(chain.from_iterable(epoch.frames for epoch in self.epochs))
 
     @property
     def knows_motion(self) -> bool | None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows
@@ -120,24 +122,19 @@ def detect_small_step(state: State) -> DetectedStep | None:
 
     Not while outlier frames may show that it is a large one.
     """
-    best, detected = 0.0, None
     if any(_is_pending(camera_state) for camera_state in state.cameras):
         return None
-    sums = [_scattered_as_usual(state, epoch) for epoch in reversed(state.epochs)]
-    afterwards = [*accumulate(sums)][::-1]
-    befores = sums_before_epochs(state)
-    next(befores)
-    for epoch, before, after in zip(state.epochs[1:], befores, afterwards[1:], strict=True):
-        if not epoch.frames:
-            continue
-        since = epoch.frames[0].number
-        for camera, camera_state in enumerate(state.cameras):
-            if not camera_state.started or _shift_excess(state, camera, before, after) <= best:
-                continue  # by what places share it is less still
-            by_places = shift_since(state, since)
-            excess = _shift_excess(state, camera, before, after, by_places=by_places)
-            if excess > best:
-                best, detected = excess, DetectedStep(since, frozenset([camera]))
+    best, detected, tests = 0.0, None, _score_tests(state)
+    for row in np.flatnonzero(tests.excess > 0):
+        if tests.excess[row] <= best:
+            continue  # by what places share it is less still
+        epoch, camera = tests.epochs[row], int(tests.cameras[row])
+        since, rows = state.epochs[epoch].frames[0].number, pose_rows(camera)
+        by_places = tests.hessian[row] @ shift_since(state, since)[rows, rows] @ tests.hessian[row]
+        wider = tests.covariance[row] + by_places
+        excess = squared_sigmas(tests.score[row], wider) / tests.limits[row] - 1.0
+        if excess > best:
+            best, detected = excess, DetectedStep(since, frozenset([camera]))
     return detected
 
 
@@ -158,33 +155,65 @@ def _scattered_as_usual(state: State, epoch: Epoch) -> Sums:
     return epoch.sums_of(frames)
 
 
-def _shift_excess(
-    state: State,
-    camera: int,
-    before: Sums,
-    after: Sums,
-    *,
-    by_places: Array | None = None,
-) -> float:
-    """Excess of the contradiction between a camera's frames before and after, over the limit.
+@dataclass(frozen=True, eq=False)
+class _ScoreTests:
+    """Whether a camera's frames before and after the start of an epoch contradict each other.
 
-    A score test: undetermined directions do not count.
+    Undetermined directions do not count.
+
+    Attributes:
+        epochs: (k,) which begin then, by their places among the live ones.
+        cameras: (k,) by their places in the rig.
+        score: (k, 6) gradient of the frames after, at the minimum of those before.
+        covariance: (k, 6, 6) of the score.
+        hessian: (k, 6, 6) of the frames after.
+        limits: (k,) of the squared sigmas.
     """
-    frames = before.frames[camera]
-    known_scatter = state.cameras[camera].groups[0].count >= _LEAST_EPOCHS
-    if frames < _BEFORE or not known_scatter or not after.frames[camera]:
-        return 0.0
-    step = before.pose.step(camera)
-    if step is None:
-        return 0.0
-    hessian, rows = after.hessian[camera, :6, :6], pose_rows(camera)
+
+    epochs: NDArray[np.int64]
+    cameras: NDArray[np.int64]
+    score: Array
+    covariance: Array
+    hessian: Array
+    limits: Array
+
+    @cached_property
+    def excess(self) -> Array:
+        """(k,) of the contradiction, over the limit."""
+        sigmas = np.linalg.solve(self.covariance, self.score[..., None])[..., 0]
+        return np.asarray((self.score * sigmas).sum(axis=1) / self.limits - 1.0)
+
+
+def _score_tests(state: State) -> _ScoreTests:
+    """Those of all cameras, at the starts of all live epochs but the first."""
+    sums = [_scattered_as_usual(state, epoch) for epoch in reversed(state.epochs)]
+    after = Sums.stack([*accumulate(sums)][::-1])
+    before = Sums.stack([*sums_before_epochs(state)])
+    ready = [one.started and one.groups[0].count >= _LEAST_EPOCHS for one in state.cameras]
+    tested = (before.frames >= _BEFORE) & (after.frames > 0) & np.array(ready)
+    tested[0] = False
+    tested &= np.array([[len(epoch.frames) > 0] for epoch in state.epochs])
+    tested[tested] = before[tested].are_determined
+    epochs, cameras = np.nonzero(tested)
+    before, after = before[tested], after[tested]
+    hessian = after.hessian[:, :6, :6]
     if state.offsets is None:
-        by_frames = before.scatter[camera] * (after.frames[camera] / (frames - 1))
-        by_frames = by_frames + hessian @ before.covariance(camera) @ hessian
-        covariance = by_frames * state.inflation(camera)
-        score = after.gradient[camera] + hessian @ step
+        score, covariance = _scores(before, after)
+        covariance = covariance * np.array([*map(state.inflation, cameras.tolist())])[:, None, None]
     else:
-        score, covariance = score_after(state, camera, before[camera], after[camera])
-    if by_places is not None:
-        covariance = covariance + hessian @ by_places[rows, rows] @ hessian
-    return squared_sigmas(score, covariance) / alarm_limit(frames) - 1.0
+        numbered = enumerate(cameras.tolist())
+        pairs = [score_after(state, camera, before[k], after[k]) for k, camera in numbered]
+        score = np.array([each for each, _ in pairs]).reshape(-1, 6)
+        covariance = np.array([each for _, each in pairs]).reshape(-1, 6, 6)
+    limits = np.array([*map(alarm_limit, before.frames)])
+    return _ScoreTests(epochs, cameras, score, covariance, hessian, limits)
+
+
+def _scores(before: Sums, after: Sums) -> tuple[Array, Array]:
+    """(k, 6) gradients of the frames after, and (k, 6, 6) their covariances by scatter."""
+    inverse = np.linalg.inv(before.hessian)
+    step = np.linalg.solve(before.hessian, -before.gradient[..., None])
+    score = after.gradient + (after.hessian @ step)[..., 0]
+    by_estimate = after.hessian @ (inverse @ before.scatter @ inverse) @ after.hessian
+    frames = after.frames / (before.frames - 1)
+    return score, before.scatter * frames[:, None, None] + by_estimate

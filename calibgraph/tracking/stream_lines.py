@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -27,7 +28,7 @@ from pydantic_core import from_json
 
 from calibgraph.errors import CorrespondenceError, MotionError
 from calibgraph.files import describe
-from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.table_columns import COORDINATES, INFORMATION, as_confidence
 from calibgraph.tracking.frame_order import LONGEST_PLACE, with_place
@@ -60,44 +61,18 @@ class CameraColumns(BaseModel):
 
     @model_validator(mode="after")
     def _require_whole_table(self) -> Self:
-        partial = sorted(self.model_fields_set.intersection(INFORMATION))
+        given = self.model_fields_set
+        partial = sorted(given.intersection(INFORMATION))
         if partial and len(partial) < len(INFORMATION):
             raise ValueError(f"has only {partial} of {list(INFORMATION)}; add all")
-        lengths = {key: len(getattr(self, key)) for key in self.given}
+        lengths = {k: len(getattr(self, k)) for k in type(self).model_fields if k in given}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"the lists differ in length: {lengths}")
         return self
 
-    @property
-    def given(self) -> tuple[str, ...]:
-        """The columns that the line has, in the order of the model."""
-        return tuple(key for key in type(self).model_fields if key in self.model_fields_set)
-
-    def table(
-        self, camera: str, frame: int, stamp_ns: int | None, *, indexed: bool
-    ) -> Correspondences:
-        """The correspondences of this camera; ``indexed``: with the index of each point, or -1.
-
-        Raises:
-            CorrespondenceError: if a value is out of its range.
-        """
-        n = len(self.u_px)
-        confidence = self.confidence if "confidence" in self.given else np.ones(n)
-        informed = INFORMATION[0] in self.given
-        return Correspondences(
-            cameras=(camera,),
-            camera_index=np.zeros(n, np.int32),
-            frame=np.full(n, frame, np.int64),
-            pixels_px=self._stack(COORDINATES[:2]),
-            points_lidar_m=self._stack(COORDINATES[2:]),
-            confidence=as_confidence(np.array(confidence, np.float64)),
-            information_px=self._stack(INFORMATION) if informed else None,
-            stamp_ns=None if stamp_ns is None else np.full(n, stamp_ns, np.int64),
-            point_index=np.array(self.point_index or [-1] * n, np.int64) if indexed else None,
-        )
-
-    def _stack(self, keys: Sequence[str]) -> NDArray[np.float64]:
-        return np.stack([np.array(getattr(self, key), np.float64) for key in keys], axis=1)
+    def array(self, keys: Sequence[str]) -> NDArray[np.float64]:
+        """(n, k) of some columns."""
+        return np.array([getattr(self, key) for key in keys], np.float64).T.copy()
 
 
 class HeaderLine(BaseModel):
@@ -129,17 +104,58 @@ class FrameLine(BaseModel):
         Raises:
             CorrespondenceError: if a value is out of its range.
         """
-        stamp_ns = self.stamp_ns if "stamp_ns" in self.model_fields_set else None
-        indexed = any("point_index" in columns.given for columns in self.cameras.values())
-        tables = [
-            columns.table(camera, self.frame, stamp_ns, indexed=indexed)
-            for camera, columns in self.cameras.items()
-        ]
-        table = concatenate(tables) if tables else _EMPTY
-        table = table.with_metadata({**header, **self.metadata})
-        if self.twist_per_s is not None:
-            table = replace(table, twist_per_s=np.tile(self.twist_per_s, (len(table), 1)))
+        metadata = {**header, **self.metadata}
+        table = self._table(metadata) if self.cameras else _EMPTY.with_metadata(metadata)
         return StreamFrame(self.frame, with_place(table, self.place))
+
+    def _table(self, metadata: dict[str, Any]) -> Correspondences:
+        """The rows of all cameras, in the order of the line."""
+        names, parts = tuple(sorted(self.cameras)), [*self.cameras.values()]
+        counts = [len(part.u_px) for part in parts]
+        given, n = set[str]().union(*(part.model_fields_set for part in parts)), sum(counts)
+        stamped, twist = "stamp_ns" in self.model_fields_set, self.twist_per_s
+        try:
+            return Correspondences(
+                cameras=names,
+                camera_index=np.repeat([*map(names.index, self.cameras)], counts).astype(np.int32),
+                frame=np.full(n, self.frame, np.int64),
+                pixels_px=np.concatenate([part.array(COORDINATES[:2]) for part in parts]),
+                points_lidar_m=np.concatenate([part.array(COORDINATES[2:]) for part in parts]),
+                confidence=_confidence(parts),
+                information_px=_information(parts) if INFORMATION[0] in given else None,
+                stamp_ns=np.full(n, self.stamp_ns, np.int64) if stamped else None,
+                point_index=_indices(parts) if "point_index" in given else None,
+                twist_per_s=None if twist is None else np.tile(twist, (n, 1)),
+                metadata=metadata,
+            )
+        except CorrespondenceError as error:  # of a row: the lists of a camera have numbers
+            before = dict(zip(self.cameras, accumulate(counts, initial=0), strict=False))
+            raise error.after(-before.get(error.camera or "", 0)) from None
+
+
+def _confidence(parts: Sequence[CameraColumns]) -> NDArray[np.float32]:
+    """(n,) of all rows; 1 where a camera states none."""
+    return as_confidence(np.concatenate([
+        np.array(part.confidence, np.float64) if "confidence" in part.model_fields_set
+        else np.ones(len(part.u_px))
+        for part in parts
+    ]))  # fmt: skip
+
+
+def _information(parts: Sequence[CameraColumns]) -> NDArray[np.float64]:
+    """(n, 3) of all rows; the identity where a camera states none."""
+    return np.concatenate([
+        part.array(INFORMATION) if INFORMATION[0] in part.model_fields_set
+        else np.tile([1.0, 0.0, 1.0], (len(part.u_px), 1))
+        for part in parts
+    ])  # fmt: skip
+
+
+def _indices(parts: Sequence[CameraColumns]) -> NDArray[np.int64]:
+    """(n,) number of each row's point, or -1."""
+    return np.concatenate(
+        [np.array(part.point_index or [-1] * len(part.u_px), np.int64) for part in parts]
+    )
 
 
 def frames_of_lines(chunks: Iterable[bytes], where: str) -> Iterator[Item]:

@@ -203,11 +203,6 @@ class Sums:
             return None
         return np.linalg.solve(self.hessian[camera], -self.gradient[camera])
 
-    def covariance(self, camera: int) -> Array:
-        """(6, 6) of that minimum, by the scatter of the frames."""
-        inverse = np.linalg.inv(self.hessian[camera])
-        return np.asarray(inverse @ self.scatter[camera] @ inverse)
-
 
 def is_determined(hessian: Array) -> bool:
     """Whether all six directions are determined."""

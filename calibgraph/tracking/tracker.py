@@ -24,7 +24,7 @@ from calibgraph.tracking.absorption import (
     count_absent,
     select_agreeing,
 )
-from calibgraph.tracking.assessment import Assessment, assess, to_calibration
+from calibgraph.tracking.assessment import Assessment, MeasureOnFrames, assess, to_calibration
 from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
 from calibgraph.tracking.epochs import at_explaining_offsets, close_epoch
 from calibgraph.tracking.events import Event
@@ -44,6 +44,7 @@ from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.step_detection import detect_small_step, detect_step
 from calibgraph.tracking.stream_tables import StreamFrame
 from calibgraph.tracking.update import Update, make_updates
+from calibgraph.trust.pose_posterior import no_posteriors
 
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
 
@@ -100,9 +101,9 @@ class IncrementalCalibrator:
         visited = *self._state.places.names[1:], *(f.place for f in self._state.live_frames)
         return tuple(reversed(dict.fromkeys(reversed(visited))))
 
-    def calibration(self) -> Calibration:
-        """The present estimate as a result of the same type as a batch solve's."""
-        return to_calibration(self._state, self._assess())
+    def calibration(self, measure: MeasureOnFrames = no_posteriors) -> Calibration:
+        """The present estimate as a batch's result; posteriors by images widen its error bars."""
+        return to_calibration(self._state, self._assess(), measure)
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -230,10 +231,9 @@ class IncrementalCalibrator:
 
     def _assess(self) -> Assessment:
         """Assess the estimates, once: the sums over closed epochs are at hand."""
-        state = self._state
-        if self._assessed is None or self._assessed[0] is not state:
+        if self._assessed is None or self._assessed[0] is not self._state:
             before = self._assessed and self._assessed[1].window
-            self._assessed = state, assess(state, self._closed, before)
+            self._assessed = self._state, assess(self._state, self._closed, before)
         return self._assessed[1]
 
     def to_bytes(self) -> bytes:

@@ -113,7 +113,10 @@ def json_lines(updates: Sequence[Update]) -> list[str]:
 
 
 def _json(content: Any) -> str:
-    return json.dumps(finite(content), allow_nan=False)
+    try:
+        return json.dumps(content, allow_nan=False)
+    except ValueError:  # of numbers that JSON does not have
+        return json.dumps(finite(content), allow_nan=False)
 
 
 def _estimate(update: Update, name: str) -> str:

@@ -7,7 +7,7 @@ limits. Adding it to ``solution_checks.ESTIMATE_CHECKS`` applies it while drivin
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
@@ -23,6 +23,7 @@ from calibgraph.trust.guess import (
     swap_checks,
 )
 from calibgraph.trust.image_checks import image_checks
+from calibgraph.trust.image_record import RunChecks
 from calibgraph.trust.intrinsics import intrinsics_checks
 from calibgraph.trust.matcher_checks import matcher_checks
 from calibgraph.trust.pair_agreement import pair_agreement_checks
@@ -82,14 +83,21 @@ def assess(evidence: Evidence) -> dict[str, list[Check]]:
     return concatenate([check(evidence) for check in SOLUTION_CHECKS], evidence.cameras)
 
 
-def assess_run(evidence: RunEvidence) -> dict[str, list[Check]]:
-    """Per camera, the checks of a run and of its solution; if it failed, first the likely cause."""
+def assess_run(evidence: RunEvidence) -> RunChecks:
+    """The checks of a run and of its solution; if it failed, with the likely cause."""
     cameras = evidence.solution.cameras
-    of_run = [check(evidence) for check in RUN_CHECKS]
-    checks = concatenate([assess(evidence.solution), *of_run], cameras)
+    of_solution = assess(evidence.solution)
+    of_run = concatenate([check(evidence) for check in RUN_CHECKS], cameras)
+    checks = concatenate([of_solution, of_run], cameras)
     convention = _intended_guess_checks(evidence, checks)
     implausible = implausible_checks(evidence.run.guess, checks)
-    return concatenate([convention, implausible, checks], cameras)
+    causes = concatenate([convention, implausible], cameras)
+    return RunChecks(of_solution, of_run, causes)
+
+
+def in_order(checks: RunChecks, cameras: Sequence[str]) -> dict[str, list[Check]]:
+    """Per camera, all checks; the likely cause of a failure comes first."""
+    return concatenate([checks.causes, checks.of_solution, checks.of_run], cameras)
 
 
 def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:

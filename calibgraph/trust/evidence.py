@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -29,26 +29,19 @@ from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
 from calibgraph.trust.estimate import Estimate
-from calibgraph.trust.observability import prior_shares, shares_of_marginal
-from calibgraph.trust.pose_posterior import (
-    PosePosterior,
-    group_tied,
-    no_posteriors,
-    widen,
+from calibgraph.trust.image_posteriors import (
+    ImagePosteriors,
+    MeasurePosteriors,
+    measured_pairs,
 )
-from calibgraph.trust.probability import probability_beyond
+from calibgraph.trust.observability import prior_shares, shares_of_marginal
+from calibgraph.trust.pose_posterior import PosePosterior, group_tied, no_posteriors
 from calibgraph.trust.thresholds import limit
-from factors import pose_sigmas
 
 _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unknown
 
 Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
-
-
-MeasurePosteriors = Callable[
-    [Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +97,8 @@ class Evidence:
 
         Cameras that are held are unknown by a radian and a metre.
         """
-        return self._widened(self.covariance_of_matches)
+        known = self.covariance_of_matches
+        return None if known is None else self._beside_images.widen(known)
 
     @property
     def mount_covariance(self) -> Array | None:
@@ -114,20 +108,24 @@ class Evidence:
             return None
         of, T = mount.T_camera_lidar, self.solution.T_camera_lidar
         away = np.concatenate([twist_between(of[name], T[name]) for name in T])
-        return self._widened(mount.covariance + np.outer(away, away))
+        return self._beside_images.widen(mount.covariance + np.outer(away, away))
 
-    def _widened(self, joint: Array | None) -> Array | None:
-        if joint is None or not self.posteriors:
-            return joint
-        posteriors = self.posteriors.items()
-        return widen(joint, {self.cameras.index(name): of.moments for name, of in posteriors})
+    @property
+    def _beside_images(self) -> ImagePosteriors:
+        known = self.covariance_of_matches
+        assert known is not None  # asked by those who have one
+        return ImagePosteriors(self.cameras, known, self.posteriors)
+
+    @property
+    def flatness(self) -> dict[str, Check]:
+        """Per camera with a posterior, the check whether the images leave its pose more open."""
+        return self._beside_images.check_flatness() if self.posteriors else {}
 
     @cached_property
     def posteriors(self) -> Mapping[str, PosePosterior]:
         """Per free camera, its posterior by the images' evidence."""
-        if self.covariance_of_matches is None:
+        if (known := self.covariance_of_matches) is None:
             return {}
-        known = self.covariance_of_matches
         own = {name: self._rows_of(known, name) for group in self.tied for name in group}
         return self.measure_posteriors(own, self.tied)
 
@@ -148,23 +146,13 @@ class Evidence:
         wrong = {(one.pair.a, one.pair.b) for one in conflicts if one.largest > limit}
         for fit in self.solution.marginals.pair_fits:
             yield fit.a, fit.b, fit.covariance
-        for pose in self.solution.inliers.rig.relative_poses:
-            if (pose.a, pose.b) in wrong:
-                continue
-            sigmas = pose_sigmas(
-                rotation_rad=pose.rotation_sigma_rad, translation_m=pose.translation_sigma_m
-            )
-            yield pose.a, pose.b, np.diag(sigmas**2)
+        yield from measured_pairs(self.solution.inliers.rig.relative_poses, wrong)
 
     def probability_beyond(self, camera: str) -> float:
         """The probability that its error is beyond the tolerance, by its posterior."""
-        known = None if camera in self.solution.held else self.covariance_of_matches
-        if known is None:
+        if camera in self.solution.held or self.covariance_of_matches is None:
             return 0.0
-        tolerance, own = self.solution.config.tolerance, self._rows_of(known, camera)
-        if camera not in self.posteriors:
-            return probability_beyond(own, tolerance)
-        return self.posteriors[camera].probability_beyond(own, tolerance)
+        return self._beside_images.probability_beyond(camera, self.solution.config.tolerance)
 
     @property
     def covariance_of_matches(self) -> Array | None:
@@ -185,12 +173,16 @@ class Evidence:
 
     def scatter_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, by the scatter between frames."""
-        return self._block(self.solution.marginals.scatter, camera)
+        scatter = self.solution.marginals.scatter
+        return None if scatter is None else self._rows_of(scatter, camera)
 
     def covariance_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, with the error that all the matcher's frames share."""
-        joint = None if camera in self.solution.held else self.joint_covariance
-        return self._block(joint, camera)
+        return self._block(self.joint_covariance, camera)
+
+    def covariance_by_matches(self, camera: str) -> Array | None:
+        """(6, 6) of one camera, not widened by what the images leave open."""
+        return self._block(self.covariance_of_matches, camera)
 
     @property
     def lens_covariance(self) -> dict[str, Array]:
@@ -205,7 +197,8 @@ class Evidence:
         return found
 
     def _block(self, joint: Array | None, camera: str) -> Array | None:
-        return None if joint is None else self._rows_of(joint, camera)
+        held = camera in self.solution.held
+        return None if joint is None or held else self._rows_of(joint, camera)
 
     def _rows_of(self, joint: Array, camera: str) -> Array:
         """(6, 6) of one camera, of the (6 N, 6 N) of all."""
@@ -274,20 +267,19 @@ class Evidence:
         """
         solution, block = self.solution, self.solution.inliers.blocks.get(camera)
         sigmas, conflicts = solution.marginals.data_sigmas, solution.marginals.conflicts
-        held = camera in solution.held
         return Estimate(
             camera=solution.rig.cameras[camera],
             residuals=self.residuals.get(camera),
             used=0 if block is None else len(block.frame),
             frames=0 if block is None else len(block.frame_edges) - 1,
-            covariance=None if held else self._block(self.covariance_of_matches, camera),
+            covariance=self.covariance_by_matches(camera),
             data_sigmas=None if sigmas is None else sigmas[self.cameras.index(camera)],
             halves=self.halves.get(camera),
             conflicts=tuple(c for c in conflicts if camera in (c.pair.a, c.pair.b)),
             pull=self.pull_of(camera),
             converged=solution.optimum.converged,
             terms=solution.terms,
-            held=held,
+            held=camera in solution.held,
             scatter_only=not self.findings.states_common_error,
             tolerance=solution.config.tolerance,
             lens=solution.lens.get(camera, ()),

@@ -13,7 +13,6 @@ from calibgraph.arrays import Array
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import angle_deg, pose_difference, relative_transform
 from calibgraph.model.verdict import Check
-from calibgraph.solver.spread_kernel import median
 from calibgraph.trust.conventions import convention_error_between
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.run_evidence import RunEvidence
@@ -43,11 +42,15 @@ def compare_with_guess(guess: Array, result: Array, findings: MatcherFindings) -
     range_m = math.sqrt(3) * (findings.range_translation_m or 0.0)
     degrees = angle_deg(guess[:3, :3] @ result[:3, :3].T)
     metres = float(np.linalg.norm(guess[:3, 3] - result[:3, 3]))
-    error = convention_error_between(guess, result)
+    rows = (
+        (replace(rotation, warn=max(rotation.warn, range_deg)), degrees),
+        (replace(translation, warn=max(translation.warn, range_m)), metres),
+    )
+    is_far = any(row.grade(value) != "PASS" for row, value in rows)
+    error = convention_error_between(guess, result) if is_far else None
     advice = "" if error is None else f"it seems that {error}"
     return [
-        replace(rotation, warn=max(rotation.warn, range_deg)).check(degrees, advice=advice),
-        replace(translation, warn=max(translation.warn, range_m)).check(metres, advice=advice),
+        *(row.check(value, advice=advice) for row, value in rows),
         threshold("guess_length").check(float(np.linalg.norm(guess[:3, 3]))),
     ]
 
@@ -102,7 +105,7 @@ def point_distance_checks(evidence: Evidence) -> Checks:
     """Whether the points can be in metres."""
     row = threshold("point_distance")
     return {
-        name: [row.check(median(_lengths(block.block.points_lidar_m)))]
+        name: [row.check(float(np.median(_lengths(block.block.points_lidar_m))))]
         for name, block in evidence.solution.objective.blocks.items()
     }
 

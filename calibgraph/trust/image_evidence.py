@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.matching.structure.consensus import z_score
-from calibgraph.matching.structure.displacement import displaced_z_score, score_displaced
+from calibgraph.matching.structure.consensus import displaced_z_score, score_displaced, z_score
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera, Rig

@@ -23,7 +23,7 @@ from scipy.special import expit
 
 from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.matching.structure.likelihood import FAR, log_likelihood
+from calibgraph.matching.structure.consensus import FAR, log_likelihood
 from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
@@ -208,14 +208,16 @@ def widen(joint: Array, moments: Mapping[int, Array]) -> Array:
     pose stays known where both are widened alike.
 
     Args:
-        joint: (6 N, 6 N) of all cameras.
+        joint: (6 N, 6 N) of all cameras; rows of cameras that are not known may be NaN.
         moments: per number of a camera, (6, 6) second moments.
     """
-    factor = np.eye(len(joint))
+    widened = joint.copy()
     for camera, own in moments.items():
         rows = pose_rows(camera)
-        factor[rows, rows] = _factor(joint[rows, rows], own)
-    return np.asarray(factor @ joint @ factor.T)
+        factor = _factor(joint[rows, rows], own)
+        widened[rows] = factor @ widened[rows]
+        widened[:, rows] = widened[:, rows] @ factor.T
+    return widened
 
 
 def _factor(covariance: Array, moments: Array) -> Array:

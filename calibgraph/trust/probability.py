@@ -1,10 +1,11 @@
 """The probability that a result is off by more than the tolerance, from which verdicts are cut.
 
-Three ways to be off. Grossly, in a way that checks notice: a logistic model of how bad each check
-is, which can only grow as a check gets worse. By a wrong lens, or by a pose that a search found by
-chance: checks whose value is a probability. And by the error bar itself, if it is wide beside the
-tolerance. The weights are fitted by ``benchmarks.accuracy.probability``, on results that were made
-wrong on purpose and right ones, and kept in ``probability.json`` with how they were got.
+Three ways to be off. Grossly, in a way that checks notice: a logistic model of how bad the worst
+check is, and single ones besides, which can only grow as a check gets worse. By a wrong lens, or by
+a pose that a search found by chance: checks whose value is a probability. And by the error bar
+itself, if it is wide beside the tolerance. The last two hold as far as they did in the cases fitted
+to. The weights are fitted by ``benchmarks.accuracy.probability``, on results that were made wrong
+on purpose and right ones, and kept in ``probability.json`` with how they were got.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from calibgraph.model.verdict import (
     WENT_ON,
     Check,
     ErrorProbability,
+    Status,
     Verdict,
 )
 from calibgraph.trust.lens_checks import LENS_KINDS, probability_of_lens
@@ -37,6 +39,9 @@ TABLES, STRUCTURE = "tables", "structure"
 
 CHANCE = "chance"
 """Kind of the check whose value is the probability that a search finds as much by chance."""
+
+WORST = "worst check"
+"""Stands beside the kinds of checks for the worst of them."""
 
 _DIRECTIONS = 400  # over which the error bar is integrated: to 1e-3 of a probability's logarithm
 
@@ -53,7 +58,9 @@ def judge(
         model: TABLES or STRUCTURE.
     """
     of_checks = probability_of_checks(checks, model)
-    return Verdict(tuple(checks), ErrorProbability(of_checks, beyond, *tolerance))
+    reliability = _models()[model]["bar_reliability"]
+    found = ErrorProbability(of_checks, beyond, *tolerance, bar_reliability=reliability)
+    return Verdict(tuple(checks), found)
 
 
 def model_of(matcher: str) -> str:
@@ -70,15 +77,21 @@ def probability_of_checks(checks: Sequence[Check], model: str) -> float:
     worst = worst_severities(zip(kinds, (check.severity for check in checks), strict=True))
     parts = contributions(worst, fitted["weights"], fitted["other"])
     grossly = float(expit(fitted["intercept"] + sum(parts.values())))
-    if any(value > 1.0 for kind, value in worst.items() if kind not in fitted["weights"]):
+    if any(value > 1.0 for kind, value in worst.items() if kind not in fitted["seen"]):
         grossly = max(grossly, PASS_BELOW)  # no case had it: what it says is not known
     values = [(k, check.status, check.value) for k, check in zip(kinds, checks, strict=True)]
+    by_values = float(fitted["value_reliability"]) * probability_by_values(values)
+    return float(1.0 - (1.0 - grossly) * (1.0 - by_values))
+
+
+def probability_by_values(values: Sequence[tuple[str, Status, float | None]]) -> float:
+    """By (kind, status, value) of the checks whose value is one: a wrong lens, a find by chance."""
     by_chance = max((value or 0.0 for kind, _, value in values if kind == CHANCE), default=0.0)
-    return 1.0 - (1.0 - grossly) * (1.0 - probability_of_lens(values)) * (1.0 - by_chance)
+    return 1.0 - (1.0 - probability_of_lens(values)) * (1.0 - by_chance)
 
 
 def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
-    """The worst of (kind, severity) pairs per kind of check.
+    """The worst of (kind, severity) pairs per kind of check, and of all, as ``WORST``.
 
     Checks of the lens are left out, as is the check of the stated error, no sign of an error; and,
     if it is known how much is found by chance, all that count data: few are no sign either.
@@ -88,7 +101,8 @@ def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
         worst[kind] = max(severity, worst.get(kind, 0.0))
     left_out = {*LENS_KINDS, COMMON_ERROR, CHANCE, FLAT_EVIDENCE, WENT_ON}
     left_out |= ABOUT_THE_DATA if CHANCE in worst else frozenset()
-    return {kind: severity for kind, severity in worst.items() if kind not in left_out}
+    kept = {kind: severity for kind, severity in worst.items() if kind not in left_out}
+    return {**kept, WORST: max(kept.values(), default=0.0)}
 
 
 def contributions(

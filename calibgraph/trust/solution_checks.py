@@ -86,12 +86,7 @@ def common_error_checks(estimate: Estimate) -> list[Check]:
 
 def flat_evidence_checks(evidence: Evidence) -> Checks:
     """Whether the images leave a pose more open than the matches, where images are known."""
-    wide, by_matches = evidence.joint_covariance, evidence.covariance_of_matches
-    if wide is None or by_matches is None:
-        return {}
-    ratios = np.sqrt(np.diag(wide) / np.diag(by_matches)).reshape(-1, 6).max(axis=1)
-    row, of_cameras = threshold("flat_evidence"), zip(evidence.cameras, ratios, strict=True)
-    return {name: [row.check(ratio)] for name, ratio in of_cameras if name in evidence.posteriors}
+    return {name: [check] for name, check in evidence.flatness.items()}
 
 
 def relative_pose_checks(estimate: Estimate) -> list[Check]:

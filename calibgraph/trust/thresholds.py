@@ -130,8 +130,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "its matches are left out; look at its frames"),
     Threshold("repeated_frames", "share of frames that repeat another one", "at most", 0.5,
               math.inf, "share", "How many frames are of the same place, or of the same content?",
-              _CHOSEN, "the vehicle stood, or frames are copies: they count as one frame each; "
-              "take frames while it drives"),
+              _CHOSEN, "the vehicle stood, a camera or the LiDAR was stuck, or frames are "
+              "copies: they count as one frame each; take frames while it drives"),
     Threshold("assumed_spread", "residual spread over the assumed one", "at most", 2.0, 4.0,
               "times", "Does the configured loss scale suit the residuals?", _COUNTED,
               "the matches are worse than loss_scale_px (delta) assumes"),
@@ -195,6 +195,11 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "KITTI 00: own clouds +0.4 and more, clouds one frame off -0.4 and less; about zero "
               "where the vehicle stands, which is no fault."),
     # while driving
+    Threshold("beyond_tolerance", "probability of an error beyond the tolerance", "at most",
+              PASS_BELOW, math.inf, "share",
+              "How much of the posterior by the images and the matches is beyond the tolerance?",
+              "The verdict's own cut, at the end of `track --matcher structure`.",
+              "the images leave the pose more open than the matches"),
     Threshold("disagreeing_frames", "share of the last frames that disagree with the estimate",
               "at most", 0.5, 1.0, "share", "Do recent frames agree with the tracked estimate?",
               "Above half, most new measurements contradict the estimate."),

@@ -1,16 +1,17 @@
 """An MCAP file of a result for Foxglove, with Foxglove's own message types."""
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calibgraph.errors import needs_extra
 from calibgraph.files import write_atomically
+from calibgraph.io.rotations import quaternion_xyzw
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Camera
 from calibgraph.outputs import VIEW_MARK
 from calibgraph.progress import Progress, no_progress
 from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
@@ -38,7 +39,7 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
-            writer = messages.writer(file)
+            writer = messages.writer(file, profile=VIEW_MARK)
             for done, frame in enumerate(read_frames(result)):
                 progress(f"frame {frame.name}", done, len(result.frames))
                 for topic, message in messages.of_frame(frame, result):
@@ -65,30 +66,15 @@ class _Messages:
         with needs_extra(
             "view", "--mcap needs mcap-protobuf-support and foxglove-schemas-protobuf"
         ):
-            from foxglove_schemas_protobuf import (
-                CameraCalibration_pb2,
-                CompressedImage_pb2,
-                FrameTransforms_pb2,
-                ImageAnnotations_pb2,
-                Log_pb2,
-                PackedElementField_pb2,
-                PointCloud_pb2,
-                PointsAnnotation_pb2,
-            )
+            import foxglove_schemas_protobuf  # noqa: F401
             from mcap_protobuf.writer import Writer
-        self._Writer = Writer
-        self._Cloud: Any = PointCloud_pb2.PointCloud
-        self._Image: Any = CompressedImage_pb2.CompressedImage
-        self._Lens: Any = CameraCalibration_pb2.CameraCalibration
-        self._Transforms: Any = FrameTransforms_pb2.FrameTransforms
-        self._Annotations: Any = ImageAnnotations_pb2.ImageAnnotations
-        self._Points: Any = PointsAnnotation_pb2.PointsAnnotation
-        self._Field: Any = PackedElementField_pb2.PackedElementField
-        self._Log: Any = Log_pb2.Log
+        self.writer: Any = Writer
+        self._make = import_module("google.protobuf.json_format").ParseDict
 
-    def writer(self, file: Any) -> Any:
-        """A writer into an open file."""
-        return self._Writer(file, profile=VIEW_MARK)
+    def _new(self, kind: str, **content: Any) -> Any:
+        """A message of a kind, of plain values."""
+        schema = import_module(f"foxglove_schemas_protobuf.{kind}_pb2")
+        return self._make(content, getattr(schema, kind)())
 
     def of_frame(self, frame: ViewFrame, result: Calibration) -> list[tuple[str, Any]]:
         """The topics and messages of a frame, stamped."""
@@ -105,37 +91,40 @@ class _Messages:
         return found
 
     def _cloud(self, frame: ViewFrame) -> Any:
-        message = self._Cloud(frame_id=LIDAR_FRAME)
-        message.pose.orientation.w = 1.0
         packed = np.empty(len(frame.points_lidar_m), [("xyz", "<f4", 3), ("rgba", "u1", 4)])
         packed["xyz"], packed["rgba"][:, :3] = frame.points_lidar_m, frame.colours
         packed["rgba"][:, 3] = 255
-        message.point_stride, message.data = packed.dtype.itemsize, packed.tobytes()
-        numbers = (("x", 0, 4), ("y", 4, 4), ("z", 8, 4))
-        colours = (("red", 12, 1), ("green", 13, 1), ("blue", 14, 1), ("alpha", 15, 1))
-        kinds = {4: self._Field.FLOAT32, 1: self._Field.UINT8}
-        for name, offset, size in (*numbers, *colours):
-            message.fields.add(name=name, offset=offset, type=kinds[size])
+        numbers = (("x", 0), ("y", 4), ("z", 8))
+        colours = (("red", 12), ("green", 13), ("blue", 14), ("alpha", 15))
+        message = self._new(
+            "PointCloud",
+            frame_id=LIDAR_FRAME,
+            pose={"orientation": {"w": 1.0}},
+            point_stride=packed.dtype.itemsize,
+            fields=[{"name": name, "offset": offset, "type": kind}
+                    for kind, of in (("FLOAT32", numbers), ("UINT8", colours))
+                    for name, offset in of],
+        )  # fmt: skip
+        message.data = packed.tobytes()
         return message
 
     def _transforms(self, result: Calibration) -> Any:
-        message = self._Transforms()
-        for rig, suffix in ((result.rig, "optical_frame"), (result.initial_rig, "before")):
-            self._add_poses(message, rig, suffix)
-        return message
-
-    def _add_poses(self, message: Any, rig: Rig, suffix: str) -> None:
-        for name, T_camera_lidar in rig.T_camera_lidar.items():
-            T = invert(T_camera_lidar)
-            one = message.transforms.add(
-                parent_frame_id=LIDAR_FRAME, child_frame_id=f"{name}_{suffix}"
-            )
-            one.translation.x, one.translation.y, one.translation.z = T[:3, 3].tolist()
-            x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
-            one.rotation.x, one.rotation.y, one.rotation.z, one.rotation.w = x, y, z, w
+        transforms = [
+            {
+                "parent_frame_id": LIDAR_FRAME,
+                "child_frame_id": f"{name}_{suffix}",
+                "translation": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
+                "rotation": dict(zip("xyzw", quaternion_xyzw(T), strict=True)),
+            }
+            for rig, suffix in ((result.rig, "optical_frame"), (result.initial_rig, "before"))
+            for name, T in ((name, invert(T)) for name, T in rig.T_camera_lidar.items())
+        ]
+        return self._new("FrameTransforms", transforms=transforms)
 
     def _image(self, name: str, jpeg: bytes) -> Any:
-        return self._Image(frame_id=f"{name}_optical_frame", format="jpeg", data=jpeg)
+        message = self._new("CompressedImage", frame_id=f"{name}_optical_frame", format="jpeg")
+        message.data = jpeg
+        return message
 
     def _lenses(self, name: str, camera: Camera) -> list[Any]:
         """The lens, if Foxglove has it."""
@@ -145,7 +134,8 @@ class _Messages:
         K = camera.matrix_px
         pinhole = "rational_polynomial" if rational else "plumb_bob"
         return [
-            self._Lens(
+            self._new(
+                "CameraCalibration",
                 frame_id=f"{name}_optical_frame",
                 width=camera.width_px,
                 height=camera.height_px,
@@ -158,8 +148,8 @@ class _Messages:
         ]
 
     def _annotations(self, points: Projected, frame: ViewFrame) -> Any:
-        message = self._Annotations()
-        one = message.points.add(type=self._Points.POINTS, thickness=_DOT_PX)
+        message = self._new("ImageAnnotations", points=[{"type": "POINTS", "thickness": _DOT_PX}])
+        one = message.points[0]
         _stamp(one, frame)
         for u, v in points.pixels_px.tolist():
             one.points.add(x=u, y=v)
@@ -168,8 +158,8 @@ class _Messages:
         return message
 
     def _verdict(self, result: Calibration) -> Any:
-        level = getattr(self._Log, _LEVELS[result.verdict.status])
-        return self._Log(level=level, message=state_verdict(result), name="calibgraph")
+        level, text = _LEVELS[result.verdict.status], state_verdict(result)
+        return self._new("Log", level=level, message=text, name="calibgraph")
 
 
 def _stamp(message: Any, frame: ViewFrame) -> None:

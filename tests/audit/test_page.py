@@ -78,7 +78,9 @@ def test_a_single_camera_that_is_right(tmp_path: Path) -> None:
 
 def test_where_the_deployed_calibration_is_from_stands_beside_the_answer(tmp_path: Path) -> None:
     """As in the terminal: an OK alone would hide a doubtful result, or a recording that made it."""
-    same = "This recording made it, and errors that it repeats are not seen: check another one."
+    same = (
+        "made from this recording, which repeats its own errors and cannot show them. Check it on"
+    )
     doubted = "This result was WARN when it was made, and its report says why. A "
     right = audit_with(RIGHT)
     for audit, expected in (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import gtsam
@@ -10,9 +10,18 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import disjoint
-from benchmarks.accuracy.disjoint import Estimate, Runs, difference, report, split
+from benchmarks.accuracy.disjoint import (
+    Estimate,
+    Runs,
+    difference,
+    repeat_covariances,
+    report,
+    split,
+)
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import Folders
+from calibgraph import Rig, solve
+from tests.trust.conftest import simulated
 
 KEY = Key("halves", "random", "05", 0)
 
@@ -36,25 +45,27 @@ def test_right_error_bars_give_one_and_95_percent() -> None:
     noise = [rng.multivariate_normal(np.zeros(6), bar, draws) for bar in bars]
 
     def both(i: int) -> Record:
-        results = (Estimate(moved(noise[k][i]), bars[k], "PASS") for k in range(2))
+        results = (Estimate(moved(noise[k][i]), 2 * bars[k], "PASS", bars[k]) for k in range(2))
         return {**asdict(KEY), "cameras": {"left": difference(*results)}}
 
     rows = report([both(i) for i in range(draws)]).rows
     found = dict(zip(disjoint.COLUMNS, rows[-1], strict=True))
     # the mean of chi-squared of 6, over 6, scatters by sqrt(2 / 6 / draws) = 0.013, the share by
     # sqrt(0.95 * 0.05 / draws) = 0.5 %
-    assert float(found["squared in its covariance, over 6"]) == pytest.approx(1, abs=0.05)
-    assert float(found["in the 95 % region"].rstrip("%")) == pytest.approx(95, abs=2)
+    assert float(found["squared in its covariance, over 6"]) == pytest.approx(0.5, abs=0.03)
+    assert float(found["without what all share"]) == pytest.approx(1, abs=0.05)
+    assert float(found["of these in the 95 % region"].rstrip("%")) == pytest.approx(95, abs=2)
     assert found["both PASS"] == str(draws)
 
 
 def test_sizes_are_those_of_the_difference() -> None:
     bar = np.diag([1e-6] * 6)
     turned = moved(np.array([0.0, np.radians(0.3), 0.0, 0.0, 0.0, 0.0]))
-    found = difference(Estimate(np.eye(4), bar, "PASS"), Estimate(turned, bar, "WARN"))
+    found = difference(Estimate(np.eye(4), bar, "PASS", bar), Estimate(turned, bar, "WARN", bar))
     assert found["difference_deg"] == pytest.approx(0.3)
     assert found["difference_cm"] == pytest.approx(0)
     assert found["normalised_squared"] == pytest.approx(np.radians(0.3) ** 2 / 2e-6 / 6)
+    assert found["repeated_squared"] == found["normalised_squared"]
 
 
 def test_a_recording_of_several_pairs_is_calibrated_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,7 +75,7 @@ def test_a_recording_of_several_pairs_is_calibrated_once(monkeypatch: pytest.Mon
         called.append(name)
         bar = np.diag([1e-6] * 6)
         cameras = ("left", "right") if name == "05" else ("left",)
-        return {camera: Estimate(np.eye(4), bar, "PASS") for camera in cameras}
+        return {camera: Estimate(np.eye(4), bar, "PASS", bar) for camera in cameras}
 
     monkeypatch.setattr(disjoint, "_calibrate", calibrated)
     disjoint._whole.cache_clear()
@@ -78,3 +89,14 @@ def test_a_recording_of_several_pairs_is_calibrated_once(monkeypatch: pytest.Mon
     assert [row[0] for row in report(records).rows] == [
         "recordings of 05/06", "recordings of 05/07", "all",
     ]  # fmt: skip
+
+
+def test_repeats_lack_what_all_places_share(pair: Rig) -> None:
+    table = simulated(pair)
+    shared = {"systematic_rotation_rad": 0.01, "systematic_translation_m": 0.1}
+    stated = solve(pair, replace(table, metadata={**table.metadata, **shared}))
+    for name, repeats in repeat_covariances(stated).items():
+        whole = stated.covariance[name]
+        assert whole is not None
+        assert np.sqrt(np.diag(whole))[:3] == pytest.approx(0.01, rel=0.2)
+        assert (np.diag(repeats) < 0.05 * np.diag(whole)).all()

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from calibgraph import FileError, load_calibration
+from calibgraph import Calibration, FileError, load_calibration, load_rig
 from calibgraph.io.calibrations import error_bars
+from calibgraph.report.html import write_result
 from tests.conftest import CommandRun
 
 WRONG: dict[str, Any] = {
@@ -47,6 +50,53 @@ def test_a_missing_part_is_named(calibrated_sample: CommandRun, tmp_path: Path) 
     path.write_text(yaml.dump(content, Dumper=yaml.CSafeDumper, sort_keys=False))
     with pytest.raises(FileError, match="'covariance' is missing"):
         load_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [(0, "is empty"), (0.3, "a part of a result.*should follow.*copy"), (0.6, "a part of a result"),
+     (0.98, "part of a result|not valid YAML.*ends within a line.*cut off")],
+)  # fmt: skip
+def test_a_result_that_was_cut_off_is_named(
+    share: float, words: str, calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    text = (calibrated_sample.folder / "calibration.yaml").read_text()
+    path, lines = tmp_path / "calibration.yaml", text.splitlines(keepends=True)
+    whole = "".join(lines[: int(share * len(lines))])
+    for cut in (whole, whole[:-1]):
+        path.write_text(cut)
+        for read in (load_calibration, load_rig):
+            with pytest.raises(FileError, match=words) as caught:
+                read(path)
+            assert "\n" not in str(caught.value)
+
+
+def test_a_result_that_a_full_disk_cuts_short_leaves_the_older_one(
+    calibrated_sample: CommandRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = load_calibration(calibrated_sample.folder)
+    write_result(result, tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert {"calibration.yaml", "correspondences.parquet", "report.html"} <= before.keys()
+
+    def fill_up(_: Calibration, path: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr("calibgraph.report.html.write_report", fill_up)
+    with pytest.raises(OSError, match="No space") as caught:
+        write_result(replace(result, camera_matches=None, warnings=("changed",)), tmp_path)
+    assert caught.value.filename == str(tmp_path / "report.html")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_files_of_the_result_before_do_not_stay_beside_the_new_one(
+    calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    result = load_calibration(calibrated_sample.folder)
+    write_result(result, tmp_path)
+    without = replace(result, correspondences=None, camera_matches=None)
+    (written,) = write_result(without, tmp_path, with_report=False)
+    assert [*tmp_path.iterdir()] == [written] == [tmp_path / "calibration.yaml"]
 
 
 def content_of(result: CommandRun) -> dict[str, Any]:

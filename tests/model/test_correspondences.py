@@ -63,6 +63,20 @@ def test_concatenating_keeps_rows_and_fills_information() -> None:
     assert len(joined.of_camera("nobody")) == 0
 
 
+def test_a_common_error_is_stated_if_all_joined_tables_state_it_as_the_largest() -> None:
+    none, small, large = (
+        table(metadata={"systematic_rotation_rad": r, "systematic_translation_m": t})
+        for r, t in ((0.0, 0.0), (0.002, 0.01), (0.001, 0.05))
+    )
+    assert concatenate([none, small, large]).findings.systematic_sigmas == (0.002, 0.05)
+    assert concatenate([none, none]).findings.states_common_error
+    for unstated in (table(), table(metadata={"matcher": "mine"})):
+        assert not concatenate([none, unstated]).findings.states_common_error
+        assert not concatenate([unstated, none]).findings.states_common_error
+    without_rows = table().select(slice(0))
+    assert concatenate([without_rows, small]).findings.systematic_sigmas == (0.002, 0.01)
+
+
 def test_a_table_holds_its_findings_and_places_and_rows_of_it_the_same() -> None:
     stated = {"place_variance": 2.0, "places": [[0, 1]], "matcher": "mine"}
     found = table(metadata=stated)

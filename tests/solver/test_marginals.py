@@ -49,6 +49,6 @@ def test_the_curvature_of_a_camera_is_summed_once_for_error_model_and_scatter(
         calls.append(block)
         return robust_hessian(block, pose)
 
-    monkeypatch.setattr("calibgraph.solver.fitted.robust_hessian", counted)
+    monkeypatch.setattr("calibgraph.solver.curvature.robust_hessian", counted)
     assert solution.marginals.errors is not None and solution.marginals.scatter is not None
     assert len(calls) == len(pair.cameras)

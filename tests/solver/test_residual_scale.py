@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibgraph.solver.residual_scale import iterate_spread, robust_spread, robust_spreads
-from calibgraph.solver.spread_kernel import quantile, quantiles
+from calibgraph.solver.residual_scale import (
+    iterate_spread,
+    quantile,
+    quantiles,
+    robust_spread,
+    robust_spreads,
+)
 
 
 def test_the_spread_of_a_core_is_found_under_a_broad_background() -> None:

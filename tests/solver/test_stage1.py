@@ -20,7 +20,7 @@ from calibgraph.model.geometry import pose_difference
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver import stage1
 from calibgraph.solver.geodesic_median import geodesic_median
-from calibgraph.solver.pnp import frame_pose, normalized
+from calibgraph.solver.pnp import frame_pose, view_plane
 from calibgraph.solver.stage1 import (
     T_hat,
     aggregate,
@@ -43,7 +43,7 @@ def test_undistorting_inverts_every_lens(mixed_rig: Rig) -> None:
     for name, camera in mixed_rig.cameras.items():
         plane = rng.uniform(-0.6, 0.6, (200, 2)) * [1.2, 0.4]
         pixels, _ = camera.lens.project(np.column_stack([plane, np.ones(200)]))
-        np.testing.assert_allclose(normalized(camera, pixels), plane, atol=1e-7, err_msg=name)
+        np.testing.assert_allclose(view_plane(camera, pixels)[1], plane, atol=1e-7, err_msg=name)
 
 
 def test_every_frame_is_solved_without_noise(mixed_rig: Rig) -> None:

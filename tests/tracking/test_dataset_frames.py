@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from calibgraph import (
+    Calibration,
     Config,
     Correspondences,
     DatasetError,
@@ -24,6 +25,9 @@ from calibgraph.tracking import command, dataset_frames
 from calibgraph.tracking.command import Tracking, track
 from calibgraph.tracking.dataset_frames import with_places
 from calibgraph.tracking.streams import StreamFrame
+from calibgraph.trust.pose_posterior import PosePosterior, no_posteriors
+from calibgraph.trust.run_evidence import RunEvidence
+from factors import pose_sigmas
 from tests.tracking.drives import (
     FRAMES,
     Crashed,
@@ -107,6 +111,66 @@ def test_a_dataset_continues_after_a_crash_and_around_an_unreadable_frame(
     first, _ = lines(tmp_path / "crashed", at)
     second, _ = lines(tmp_path / "crashed", None)
     assert first + second == whole
+
+
+def flat(rad: float, m: float) -> PosePosterior:
+    """Samples of a posterior that is as wide."""
+    sigmas = pose_sigmas(rotation_rad=rad, translation_m=m)
+    samples = sigmas * np.random.default_rng(0).standard_normal((4000, 6))
+    return PosePosterior(samples, samples, 0.0)
+
+
+def test_flat_images_widen_the_result_at_the_end_and_its_verdict(
+    world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lines stay as they are: images are scored once, at the end, on the kept frames."""
+    asked: list[tuple[Dataset, Rig]] = []
+
+    def measure(data: Dataset, rig: Rig, known: object, groups: object, *, seed: int) -> object:
+        asked.append((data, rig))
+        return {"left": flat(np.radians(1.0), 0.25)}
+
+    def run(name: str, matcher: Given) -> Calibration:
+        wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / name, matcher=matcher)
+        return track(wanted, recorded.folders, notify=lambda _: None)[0]
+
+    monkeypatch.setattr(RunEvidence, "_measure_posteriors", no_posteriors)
+    monkeypatch.setattr(dataset_frames, "measure_posteriors", measure)
+    monkeypatch.setattr(Given, "image_checks_can_fail", True, raising=False)
+    wide = run("wide", Given(concatenate(world.tables)))
+    ((data, rig),) = asked
+    assert [frame.index for frame in data.frames] == [*range(FRAMES)]
+    monkeypatch.setattr(Given, "image_checks_can_fail", False, raising=False)
+    narrow = run("narrow", Given(concatenate(world.tables)))
+    assert len(asked) == 1
+    for name, T in narrow.T_camera_lidar.items():
+        np.testing.assert_array_equal(wide.T_camera_lidar[name], T)
+        np.testing.assert_array_equal(rig.T_camera_lidar[name], T)
+    wider = {n: wide.sigmas(n)[1] / narrow.sigmas(n)[1] for n in ("left", "right")}
+    assert wider["left"].min() > 3 and wider["right"].max() == pytest.approx(1)
+    assert wide.joint_covariance is not None
+    np.testing.assert_array_equal(wide.joint_covariance[:6, :6], wide.covariance["left"])
+    kinds = {check.kind: check for check in wide.camera_verdicts["left"].checks}
+    beyond = kinds["beyond_tolerance"]
+    assert beyond.status == "WARN" and beyond.value is not None and beyond.value > 0.5
+    assert wide.camera_verdicts["left"].status == "WARN"
+    assert wide.camera_verdicts["left"].cannot_tell
+    assert "beyond_tolerance" not in {c.kind for c in narrow.camera_verdicts["left"].checks}
+    assert "no images" in narrow.verdict.images_note and not wide.verdict.images_note
+
+
+def test_images_that_cannot_be_read_at_the_end_leave_the_result_without_them(
+    world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The files are empty."""
+    monkeypatch.setattr(RunEvidence, "_measure_posteriors", no_posteriors)
+    monkeypatch.setattr(Given, "image_checks_can_fail", True, raising=False)
+    notes: list[str] = []
+    matcher = Given(concatenate(world.tables))
+    wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
+    result, _ = track(wanted, recorded.folders, notify=notes.append)
+    assert any(note.startswith("warning: the images could not be checked") for note in notes)
+    assert result.covariance["left"] is not None and result.verdict.images_note
 
 
 class Odometer:

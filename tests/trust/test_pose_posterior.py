@@ -20,6 +20,7 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
 from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.image_record import RunChecks
 from calibgraph.trust.pose_posterior import (
     REACH,
     PosePosterior,
@@ -214,7 +215,9 @@ def test_the_likelihood_ratio_is_low_at_the_truth_and_high_a_degree_away(
 def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: Rig) -> None:
     solution = solve_joint(pair, simulated(pair, frames=20))
     evidence = Evidence(solution, pair, lambda *_: dict.fromkeys(pair.cameras, certain(4 * WIDE)))
-    found = to_calibration(evidence, assess(evidence)).camera_verdicts["left"]
+    found = to_calibration(
+        evidence, RunChecks(assess(evidence), with_images=False)
+    ).camera_verdicts["left"]
     assert found.error_probability is not None
     assert found.error_probability.by_error_bar > 0.9
     assert found.error_probability.by_checks < 0.01
@@ -232,7 +235,9 @@ def test_a_wider_surface_is_a_finding_that_changes_no_verdict(
     covariance = Evidence(solution, pair).covariance_of("left")
     assert covariance is not None
     evidence = Evidence(solution, pair, lambda *_: {"left": certain(wider**2 * covariance)})
-    found = to_calibration(evidence, assess(evidence)).camera_verdicts["left"]
+    found = to_calibration(
+        evidence, RunChecks(assess(evidence), with_images=False)
+    ).camera_verdicts["left"]
     (check,) = (each for each in found.checks if each.kind == "flat_evidence")
     assert check.status == status
     assert check.value == pytest.approx(wider)

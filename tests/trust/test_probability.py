@@ -74,15 +74,28 @@ def test_without_a_doubt_a_result_passes_and_a_check_nobody_has_seen_fails_it(mo
     assert judge([], 0.0, (0.5, 10.0), model).status == "PASS"
     new = Check("new", "FAIL", "", 3.5, 1.0, 2.0)
     assert judge([new], 0.0, (0.5, 10.0), model).status == "FAIL"
-    assert judge(
-        [Check("search", "FAIL", "not found")], 0.0, (0.5, 10.0), model
-    ).error_probability == ErrorProbability(1)
+    not_found = judge([Check("search", "FAIL", "not found")], 0.0, (0.5, 10.0), model)
+    assert not_found.error_probability is not None
+    assert not_found.error_probability.by_checks == 1
 
 
-def test_several_doubts_are_worse_than_one() -> None:
-    one = probability_of_checks([Check("first", "WARN", "")], STRUCTURE)
+def test_several_doubts_are_worse_than_one_in_tables_and_as_the_worst_in_runs() -> None:
+    one = [Check("first", "WARN", "")]
     four = [Check(f"doubt {k}", "WARN", "") for k in range(4)]
-    assert probability_of_checks(four, STRUCTURE) > max(FAIL_ABOVE, 10 * one)
+    of_tables, of_runs = (
+        [probability_of_checks(checks, model) for checks in (one, four)]
+        for model in (TABLES, STRUCTURE)
+    )
+    assert of_tables[1] > max(FAIL_ABOVE, 10 * of_tables[0])
+    assert PASS_BELOW < of_runs[1] == of_runs[0] < FAIL_ABOVE
+
+
+def test_a_wide_error_bar_counts_as_far_as_it_is_reliable() -> None:
+    verdict = judge([], 0.9, (0.5, 10.0), STRUCTURE)
+    found = verdict.error_probability
+    assert found is not None and found.by_error_bar == 0.9
+    assert 0.7 < found.probability < 0.9
+    assert judge([], 0.9, (0.5, 10.0), TABLES).error_probability.probability > 0.9  # type: ignore[union-attr]
 
 
 def test_a_wide_error_bar_is_as_probably_off_as_draws_from_it() -> None:
@@ -132,7 +145,14 @@ def test_a_wide_error_bar_is_no_fail_but_named() -> None:
 
 def test_probabilities_are_printed_without_digits_that_mean_nothing() -> None:
     printed = [ErrorProbability(p).percent for p in (1e-6, 0.0023, 0.0456, 0.5, 0.999)]
-    assert printed == ["0.0%", "0.2%", "4.6%", "50%", "over 99%"]
+    assert printed == ["<0.1%", "0.2%", "4.6%", "50%", "over 99%"]
+
+
+def test_a_probability_is_not_printed_where_data_for_it_are_missing() -> None:
+    few = threshold("frames").check(3)
+    assert (few.status, Verdict((few,), ErrorProbability(1e-5)).percent) == ("WARN", "-")
+    assert Verdict((few,), ErrorProbability(0.0, 0.1)).percent == "10%"
+    assert (Verdict((), ErrorProbability(1e-5)).percent, Verdict().percent) == ("<0.1%", "-")
 
 
 def test_a_rig_is_as_doubtful_as_its_worst_camera() -> None:

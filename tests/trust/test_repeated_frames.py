@@ -8,6 +8,7 @@ import pytest
 import calibgraph
 from calibgraph import CorrespondenceError, Correspondences, Rig, concatenate, solve
 from calibgraph.files import sha256
+from calibgraph.solver.repeats import number_repeats
 from calibgraph.trust.rematch_checks import check_repeated_clouds
 from tests.conftest import SAMPLE
 from tests.trust.conftest import simulated
@@ -56,6 +57,44 @@ def test_a_cloud_that_was_matched_again_counts_once(pair: Rig) -> None:
         assert result.counts[name]["frames"] == 3 and result.counts[name]["repeated_frames"] == 27
         sigmas = [np.sqrt(np.diag(each.covariance[name])) for each in (result, alone)]
         assert (sigmas[0] > 0.5 * sigmas[1]).all()  # as independent frames: a third and less
+
+
+def stuck_camera(table: Correspondences, *, first: int) -> Correspondences:
+    """The table with the image of a frame in all later ones, while the LiDAR moves 12 cm and on."""
+    parts = [table.select(table.frame <= first)]
+    image = table.select(table.frame == first)
+    for number in range(first + 1, int(table.frame.max()) + 1):
+        ahead = np.array([0.12 + 0.002 * number, 0.0, 0.0])
+        frame = np.full(len(image), number, dtype=np.int64)
+        parts.append(replace(image, frame=frame, points_lidar_m=image.points_lidar_m - ahead))
+    return concatenate(parts)
+
+
+def test_frames_of_a_stuck_camera_count_as_one(pair: Rig) -> None:
+    """Twelve of fifteen frames agree on a pose 15 cm off, by one image."""
+    result = solve(pair, stuck_camera(simulated(pair, frames=15), first=3))
+    for name, verdict in result.camera_verdicts.items():
+        assert result.counts[name]["repeated_frames"] == 11
+        assert verdict.status != "PASS"
+        assert any("a camera or the LiDAR was stuck" in text for text in verdict.reasons)
+
+
+def test_pixels_of_a_grid_are_no_repeats() -> None:
+    """A dense matcher has a point for each of the same pixels in every frame."""
+    rng = np.random.default_rng(0)
+    u, v = (0.5 + 7.7 * axis.ravel() for axis in np.mgrid[:60, :30])
+    parts = [
+        Correspondences.from_arrays(
+            camera="left",
+            frame=frame,
+            pixels_px=np.column_stack([u, v]),
+            points_lidar_m=rng.uniform(5, 20, (len(u), 3)),
+        )
+        for frame in range(3)
+    ]
+    table = concatenate(parts)
+    numbers = number_repeats(table, table.camera_index.astype(np.int64))
+    np.testing.assert_array_equal(numbers, table.frame)
 
 
 def test_copies_do_not_narrow_the_error_bar(pair: Rig) -> None:

@@ -2,13 +2,11 @@
 
 import math
 
-import cv2
 import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.matching.camera_pairs.geometry import MAX_ANGLE_RAD, turn_to_axis
-from calibgraph.model.geometry import transform
-from calibgraph.solver.pnp import magsac
+from calibgraph.solver.pnp import magsac, ransac_on_plane
 
 MIN_INLIERS = 12
 """Features that must agree on a pose: 4 determine one, and of those that agree on an epipolar
@@ -41,19 +39,7 @@ def relative_pose(points_a_m: Array, rays_b: Array, *, seed: int) -> Array | Non
     narrow = turned[:, 2] > math.cos(MAX_ANGLE_RAD)
     if np.count_nonzero(narrow) < MIN_INLIERS:
         return None
-    plane = _FOCAL_PX * turned[narrow, :2] / turned[narrow, 2:]
+    plane = turned[narrow, :2] / turned[narrow, 2:]
     parameters = magsac(_THRESHOLD_RAD * _FOCAL_PX, iterations=_ITERATIONS, seed=seed)
-    ideal = np.diag([_FOCAL_PX, _FOCAL_PX, 1.0])
-    try:
-        found, _, rotation, translation, inliers = cv2.solvePnPRansac(
-            points_a_m[narrow], plane, ideal, None, params=parameters
-        )
-    except cv2.error:  # degenerate samples
-        return None
-    if not found or inliers is None or len(inliers) < MIN_INLIERS:
-        return None
-    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-        return None
-    T_b_a = transform(cv2.Rodrigues(rotation)[0], translation.ravel())
-    T_b_a[:3] = turn.T @ T_b_a[:3]
-    return T_b_a
+    found = ransac_on_plane(points_a_m[narrow], plane, _FOCAL_PX, parameters, turn=turn)
+    return None if found is None or found[1] < MIN_INLIERS else found[0]

@@ -4,7 +4,7 @@ First a global search locates every camera, from a guess that may be far off (`g
 
 1. `correlation_maps`: windows of LiDAR points are correlated with the image at all its places, by
    inverse range and intensity (`correlation_kernels`: their compiled loops).
-2. `box_search`: the poses within the range at which most windows agree (`cross_entropy`).
+2. `box_search`: the poses within the range at which most windows agree (`consensus.maximize`).
 3. `pose_refinement`: each candidate pose is refined, and accepted if its z-score is high enough.
 4. `proposals`: a located camera proposes poses for the others: by known relative poses, by features
    that both see (`epipolar`), and by the guess.

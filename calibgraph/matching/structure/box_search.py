@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
+from calibgraph.matching.structure.consensus import maximize
 from calibgraph.matching.structure.correlation_maps import CorrelationMaps
-from calibgraph.matching.structure.cross_entropy import maximize
 from calibgraph.model.geometry import invert, relative_transform
 
 COARSE_BLUR_CELLS, COARSE_EVERY, FINE_BLUR_CELLS = 2.0, 2, 1.0

@@ -1,12 +1,21 @@
-"""Pose consensus: the pose at which the shifts of all groups agree best."""
+"""Pose consensus: the summed score of a pose over all groups, and what follows from it.
 
+The pose at which the shifts of all groups agree best, by the cross-entropy method: samples that
+concentrate on the best. Whether a pose stands out among displaced ones, over the same windows. And
+the likelihood of poses by fine scores, against chance: among unrelated shifts the summed score
+scatters by ``chance_sigma``; at the true pose it is z of these higher. For noise of that size the
+logarithm of the likelihood is z times the score, in ``chance_sigma``. What windows of a frame and
+frames of a place share makes the noise larger.
+"""
+
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.matching.structure.cross_entropy import maximize
-from calibgraph.matching.structure.schedule import Level
+from calibgraph.matching.structure.schedule import LEVELS, Level
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from factors.compiled import compiled
 
@@ -17,6 +26,21 @@ SAME_MAXIMUM = 1e-3  # relative difference of two searches' ends at the same max
 PRIOR = 6.0
 """Penalty, in standard deviations of chance agreement, of a twist sqrt(2 / 6) of the box from 0."""
 WEAK_PRIOR = 0.5  # the same of further unknowns, which have a prior of their own in the graph
+
+ELITE_SHARE = 0.1  # of the samples, the best, shape the next step's distribution
+WIDENING = 1.2  # of the elites' covariance, against premature convergence
+
+DISPLACEMENTS_DEG, DISPLACEMENT_M = (1.2, 2.2), 0.4
+"""About and along each axis: the displaced poses."""
+
+FAR = replace(LEVELS[3], reach_rad=np.radians(2.0), weighed=False)
+"""A fine level that reaches as far as rounds may end off. Coarse levels only propose poses: they
+prefer some a degree off where fine ones are flat, as on grass slopes."""
+
+CHANCE_VARIANCE = 3.0
+"""Variance of the summed score over that of independent windows: what windows of a frame and frames
+of a place share. With it the errors of a KITTI rig, of a car with six cameras and of a 16-beam
+LiDAR are likeliest under the error bars that it leads to; without any one of them it is 3 or 4."""
 
 
 def z_score(scores: ShiftScores, unknowns: Array) -> float:
@@ -149,3 +173,81 @@ def _sum_interpolated(grids, jacobian, unknowns, out):  # type: ignore[no-untype
             first = grid[at] + x * (grid[at + right] - grid[at])
             second = grid[under] + x * (grid[under + right] - grid[under])
             out[i] += first + y * (second - first) if y >= 0 else np.float32(0)
+
+
+def maximize(
+    objective: Callable[[Array], Array],
+    *,
+    start: Array,
+    sigmas: Array,
+    half_widths: Array,
+    samples: int,
+    steps: int,
+    rng: np.random.Generator,
+) -> tuple[Array, float]:
+    """Maximise within a box about a start.
+
+    Args:
+        objective: (n,) values of (n, k) points.
+        start: (k,) mean of the first samples, and centre of the box.
+        sigmas: (k,) standard deviations of the first samples.
+        half_widths: (k,) of the box.
+        samples: per step; four times that in the first.
+        steps: number of steps.
+        rng: source of the samples.
+
+    Returns:
+        The last mean (k,), and its value.
+    """
+    mean, root = start, np.diag(sigmas)
+    elites = max(len(start) + 2, round(ELITE_SHARE * samples))
+    for step in range(steps):
+        count = samples * (4 if step == 0 else 1)
+        points = mean + rng.standard_normal((count, len(start))) @ root.T
+        points = np.clip(points, start - half_widths, start + half_widths)
+        elite = points[np.argsort(-objective(points))[:elites]]
+        mean = elite.mean(axis=0)
+        covariance = WIDENING * np.cov(elite.T) + np.diag((1e-4 * half_widths) ** 2)
+        root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+    return mean, float(objective(mean[None])[0])
+
+
+def score_displaced(scores: ShiftScores) -> tuple[NDArray[np.int64], Array]:
+    """Frames (f,), and their scores (f, n) at a pose, then at displaced poses."""
+    frames, twists = np.unique(scores.frame), _displacements()
+    per_frame = [sum_scores(_of_frame(scores, frame), twists) for frame in frames]
+    return frames, np.array(per_frame).reshape(len(frames), len(twists))
+
+
+def displaced_z_score(per_frame: Array) -> float:
+    """The summed score at the pose less the mean of the displaced, in deviations of the latter."""
+    own, *displaced = per_frame.sum(axis=0)
+    return float((own - np.mean(displaced)) / (np.std(displaced) + 1e-12))
+
+
+def _of_frame(scores: ShiftScores, frame: int) -> ShiftScores:
+    rows = scores.frame == frame
+    return replace(scores, grids=scores.grids[rows], jacobian=scores.jacobian[rows])
+
+
+def _displacements() -> Array:
+    """(n, 6) twists: none, then rotations about and shifts along each axis, both ways."""
+    angles = [np.radians(angle) * sign for angle in DISPLACEMENTS_DEG for sign in (-1, 1)]
+    shifts = [DISPLACEMENT_M * sign for sign in (-1, 1)]
+    axes = np.eye(6)
+    twists = [axes[axis] * size for axis in range(3) for size in angles]
+    twists += [axes[axis] * size for axis in range(3, 6) for size in shifts]
+    return np.array([np.zeros(6), *twists])
+
+
+def log_likelihood(scores: ShiftScores) -> Callable[[Array], Array]:
+    """The (n,) logarithms of the likelihood of twists (n, 6) from the pose of the scores.
+
+    Args:
+        scores: of one camera, at ``FAR``, about the pose in question.
+    """
+    if not len(scores.weights):
+        return lambda twists: np.zeros(len(twists))
+    amplitude = max(z_score(scores, np.zeros(6)), 0.0)
+    factor = amplitude / (CHANCE_VARIANCE * (scores.chance_sigma + 1e-12))
+    return lambda twists: factor * sum_scores(scores, twists)

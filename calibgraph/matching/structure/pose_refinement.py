@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 
 from calibgraph.io.frame import Frame
 from calibgraph.matching.structure.bodies import Body, adjoint, lead, place
-from calibgraph.matching.structure.consensus import find_consensus
-from calibgraph.matching.structure.displacement import displaced_z_score, score_displaced
+from calibgraph.matching.structure.consensus import (
+    displaced_z_score,
+    find_consensus,
+    score_displaced,
+)
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS, WIDE, Level
 from calibgraph.matching.structure.shift_scores import (

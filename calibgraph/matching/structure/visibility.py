@@ -58,7 +58,7 @@ def find_visible(angles: Array, distance_m: Array, cell_rad: float) -> Mask:
     """
     if not len(angles):
         return np.empty(0, np.bool_)
-    rows, columns = ((angles - angles.min(axis=0)) / cell_rad).astype(np.intp).T
+    rows, columns = (((a - a.min()) / cell_rad).astype(np.intp) for a in angles.T)
     cell = rows * (columns.max() + 1) + columns
     nearest_m = np.full(cell.max() + 1, np.inf)
     np.minimum.at(nearest_m, cell, distance_m)

@@ -57,6 +57,7 @@ class WindowTable:
         self._centres = mmap_copy(np.random.default_rng(0).permutation(centres).astype(np.int32))
         self._slots = mmap_copy(np.full(len(centres), _UNCUT, np.int32))
         self._windows, self._count = Windows.empty(len(centres), mmap_zeros), 0
+        self._windows_nbytes = self._windows.nbytes
         self._neighbours: Neighbours | None = None
         self._spacing_rad, self._keep_linear = spacing_rad, keep_linear
         self._lock = Lock()
@@ -77,9 +78,9 @@ class WindowTable:
         if seed:
             chosen = np.random.default_rng(seed).permutation(chosen)
         windows, slots = self._take(chosen[:max_windows])
-        rows = windows.members[slots]
-        covered = (windows.front[slots] & ~clear[rows]).mean(axis=1)
-        return windows.select(slots[in_view[rows].all(axis=1) & (covered <= max_covered)])
+        rows = windows.members.take(slots, axis=0)
+        covered = (windows.front.take(slots, axis=0) & ~clear.take(rows)).mean(axis=1)
+        return windows.select(slots[in_view.take(rows).all(axis=1) & (covered <= max_covered)])
 
     def _take(self, chosen: Rows) -> tuple[Windows, NDArray[np.int32]]:
         """The window buffer and the rows of the chosen centres; missing windows are extracted."""
@@ -105,7 +106,7 @@ class WindowTable:
     @property
     def nbytes(self) -> int:
         """Size in memory, without the tree of neighbours and the cloud."""
-        cut = self._count * self._windows.nbytes // max(1, len(self._centres))
+        cut = self._count * self._windows_nbytes // max(1, len(self._centres))
         return cut + self._rows.nbytes + self._centres.nbytes + self._slots.nbytes
 
     @property

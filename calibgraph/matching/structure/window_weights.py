@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_json, sha256, write_text
-from calibgraph.matching.structure.window_features_kernel import FEATURES
+from calibgraph.matching.structure.window_kernels import FEATURES
 from calibgraph.outputs import WINDOW_WEIGHTS_MARK
 
 Floats = NDArray[np.float32]

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.matching.structure.window_features_kernel import FEATURES, fill_features
-from calibgraph.matching.structure.window_kernel import describe_windows
+from calibgraph.matching.structure.window_kernels import FEATURES, describe_windows, fill_features
 from calibgraph.matching.structure.window_weights import WindowNetwork
 
 Rows = NDArray[np.intp]
@@ -75,7 +74,8 @@ class Windows:
 
     def select(self, rows: Mask | Rows) -> Windows:
         """Some of the windows."""
-        return Windows(**{name: values[rows] for name, values in vars(self).items()})
+        rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
+        return Windows(**{name: values.take(rows, axis=0) for name, values in vars(self).items()})
 
     def weighed(self, network: WindowNetwork) -> Windows:
         """Those that tell something, with the shares of variation they explain times the weights.
@@ -139,6 +139,9 @@ class Neighbours:
         rays_m: (n, 3) of a cloud.
         rows: (m,) those that have neighbours and are some.
         spacing_rad: between them.
+
+    Attributes:
+        nbytes: size in memory.
     """
 
     def __init__(self, rays_m: Array, rows: NDArray[np.int32], spacing_rad: float) -> None:
@@ -146,6 +149,8 @@ class Neighbours:
         self._tree = cKDTree(to_directions(rays_m[rows]), balanced_tree=False)
         even = math.sqrt(WINDOW_POINTS / math.pi) * max(spacing_rad, MIN_SPACING_RAD)
         self._reach = 2 * math.sin(WINDOW_STRETCH * even / 2)  # as a chord
+        tree = self._tree
+        self.nbytes = int(tree.data.nbytes + tree.indices.nbytes + tree.size * _TREE_NODE_BYTES)
 
     def of(self, centres: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """The nearest rays of some of the m.
@@ -159,12 +164,6 @@ class Neighbours:
         )
         found = nearest < self._tree.n
         return self._rows[np.where(found, nearest, centres[:, None])], found.sum(axis=1)
-
-    @property
-    def nbytes(self) -> int:
-        """Size in memory."""
-        tree = self._tree
-        return int(tree.data.nbytes + tree.indices.nbytes + tree.size * _TREE_NODE_BYTES)
 
 
 def to_directions(rays: Array) -> Array:

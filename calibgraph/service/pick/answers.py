@@ -1,6 +1,6 @@
 """What the page gets: the session, the estimate and the advice, as plain values."""
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from calibgraph.model.geometry import degrees_and_centimetres, pose_difference
 from calibgraph.service.pick.advice import Advice
@@ -76,8 +76,6 @@ class CameraEstimateAnswer(BaseModel):
 class AdviceAnswer(BaseModel):
     """Where to pick next: words, and the third of the image."""
 
-    model_config = ConfigDict(from_attributes=True)
-
     words: str
     column: int
     row: int
@@ -131,7 +129,7 @@ def estimate_answer(revision: int, estimate: PickEstimate, advice: Advice | None
         revision=revision,
         scale=None if solve is None else solve.scale,
         cameras=[_camera_answer(name, one, solve) for name, one in estimate.cameras.items()],
-        advice=None if advice is None else AdviceAnswer.model_validate(advice),
+        advice=None if advice is None else AdviceAnswer(**vars(advice)),
     )
 
 
@@ -161,24 +159,13 @@ def _camera_answer(
 
 def _solver_answers(name: str, estimate: CameraEstimate, solve: JointSolve) -> list[SolverAnswer]:
     T = solve.rig.T_camera_lidar[name]
-    differences = [(pose, pose_difference(pose.T_camera_lidar, T)) for pose in estimate.solvers]
-    return [
-        SolverAnswer(
-            solver=pose.solver, median_px=pose.median_px, rotation_deg=turn, distance_cm=shift
-        )
-        for pose, (turn, shift) in differences
-    ]
+    found = []
+    for pose in estimate.solvers:
+        turn, shift = pose_difference(pose.T_camera_lidar, T)
+        found.append(SolverAnswer(**vars(pose), rotation_deg=turn, distance_cm=shift))
+    return found
 
 
 def _pair_answers(estimate: CameraEstimate) -> list[PairAnswer]:
     together = zip(estimate.pairs, estimate.influences, strict=False)  # none without an estimate
-    return [
-        PairAnswer(
-            place=place,
-            residual_px=one.residual_px,
-            moves_deg=one.moves_deg,
-            moves_cm=one.moves_cm,
-            suspicious=one.suspicious,
-        )
-        for (place, _), one in together
-    ]
+    return [PairAnswer(place=place, **vars(one)) for (place, _), one in together]

@@ -19,9 +19,10 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.service.pick.session import Pair, pixels_of, points_of, sigmas_of
 from calibgraph.solver.camera_twist import project_with_jacobian
-from calibgraph.solver.curvature import invert_or_none, pose_hessian
+from calibgraph.solver.curvature import pose_hessian
 from calibgraph.solver.optimizer import optimize
 from factors import ProjectionBlock
+from factors.conditioning import invert_or_none
 
 PSEUDO_RESIDUALS = 8.0
 """Residuals of the stated sigma that are added to the measured ones: those of four pairs, so that

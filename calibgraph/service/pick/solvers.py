@@ -6,12 +6,11 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
-from calibgraph.solver.pnp import magsac, normalized
+from calibgraph.solver.pnp import magsac, ransac_on_plane, view_plane
 
 Shape = Literal["line", "plane", "space"]
 
@@ -23,7 +22,6 @@ MIN_PAIRS = 4
 MIN_PAIRS_LINEAR = 6
 """From which OpenCV's iterative solver finds its own start."""
 
-_MAX_ANGLE_RAD = np.radians(80.0)  # PnP works on a plane: wider rays would dominate it
 _INLIER_SIGMAS = 3.0
 _ITERATIONS = 2000  # of samples of 4: with half of the pairs wrong, all but 1e-56 of runs have one
 
@@ -45,9 +43,6 @@ class _Problem:
     threshold_px: float
 
 
-Poses = list[tuple[NDArray[Any], NDArray[Any]]]  # rotation vectors and translations
-
-
 def poses_by_solver(
     camera: Camera, points_lidar_m: Array, pixels_px: Array, sigmas_px: Array, *, flat: bool
 ) -> list[SolverPose]:
@@ -63,8 +58,8 @@ def poses_by_solver(
     Returns:
         Sorted by the median error; IPPE with both of its solutions. Empty under MIN_PAIRS.
     """
-    plane = normalized(camera, pixels_px)
-    usable = np.hypot(plane[:, 0], plane[:, 1]) < np.tan(_MAX_ANGLE_RAD)
+    turn, plane = view_plane(camera, pixels_px)
+    usable = np.isfinite(plane[:, 0])
     if np.count_nonzero(usable) < MIN_PAIRS:
         return []
     focal = camera.intrinsics_px.fx
@@ -74,7 +69,7 @@ def poses_by_solver(
         np.diag([focal, focal, 1.0]),
         _INLIER_SIGMAS * float(sigmas_px.max()),
     )
-    solvers: dict[str, Callable[[_Problem], Poses]] = {
+    solvers: dict[str, Callable[[_Problem], list[Array]]] = {
         "SQPnP": lambda p: _all_solutions(p, cv2.SOLVEPNP_SQPNP)[:1],
         "EPnP": lambda p: _all_solutions(p, cv2.SOLVEPNP_EPNP)[:1],
         "P3P + RANSAC": _p3p_ransac,
@@ -87,31 +82,27 @@ def poses_by_solver(
     found = []
     for name, solver in solvers.items():
         for T in _transforms(solver, problem):
+            T[:3] = turn.T @ T[:3]
             error = _median_error(camera, T, points_lidar_m, pixels_px)
             found.append(SolverPose(name, T, error))
     return sorted(found, key=lambda pose: pose.median_px)
 
 
-def _transforms(solver: Callable[[_Problem], Poses], problem: _Problem) -> list[Array]:
+def _transforms(solver: Callable[[_Problem], list[Array]], problem: _Problem) -> list[Array]:
     try:
-        poses = solver(problem)
+        return [T for T in solver(problem) if np.isfinite(T).all()]
     except cv2.error:  # points in one place or on one line
         return []
-    found = []
-    for rotation, translation in poses:
-        if np.isfinite(rotation).all() and np.isfinite(translation).all():
-            found.append(transform(cv2.Rodrigues(rotation)[0], translation.ravel()))
-    return found
 
 
-def _all_solutions(problem: _Problem, method: int) -> Poses:
+def _all_solutions(problem: _Problem, method: int) -> list[Array]:
     _, rotations, translations, _ = cv2.solvePnPGeneric(
         problem.points_m, problem.pixels_px, problem.matrix, None, flags=method
     )
-    return [(np.asarray(r), np.asarray(t)) for r, t in zip(rotations, translations, strict=True)]
+    return [_to_transform(r, t) for r, t in zip(rotations, translations, strict=True)]
 
 
-def _p3p_ransac(problem: _Problem) -> Poses:
+def _p3p_ransac(problem: _Problem) -> list[Array]:
     cv2.setRNGSeed(0)
     found, rotation, translation, _ = cv2.solvePnPRansac(
         problem.points_m,
@@ -123,15 +114,19 @@ def _p3p_ransac(problem: _Problem) -> Poses:
         confidence=0.999,
         flags=cv2.SOLVEPNP_P3P,
     )
-    return [(np.asarray(rotation), np.asarray(translation))] if found else []
+    return [_to_transform(rotation, translation)] if found else []
 
 
-def _magsac(problem: _Problem) -> Poses:
+def _magsac(problem: _Problem) -> list[Array]:
     parameters = magsac(problem.threshold_px, iterations=_ITERATIONS, seed=0)
-    found, _, rotation, translation, _ = cv2.solvePnPRansac(
-        problem.points_m, problem.pixels_px, problem.matrix, None, params=parameters
-    )
-    return [(np.asarray(rotation), np.asarray(translation))] if found else []
+    focal = float(problem.matrix[0, 0])
+    plane = problem.pixels_px / focal
+    found = ransac_on_plane(problem.points_m, plane, focal, parameters, turn=np.eye(3))
+    return [] if found is None else [found[0]]
+
+
+def _to_transform(rotation: Any, translation: Any) -> Array:
+    return transform(cv2.Rodrigues(rotation)[0], translation.ravel())
 
 
 def _median_error(camera: Camera, T: Array, points_lidar_m: Array, pixels_px: Array) -> float:

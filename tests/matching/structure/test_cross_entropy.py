@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibgraph.matching.structure.cross_entropy import maximize
+from calibgraph.matching.structure.consensus import maximize
 
 
 def test_a_tilted_maximum_is_found() -> None:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibgraph.matching.structure.displacement import displaced_z_score, score_displaced
+from calibgraph.matching.structure.consensus import displaced_z_score, score_displaced
 from calibgraph.matching.structure.pose_refinement import STANDING_OUT
 from tests.matching.structure.score_grids import make_scores
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibgraph.matching.structure.consensus import z_score
-from calibgraph.matching.structure.likelihood import CHANCE_VARIANCE, log_likelihood
+from calibgraph.matching.structure.consensus import CHANCE_VARIANCE, log_likelihood, z_score
 from tests.matching.structure.score_grids import make_scores
 
 HERE, BESIDE = np.zeros(6), np.array([0.0, np.radians(2.2), 0.0, 0.0, 0.0, 0.0])

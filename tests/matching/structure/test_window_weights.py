@@ -22,7 +22,7 @@ from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.shift_scores import score_frame
-from calibgraph.matching.structure.window_features_kernel import FEATURES, fill_features
+from calibgraph.matching.structure.window_kernels import FEATURES, fill_features
 from calibgraph.matching.structure.window_weights import (
     PACKAGE_FILE,
     WindowNetwork,

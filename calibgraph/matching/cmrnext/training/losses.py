@@ -11,7 +11,8 @@ from torch import Tensor
 from calibgraph.matching.cmrnext.correlation import WINDOW, Correlation, cross_entropy
 from calibgraph.matching.cmrnext.layers import CELL
 from calibgraph.matching.cmrnext.network import upscale
-from calibgraph.matching.cmrnext.training.samples import Sample, SampleSettings
+from calibgraph.matching.cmrnext.training.samples import Sample
+from calibgraph.matching.cmrnext.training.settings import TrainSettings
 from calibgraph.matching.optimum_loss import optimum_loss as pose_optimum_loss
 from factors import ProjectionBlock, pose_sigmas
 
@@ -84,7 +85,7 @@ def true_flow(samples: Sequence[Sample], device: torch.device) -> Tensor:
     return torch.cat([sample.flow_px for sample in samples]).to(device)
 
 
-def optimum_loss(flow: Tensor, samples: Sequence[Sample], settings: SampleSettings) -> Tensor:
+def optimum_loss(flow: Tensor, samples: Sequence[Sample], settings: TrainSettings) -> Tensor:
     """How unlikely the true poses are under those that minimize the graph of the predicted pixels.
 
     A graph has the matches of a sample, with the Cauchy loss, and the perturbation's distribution
@@ -93,7 +94,7 @@ def optimum_loss(flow: Tensor, samples: Sequence[Sample], settings: SampleSettin
     Args:
         flow: (B, 2, H, W) after the last iteration [px].
         samples: of the batch.
-        settings: of the samples.
+        settings: of the training.
     """
     losses = [
         _optimum_loss_of(
@@ -106,7 +107,7 @@ def optimum_loss(flow: Tensor, samples: Sequence[Sample], settings: SampleSettin
     return torch.stack(losses).mean()
 
 
-def _optimum_loss_of(flow_px: Tensor, sample: Sample, settings: SampleSettings) -> Tensor:
+def _optimum_loss_of(flow_px: Tensor, sample: Sample, settings: TrainSettings) -> Tensor:
     """Of (n, 2) flow at the points of one sample; the prior is about the perturbed start."""
     pixels = sample.pixels_px + flow_px.detach().cpu().numpy()
     errors_px = np.linalg.norm(pixels - sample.view.project(sample.points_camera_m), axis=1)

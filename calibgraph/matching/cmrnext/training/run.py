@@ -19,13 +19,12 @@ from calibgraph.matching.cmrnext.training.losses import (
     optimum_loss,
     true_flow,
 )
-from calibgraph.matching.cmrnext.training.samples import Sample, stack_inputs
-from calibgraph.matching.cmrnext.training.scenes import Scene
+from calibgraph.matching.cmrnext.training.samples import Sample, Scene, stack_inputs
 from calibgraph.matching.cmrnext.training.settings import (
+    CONFIG_PREFIX,
     TrainSettings,
     adopt_architecture,
     settings_of,
-    to_config,
 )
 from calibgraph.matching.cmrnext.training.validation import (
     Validation,
@@ -90,8 +89,7 @@ class TrainingRun:
                 flows, samples, iterations=s.iterations, halved=s.half_resolution
             )
             if s.pose_weight:
-                of_samples = s.samples(augment=True)
-                loss = loss + s.pose_weight * optimum_loss(flows[-1], samples, of_samples)
+                loss = loss + s.pose_weight * optimum_loss(flows[-1], samples, s)
         return loss
 
     @torch.inference_mode()
@@ -116,13 +114,13 @@ class TrainingRun:
             epe_px=float(error.mean()),
             median_px=float(error.median()),
             zero_px=float(length.mean()),
-            **summarize_poses(samples, poses, self.settings.samples(augment=False)),
+            **summarize_poses(samples, poses, self.settings),
         )
 
     def save(self, out: Path, validation: Validation) -> None:
         """Write the checkpoint."""
         content = {
-            "config": to_config(self.settings, validation),
+            "config": _to_config(self.settings, validation),
             "epoch": self.step,
             "state_dict": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -130,6 +128,29 @@ class TrainingRun:
             "test_epe": validation.epe_px,
         }
         write_atomically(out, lambda temporary: torch.save(content, temporary))
+
+
+def _to_config(settings: TrainSettings, validation: Validation) -> dict[str, Any]:
+    """The checkpoint's config: the keys of the published files, and all settings."""
+    return {
+        "use_reflectance": settings.reflectance,
+        "normalize_images": True,
+        "max_depth": settings.max_depth_m,
+        "upsample_method": "transposed",
+        "fourier_levels": settings.architecture.fourier_levels,
+        "context_encoder": settings.context,
+        "uncertainty": False,
+        "der_type": "NLL",
+        "unc_freeze": False,
+        "num_scales": 1,
+        "al_contrario": False,
+        "max_r": settings.rotation_deg,
+        "max_t": settings.translation_m,
+        **{f"{CONFIG_PREFIX}{key}": value for key, value in settings.model_dump().items()},
+        "half_resolution": settings.half_resolution,
+        "systematic_rotation_rad": validation.systematic_rotation_rad,
+        "systematic_translation_m": validation.systematic_translation_m,
+    }
 
 
 def start_run(

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from calibgraph.arrays import Array
+from calibgraph.io.frame import Frame
 from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.inputs import (
     LidarImage,
@@ -24,8 +25,9 @@ from calibgraph.matching.cmrnext.inputs import (
     lidar_tensor,
     rgb_tensor,
 )
-from calibgraph.matching.cmrnext.training.scenes import Scene
+from calibgraph.matching.cmrnext.training.settings import TrainSettings
 from calibgraph.model.geometry import invert, transform
+from calibgraph.model.rig import Camera
 
 MIN_POINTS = 50
 _ROLL_DEG, _TURN_DEG = 5.0, 3.0
@@ -33,6 +35,15 @@ _JITTER = 0.2
 _BORDER = cv2.BORDER_REFLECT_101  # a black border would reveal the rotation
 _MAX_DOWN_M = 1.0  # the virtual camera stays above the ground
 _MAX_FLOW_PX = 1000.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One camera's image and the cloud of one frame."""
+
+    frame: Frame
+    name: str
+    camera: Camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,37 +84,20 @@ def draw_perturbation(rng: np.random.Generator, rotation_deg: float, translation
     return transform(turn, rng.uniform(-translation_m, high))
 
 
-@dataclass(frozen=True)
-class SampleSettings:
-    """Settings of samples.
-
-    Attributes:
-        rotation_deg, translation_m: largest perturbation per axis.
-        max_depth_m: divisor of depths.
-        half_resolution: whether the network's images have half the size.
-        crop_px: height and width of a random crop, at full resolution; None: the whole image.
-        augment: mirror, rotate and recolour at random.
-    """
-
-    rotation_deg: float
-    translation_m: float
-    max_depth_m: float
-    half_resolution: bool
-    crop_px: tuple[int, int] | None
-    augment: bool
-
-
 def make_sample(
-    scene: Scene,
-    *,
-    settings: SampleSettings,
-    architecture: Architecture,
-    rng: np.random.Generator,
+    scene: Scene, settings: TrainSettings, rng: np.random.Generator, *, augment: bool
 ) -> Sample | None:
-    """Perturb a scene's extrinsic; None if too few points are in the image."""
+    """Perturb a scene's extrinsic; None if too few points are in the image.
+
+    Args:
+        scene: with its trusted extrinsic.
+        settings: of the training.
+        rng: for all draws.
+        augment: mirror, rotate, recolour and crop at random, for training; else the whole image.
+    """
     view = View(scene.camera, crop_even=True)
     image, cloud = _load(scene, view)
-    if settings.augment:
+    if augment:
         image, cloud = _augment(image, cloud, view, rng)
     E = draw_perturbation(rng, settings.rotation_deg, settings.translation_m)
     lidar = LidarImage.render(cloud.astype(np.float32), invert(E), view)
@@ -111,7 +105,7 @@ def make_sample(
     ahead = truth[:, 2] > 0
     lidar, truth = lidar.select(ahead), truth[ahead]
     flow = view.project(truth) - lidar.pixels_px
-    corner, (height, width) = _draw_crop(lidar.shape, settings.crop_px, rng)
+    corner, (height, width) = _draw_crop(lidar.shape, settings.crop_px if augment else None, rng)
     cells = lidar.cells - corner
     inside = ((cells >= 0) & (cells < (height, width))).all(axis=1)
     inside &= (np.abs(flow) < _MAX_FLOW_PX).all(axis=1)
@@ -120,7 +114,7 @@ def make_sample(
     rows, columns = (slice(a, a + n) for a, n in zip(corner, (height, width), strict=True))
     rgb, depth = _to_tensors(
         image[rows, columns],
-        lidar_channels(lidar, architecture, settings.max_depth_m)[:, rows, columns],
+        lidar_channels(lidar, settings.architecture, settings.max_depth_m)[:, rows, columns],
         halved=settings.half_resolution,
     )
     return Sample(

@@ -12,15 +12,14 @@ from calibgraph.errors import FileError
 from calibgraph.files import describe, write_yaml
 from calibgraph.matching.cmrnext.architecture import FULL_WIDTH, Architecture
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint
-from calibgraph.matching.cmrnext.training.samples import SampleSettings
-from calibgraph.matching.cmrnext.training.validation import Validation
 from calibgraph.model.config import Seed
 from calibgraph.outputs import yaml_mark
 
 Count = Annotated[int, Field(ge=1, le=10**9)]
 CropSize = Annotated[int, Field(ge=64, le=100_000, multiple_of=2)]
 
-_PREFIX = "train_"  # of the settings in a checkpoint's config
+CONFIG_PREFIX = "train_"
+"""Of the settings in a checkpoint's config."""
 
 
 class TrainSettings(BaseModel):
@@ -93,56 +92,26 @@ class TrainSettings(BaseModel):
             width=self.width,
         )
 
-    def samples(self, *, augment: bool) -> SampleSettings:
-        """Settings of augmented samples for training, or of whole images for validation."""
-        return SampleSettings(
-            rotation_deg=self.rotation_deg,
-            translation_m=self.translation_m,
-            max_depth_m=self.max_depth_m,
-            half_resolution=self.half_resolution,
-            crop_px=self.crop_px if augment else None,
-            augment=augment,
-        )
-
     def save(self, path: Path) -> None:
         """Write all settings as YAML."""
         write_yaml(path, self.model_dump(), first_line=yaml_mark("train"))
 
 
-def to_config(settings: TrainSettings, validation: Validation) -> dict[str, Any]:
-    """The checkpoint's config: the keys of the published files, and all settings."""
-    return {
-        "use_reflectance": settings.reflectance,
-        "normalize_images": True,
-        "max_depth": settings.max_depth_m,
-        "upsample_method": "transposed",
-        "fourier_levels": settings.architecture.fourier_levels,
-        "context_encoder": settings.context,
-        "uncertainty": False,
-        "der_type": "NLL",
-        "unc_freeze": False,
-        "num_scales": 1,
-        "al_contrario": False,
-        "max_r": settings.rotation_deg,
-        "max_t": settings.translation_m,
-        **{f"{_PREFIX}{key}": value for key, value in settings.model_dump().items()},
-        "half_resolution": settings.half_resolution,
-        "systematic_rotation_rad": validation.systematic_rotation_rad,
-        "systematic_translation_m": validation.systematic_translation_m,
-    }
-
-
 def settings_of(config: Mapping[str, Any]) -> TrainSettings:
-    """The settings in a config that :func:`to_config` made.
+    """The settings in the config of a training.
 
     Raises:
-        ValueError: if it was not made so.
+        ValueError: if it is none.
     """
-    given = {key.removeprefix(_PREFIX): config[key] for key in config if key.startswith(_PREFIX)}
+    given = {
+        key.removeprefix(CONFIG_PREFIX): config[key]
+        for key in config
+        if key.startswith(CONFIG_PREFIX)
+    }
     if not given:
         raise ValueError("it was not made by calibgraph train; start from it with --from")
     if missing := TrainSettings.model_fields.keys() - given.keys():
-        raise ValueError(f"its config lacks a sound {_PREFIX}{min(missing)}")
+        raise ValueError(f"its config lacks a sound {CONFIG_PREFIX}{min(missing)}")
     return _validate(given)
 
 

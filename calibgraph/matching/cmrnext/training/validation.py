@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.io.dataset import spread_out
-from calibgraph.matching.cmrnext.architecture import Architecture
-from calibgraph.matching.cmrnext.training.samples import Sample, SampleSettings, make_sample
-from calibgraph.matching.cmrnext.training.scenes import Scene
+from calibgraph.matching.cmrnext.training.samples import Sample, Scene, make_sample
+from calibgraph.matching.cmrnext.training.settings import TrainSettings
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.solver.pnp import frame_pose
@@ -54,16 +53,16 @@ class Validation:
 
 
 def make_validation_samples(
-    held_out: Sequence[Scene], settings: SampleSettings, architecture: Architecture, *, seed: int
+    held_out: Sequence[Scene], settings: TrainSettings
 ) -> list[tuple[Scene, Sample]]:
     """At most ``MAX_SCENES`` perturbed scenes; the same at every call.
 
     Raises:
         DatasetError: if none shows enough points.
     """
-    rng = np.random.default_rng([seed, 2**31])
+    rng = np.random.default_rng([settings.seed, 2**31])
     made = [
-        (scene, make_sample(scene, settings=settings, architecture=architecture, rng=rng))
+        (scene, make_sample(scene, settings, rng, augment=False))
         for scene in spread_out(held_out, MAX_SCENES)
     ]
     samples = [(scene, sample) for scene, sample in made if sample is not None]
@@ -92,7 +91,7 @@ def _twist(T: Array) -> Array:
 
 
 def summarize_poses(
-    samples: Sequence[tuple[Scene, Sample]], poses: list[Array | None], settings: SampleSettings
+    samples: Sequence[tuple[Scene, Sample]], poses: list[Array | None], settings: TrainSettings
 ) -> dict[str, float]:
     """The members of a :class:`Validation` that concern poses."""
     starts = np.array([_twist(sample.E) for _, sample in samples])

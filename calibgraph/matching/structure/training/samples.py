@@ -37,7 +37,7 @@ class CameraWindows:
 
     Attributes:
         camera: at its trusted pose.
-        features: (w, f) see ``window_features_kernel.FEATURES``.
+        features: (w, f) see ``window_kernels.FEATURES``.
         near: (w, SIDE, SIDE) scores by shift [v, u] from the truth, which is in the middle.
         chance: (w, CHANCE_SHIFTS) scores at unrelated shifts.
         group: (w,) its group.

@@ -10,12 +10,10 @@ from calibgraph.matching.cmrnext.training.losses import optimum_loss
 from calibgraph.matching.cmrnext.training.samples import Sample, make_sample
 from tests.matching.cmrnext.training.tiny import TINY, scene
 
-SETTINGS = TINY.samples(augment=True)
-
 
 def drawn(trusted: Dataset) -> Sample:
     rng = np.random.default_rng(3)
-    sample = make_sample(scene(trusted), settings=SETTINGS, architecture=TINY.architecture, rng=rng)
+    sample = make_sample(scene(trusted), TINY, rng, augment=True)
     assert sample is not None
     return sample
 
@@ -32,13 +30,13 @@ def test_the_gradient_leads_to_the_true_pose_and_reaches_the_points_alone(truste
     truth = image_of(sample, sample.flow_px)
     noise = torch.randn(sample.flow_px.shape, generator=torch.Generator().manual_seed(0))
     flow = (truth + image_of(sample, noise)).requires_grad_()
-    loss = optimum_loss(flow, [sample], SETTINGS)
+    loss = optimum_loss(flow, [sample], TINY)
     loss.backward()
     assert flow.grad is not None
     at_points = image_of(sample, torch.ones_like(sample.flow_px)) != 0
     assert torch.count_nonzero(flow.grad[~at_points]) == 0
     step = 0.1 / float(flow.grad.abs().max()) * flow.grad
-    lower = optimum_loss(flow.detach() - step, [sample], SETTINGS)
+    lower = optimum_loss(flow.detach() - step, [sample], TINY)
     expected = float((step * flow.grad).sum())
     # To second order: of a step of this size, the loss falls by its slope to within a half.
     assert 0.5 * expected < float(loss.detach() - lower) < 1.5 * expected
@@ -50,7 +48,7 @@ def test_a_common_error_of_all_pixels_costs_more_than_the_same_noise(trusted: Da
     common = torch.ones_like(sample.flow_px)
     signs = torch.randint(0, 2, common.shape, generator=torch.Generator().manual_seed(1)) * 2 - 1
     losses = [
-        float(optimum_loss(image_of(sample, sample.flow_px + e), [sample], SETTINGS))
+        float(optimum_loss(image_of(sample, sample.flow_px + e), [sample], TINY))
         for e in (common, signs.float())
     ]
     assert losses[0] > losses[1]

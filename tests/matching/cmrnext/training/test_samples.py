@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -64,10 +62,8 @@ def test_augmented_clouds_still_fit_their_images(trusted: Dataset, change: objec
 
 def test_the_flow_of_a_sample_leads_to_the_true_pixel(trusted: Dataset) -> None:
     some = scene(trusted)
-    settings = replace(TINY.samples(augment=False), half_resolution=True)
-    sample = make_sample(
-        some, settings=settings, architecture=TINY.architecture, rng=np.random.default_rng(0)
-    )
+    settings = TINY.changed(half_resolution=True)
+    sample = make_sample(some, settings, np.random.default_rng(0), augment=False)
     assert sample is not None
     view = View(some.camera)
     expected = view.project(sample.points_camera_m)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from calibgraph import Dataset
 from calibgraph.matching.cmrnext import TrainSettings
-from calibgraph.matching.cmrnext.training.scenes import Scene
+from calibgraph.matching.cmrnext.training.samples import Scene
 
 TINY = TrainSettings(
     rotation_deg=1.0,

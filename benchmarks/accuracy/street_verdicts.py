@@ -1,0 +1,163 @@
+"""Verdicts of rendered drives from images: five streets of one sensor together, and one alone.
+
+    python -m benchmarks.accuracy.street_verdicts --groups 116:163 --scenes out/error_bars
+
+Groups are those of ``error_bars``, whose streets must have been rendered: five of a rig whose
+sensors err, three frames each. Per group ``calibrate`` gets all five, from a guess 2 degrees and
+0.2 m off; the same, made wrong in one of the ways of ``verdicts``, in turn; and one more street of
+six frames, rendered when it is needed. Groups 100 to 115 are to choose by, others are kept out.
+A result is right within 0.3 degrees and 7 cm of its alignment, and off beyond 0.5 degrees or 10 cm.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.accuracy import ledger
+from benchmarks.accuracy.alignment import mean_poses
+from benchmarks.accuracy.data_cases import KINDS
+from benchmarks.accuracy.error_bars import (
+    OFF,
+    RIGS,
+    STATUSES,
+    STREETS,
+    render_street,
+    seeds_of,
+)
+from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.scenes import Folders, Scene
+from benchmarks.tables import ROOT, Table, add_record_option
+from calibgraph import calibrate, load_dataset
+
+LONGER, CLOSER_M = 6, 1.5  # frames of the street that is alone, and their distance
+_ALONE = 300_000  # seeds of such streets
+RIGHT = (0.3, 7.0)  # deg, cm
+CLASSES = ("right", "between", "off")
+GOOD, ONE = "good", "good, one place"
+WRONG = (
+    "focal_5", "shuffled", "principal", "mirrored", "focal_3", "moved_halfway", "sheared",
+    "swapped_unknown", "focal_y", "shifted", "half_resolution", "frozen",
+)  # fmt: skip
+KINDS_IN_ORDER = (GOOD, ONE, *WRONG)
+
+
+def main() -> None:
+    """Run cases, print the tables."""
+    options = parse_options()
+    cases = [
+        Key("streets", kind, f"{options.size:g}", group)
+        for group in range(*options.groups)
+        for kind in (GOOD, ONE, WRONG[group % len(WRONG)])
+    ]
+    records = ledger.records_of(options, cases, partial(run_case, scenes=options.scenes))
+    tables = [report(records), report_checks(records)]
+    ledger.publish_cases("accuracy.street_verdicts", tables, records, record=options.record)
+
+
+def parse_options() -> argparse.Namespace:
+    """The options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenes", type=Path, default=ROOT / "out" / "error_bars")
+    parser.add_argument(
+        "--groups", type=lambda text: [int(n) for n in text.split(":")], default=[116, 163]
+    )
+    parser.add_argument("--size", type=float, default=2.0, help="of the errors; one folder each")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "street_verdicts.jsonl")
+    parser.add_argument("--summary", type=Path, help="print the tables of a file, run nothing")
+    add_record_option(parser)
+    return parser.parse_args()
+
+
+def run_case(case: Key, scenes: Path) -> Record:
+    """Join the streets of a group, spoil them, calibrate."""
+    group, rendered = case.seed, partial(render_street, size=float(case.data))
+    if case.kind == ONE:
+        folders = [scenes / f"scene_{_ALONE + group}"]
+        rigs = [rendered(folders[0], group, _ALONE + group, frames=LONGER, step_m=CLOSER_M)]
+    else:
+        seeds = seeds_of(group, STREETS)
+        folders = [scenes / f"scene_{seed}" for seed in seeds]
+        rigs = [rendered(*each) for each in zip(folders, [group] * STREETS, seeds, strict=True)]
+    stated = rigs[0][0]
+    truth = stated.moved_to(mean_poses([aligned.T_camera_lidar for _, aligned in rigs]))
+    spoil = KINDS[GOOD if case.kind == ONE else case.kind]
+    with tempfile.TemporaryDirectory() as scratch:
+        name, data = RIGS[group % len(RIGS)][0], load_dataset(folders, stated)
+        scene = Scene(name, data, stated, Folders(None, None), Path(scratch), group)
+        spoilt, guess, drawn = spoil(scene, np.random.default_rng([17, group]))
+        result = calibrate(spoilt, guess)
+    found = ledger.to_record(result, truth)
+    return {"drawn": drawn, "places": len(result.places), **found}
+
+
+def class_of(camera: Record) -> str:
+    """How wrong one camera's result is."""
+    deg, cm = camera["error_deg"], camera["error_cm"]
+    if not (deg <= OFF[0] and cm <= OFF[1]):
+        return "off"  # also NaN
+    return "right" if deg <= RIGHT[0] and cm <= RIGHT[1] else "between"
+
+
+def report(records: Sequence[Record]) -> Table:
+    """A row per kind, and one of all that were made wrong."""
+    groups: dict[str, list[Record]] = {}
+    for record in sorted(records, key=lambda one: KINDS_IN_ORDER.index(one["kind"])):
+        groups.setdefault(record["kind"], []).append(record)
+    rows = [_cells(kind, of_kind) for kind, of_kind in groups.items()]
+    rows.append(_cells("made wrong", [one for one in records if one["kind"] in WRONG]))
+    heads = (f"{which}: {status}" for which in CLASSES for status in STATUSES)
+    return Table(
+        "Verdicts of five streets together, and of one",
+        ("", "drives", "refused", "places, median", "error, median [deg]", "[cm]", *heads),
+        tuple(rows),
+    )
+
+
+def _cells(name: str, records: Sequence[Record]) -> tuple[str, ...]:
+    done = [record for record in records if "cameras" in record]
+    cameras = [camera for record in done for camera in record["cameras"].values()]
+    found = Counter((class_of(camera), camera["status"]) for camera in cameras)
+    sizes = [_median(camera[f"error_{unit}"] for camera in cameras) for unit in ("deg", "cm")]
+    refused = sum("refusal" in record for record in records)
+    counts = [str(found[which, status]) for which in CLASSES for status in STATUSES]
+    places = _median(record["places"] for record in done)
+    return (
+        name,
+        str(len(records)),
+        str(refused),
+        f"{places:g}",
+        *(f"{v:.2f}" for v in sizes),
+        *counts,
+    )
+
+
+def _median(values: Iterable[float]) -> float:
+    return float(np.median([*values] or [np.nan]))
+
+
+def report_checks(records: Sequence[Record]) -> Table:
+    """What keeps right results of good drives from a PASS: checks beyond their limits."""
+    found: Counter[tuple[str, str]] = Counter()
+    for record in records:
+        for camera in record.get("cameras", {}).values():
+            if record["kind"] in WRONG or camera["status"] == "PASS" or class_of(camera) != "right":
+                continue
+            beyond = {kind for kind, status, *_ in camera["checks"] if status != "PASS"}
+            found.update((record["kind"], kind) for kind in beyond or {"(none: by the error bar)"})
+    rows = [(*key, str(count)) for key, count in found.most_common()]
+    return Table("Checks beyond a limit, of right results that are not PASS",
+                 ("drives", "check", "cameras"), tuple(rows))  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,124 @@
+"""A table that a run left, solved again, is as sure as the run, and not surer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph import Calibration, CorrespondenceError, Correspondences, Rig
+from calibgraph.model.findings import IMAGES
+from calibgraph.model.verdict import Check
+from calibgraph.pipeline import to_calibration
+from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.assess import assess
+from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.image_record import RunChecks, to_metadata
+from calibgraph.trust.pose_posterior import PosePosterior
+from tests.conftest import make_pair
+from tests.trust.conftest import simulated
+
+CAMERA, OTHER = "left", "right"
+FLAT = 0.01 * np.random.default_rng(1).standard_normal((50, 6))
+"""Half a degree, a centimetre."""
+FAILED = Check("own clouds", "FAIL", "the images fit the clouds of the next frame better", -0.2)
+CAUSE = Check("convention of the guess", "FAIL", "T_camera_lidar is inverted")
+
+
+@pytest.fixture(scope="module")
+def left_by_run(pair: Rig) -> tuple[Calibration, Correspondences]:
+    """The result of a run that saw flat evidence of one camera, and a fault; and its table."""
+    solution = solve_joint(pair, simulated(pair, frames=20))
+    posterior = PosePosterior(0.1 * FLAT, FLAT, 0.3)
+    evidence = Evidence(solution, pair, lambda *_: {CAMERA: posterior})
+    checks = RunChecks(assess(evidence), {CAMERA: [FAILED]}, {CAMERA: [CAUSE]})
+    table = solution.correspondences
+    seen = table.with_metadata({**table.metadata, **to_metadata(evidence, checks)})
+    return to_calibration(evidence, checks), seen
+
+
+@pytest.fixture(scope="module")
+def pair() -> Rig:
+    return make_pair()
+
+
+def test_covariance_and_verdict_of_the_saved_table_are_those_of_the_run(
+    left_by_run: tuple[Calibration, Correspondences], tmp_path: Path, pair: Rig
+) -> None:
+    made, table = left_by_run
+    table.save(tmp_path / "table.parquet")
+    again = calibgraph.solve(made.initial_rig, tmp_path / "table.parquet")
+    for name in made.rig.cameras:
+        np.testing.assert_allclose(again.covariance[name], made.covariance[name], rtol=1e-5)
+        mine, theirs = (r.camera_verdicts[name] for r in (made, again))
+        assert [(c.name, c.status) for c in mine.checks] == [
+            (c.name, c.status) for c in theirs.checks
+        ]
+        assert mine.status == theirs.status
+    checks = again.camera_verdicts[CAMERA].checks
+    assert checks[0] == CAUSE and checks[-1] == FAILED
+    without = calibgraph.solve(pair, table.with_metadata({}))
+    assert np.trace(without.covariance[CAMERA]) < 0.1 * np.trace(again.covariance[CAMERA])
+
+
+def test_what_images_said_of_another_pose_is_not_of_this_one(
+    left_by_run: tuple[Calibration, Correspondences],
+) -> None:
+    """The posterior, which covers its surroundings, is; the checks are not, and it is said."""
+    made, table = left_by_run
+    T = made.T_camera_lidar[CAMERA]
+    step = np.eye(4)
+    step[0, 3] = 0.5
+    points = table.points_lidar_m.copy()
+    own = table.camera_index == table.cameras.index(CAMERA)
+    inverse = np.linalg.inv(T) @ step @ T
+    points[own] = points[own] @ inverse[:3, :3].T + inverse[:3, 3]
+    found = calibgraph.solve(made.rig, replace(table, points_lidar_m=points))
+    verdict = found.camera_verdicts[CAMERA]
+    assert FAILED not in verdict.checks and CAUSE not in verdict.checks
+    (said,) = (check for check in verdict.checks if check.name == "images")
+    assert said.status == "WARN" and "50 cm from this one" in said.text
+    assert "images" not in [check.name for check in found.camera_verdicts[OTHER].checks]
+    assert found.covariance[CAMERA][3, 3] > 0.4**2  # the images said that it is 0.5 m away
+
+
+def test_what_images_said_with_another_lens_is_not_of_this_one(
+    left_by_run: tuple[Calibration, Correspondences],
+) -> None:
+    made, table = left_by_run
+    camera = made.rig.cameras[CAMERA]
+    lens = camera.intrinsics_px.model_copy(update={"fx": 1.02 * camera.intrinsics_px.fx})
+    cameras = {**made.rig.cameras, CAMERA: camera.model_copy(update={"intrinsics_px": lens})}
+    found = calibgraph.solve(made.rig.model_copy(update={"cameras": cameras}), table)
+    said = [check for check in found.camera_verdicts[CAMERA].checks if check.name == "images"]
+    assert [check.status for check in said] == ["WARN"] and "another lens" in said[0].text
+    assert "flat_evidence" not in [check.kind for check in found.camera_verdicts[CAMERA].checks]
+
+
+def test_joined_tables_keep_what_all_state(
+    left_by_run: tuple[Calibration, Correspondences],
+) -> None:
+    _, table = left_by_run
+    parts = [table.select(table.frame % 2 == odd) for odd in (0, 1)]
+    assert IMAGES in calibgraph.concatenate(parts).metadata
+    parts[1] = parts[1].with_metadata({})
+    assert IMAGES not in calibgraph.concatenate(parts).metadata
+
+
+@pytest.mark.parametrize(
+    ("path", "value"), [("near", "AAAA"), ("near", "no base64!"), ("share", "much")]
+)
+def test_a_malformed_record_is_one_line(
+    left_by_run: tuple[Calibration, Correspondences], path: str, value: str
+) -> None:
+    made, table = left_by_run
+    record = table.metadata[IMAGES]
+    cameras = dict(record["cameras"])
+    posterior = {**cameras[CAMERA]["posterior"], path: value}
+    cameras[CAMERA] = {**cameras[CAMERA], "posterior": posterior}
+    wrong = table.with_metadata({**table.metadata, IMAGES: {"cameras": cameras}})
+    with pytest.raises(CorrespondenceError, match=f"metadata 'images': .*{path}"):
+        calibgraph.solve(made.rig, wrong)
