@@ -129,8 +129,8 @@ class LensParameter:
     sigmas: Array
     units: Array
     by_unit: Array
-    probability: float = 0.0
-    is_determined: bool = True
+    probability: float
+    is_determined: bool
 
     @property
     def moved(self) -> tuple[float, float]:
@@ -140,23 +140,14 @@ class LensParameter:
 
 
 class _Mixture(NamedTuple):
-    """The lens by which of d sets of parameters are wrong.
+    """The lens by which of d sets of g names are wrong: probabilities and moments of each set."""
 
-    Attributes:
-        wrong: (d, g) which of g names are.
-        before: (d,) probability of each set.
-        after: (d,) the same, by the data.
-        spreads: (d, k) standard deviations of the parameters before.
-        means: (d, k) after.
-        covariances: (d, k, k) after.
-    """
-
-    wrong: Array
-    before: Array
-    after: Array
-    spreads: Array
-    means: Array
-    covariances: Array
+    wrong: Array  # (d, g)
+    before: Array  # (d,)
+    after: Array  # (d,) by the data
+    spreads: Array  # (d, k) before
+    means: Array  # (d, k) after
+    covariances: Array  # (d, k, k) after
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,16 +234,8 @@ class LensPosterior:
         for name, probability in zip(self._names, self._probabilities(tolerance), strict=True):
             rows = [row for row, number in enumerate(self.free) if NAMES[number] == name]
             is_open = np.diag(self.covariance)[rows] >= limit("lens_wrong") ** 2
-            own = LensParameter(
-                name=name,
-                values=values[rows],
-                sigmas=sigmas[rows],
-                units=self.units[rows],
-                by_unit=self.compensating[:, rows],
-                probability=float(probability),
-                is_determined=not is_open.all(),
-            )
-            found.append(own)
+            moments = values[rows], sigmas[rows], self.units[rows], self.compensating[:, rows]
+            found.append(LensParameter(name, *moments, float(probability), not is_open.all()))
         return tuple(found)
 
     def _probabilities(self, tolerance: tuple[float, float]) -> Array:
