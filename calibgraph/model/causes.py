@@ -130,6 +130,7 @@ CAUSES: dict[str, Cause] = {
          "difference between even and odd frames": "Record at least 5 frames, 10 s apart.",
          "repeated_frames": "Take frames while the vehicle drives.",
          "image evidence": _STRUCTURE,
+         "images": "Calibrate again from images and clouds.",
          "common_error": "State the error that all frames share (0 if none): common_deg and "
          "common_cm in the config (of solve also as options), or systematic_rotation_rad and "
          "systematic_translation_m in the metadata.",

@@ -170,7 +170,7 @@ class ImageRecord:
         camera, seen = evidence.solution.solved_rig.cameras.get(name), self.cameras[name].camera
         if camera is None:
             return ""
-        advice = "was compared with its images; calibrate again from images and clouds"
+        advice = "was compared with its images"
         if not _same_lens(seen, camera):
             return f"another lens {advice}"
         covariance = evidence.covariance_by_matches(name)

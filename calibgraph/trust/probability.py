@@ -77,7 +77,7 @@ def probability_of_checks(checks: Sequence[Check], model: str) -> float:
     worst = worst_severities(zip(kinds, (check.severity for check in checks), strict=True))
     parts = contributions(worst, fitted["weights"], fitted["other"])
     grossly = float(expit(fitted["intercept"] + sum(parts.values())))
-    if any(value > 1.0 for kind, value in worst.items() if kind not in fitted["seen"]):
+    if any(value > 1.0 for kind, value in worst.items() if kind not in {*fitted["seen"], WORST}):
         grossly = max(grossly, PASS_BELOW)  # no case had it: what it says is not known
     values = [(k, check.status, check.value) for k, check in zip(kinds, checks, strict=True)]
     by_values = float(fitted["value_reliability"]) * probability_by_values(values)
