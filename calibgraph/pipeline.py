@@ -17,6 +17,7 @@ from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.dataset import Dataset
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.camera_matches import CameraMatches
+from calibgraph.model.clock import odd_motions, unused_times
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pair_covariances
@@ -128,7 +129,10 @@ def solve(
     with watch("checks"):
         checks = record.checks(evidence, assess(evidence))
     result = to_calibration(evidence, checks)
-    return replace(result, timings_s={**result.timings_s, **watch.seconds})
+    motion = solution.correspondences
+    unused = unused_times(rig, is_known=motion.twist_per_s is not None)
+    warnings = (*unused, *odd_motions(motion))
+    return replace(result, warnings=warnings, timings_s={**result.timings_s, **watch.seconds})
 
 
 def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:

@@ -6,6 +6,7 @@ taken. Points of clouds and tables stay as they are recorded; they are moved whe
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -16,10 +17,17 @@ from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import LensPart
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.rig import Camera
+from calibgraph.model.rig import Camera, Rig
 from factors import Clock, displace
 from factors.free_lens import CLOCK
 
+_log = logging.getLogger(__name__)
+
+_HOW = (
+    "--interval-s with folders, --motion with bags, twists_per_s with arrays, twist_per_s with "
+    "every line of JSON, or the columns wx_rad_s to vz_m_s of a table"
+)
+_ALONG = 0.9  # mean cosine of turns and ways; of noise it is a half
 _ROW_STEPS = 2  # a point 20 rows further is seen 2 ms later, and moves by 2 rows in these at most
 
 
@@ -33,10 +41,38 @@ def require_motion(parts: Sequence[LensPart], *, is_known: bool) -> None:
     clock = [part for part in CLOCK if part in parts]
     if clock and not is_known:
         raise CorrespondenceError(
-            f"to estimate {', '.join(clock)}, the motion of the LiDAR must be known: give "
-            "--interval-s with folders, --motion with bags, twists_per_s with arrays, "
-            "twist_per_s with every line of JSON, or the columns wx_rad_s to vz_m_s of a table"
+            f"to estimate {', '.join(clock)}, the motion of the LiDAR must be known: give {_HOW}"
         )
+
+
+def unused_times(rig: Rig, *, is_known: bool) -> list[str]:
+    """A warning, which is logged, if the motion is unknown that the times of a rig need."""
+    stated = [n for n, c in rig.cameras.items() if c.time_offset_s or c.readout_s]
+    if is_known or not stated:
+        return []
+    text = (
+        f"{', '.join(stated)}: time_offset_s and readout_s are not used, since the motion of the "
+        f"LiDAR is unknown; give {_HOW}"
+    )
+    _log.warning(text)
+    return [text]
+
+
+def odd_motions(table: Correspondences) -> list[str]:
+    """A warning, which is logged, if a LiDAR turns about its way: of wheels, swapped columns do."""
+    if table.twist_per_s is None or not len(table):
+        return []
+    turns, moves = np.split(table.twist_per_s, 2, axis=1)
+    about_its_way = np.abs((turns * moves).sum(axis=1)).sum()
+    whole = (np.linalg.norm(turns, axis=1) * np.linalg.norm(moves, axis=1)).sum()
+    if not about_its_way > _ALONG * whole:
+        return []
+    text = (
+        "by its motion, the LiDAR turns about its direction of travel; are these the rotation "
+        "wx, wy, wz, then the velocity vx, vy, vz, about and along its own axes?"
+    )
+    _log.warning(text)
+    return [text]
 
 
 def motion_of(camera: Camera, rows: Correspondences) -> Array | None:

@@ -16,7 +16,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.graph.lens import LensVariable
-from calibgraph.model.clock import clock_of, require_motion
+from calibgraph.model.clock import clock_of, require_motion, unused_times
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import adjoint_camera_lidar
@@ -129,6 +129,8 @@ def with_motion_in_use(
             f"it has {found}motion of the LiDAR (twist_per_s), earlier frames have {earlier}; the "
             "rig's time_offset_s and readout_s need it with every frame: give it or leave it out"
         )
+    if before is None:
+        unused_times(rig, is_known=known)
     return table
 
 

@@ -14,6 +14,7 @@ from calibgraph.errors import DatasetError
 from calibgraph.io.bags import scan_duration_s
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
+from calibgraph.model.clock import unused_times
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.model.verdict import Check
@@ -114,22 +115,11 @@ def check_inputs(data: Dataset, rig: Rig, *, at_guess: bool = True) -> tuple[str
         DatasetError: if no camera has points of a cloud in view. One that has none may still be
             placed by co-visible features.
     """
-    warnings = [
-        *_unused_times(data, rig),
-        *(_check_at_guess(data, rig) if at_guess else find_implausible(rig)),
-    ]
-    for text in warnings:
+    known = data.frames[0].twist_per_s is not None
+    doubts = _check_at_guess(data, rig) if at_guess else find_implausible(rig)
+    for text in doubts:
         _log.warning(text)
-    return tuple(warnings)
-
-
-def _unused_times(data: Dataset, rig: Rig) -> Iterator[str]:
-    stated = [n for n, c in rig.cameras.items() if c.time_offset_s or c.readout_s]
-    if stated and data.frames[0].twist_per_s is None:
-        yield (
-            f"{', '.join(stated)}: time_offset_s and readout_s are not used, since the motion of "
-            "the LiDAR is unknown; give --interval-s with folders, --motion with bags"
-        )
+    return (*unused_times(rig, is_known=known), *doubts)
 
 
 def _check_at_guess(data: Dataset, rig: Rig) -> list[str]:

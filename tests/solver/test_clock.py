@@ -244,3 +244,20 @@ def test_alignments_err_as_their_error_bar_says_with_the_stated_error_of_a_clock
         )
     scatter = 3 * np.sqrt(2 / 6 / draws)
     assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter
+
+
+def test_times_of_a_rig_that_are_not_used_are_told() -> None:
+    rig, table = late(0.02, 0.0)
+    stated = with_times(rig, time_offset_s=0.02)
+    (text,) = solve(stated, replace(table, twist_per_s=None)).warnings
+    assert ", ".join(rig.cameras) in text
+    assert "time_offset_s and readout_s are not used" in text and "wx_rad_s to vz_m_s" in text
+    assert solve(stated, table).warnings == ()
+
+
+def test_a_lidar_that_turns_about_its_way_is_told() -> None:
+    rig, table = late(0.0, 0.0)
+    assert table.twist_per_s is not None
+    swapped = replace(table, twist_per_s=table.twist_per_s[:, [2, 1, 0, 3, 4, 5]])
+    (text,) = solve(rig, swapped).warnings
+    assert "turns about its direction of travel" in text
