@@ -75,11 +75,6 @@ class Linearization:
         """The same factors without the variables of places, which are eliminated."""
         return self.placed.eliminatePartialSequential(to_ordering(self.model.place_keys))[1]
 
-    @property
-    def graph(self) -> gtsam.GaussianFactorGraph:
-        """All linear factors."""
-        return join_linear(self.shared, self.placed)
-
     @cached_property
     def cost(self) -> float:
         """Twice GTSAM's error."""
@@ -123,7 +118,8 @@ class Linearization:
     @cached_property
     def step(self) -> gtsam.VectorValues:
         """The step of Gauss-Newton."""
-        return self.graph.eliminateSequential(self.model.ordering).optimize()
+        graph = join_linear(self.shared, self.placed)
+        return graph.eliminateSequential(self.model.ordering).optimize()
 
     def descend(self) -> Linearization | None:
         """The graph after a step, shortened until it descends; None if no step does."""

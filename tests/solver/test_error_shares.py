@@ -13,6 +13,7 @@ from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.config import Config, preset
 from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES
+from calibgraph.solver.elimination import join_linear
 from calibgraph.solver.error_model import ErrorFit
 from calibgraph.solver.error_shares import variances_by_source
 from calibgraph.solver.joint import solve_joint
@@ -82,7 +83,7 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
     for number in range(order.size()):
         starts[order.at(number)] = end
         end += 3 if order.at(number) == DISTORTION else 6
-    moved = np.linalg.inv(linear.graph.hessian(order)[0])[: 6 * len(model.cameras)]
+    moved = np.linalg.inv(join_linear(linear.shared, linear.placed).hessian(order)[0])[: 6 * len(model.cameras)]
     information = np.zeros((end, end))
     for number in range(linear.data.graph.size()):
         factor = linear.data.graph.at(number)
