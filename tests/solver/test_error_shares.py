@@ -83,7 +83,8 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
     for number in range(order.size()):
         starts[order.at(number)] = end
         end += 3 if order.at(number) == DISTORTION else 6
-    moved = np.linalg.inv(join_linear(linear.shared, linear.placed).hessian(order)[0])[: 6 * len(model.cameras)]
+    graph = join_linear(linear.shared, linear.placed)
+    moved = np.linalg.inv(graph.hessian(order)[0])[: 6 * len(model.cameras)]
     information = np.zeros((end, end))
     for number in range(linear.data.graph.size()):
         factor = linear.data.graph.at(number)
