@@ -28,6 +28,7 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
 from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.image_record import RunChecks
 
 FRAMES = 3  # of a street
 
@@ -88,9 +89,9 @@ def solve_streets(streets: Streets) -> Iterator[Found]:
         camera_matches=streets.matches,
     )  # fmt: skip
     evidence = Evidence(solved, guess=streets.start)
-    statuses = {
-        n: v.status for n, v in to_calibration(evidence, assess(evidence)).camera_verdicts.items()
-    }
+    checks = RunChecks(assess(evidence), with_images=False)
+    verdicts = to_calibration(evidence, checks).camera_verdicts
+    statuses = {name: verdict.status for name, verdict in verdicts.items()}
     joint, mount = solved.covariance, solved.marginals.mount
     assert joint is not None and mount.covariance is not None
     errors, T = [], mount.T_camera_lidar
