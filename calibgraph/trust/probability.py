@@ -32,7 +32,7 @@ from calibgraph.model.verdict import (
     Status,
     Verdict,
 )
-from calibgraph.trust.lens_checks import LENS_KINDS, probability_of_lens
+from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
 
 TABLES, STRUCTURE = "tables", "structure"
 """The models: of correspondences from any source; of runs of the matcher."""
