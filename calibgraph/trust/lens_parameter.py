@@ -265,4 +265,4 @@ def probability_of_lens(values: Iterable[tuple[str, Status, float | None]]) -> f
     """
     most: dict[Status, float] = {"FAIL": 1.0, "WARN": FAIL_ABOVE, "PASS": PASS_BELOW}
     of_lens = [(status, value) for kind, status, value in values if kind in LENS_KINDS]
-    return max((min(value or 0.0, most[status]) for status, value in of_lens), default=0.0)
+    return max([0.0, *(min(value or 0.0, most[status]) for status, value in of_lens)])
