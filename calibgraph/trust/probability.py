@@ -32,7 +32,7 @@ from calibgraph.model.verdict import (
     Status,
     Verdict,
 )
-from calibgraph.trust.lens_checks import LENS_KINDS, probability_of_lens
+from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
 
 TABLES, STRUCTURE = "tables", "structure"
 """The models: of correspondences from any source; of runs of the matcher."""
@@ -87,6 +87,7 @@ def probability_of_checks(checks: Sequence[Check], model: str) -> float:
 def probability_by_values(values: Sequence[tuple[str, Status, float | None]]) -> float:
     """By (kind, status, value) of the checks whose value is one: a wrong lens, a find by chance."""
     by_chance = max((value or 0.0 for kind, _, value in values if kind == CHANCE), default=0.0)
+    by_chance = min(max(by_chance, 0.0), 1.0)  # tables may state anything
     return 1.0 - (1.0 - probability_of_lens(values)) * (1.0 - by_chance)
 
 
