@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,7 +13,8 @@ from calibgraph.arrays import Array
 from calibgraph.model.config import Tracking
 from calibgraph.model.geometry import relative_transform
 from calibgraph.model.rig import RelativePose
-from calibgraph.trust.pose_posterior import PosePosterior
+from calibgraph.tracking.shown_frames import groups_by_frames
+from calibgraph.trust.pose_posterior import MAX_FRAMES, PosePosterior
 from tests.tracking.drives import drive, flat, pair_of
 
 SHORT = Config(tracking=Tracking(epoch_frames=4, live_epochs=2))
@@ -109,3 +111,12 @@ def test_without_images_no_check_speaks_of_them() -> None:
         tracker.update(table)
     checks = tracker.calibration().verdict.checks
     assert checks and not {"image evidence", "flat_evidence"} & {check.kind for check in checks}
+
+
+def test_of_a_drift_the_last_frames_are_scored() -> None:
+    """Those of another camera, which does not drift, all the same."""
+    frames = [SimpleNamespace(number=n, raw={0: None, 1: None}) for n in range(30)]
+    state: Any = SimpleNamespace(names=BOTH, live_frames=frames, drifting=[1])
+    last, whole = tuple(range(30 - MAX_FRAMES, 30)), tuple(range(30))
+    assert groups_by_frames(state, [BOTH]) == {last: [BOTH]}
+    assert groups_by_frames(state, [LEFT, RIGHT]) == {whole: [LEFT], last: [RIGHT]}
