@@ -143,10 +143,10 @@ def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
         checks: all of them.
     """
     solution, cameras = evidence.solution, evidence.cameras
-    model = model_of(solution.correspondences.matcher) if checks.with_images else TABLES
-    tolerance = solution.config.tolerance
+    model, tolerance = model_of(solution.correspondences.matcher), solution.config.tolerance
+    models = dict.fromkeys(cameras, model) | dict.fromkeys(checks.unseen, TABLES)
     verdicts = {
-        name: judge(each, evidence.probability_beyond(name), tolerance, model)
+        name: judge(each, evidence.probability_beyond(name), tolerance, models[name])
         for name, each in in_order(checks, cameras).items()
     }
     result = Calibration(

@@ -89,7 +89,7 @@ def solve_streets(streets: Streets) -> Iterator[Found]:
         camera_matches=streets.matches,
     )  # fmt: skip
     evidence = Evidence(solved, guess=streets.start)
-    checks = RunChecks(assess(evidence), with_images=False)
+    checks = RunChecks(assess(evidence), unseen=evidence.cameras)
     verdicts = to_calibration(evidence, checks).camera_verdicts
     statuses = {name: verdict.status for name, verdict in verdicts.items()}
     joint, mount = solved.covariance, solved.marginals.mount

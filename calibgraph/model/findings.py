@@ -14,7 +14,7 @@ _FINITE = ("z_score", "found", "missed", "chance")
 _OF_ONE_SEARCH = ("found", "missed", "chance")
 _PER_CAMERA = (*_FINITE, "start_dependence", "memorization", "failed_share")
 _FORMER_KEYS = {"contrast": "z_score", "recall": "memorization"}
-IMAGES = "images"
+IMAGES = "calibgraph_images"
 """Key of what the images said of a result; its content is of ``calibgraph.trust.image_record``."""
 STAGE1, _SOURCES = "stage1", ("pnp", "rig")
 _NUMBERS = {
@@ -145,11 +145,11 @@ def joined_metadata(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     A common error is stated if all tables state it, as the largest. Where searches differ, only the
     cameras that one has missed remain of them, at their lowest. What images said is of one result,
-    and of tables that share it.
+    and of tables that share it; of others only the names of its cameras are kept.
     """
     joined = dict(tables[0])
     if any(one.get(IMAGES) != joined.get(IMAGES) for one in tables):
-        joined.pop(IMAGES, None)
+        joined[IMAGES] = _joined_images([one.get(IMAGES) for one in tables])
     for key in _COMMON:
         stated = [one.get(key) for one in tables]
         if None in stated:
@@ -164,6 +164,15 @@ def joined_metadata(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         missed[camera] = min(z_score, missed.get(camera, z_score))
     kept = {key: value for key, value in joined.items() if key not in _OF_ONE_SEARCH}
     return kept | ({"missed": missed} if missed else {})
+
+
+def _joined_images(records: Sequence[Any]) -> dict[str, list[str]]:
+    """The cameras of which any of the records is."""
+    known = [record for record in records if isinstance(record, dict)]
+    names = (
+        name for record in known for key in ("cameras", "joined") for name in record.get(key, ())
+    )
+    return {"joined": sorted(map(str, {*names}))}
 
 
 def _size(value: Any) -> float:

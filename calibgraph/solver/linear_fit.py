@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.clock import at_pixels, motion_of
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
@@ -159,12 +158,8 @@ def _weak(size: int) -> Array:
 
 
 def block_of(camera: Camera, table: Correspondences) -> CameraBlock:
-    """The rows of one camera, by frame, whitened by their information alone.
-
-    Points are where they are when their pixels are taken.
-    """
-    table = at_pixels(camera, table.select(np.argsort(table.frame, kind="stable")))
+    """The rows of one camera, by frame, whitened by their information alone."""
+    table = table.select(np.argsort(table.frame, kind="stable"))
     root = None if table.information_px is None else upper_root(table.information_px)
-    motion = motion_of(camera, table)
-    block = ProjectionBlock(camera.lens, table.points_lidar_m, table.pixels_px, root, motion=motion)
+    block = ProjectionBlock(camera.lens, table.points_lidar_m, table.pixels_px, root)
     return CameraBlock(block, table.information_px, table.frame)

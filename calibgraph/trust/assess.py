@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
-from calibgraph.trust.clock_checks import image_offset_checks
+from calibgraph.trust.clock_checks import image_offset_checks, offset_checks
 from calibgraph.trust.competing_solution import competing_solution_checks
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.evidence import Checks, Evidence, concatenate
@@ -25,6 +25,7 @@ from calibgraph.trust.guess import (
 from calibgraph.trust.image_checks import image_checks
 from calibgraph.trust.image_record import RunChecks
 from calibgraph.trust.intrinsics import intrinsics_checks
+from calibgraph.trust.lens_parameter import advise_together
 from calibgraph.trust.matcher_checks import matcher_checks
 from calibgraph.trust.pair_agreement import pair_agreement_checks
 from calibgraph.trust.place_checks import place_checks
@@ -59,7 +60,8 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     place_checks,               # does a place contradict the others?
     repeated_frame_checks,      # how many are of one place, or copies?
     assumed_spread_checks,      # does the configured loss scale suit the residuals?
-    intrinsics_checks,          # would another lens or clock explain the residuals?
+    intrinsics_checks,          # would another lens explain the residuals?
+    offset_checks,              # would images of another time?
     bootstrap_checks,           # does a bootstrap over frames give the reported covariance?
     prior_share_checks,         # how much of it comes from the priors?
 )  # fmt: skip
@@ -80,7 +82,8 @@ RUN_CHECKS: tuple[Callable[[RunEvidence], Checks], ...] = (
 
 def assess(evidence: Evidence) -> dict[str, list[Check]]:
     """Per camera, the checks of a solution."""
-    return concatenate([check(evidence) for check in SOLUTION_CHECKS], evidence.cameras)
+    checks = concatenate([check(evidence) for check in SOLUTION_CHECKS], evidence.cameras)
+    return {name: advise_together(each) for name, each in checks.items()}
 
 
 def assess_run(evidence: RunEvidence) -> RunChecks:
@@ -97,7 +100,8 @@ def assess_run(evidence: RunEvidence) -> RunChecks:
 
 def in_order(checks: RunChecks, cameras: Sequence[str]) -> dict[str, list[Check]]:
     """Per camera, all checks; the likely cause of a failure comes first."""
-    return concatenate([checks.causes, checks.of_solution, checks.of_run], cameras)
+    joined = concatenate([checks.causes, checks.of_solution, checks.of_run], cameras)
+    return {name: advise_together(each) for name, each in joined.items()}
 
 
 def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:

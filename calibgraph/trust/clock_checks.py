@@ -1,8 +1,8 @@
 """Whether images are taken when their clouds are: the posterior of a free offset.
 
 Matches follow a wrong time as they follow a wrong pose, so the matcher matches again with the
-offset free; the posterior of lens and clock is by these matches. Where the motion of the LiDAR is
-not known, neighbouring clouds are registered; without stamps they are taken to be 0.1 s apart.
+offset free, and pose and offset are fitted to these matches. Where the motion of the LiDAR is not
+known, neighbouring clouds are registered; without stamps they are taken to be 0.1 s apart.
 
 A constant motion straight ahead is equivalent to a camera that is mounted further ahead.
 """
@@ -20,22 +20,43 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame, ScanSteps, seconds_between, twist_by_scans
 from calibgraph.io.kept_frames import KeptFrame
 from calibgraph.matching.run import with_motion
-from calibgraph.model.config import Config
+from calibgraph.model.clock import at_pixels, clock_of
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.model.verdict import Check
-from calibgraph.solver.linear_fit import block_of
-from calibgraph.trust.evidence import Checks
-from calibgraph.trust.intrinsics import MIN_FRAMES, fit_lens
-from calibgraph.trust.lens_checks import IMAGES, KINDS, check_lens
-from calibgraph.trust.lens_posterior import TIME
+from calibgraph.model.verdict import TOLERANCE, Check
+from calibgraph.solver.camera_twist import free_fields_px
+from calibgraph.solver.linear_fit import block_of, fit_camera
+from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.trust.lens_parameter import (
+    IMAGES,
+    RESIDUALS,
+    TIME,
+    LensParameter,
+    check_parameter,
+)
 from calibgraph.trust.run_evidence import RunEvidence
-from factors.free_lens import CLOCK
+from calibgraph.trust.thresholds import limit
+from factors import FreeLens
+from factors.free_lens import CLOCK, OFFSET
 
+USUAL_SIGMA_S = 0.002  # of an offset, where the rig states none: of sensors that are synchronised
 INTERVAL_S = 0.1  # between clouds, where they have no stamps
 MAX_STEPS = 10  # between the numbers of neighbouring clouds, if it is clouds that they count
 MAX_FRAMES = 10  # evenly spread: bounds the time
+MIN_FRAMES = 4  # with fewer, a single frame decides
+_TOLD_S, _TOLD_CM = 0.01, 0.1  # whose effect is told, if it has one
 _JERK, _JERK_M_S = 0.2, 1.0  # share and size by which the speeds to both neighbours may differ
+
+
+def offset_checks(evidence: Evidence) -> Checks:
+    """The offset of each camera by the matches of a table that comes with the LiDAR's motion."""
+    solution = evidence.solution
+    table, rig = solution.correspondences, solution.solved_rig
+    if table.twist_per_s is None or not {*CLOCK}.isdisjoint(solution.config.estimate):
+        return {}
+    fits = _fit_cameras(rig, table, evidence.findings)
+    return {n: [check_offset(fit, RESIDUALS, solution.config.tolerance)] for n, fit in fits}
 
 
 def image_offset_checks(evidence: RunEvidence) -> Checks:
@@ -59,29 +80,59 @@ def image_offset_checks(evidence: RunEvidence) -> Checks:
     )
     matcher.release()
     table = with_motion(table, moved).with_places(run.correspondences.places)
-    variance = run.correspondences.findings.place_variance
-    checks = {
-        name: _check_offset(camera, table.of_camera(name), variance, config)
-        for name, camera in rig.cameras.items()
-    }
+    fits = _fit_cameras(rig, table, run.correspondences.findings)
+    checks = {n: [check_offset(fit, IMAGES, config.tolerance)] for n, fit in fits}
     if registered and seconds_between(*moved.frames[:2]) is None:
         taken = f"; successive clouds are taken to be {INTERVAL_S:g} s apart"
         checks = {n: [replace(c, text=c.text + taken) for c in of] for n, of in checks.items()}
     return evidence.grade_by_images(checks)
 
 
-def _check_offset(
-    camera: Camera, rows: Correspondences, place_variance: float, config: Config
-) -> list[Check]:
-    """The check of the offset beside the lens, by one camera's matches; none of too few."""
-    places = rows.places
-    block = block_of(camera, replace(rows, frame=places.merge_stationary(rows.frame)))
+def _fit_cameras(
+    rig: Rig, table: Correspondences, findings: MatcherFindings
+) -> list[tuple[str, LensParameter]]:
+    fits = (
+        (name, fit_offset(camera, table.of_camera(name), findings.place_variance))
+        for name, camera in rig.cameras.items()
+    )
+    return [(name, fit) for name, fit in fits if fit is not None]
+
+
+def check_offset(
+    found: LensParameter, by: str, tolerance: tuple[float, float] = TOLERANCE
+) -> Check:
+    """The check of an offset; of one that is not determined, it tells how much depends on it."""
+    check, size = check_parameter(found, by, tolerance), float(found.units[0] * found.size)
+    if found.sigmas[0] < limit("lens_wrong"):
+        return check
+    text = "the time of the images is not determined by these data, and taken for right"
+    if size and (moved_cm := _TOLD_S * found.moved[1] / size) > _TOLD_CM:
+        text += f"; {1e3 * _TOLD_S:.0f} ms would move the camera by {moved_cm:.2g} cm"
+    return replace(check, text=text)
+
+
+def fit_offset(
+    camera: Camera, table: Correspondences, place_variance: float
+) -> LensParameter | None:
+    """Pose and offset by one camera's matches; None of too few matches or frames.
+
+    Args:
+        camera: lens, clock, and the extrinsic of the result.
+        table: its rows, with the motion of the LiDAR.
+        place_variance: of what the matches of a place share, over that of independent ones.
+    """
+    table = at_pixels(camera, table.select(np.argsort(table.frame, kind="stable")))
+    if len(np.unique(table.frame)) < MIN_FRAMES or table.twist_per_s is None:
+        return None
+    sigma_s = camera.time_offset_sigma_s or USUAL_SIGMA_S
+    free = FreeLens(camera.lens, (OFFSET,), (sigma_s,), clock_of(camera))
+    fields = free_fields_px(camera, free, table.points_lidar_m, table.twist_per_s)
+    places = table.places
+    block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
     of_place = place_variance * places.frames_per_place(block.frame_numbers)
-    found = fit_lens(camera, block, place_variance=of_place)
-    if found is None:
-        return []
-    checks = check_lens(found, IMAGES, config.tolerance, config.estimate)
-    return [check for check in checks if check.kind == KINDS[IMAGES][TIME]]
+    shared = max(of_place, limit("lens_match_share") * len(block))
+    fit = fit_camera(camera, block, fields, shared_variance=shared)
+    return None if fit is None else LensParameter.of(TIME, np.array([sigma_s]), fit.free(0))
 
 
 def _without_times(rig: Rig) -> Rig:

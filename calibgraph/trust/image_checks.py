@@ -13,7 +13,7 @@ from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.progress import Progress
 from calibgraph.trust.evidence import Checks
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
-from calibgraph.trust.lens_checks import IMAGES, check_lens
+from calibgraph.trust.lens_parameter import IMAGES, check_parameter
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import limit, threshold
 
@@ -36,7 +36,6 @@ def image_checks(evidence: RunEvidence) -> Checks:
             rig,
             run.correspondences,
             tolerance=config.tolerance,
-            estimated=config.estimate,
             seed=config.seed,
             progress=evidence.progress,
         )
@@ -52,7 +51,6 @@ def check_images(
     table: Correspondences,
     *,
     tolerance: tuple[float, float] = TOLERANCE,
-    estimated: Sequence[str] = (),
     seed: int = 0,
     progress: Progress | None = None,
 ) -> dict[str, tuple[Check, ...]]:
@@ -77,7 +75,7 @@ def check_images(
     placed = {n for n, found in evidence.items() if row.grade(found.displaced_z_score) != "FAIL"}
     of_placed = {name: checks for name, checks in of_time.items() if name in placed}
     return {
-        name: (*evidence_checks(found, names, tolerance, estimated), *of_time[name])
+        name: (*evidence_checks(found, names, tolerance), *of_time[name])
         + _clouds_checks(of_time[name], of_placed)
         for name, found in evidence.items()
     }
@@ -98,10 +96,7 @@ def _clouds_checks(
 
 
 def evidence_checks(
-    found: ImageEvidence,
-    names: Mapping[int, str],
-    tolerance: tuple[float, float] = TOLERANCE,
-    estimated: Sequence[str] = (),
+    found: ImageEvidence, names: Mapping[int, str], tolerance: tuple[float, float] = TOLERANCE
 ) -> tuple[Check, ...]:
     """The checks of one camera's extrinsic and lens by the image evidence."""
     if math.isnan(found.displaced_z_score):
@@ -113,9 +108,10 @@ def evidence_checks(
     displaced = threshold("displaced_z_score").check(found.displaced_z_score)
     frames = _check_frames(found, names)
     mispaired = found.frames_best <= threshold("frames_best").fail
-    if found.displaced_z_score < limit("lens_z_score") or mispaired or found.lens is None:
+    if found.displaced_z_score < limit("lens_z_score") or mispaired:
         return displaced, frames  # at a wrong extrinsic the lens cannot be measured
-    return displaced, frames, *check_lens(found.lens, IMAGES, tolerance, estimated)
+    lens = (check_parameter(each, IMAGES, tolerance) for each in found.lens)
+    return displaced, frames, *lens
 
 
 def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:

@@ -27,7 +27,7 @@ from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress, no_progress
 from calibgraph.trust.frame_scores import WIDE, FrameScorer, Images
 from calibgraph.trust.lens_evidence import measure_lens
-from calibgraph.trust.lens_posterior import LensPosterior
+from calibgraph.trust.lens_parameter import LensParameter
 
 MAX_FRAMES = 20  # evenly spread over the dataset: bounds the time
 MIN_GROUPS = 30  # fewer groups of windows are no evidence
@@ -41,7 +41,7 @@ class ImageEvidence:
 
     Attributes:
         groups: groups of windows that were scored; with fewer than MIN_GROUPS all else is NaN.
-        lens: its posterior; None where images do not determine it.
+        lens: how the lens that fits best differs; none where images do not determine it.
         displaced_z_score: score at the result less the mean score of the displaced poses, in
             standard deviations of the latter.
         frames_best: share of the frames whose score is highest at the result.
@@ -52,7 +52,7 @@ class ImageEvidence:
     """
 
     groups: int
-    lens: LensPosterior | None = None
+    lens: tuple[LensParameter, ...] = ()
     displaced_z_score: float = math.nan
     frames_best: float = math.nan
     frames_lost: tuple[int, ...] = ()

@@ -25,6 +25,7 @@ from calibgraph.model.verdict import (
     ABOUT_THE_DATA,
     COMMON_ERROR,
     FLAT_EVIDENCE,
+    IMAGES_ELSEWHERE,
     PASS_BELOW,
     WENT_ON,
     Check,
@@ -32,7 +33,7 @@ from calibgraph.model.verdict import (
     Status,
     Verdict,
 )
-from calibgraph.trust.lens_checks import LENS_KINDS, probability_of_lens
+from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
 
 TABLES, STRUCTURE = "tables", "structure"
 """The models: of correspondences from any source; of runs of the matcher."""
@@ -87,6 +88,7 @@ def probability_of_checks(checks: Sequence[Check], model: str) -> float:
 def probability_by_values(values: Sequence[tuple[str, Status, float | None]]) -> float:
     """By (kind, status, value) of the checks whose value is one: a wrong lens, a find by chance."""
     by_chance = max((value or 0.0 for kind, _, value in values if kind == CHANCE), default=0.0)
+    by_chance = min(max(by_chance, 0.0), 1.0)  # tables may state anything
     return 1.0 - (1.0 - probability_of_lens(values)) * (1.0 - by_chance)
 
 
@@ -99,7 +101,7 @@ def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
     worst: dict[str, float] = {}
     for kind, severity in checks:
         worst[kind] = max(severity, worst.get(kind, 0.0))
-    left_out = {*LENS_KINDS, COMMON_ERROR, CHANCE, FLAT_EVIDENCE, WENT_ON}
+    left_out = {*LENS_KINDS, COMMON_ERROR, CHANCE, FLAT_EVIDENCE, WENT_ON, IMAGES_ELSEWHERE}
     left_out |= ABOUT_THE_DATA if CHANCE in worst else frozenset()
     kept = {kind: severity for kind, severity in worst.items() if kind not in left_out}
     return {**kept, WORST: max(kept.values(), default=0.0)}

@@ -234,8 +234,6 @@ LIMITS: tuple[Limit, ...] = (
           "deviations of a calibrated one: 0.2 % of the focal length, fx / fy and the skew, "
           "0.002 focal lengths of the principal point, 0.002 of k1, 2 ms of the time of "
           "an image, or as the rig states."),
-    Limit("lens_usual", 0.3, "sigma", "The same of a usual one. With 1, six of 570 simulated "
-          "results that are off pass; with 0.1, eight of 84 with far points only WARN."),
     Limit("lens_wrong_share", _WRONG_SHARE, "share", "So many are taken for wrong."),
     Limit("lens_match_share", MATCH_SHARE, "share", "So much of a match's variance is taken to be "
           "shared by all: less cannot be told from a wrong lens."),

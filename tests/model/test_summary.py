@@ -11,7 +11,7 @@ from calibgraph.model.causes import CAUSES, cause_of
 from calibgraph.model.error_sources import COMMON, LENSES, MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.summary import MOST, summarize
 from calibgraph.model.verdict import COMMON_ERROR, Check, ErrorProbability, Verdict
-from calibgraph.trust.lens_checks import LENS_KINDS
+from calibgraph.trust.lens_parameter import LENS_KINDS
 from calibgraph.trust.thresholds import THRESHOLDS, threshold
 
 FAILED = Check("convergence", "FAIL", "the optimizer did not converge")

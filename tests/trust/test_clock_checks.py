@@ -18,14 +18,16 @@ from calibgraph.io.kept_frames import keep_frames
 from calibgraph.io.motion import ScanMotion
 from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.matching.run import MatchingRun
-from calibgraph.model.verdict import TOLERANCE, Check
+from calibgraph.model.verdict import Check
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.linear_fit import block_of
-from calibgraph.trust.clock_checks import _with_known_motion, image_offset_checks
-from calibgraph.trust.intrinsics import fit_lens
-from calibgraph.trust.lens_checks import RESIDUALS, check_lens, describe
-from calibgraph.trust.lens_posterior import LensPosterior
+from calibgraph.trust.clock_checks import (
+    _with_known_motion,
+    check_offset,
+    fit_offset,
+    image_offset_checks,
+)
+from calibgraph.trust.lens_parameter import RESIDUALS, LensParameter
 from calibgraph.trust.run_evidence import RunEvidence
 from factors import Clock
 from tests.draws.clocks import draw_twists, put_clock_error
@@ -34,34 +36,34 @@ from tests.solver.test_lens import FIVE_SIGMAS, simulated
 STRAIGHT = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
 
 
-def fit(offset_s: float, twists: np.ndarray | None = None) -> LensPosterior:
+def fit(offset_s: float, twists: np.ndarray | None = None) -> LensParameter:
     """The offset of a camera like KITTI's whose images are late: to first order in it."""
     rig, table = simulated(0, frames=30, matches=100)
     twists = draw_twists(30, np.random.default_rng(0)) if twists is None else twists
     (name, camera), *_ = rig.cameras.items()
     late = put_clock_error(table, rig, twists, Clock(offset_s)).of_camera(name)
-    found = fit_lens(camera, block_of(camera, late))
+    found = fit_offset(camera, late, 0.0)
     assert found is not None
     return found
 
 
 @pytest.mark.parametrize("offset_s", [0.02, -0.02, 0.0])
 def test_an_offset_is_recovered_within_its_sigma(offset_s: float) -> None:
-    found = fit(offset_s).parameters(TOLERANCE)[-1]
+    found = fit(offset_s)
     (seconds,), (sigma,) = found.units * found.values, found.units * found.sigmas
     assert abs(seconds - offset_s) < FIVE_SIGMAS * sigma
     assert sigma < 0.002
-    assert (found.probability > 0.5) == (offset_s != 0.0)
-    assert f"ms {'earlier' if seconds < 0 else 'later'}" in describe(found)
+    assert (found.probability() > 0.5) == (offset_s != 0.0)
+    assert f"ms {'earlier' if seconds < 0 else 'later'}" in found.describe()
 
 
 @pytest.mark.parametrize("twists", [np.zeros((30, 6)), np.tile(STRAIGHT, (30, 1))])
 def test_at_rest_and_straight_ahead_nothing_is_known_of_it(twists: np.ndarray) -> None:
     """Less than the 40 ms of an offset that is wrong, so it raises no doubt, and that is told."""
     found = fit(0.05, twists)
-    *_, offset = found.parameters(TOLERANCE)
-    assert not offset.is_determined and offset.probability < 1e-3
-    *_, check = check_lens(found, RESIDUALS)
+    assert 0.002 * found.sigmas[0] > 0.04
+    assert found.probability() < 1e-3
+    check = check_offset(found, RESIDUALS)
     assert check.status == "PASS"
     assert "not determined by these data, and taken for right" in check.text
     assert ("10 ms would move the camera by 10 cm" in check.text) == twists.any()

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibgraph import Camera, Config, CorrespondenceError, Correspondences, Rig, solve
-from calibgraph.model.rig import IntrinsicsSigma
+from calibgraph import Camera, CorrespondenceError, Correspondences, Rig, solve
 from tests.trust.conftest import named, simulated
 
 
@@ -113,18 +112,3 @@ def test_points_that_no_focal_length_explains_fail_without_a_fault(pair: Rig) ->
         except CorrespondenceError:
             continue
         assert result.verdict.status == "FAIL"
-
-
-def test_a_prior_that_holds_a_wrong_lens_back_is_named_instead_of_advice_that_circles(
-    pair: Rig,
-) -> None:
-    rig, tight = with_lens(pair, focal=1.03), IntrinsicsSigma(focal=0.02)
-    cameras = {
-        n: c.model_copy(update={"intrinsics_sigma_px": tight}) for n, c in rig.cameras.items()
-    }
-    stated, table = rig.model_copy(update={"cameras": cameras}), simulated(pair)
-    before = named(solve(stated, table), "left", "a focal length")[0].text
-    assert "run with --estimate focal" in before
-    after = named(solve(stated, table, Config(estimate="focal")), "left", "a focal length")[0].text
-    assert "--estimate" not in after
-    assert "state intrinsics_sigma_px.focal in the rig wider" in after

@@ -216,7 +216,7 @@ def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: 
     solution = solve_joint(pair, simulated(pair, frames=20))
     evidence = Evidence(solution, pair, lambda *_: dict.fromkeys(pair.cameras, certain(4 * WIDE)))
     found = to_calibration(
-        evidence, RunChecks(assess(evidence), with_images=False)
+        evidence, RunChecks(assess(evidence), unseen=evidence.cameras)
     ).camera_verdicts["left"]
     assert found.error_probability is not None
     assert found.error_probability.by_error_bar > 0.9
@@ -236,7 +236,7 @@ def test_a_wider_surface_is_a_finding_that_changes_no_verdict(
     assert covariance is not None
     evidence = Evidence(solution, pair, lambda *_: {"left": certain(wider**2 * covariance)})
     found = to_calibration(
-        evidence, RunChecks(assess(evidence), with_images=False)
+        evidence, RunChecks(assess(evidence), unseen=evidence.cameras)
     ).camera_verdicts["left"]
     (check,) = (each for each in found.checks if each.kind == "flat_evidence")
     assert check.status == status

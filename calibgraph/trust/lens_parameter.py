@@ -1,0 +1,268 @@
+"""The probability that a lens parameter is wrong, by the posterior of a free lens.
+
+A parameter is in standard deviations of a lens that was calibrated with a target, or of those that
+the rig states. Half of a skew, which no lens of a rig has, is a rotation about the axis; the other
+half is a field of displacements of its own.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from itertools import product
+
+import numpy as np
+from scipy.special import expit, logit, ndtr, softmax
+
+from calibgraph.arrays import Array
+from calibgraph.graph.lens import LensSigmas, LensVariable
+from calibgraph.model.config import LensPart
+from calibgraph.model.rig import Camera
+from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Check, Status
+from calibgraph.solver.linear_fit import Freed
+from calibgraph.trust.thresholds import limit, threshold
+from factors import FreeLens
+from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, FOCAL
+
+
+class Free(IntEnum):
+    """What is free, by number: parameters of a lens, and the skew."""
+
+    FOCAL, RADIAL, CENTRE_X, CENTRE_Y, ASPECT, SKEW = range(6)
+
+
+NAMES = {
+    "focal length": ("focal", "a focal length {} % longer", "a focal length {} % shorter"),
+    "distortion": ("distortion", "a k1 larger by {}", "a k1 smaller by {}"),
+    "principal point": ("centre", "a principal point off by ({}) px", ""),
+    "aspect ratio": ("aspect", "a ratio fx / fy {} % larger", "a ratio fx / fy {} % smaller"),
+    "skew": (None, "a skew of {} % of fx", "a skew of -{} % of fx"),
+}
+"""Parameters that are judged: what ``--estimate`` calls them, and a lens with more or less."""
+TIME = "time offset"
+_WORDS = {**NAMES, TIME: ("offset", "images taken {} ms later", "images taken {} ms earlier")}
+
+SHAPES = "aspect ratio", "skew"
+"""Those that no lens has wrong by much."""
+
+RESIDUALS, IMAGES = "residuals over the image", "images"
+"""What an estimate is by."""
+
+KINDS = {
+    by: {name: prefix + name.replace(" ", "_") for name in _WORDS}
+    for by, prefix in ((RESIDUALS, "lens_"), (IMAGES, ""))
+}
+"""Kinds of the checks."""
+LENS_KINDS = frozenset(kind for kinds in KINDS.values() for kind in kinds.values())
+_PART_OF = {
+    kind: part
+    for kinds in KINDS.values()
+    for name, kind in kinds.items()
+    if (part := _WORDS[name][0]) is not None
+}
+_ESTIMATE = re.compile(r"(run with --estimate )\S+$")
+
+_NAMES = FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT
+_PARTS: tuple[LensPart, ...] = "focal", "aspect", "centre", "distortion"
+_SKEW_SIGMA = 0.002  # in parts of fx
+_MOST_SIGMAS = 1e6  # enough for any probability
+
+
+def lens_variable(camera: Camera) -> LensVariable:
+    """The lens of a camera with the parameters that are checked, at its calibration."""
+    all_of = LensVariable.of(camera, _PARTS, LensSigmas.calibrated(camera)).free
+    sigmas = dict(zip(all_of.parameters, all_of.sigmas, strict=True))
+    free = FreeLens(camera.lens, _NAMES, tuple(sigmas[name] for name in _NAMES))
+    return LensVariable(camera, free, np.zeros(len(free)))
+
+
+def units_of(camera: Camera) -> Array:
+    """(6,) standard deviations of what is free in a calibrated lens: relative, pixels, or of k1."""
+    return np.array([*lens_variable(camera).free.sigmas, _SKEW_SIGMA])
+
+
+def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
+    """(6, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
+    free, T, k = lens_variable(camera).free, camera.T_camera_lidar, camera.intrinsics_px
+    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    fields = np.empty((len(Free), 2, len(points)))
+    free.fill_columns(camera.lens, points, fields[:-1])
+    off_centre = fields[Free.FOCAL] / free.sigmas[Free.FOCAL]
+    fields[-1] = 0.5 * _SKEW_SIGMA * off_centre[::-1] * [[k.fx / k.fy], [k.fy / k.fx]]
+    return fields
+
+
+@dataclass(frozen=True, eq=False)
+class LensParameter:
+    """An estimate of one lens parameter together with the extrinsic.
+
+    Attributes:
+        name: one of ``NAMES``, or ``TIME``.
+        values: (m,) change, in standard deviations of a calibrated lens.
+        sigmas: (m,) their standard deviations, frames as clusters.
+        twist: (6,) rotation [rad] and translation [m] by which the camera moves.
+        units: (m,) of the values: relative, pixels, of k1, or seconds.
+    """
+
+    name: str
+    values: Array
+    sigmas: Array
+    twist: Array
+    units: Array
+
+    @staticmethod
+    def of(name: str, units: Array, freed: Freed) -> LensParameter:
+        """Of a fit whose last unknowns have these units; others may be free before them."""
+        count = len(units)
+        values, covariance = _beside_others(name, freed, len(freed.values) - count)
+        twist = freed.compensating[:, -count:] @ values
+        return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, units)
+
+    @property
+    def moved(self) -> tuple[float, float]:
+        """How far the camera turns [deg] and its centre moves [cm]."""
+        turned, shifted = np.linalg.norm(self.twist.reshape(2, 3), axis=1)
+        return float(np.degrees(turned)), 100 * float(shifted)
+
+    @property
+    def size(self) -> float:
+        """The length of the values."""
+        return float(np.linalg.norm(self.values))
+
+    @property
+    def sigma(self) -> float:
+        """Its standard deviation."""
+        along = self.values / max(self.size, np.finfo(float).tiny)
+        return max(float(np.linalg.norm(along * self.sigmas)), np.finfo(float).tiny)
+
+    def probability(self, tolerance: tuple[float, float] = TOLERANCE) -> float:
+        """That the parameter is wrong and displaces the camera beyond a tolerance [deg, cm].
+
+        What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
+        wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. An
+        aspect ratio or skew as no lens has it counts also if set free it moves the camera little:
+        matches from rounds have followed it.
+        """
+        if not math.isfinite(self.sigma):  # not determined
+            return 0.0
+        moves = max(moved / most for moved, most in zip(self.moved, tolerance, strict=True))
+        tolerated = self.size / moves if moves else math.inf
+        spreads, share = np.array([1.0, limit("lens_wrong")]), limit("lens_wrong_share")
+        total = np.hypot(self.sigma, spreads)
+        evidence = -(np.minimum(self.size / total, _MOST_SIGMAS) ** 2) / 2 - np.log(total)
+        is_wrong = float(expit(logit(share) + evidence[1] - evidence[0]))
+        gain = spreads / total
+        after = _share_beyond(tolerated, gain**2 * self.size, gain * self.sigma)
+        before = _share_beyond(tolerated, 0.0, spreads)
+        if self.name in SHAPES:
+            after[1] = before[1] = 1.0
+        if_wrong = max(is_wrong * after[1] - share * before[1], 0.0)
+        return float(if_wrong + (1 - is_wrong) * max(after[0] - before[0], 0.0))
+
+    def describe(self) -> str:
+        """The lens that would be right, in words."""
+        _, more, less = _WORDS[self.name]
+        units = self.units * (100 if "%" in more else 1000 if "ms" in more else 1)
+        values = units * (np.abs(self.values) if less else self.values)
+        numbers = ", ".join(map(_with_sigma, values, units * self.sigmas))
+        return (less if less and self.values[0] < 0 else more).format(numbers)
+
+
+def _beside_others(name: str, freed: Freed, others: int) -> tuple[Array, Array]:
+    """(m,) values and (m, m) covariance of unknowns beside others, each of them usual or wrong.
+
+    A focal length that is 1 % off is no less rare beside a distortion than alone. So the other
+    unknowns have the errors of lens parameters, too: the mean and the covariance over all of their
+    combinations of usual and wrong. Not beside a shape: a wrong fy alone is a wrong focal length,
+    too, which stays free.
+
+    Args:
+        name: of the unknowns.
+        freed: the fit, with all of them free.
+        others: how many of its first unknowns are the others.
+    """
+    first, last = slice(others), slice(others, None)
+    values, covariance = freed.values, freed.covariance
+    if not others or name in SHAPES or not np.isfinite(covariance).all():
+        return values[last], covariance[last, last]
+    wrong = np.array([*product((False, True), repeat=others)])
+    spreads = np.where(wrong, limit("lens_wrong"), 1.0)
+    total = covariance[first, first] + spreads[:, :, None] ** 2 * np.eye(others)
+    gain, misfit = (
+        np.linalg.solve(total, each) for each in (covariance[first, last], values[first, None])
+    )
+    odds = logit(limit("lens_wrong_share")) * wrong.sum(axis=1)
+    fits = values[first] @ misfit[..., 0].T + np.linalg.slogdet(total).logabsdet
+    weights = softmax(odds - fits / 2)
+    means = values[last] - values[first] @ gain
+    within = covariance[last, last] - covariance[last, first] @ gain
+    mean = weights @ means
+    apart = (means - mean)[:, :, None] * (means - mean)[:, None]
+    return mean, np.tensordot(weights, within + apart, axes=1)
+
+
+def _share_beyond(size: float, mean: Array | float, sigma: Array) -> Array:
+    """The probability that normally distributed numbers are larger than a size."""
+    return np.asarray(ndtr((mean - size) / sigma) + ndtr((-mean - size) / sigma))
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    """A number with its standard deviation, in two digits of that."""
+    if not 0 < sigma < math.inf:
+        return f"{value:.2g} +- unknown"
+    decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    return f"{value:.{decimals}f} +- {sigma:.{decimals}f}"
+
+
+def check_parameter(
+    found: LensParameter, by: str, tolerance: tuple[float, float] = TOLERANCE
+) -> Check:
+    """Whether a lens parameter is wrong: the value of the check is the probability.
+
+    Args:
+        found: its estimate.
+        by: RESIDUALS or IMAGES.
+        tolerance: of the user [deg, cm].
+    """
+    row, probability, (deg, cm) = threshold("lens"), found.probability(tolerance), found.moved
+    status, (part, *_) = row.grade(probability), _WORDS[found.name]
+    text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
+    if status != "PASS":
+        advice = "correct the time stamps" if found.name == TIME else row.advice
+        text += f": {advice}" + (f"; or run with --estimate {part}" if part else "")
+    check = row.describe(probability, status, text, name=f"{found.name} by the {by}: {row.name}")
+    return replace(check, kind=KINDS[by][found.name])
+
+
+def advise_together(checks: Sequence[Check]) -> list[Check]:
+    """The checks of a camera; of several parameters that look wrong, the advice is one.
+
+    A wrong parameter makes others look wrong, since matches follow it. To estimate one of those
+    alone would leave the camera where it is, with an error bar that does not hold.
+    """
+    look_wrong = {check.kind for check in checks if check.status != "PASS"}
+    parts = {_PART_OF[kind] for kind in look_wrong & _PART_OF.keys()}
+    if len(parts) < 2:  # noqa: PLR2004
+        return list(checks)
+    all_parts = ",".join(["lens", *sorted(parts & {"aspect", "offset"})])
+    return [
+        replace(check, text=_ESTIMATE.sub(rf"\1{all_parts}", check.text))
+        if check.kind in _PART_OF
+        else check
+        for check in checks
+    ]
+
+
+def probability_of_lens(values: Iterable[tuple[str, Status, float | None]]) -> float:
+    """The probability that the worst of the lens parameters is wrong.
+
+    Args:
+        values: kind, status and value of checks. One that is a WARN counts as one, whatever its
+            value.
+    """
+    most: dict[Status, float] = {"FAIL": 1.0, "WARN": FAIL_ABOVE, "PASS": PASS_BELOW}
+    of_lens = [(status, value) for kind, status, value in values if kind in LENS_KINDS]
+    return max([0.0, *(min(value or 0.0, most[status]) for status, value in of_lens)])
