@@ -295,7 +295,5 @@ class Calibration:
 
 
 def _sigma_mapping(covariance: Array | None) -> dict[str, list[float]] | None:
-    if covariance is None:
-        return None
-    sigmas = np.sqrt(np.diag(covariance)).tolist()
-    return {"rotation_rad": sigmas[:3], "translation_m": sigmas[3:]}
+    sigmas = [] if covariance is None else np.sqrt(np.diag(covariance)).tolist()
+    return {"rotation_rad": sigmas[:3], "translation_m": sigmas[3:]} if sigmas else None
