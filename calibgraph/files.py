@@ -6,8 +6,7 @@ import json
 import os
 import tempfile
 import textwrap
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_origin
 
@@ -55,33 +54,13 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
             temporary.unlink(missing_ok=True)
 
 
-@contextmanager
-def written_together(folder: Path) -> Iterator[Path]:
-    """In the body, a folder for files that are moved into ``folder`` at its end.
-
-    After an error, as of a full disk, none of them is there, and older ones are as they were.
-    """
-    require_place_for_folder(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
-        try:
-            yield Path(name)
-        except OSError as error:  # of a file where it will be, not where it is written
-            if Path(error.filename or "").parent == Path(name):
-                error.filename = str(folder / Path(error.filename).name)
-            raise
-        for path in Path(name).iterdir():
-            path.replace(folder / path.name)
-        sync_folder(folder)
-
-
 def cannot_write(path: Path, error: Exception, number: int | None = None) -> OSError:
     """An error of the disk, with the file that it is about."""
     number = number or getattr(error, "errno", None) or errno.EIO
     reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-    return OSError(
-        number, f"cannot be written ({reason}); free or mend the disk and start again", str(path)
-    )
+    refused = number in (errno.EPERM, errno.EACCES, errno.EROFS)
+    remedy = "choose another folder" if refused else "free or mend the disk and start again"
+    return OSError(number, f"cannot be written ({reason}); {remedy}", str(path))
 
 
 def require_place_for_file(path: Path, *suffixes: str) -> None:

@@ -9,11 +9,13 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from calibgraph.errors import FileError
 
 _PNG_HEADER_BYTES = 33  # signature and IHDR
-_SEARCHED_BYTES = 2**20  # at the beginning, and at the end: Parquet has its metadata there
+_PARQUET_END_BYTES = 8  # length of the footer and magic
+_SEARCHED_BYTES = 2**20  # at the beginning and at the end
 PAGE_MARK = b'<meta name="generator" content="calibgraph">'
 AUDIT_PAGE_MARK = b'<meta name="generator" content="calibgraph check">'
 DOT_MARK = "// calibgraph graph"
@@ -53,8 +55,16 @@ def is_marked(path: Path, mark: bytes) -> bool:
     with path.open("rb") as file:
         if mark in file.read(_SEARCHED_BYTES):
             return True
-        file.seek(max(0, path.stat().st_size - _SEARCHED_BYTES))
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - max(_SEARCHED_BYTES, _parquet_footer_bytes(file))))
         return mark in file.read()
+
+
+def _parquet_footer_bytes(file: BinaryIO) -> int:
+    """The length of the footer, which holds the metadata, and its frame; 0 for other files."""
+    file.seek(max(0, file.seek(0, os.SEEK_END) - _PARQUET_END_BYTES))
+    length, magic = file.read(4), file.read(4)
+    return int.from_bytes(length, "little") + _PARQUET_END_BYTES if magic == b"PAR1" else 0
 
 
 def require_writable(outputs: Iterable[Output], read: Iterable[Path] = ()) -> None:

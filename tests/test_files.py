@@ -18,9 +18,7 @@ from calibgraph import (
 from calibgraph.files import (
     read_yaml,
     write_atomically,
-    write_text,
     write_yaml,
-    written_together,
 )
 from calibgraph.model.config import load_config
 from calibgraph.yaml_text import parse_yaml, yaml_text
@@ -205,19 +203,3 @@ def test_numbers_of_base_60_are_texts() -> None:
     assert found["frames"] == "10:40"
     assert found["negative"] == "-1:30.5"
     assert found["plain"] == [12, -3, 1.5e-3, 16, float("inf")]
-
-
-def test_files_that_are_written_together_appear_together_or_not_at_all(tmp_path: Path) -> None:
-    old = tmp_path / "a.txt"
-    old.write_text("old")
-    with pytest.raises(OSError, match="No space") as caught, written_together(tmp_path) as new:
-        write_text(new / "a.txt", "new")
-        raise OSError(errno.ENOSPC, "No space left on device", str(new / "b.txt"))
-    assert caught.value.filename == str(tmp_path / "b.txt")
-    assert ([*tmp_path.iterdir()], old.read_text()) == ([old], "old")
-    with written_together(tmp_path) as new:
-        write_text(new / "a.txt", "new")
-        write_text(new / "b.txt", "new")
-        assert old.read_text() == "old"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.txt", "b.txt"]
-    assert old.read_text() == "new"

@@ -291,6 +291,8 @@ def _require_whole(content: Mapping[str, Any], path: Path) -> None:
 
 
 def rig_of_calibration(content: Mapping[str, Any], path: Path) -> Rig:
-    """The calibrated rig in the content of a result file."""
-    _require_whole(content, path)
+    """The calibrated rig in the content of a result file, which may hold nothing else."""
+    # Behind a verdict, a rig that is the last key may be cut off.
+    if "rig" not in content or (list(content)[-1] == "rig" and "verdict" in content):
+        _require_whole(content, path)
     return checked_model(Rig, content["rig"], path)

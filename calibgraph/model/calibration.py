@@ -13,7 +13,8 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.files import sha256, write_yaml, written_together
+from calibgraph.file_sets import written_together
+from calibgraph.files import sha256, write_yaml
 from calibgraph.model import geometry, result_files
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
@@ -216,7 +217,7 @@ class Calibration:
     def save(self, folder: Path | str) -> Path:
         """Write ``calibration.yaml``, and tables of the matches if there are any, into a folder.
 
-        They appear together or not at all. Returns the path of the YAML file.
+        After an error none of them appears, and the YAML file is the last. Returns its path.
 
         Raises:
             FileError: if a file of these names is there that is not of a result.
@@ -227,7 +228,7 @@ class Calibration:
             result_files.CORRESPONDENCES_FILE: self.correspondences,
             result_files.CAMERA_MATCHES_FILE: self.camera_matches,
         }
-        with written_together(path.parent) as new:
+        with written_together(path.parent, last=path.name) as new:
             content = self._to_mapping()
             for name, table in tables.items():
                 content[f"{Path(name).stem}_sha256"] = self._save_table(table, new / name)

@@ -28,6 +28,7 @@ ABOUT_THE_DATA = frozenset(
         "focal_sensitivity",
         "frames",
         "image evidence",
+        "images",
         "prior_share",
         "repeated_frames",
         "sigma_rotation",
@@ -43,6 +44,8 @@ and keeps from a PASS, since the same posterior cannot vouch for it."""
 FLAT_EVIDENCE = "flat_evidence"
 """Kind of the check that compares the error bars by images and by matches. The wider one is in the
 result, so that the check itself changes no verdict."""
+IMAGES_ELSEWHERE = "images"
+"""Kind of the check that the images of a table were compared with another pose, lens or time."""
 _SURE, _LEAST = 0.99, 0.001  # beyond these, probabilities are not known
 
 

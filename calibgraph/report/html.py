@@ -5,13 +5,15 @@ from pathlib import Path
 
 import yaml
 
-from calibgraph.files import write_text, written_together
+from calibgraph.file_sets import written_together
+from calibgraph.files import write_text
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
+    CALIBRATION_FILE,
     CAMERA_MATCHES_FILE,
     CORRESPONDENCES_FILE,
     REPORT_FILE,
@@ -104,7 +106,7 @@ def write_result(
 ) -> list[Path]:
     """Write a result in place of an older one: of images with an overlay picture per camera.
 
-    All files appear together or, after an error, none.
+    After an error none of them appears, and the calibration is the last.
 
     Returns:
         The files to name to the user.
@@ -112,7 +114,7 @@ def write_result(
     outputs = outputs_of_result(folder)
     require_writable(outputs)
     stale = [output.path for output in outputs if output.is_ours]
-    with written_together(folder) as new:
+    with written_together(folder, last=CALIBRATION_FILE) as new:
         written = [result.save(new)]
         tables = (new / CORRESPONDENCES_FILE, new / CAMERA_MATCHES_FILE)
         written += [table for table in tables if table.exists()]

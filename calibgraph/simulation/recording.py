@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
+from calibgraph.file_sets import written_together
 from calibgraph.files import (
     require_place_for_folder,
     write_atomically,
     write_bytes,
-    written_together,
 )
 from calibgraph.io.rigs import REFERENCE_FILE, RIG_FILE
 from calibgraph.model.geometry import relative_transform
@@ -121,7 +121,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     drive = build_drive(
         frames=frames, step_m=step_m, seed=seed, vary_layout=vary_layout, surroundings=surroundings
     )
-    with written_together(out) as made:
+    with written_together(out, last=RIG_FILE) as made:
         _write_scans(made / "lidar", lidar, drive, seed, progress=progress)
         _write_images(made / "cameras", rig, drive, seed, progress=progress)
         stated.save(made / REFERENCE_FILE)

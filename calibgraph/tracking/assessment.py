@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -25,17 +25,13 @@ from calibgraph.tracking.epoch_sums import estimates_of_halves, in_its_half
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.optimum import Optimum
+from calibgraph.tracking.shown_frames import groups_by_frames
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
 from calibgraph.tracking.window import Window
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.image_posteriors import ImagePosteriors, measured_pairs
-from calibgraph.trust.pose_posterior import (
-    MAX_FRAMES,
-    PosePosterior,
-    group_tied,
-    no_posteriors,
-)
+from calibgraph.trust.pose_posterior import PosePosterior, group_tied
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
 from factors.conditioning import sigmas_of_hessian
@@ -44,6 +40,8 @@ MeasureOnFrames = Callable[
     [Sequence[int], Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
 ]
 """As ``MeasurePosteriors``, on the frames of some numbers."""
+
+NOT_COMPARED = "its images were not compared with the clouds: no frame that is at hand shows it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +111,19 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
 
 
 def with_images(
-    state: State, assessment: Assessment, measure: MeasureOnFrames
+    state: State, assessment: Assessment, measure: MeasureOnFrames | None
 ) -> tuple[Assessment, ImagePosteriors]:
-    """The assessment with error bars and verdicts by the posteriors of cameras with error bars."""
+    """The assessment with error bars and verdicts by the posteriors of cameras with error bars.
+
+    Without ``measure`` it stays as it is.
+    """
     own = covariance_by_camera(assessment, state.names)
     known = {name: covariance for name, covariance in own.items() if covariance is not None}
     groups = group_tied(tuple(known), measured_pairs(assessment.pairs))
-    posteriors = measure(_frames_of(state, known), known, groups)
+    posteriors: dict[str, PosePosterior] = {}
+    if measure is not None:
+        for frames, of_frames in groups_by_frames(state, groups).items():
+            posteriors |= measure(frames, known, of_frames)
     images = ImagePosteriors(state.names, assessment.joint_covariance, posteriors)
     row, flatness, verdicts = threshold("beyond_tolerance"), images.check_flatness(), {}
     for name, verdict in assessment.verdicts.items():
@@ -127,16 +131,11 @@ def with_images(
         if name in flatness:
             beyond = images.probability_beyond(name, state.config.tolerance)
             more = [flatness[name], row.check(beyond)]
+        elif measure is not None and name in known:
+            more = [Check("image evidence", "WARN", NOT_COMPARED)]
         verdicts[name] = Verdict((*verdict.checks, *more))
     joint = images.widen(assessment.joint_covariance)
     return replace(assessment, joint_covariance=joint, verdicts=verdicts), images
-
-
-def _frames_of(state: State, cameras: Collection[str]) -> list[int]:
-    """Numbers of the frames that show cameras at their present poses, as of a drift the last."""
-    numbers = {state.names.index(name) for name in cameras}
-    frames = [frame.number for frame in state.live_frames if numbers <= frame.raw.keys()]
-    return frames[-MAX_FRAMES:] if numbers & {*state.drifting} else frames
 
 
 def _lens_estimates(window: Window) -> dict[str, tuple[LensEstimate, ...]]:
@@ -256,7 +255,7 @@ def second_moments(assessment: Assessment) -> Array:
 
 
 def to_calibration(
-    state: State, assessment: Assessment, measure: MeasureOnFrames = no_posteriors
+    state: State, assessment: Assessment, measure: MeasureOnFrames | None = None
 ) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     assessment, images = with_images(state, assessment, measure)

@@ -125,7 +125,7 @@ def _opened(
             begin=lambda: _first_rig(drive, settings.rig, notify),
         )
         items = drive.items(calibrator.tracker)
-        result_of = partial(drive.result, notify=notify)
+        result_of = partial(drive.result, stop=stop, notify=notify)
     for damage in calibrator.damages:
         notify(f"warning: {damage}")
     if calibrator.resumed:

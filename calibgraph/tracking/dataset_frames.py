@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
+import cv2
 import numpy as np
 
 from calibgraph.arrays import Array
@@ -27,6 +28,9 @@ from calibgraph.tracking.place_sums import MOST_PLACES
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
 from calibgraph.tracking.tracker import IncrementalCalibrator
 from calibgraph.trust.pose_posterior import PosePosterior, measure_posteriors
+
+_UNSCORED = (CalibrationError, OSError, np.linalg.LinAlgError, cv2.error)
+"""What reading and scoring images raises: a result after a long drive is not lost by it."""
 
 MOST_AGAIN = 200
 """Frames that a restart looks at again, at 0.1 s each, to find where the vehicle is."""
@@ -66,18 +70,28 @@ class DatasetDrive:
         finder = PlaceFinder(tracker.initial_rig, most_places=MOST_PLACES, seed=seed)
         return with_places(self._frames(tracker), self.dataset, finder, tracker.places)
 
-    def result(self, tracker: IncrementalCalibrator, notify: Callable[[str], None]) -> Calibration:
+    def result(
+        self,
+        tracker: IncrementalCalibrator,
+        *,
+        stop: Callable[[], bool],
+        notify: Callable[[str], None],
+    ) -> Calibration:
         """The estimate, with its error bar and verdict by the images of its last frames, too.
 
         Args:
             tracker: at the end of the drive.
-            notify: called with a warning if they cannot be read any longer.
+            stop: whether the result is wanted at once, without the images.
+            notify: called with a sentence if they are left out, or cannot be scored.
         """
         if not self.matcher.image_checks_can_fail:  # may use what the scores do not
             return tracker.calibration()
+        if stop():
+            notify("stopped: the images were not compared with the clouds")
+            return tracker.calibration()
         try:
             return tracker.calibration(partial(self._measure, tracker.rig))
-        except (CalibrationError, OSError) as error:
+        except _UNSCORED as error:
             notify(f"warning: the images could not be checked: {error}")
             return tracker.calibration()
 
@@ -88,7 +102,8 @@ class DatasetDrive:
         covariances: Mapping[str, Array],
         groups: Sequence[Sequence[str]],
     ) -> Mapping[str, PosePosterior]:
-        frames = tuple(frame for frame in self.dataset.frames if frame.index in {*numbers})
+        wanted = {*numbers}
+        frames = tuple(frame for frame in self.dataset.frames if frame.index in wanted)
         if not frames:
             return {}
         data = replace(self.dataset, frames=frames)

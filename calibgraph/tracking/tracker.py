@@ -44,7 +44,6 @@ from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.step_detection import detect_small_step, detect_step
 from calibgraph.tracking.stream_tables import StreamFrame
 from calibgraph.tracking.update import Update, make_updates
-from calibgraph.trust.pose_posterior import no_posteriors
 
 _UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
 
@@ -101,7 +100,7 @@ class IncrementalCalibrator:
         visited = *self._state.places.names[1:], *(f.place for f in self._state.live_frames)
         return tuple(reversed(dict.fromkeys(reversed(visited))))
 
-    def calibration(self, measure: MeasureOnFrames = no_posteriors) -> Calibration:
+    def calibration(self, measure: MeasureOnFrames | None = None) -> Calibration:
         """The present estimate as a batch's result; posteriors by images widen its error bars."""
         return to_calibration(self._state, self._assess(), measure)
 

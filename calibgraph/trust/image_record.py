@@ -31,6 +31,7 @@ from calibgraph.trust.pose_posterior import PosePosterior
 
 _SAME_SIGMAS = 1.0  # along every axis: at such a pose the images say the same
 _SAME_PX, _GRID = 0.5, 9  # all over the image, so many pixels a side: such a lens is the same
+_EXCLUDED_SIGMAS = 6.0  # of six numbers, by chance three in a million
 _SAME_S = 1e-4  # of both times of the image: such a clock is the same
 
 
@@ -164,9 +165,33 @@ class ImageRecord:
         other = {name: self._other_than_seen(evidence, name) for name in evidence.cameras}
         seen = {name: self.content.cameras[name] for name, text in other.items() if not text}
         of_run = {name: [*of.checks, *self._of_tolerance(evidence)] for name, of in seen.items()}
-        told = {name: [_not_compared(text)] for name, text in other.items() if text}
+        told = {
+            name: [self._contradiction(evidence, name) or _not_compared(text)]
+            for name, text in other.items()
+            if text
+        }
         causes = {name: of.causes for name, of in seen.items()}
         return RunChecks(of_solution, {**of_run, **told}, causes, [*told])
+
+    def _contradiction(self, evidence: Evidence, name: str) -> Check | None:
+        """A FAIL if the recorded posterior excludes the pose of a camera with the same lens."""
+        seen, covariance = self.content.cameras.get(name), evidence.covariance_by_matches(name)
+        camera = evidence.solution.solved_rig.cameras[name]
+        if seen is None or seen.posterior is None or covariance is None:
+            return None
+        if not (_same_lens(seen.camera, camera) and _same_clock(seen.camera, camera)):
+            return None
+        of = seen.posterior
+        moments = PosePosterior(of.near, of.elsewhere, of.share).moments
+        away = twist_between(camera.T_camera_lidar, seen.camera.T_camera_lidar)
+        if away @ np.linalg.solve(moments + covariance, away) < _EXCLUDED_SIGMAS**2:
+            return None
+        degrees, cm = pose_difference(camera.T_camera_lidar, seen.camera.T_camera_lidar)
+        text = (
+            f"its images exclude this pose: with them it was {degrees:.2g} deg, {cm:.2g} cm away; "
+            "the table was changed since, or is of another rig"
+        )
+        return Check("images", "FAIL", text)
 
     def _of_tolerance(self, evidence: Evidence) -> list[Check]:
         """What to say of checks that were made for a wider tolerance."""

@@ -25,6 +25,7 @@ from calibgraph.model.verdict import (
     ABOUT_THE_DATA,
     COMMON_ERROR,
     FLAT_EVIDENCE,
+    IMAGES_ELSEWHERE,
     PASS_BELOW,
     WENT_ON,
     Check,
@@ -100,7 +101,7 @@ def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
     worst: dict[str, float] = {}
     for kind, severity in checks:
         worst[kind] = max(severity, worst.get(kind, 0.0))
-    left_out = {*LENS_KINDS, COMMON_ERROR, CHANCE, FLAT_EVIDENCE, WENT_ON}
+    left_out = {*LENS_KINDS, COMMON_ERROR, CHANCE, FLAT_EVIDENCE, WENT_ON, IMAGES_ELSEWHERE}
     left_out |= ABOUT_THE_DATA if CHANCE in worst else frozenset()
     kept = {kind: severity for kind, severity in worst.items() if kind not in left_out}
     return {**kept, WORST: max(kept.values(), default=0.0)}

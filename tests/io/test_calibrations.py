@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from calibgraph import Calibration, FileError, load_calibration, load_rig
+from calibgraph import Calibration, FileError, load_calibration, load_correspondences, load_rig
 from calibgraph.io.calibrations import error_bars
 from calibgraph.report.html import write_result
 from tests.conftest import CommandRun
@@ -65,10 +65,28 @@ def test_a_result_that_was_cut_off_is_named(
     whole = "".join(lines[: int(share * len(lines))])
     for cut in (whole, whole[:-1]):
         path.write_text(cut)
-        for read in (load_calibration, load_rig):
-            with pytest.raises(FileError, match=words) as caught:
-                read(path)
-            assert "\n" not in str(caught.value)
+        with pytest.raises(FileError, match=words) as caught:
+            load_calibration(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_rig_that_was_cut_off_is_refused_and_a_whole_one_needs_nothing_else(
+    calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    whole, path = load_rig(calibrated_sample.folder), tmp_path / "calibration.yaml"
+    lines = (calibrated_sample.folder / "calibration.yaml").read_text().splitlines(keepends=True)
+    begin, end = (lines.index(next(a for a in lines if a.startswith(key)))
+                  for key in ("rig:", "covariance_of:"))  # fmt: skip
+    for count in {begin, begin + 1, *range(begin + 2, end, 7), end}:
+        path.write_text("".join(lines[:count]))
+        with pytest.raises(FileError, match="part of a result|ends within a line"):
+            load_rig(path)
+    alone = "".join([lines[0], *lines[begin:end]])
+    for text in ("".join(lines[: end + 1]), alone):
+        path.write_text(text)
+        assert load_rig(path).model_dump_json() == whole.model_dump_json()
+        with pytest.raises(FileError, match="part of a result.*'versions' should follow"):
+            load_calibration(path)
 
 
 def test_a_result_that_a_full_disk_cuts_short_leaves_the_older_one(
@@ -97,6 +115,22 @@ def test_files_of_the_result_before_do_not_stay_beside_the_new_one(
     without = replace(result, correspondences=None, camera_matches=None)
     (written,) = write_result(without, tmp_path, with_report=False)
     assert [*tmp_path.iterdir()] == [written] == [tmp_path / "calibration.yaml"]
+
+
+def test_a_result_of_much_metadata_is_replaced_but_no_table_of_others(
+    calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    result, path = load_calibration(calibrated_sample.folder), tmp_path / "correspondences.parquet"
+    table = result.correspondences
+    assert table is not None
+    long = table.with_metadata({"of_cameras": "x" * 3 * 2**20})  # 150 kB per camera in practice
+    for warning in ("first", "second"):
+        replace(result, correspondences=long, warnings=(warning,)).save(tmp_path)
+        assert load_calibration(tmp_path).warnings == (warning,)
+    long.save(path)
+    with pytest.raises(FileError, match="was not written by calibgraph"):
+        result.save(tmp_path)
+    assert load_correspondences(path).metadata == long.metadata
 
 
 def content_of(result: CommandRun) -> dict[str, Any]:

@@ -21,6 +21,8 @@ from calibgraph import (
 from calibgraph.tracking.frame_group import in_groups, update_all
 from calibgraph.tracking.stream_tables import StreamFrame
 from calibgraph.tracking.update import json_line
+from calibgraph.trust.pose_posterior import PosePosterior
+from factors import pose_sigmas
 from tests.conftest import make_camera
 from tests.draws.drives import simulate_drive
 from tests.draws.places import Drawn
@@ -95,6 +97,13 @@ def frames_in(out: str) -> list[int]:
 
 def left_out(err: str) -> list[str]:
     return [line for line in err.splitlines() if line.startswith("left out: ")]
+
+
+def flat(rad: float, m: float) -> PosePosterior:
+    """Samples of a posterior that is as wide."""
+    sigmas = pose_sigmas(rotation_rad=rad, translation_m=m)
+    samples = sigmas * np.random.default_rng(0).standard_normal((4000, 6))
+    return PosePosterior(samples, samples, 0.0)
 
 
 @dataclass

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 import pytest
 
@@ -21,17 +24,18 @@ from calibgraph import (
 )
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.frame import Frame
+from calibgraph.matching.protocol import to_full_matcher
 from calibgraph.tracking import command, dataset_frames
 from calibgraph.tracking.command import Tracking, track
-from calibgraph.tracking.dataset_frames import with_places
+from calibgraph.tracking.dataset_frames import DatasetDrive, with_places
 from calibgraph.tracking.streams import StreamFrame
 from calibgraph.trust.pose_posterior import PosePosterior, no_posteriors
 from calibgraph.trust.run_evidence import RunEvidence
-from factors import pose_sigmas
 from tests.tracking.drives import (
     FRAMES,
     Crashed,
     World,
+    flat,
 )
 
 pytestmark = pytest.mark.usefixtures("no_picture")
@@ -113,13 +117,6 @@ def test_a_dataset_continues_after_a_crash_and_around_an_unreadable_frame(
     assert first + second == whole
 
 
-def flat(rad: float, m: float) -> PosePosterior:
-    """Samples of a posterior that is as wide."""
-    sigmas = pose_sigmas(rotation_rad=rad, translation_m=m)
-    samples = sigmas * np.random.default_rng(0).standard_normal((4000, 6))
-    return PosePosterior(samples, samples, 0.0)
-
-
 def test_flat_images_widen_the_result_at_the_end_and_its_verdict(
     world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -171,6 +168,76 @@ def test_images_that_cannot_be_read_at_the_end_leave_the_result_without_them(
     result, _ = track(wanted, recorded.folders, notify=notes.append)
     assert any(note.startswith("warning: the images could not be checked") for note in notes)
     assert result.covariance["left"] is not None and result.verdict.images_note
+
+
+@pytest.mark.parametrize("error", [np.linalg.LinAlgError, cv2.error])
+def test_images_that_cannot_be_scored_at_the_end_leave_the_result_without_them(
+    error: type[Exception],
+    world: World,
+    recorded: Dataset,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error("not positive definite")
+
+    monkeypatch.setattr(RunEvidence, "_measure_posteriors", no_posteriors)
+    monkeypatch.setattr(dataset_frames, "measure_posteriors", fail)
+    monkeypatch.setattr(Given, "image_checks_can_fail", True, raising=False)
+    notes: list[str] = []
+    matcher = Given(concatenate(world.tables))
+    wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
+    result, (saved, *_) = track(wanted, recorded.folders, notify=notes.append)
+    assert saved.is_file() and result.covariance["left"] is not None
+    assert "warning: the images could not be checked: not positive definite" in notes
+
+
+def test_after_a_signal_the_result_is_written_without_the_images(
+    world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[str] = []
+
+    def write(line: str) -> None:
+        given.append(line)
+        if len(given) == FRAMES - 2:
+            signal.raise_signal(signal.SIGTERM)
+
+    def score(*_: object, **__: object) -> None:
+        raise AssertionError("images are scored")
+
+    monkeypatch.setattr(command, "print_line", write)
+    monkeypatch.setattr(RunEvidence, "_measure_posteriors", no_posteriors)
+    monkeypatch.setattr(dataset_frames, "measure_posteriors", score)
+    monkeypatch.setattr(Given, "image_checks_can_fail", True, raising=False)
+    notes: list[str] = []
+    matcher = Given(concatenate(world.tables))
+    wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
+    result, (saved, *_) = track(wanted, recorded.folders, notify=notes.append)
+    assert saved.is_file() and len(given) == FRAMES - 2 and result.verdict.images_note
+    assert "stopped: the images were not compared with the clouds" in notes
+
+
+class Numbers(list[int]):
+    """Counts how often all are read."""
+
+    reads = 0
+
+    def __iter__(self) -> Iterator[int]:
+        self.reads += 1
+        return super().__iter__()
+
+
+def test_frames_to_score_are_found_in_linear_time(
+    world: World, recorded: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measure(data: Dataset, *_: object, seed: int) -> dict[str, PosePosterior]:
+        assert [frame.index for frame in data.frames] == [2, 5]
+        return {"left": flat(1.0, 1.0)}
+
+    monkeypatch.setattr(dataset_frames, "measure_posteriors", measure)
+    given = DatasetDrive(recorded, to_full_matcher(Given(world.tables[0])), Config())
+    numbers = Numbers([5, 2])
+    assert given._measure(recorded.rig, numbers, {}, []) and numbers.reads == 1
 
 
 class Odometer:
