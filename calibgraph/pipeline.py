@@ -124,7 +124,8 @@ def solve(
     """
     solution = solve_joint(rig, table, config, terms, camera_matches=camera_matches)
     record = ImageRecord.from_metadata(solution.correspondences.metadata)
-    evidence = Evidence(solution, rig, record.posteriors_of(solution.solved_rig.cameras))
+    posteriors = record.posteriors_of(solution.solved_rig.cameras)
+    evidence = Evidence(solution, rig, posteriors, solution.config.excluded_cameras)
     watch = Stopwatch()
     with watch("checks"):
         checks = record.checks(evidence, assess(evidence))

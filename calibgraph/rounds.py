@@ -101,7 +101,7 @@ def match_in_rounds(
     missed = full.rounds - 1 - index
     run = MatchingRun(
         data, full, guess, table, solution, tuple(rounds), watch, missed,
-        warnings=warnings, is_late=out_of_time,
+        warnings=warnings, is_late=out_of_time, excluded=config.excluded_cameras,
     )  # fmt: skip
     if not out_of_time():
         with watch("match_again"):

@@ -164,6 +164,8 @@ def _values(schema: Mapping[str, Any]) -> str:
         return "`null`"
     low = schema.get("minimum", schema.get("exclusiveMinimum"))
     high = schema.get("maximum", schema.get("exclusiveMaximum"))
+    if "exclusiveMaximum" in schema and schema["type"] == "integer":
+        high -= 1
     if low is not None and high is not None:
         above = "above " if "exclusiveMinimum" in schema else ""
         return f"{above}{low:.10g} to {high:.10g}"

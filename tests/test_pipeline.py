@@ -230,6 +230,15 @@ def test_the_commands_solve_what_calibrate_saved(
     require_same(made, calibgraph.load_calibration(tmp_path / "again"))
 
 
+def test_an_excluded_camera_is_told_so_and_its_images_are_not_blamed(
+    guess: Rig, truth: Rig
+) -> None:
+    result = calibgraph.solve(guess, table_of(truth), Config(excluded_cameras=("left",)))
+    (check,) = (c for c in result.camera_verdicts["left"].checks if c.name == "correspondences")
+    assert check.text.startswith("excluded by the settings") and "sharp" not in check.text
+    assert not any("sharp" in action for action in result.summary.actions)
+
+
 def test_an_excluded_camera_that_the_rig_lacks_is_refused(guess: Rig, truth: Rig) -> None:
     with pytest.raises(ValueError, match=r"excluded_cameras names 'rear'; the rig has front_left"):
         calibgraph.solve(guess, table_of(truth), Config(excluded_cameras=("rear",)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -78,9 +79,12 @@ class RigFilesOptions:
 def _list_formats(format: str) -> str:
     """Print the formats for ``--format list``, before other arguments are required."""
     if format == _LIST:
+        from calibgraph.report.as_json import print_line
+
         width = max(map(len, EXPORT_FORMATS))
-        for name, meaning in EXPORT_FORMATS.items():
-            print(f"{name:{width}}  {meaning}")
+        lines = (f"{name:{width}}  {meaning}" for name, meaning in EXPORT_FORMATS.items())
+        with suppress(BrokenPipeError):
+            print_line("\n".join(lines))
         raise typer.Exit
     return format
 

@@ -67,7 +67,7 @@ class MatchingOptions(DatasetOptions):
         interval_s (SECONDS): Time between neighbouring clouds of a folder: the motion of the LiDAR
             is found by their registration. For --estimate offset or readout. (default: unknown)
         time_limit_s (SECONDS): Stop matching after this time; a result of fewer rounds is marked as
-            partial. [default: 1800 with structure, else none; inf for none]
+            partial. (default: 1800 with structure, else none; inf for none)
         search_deg (DEG|none): Largest rotation error of the guess, per axis; none: no search, for a
             guess within about 2.5 deg and 25 cm. The guess itself is tried first. (default: 20)
         search_m (M|none): Largest translation error of the guess, per axis; or none. (default: 1.5)

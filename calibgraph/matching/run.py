@@ -57,6 +57,7 @@ class MatchingRun:
         is_late: whether the time limit has passed by now.
         went_on: per camera whose rounds went on from where its images agree better, how far that
             was [deg, cm].
+        excluded: cameras that the user excluded.
     """
 
     dataset: Dataset
@@ -72,6 +73,7 @@ class MatchingRun:
     rematch: Rematch | None = None
     is_late: Callable[[], bool] = lambda: False
     went_on: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    excluded: tuple[str, ...] = ()
 
 
 def require_known_motion(data: Dataset, matcher: FullMatcher, parts: Sequence[LensPart]) -> None:

@@ -125,6 +125,7 @@ CAUSES: dict[str, Cause] = {
         "Record more frames.",
         {"correspondences": "Check that this camera's images are sharp and show what the LiDAR "
          "measures.",
+         "excluded": "To calibrate it by its own matches, take it out of excluded_cameras.",
          "correspondences_used": "Give at least 50 matches.",
          "frames": "Record at least 5 frames, 10 s apart.",
          "difference between even and odd frames": "Record at least 5 frames, 10 s apart.",

@@ -33,6 +33,7 @@ class Reason:
         text: one sentence.
         cause: its key in ``CAUSES``; empty for a weakness.
         action: what to do about it; empty if nothing that a user can do would help.
+        kind: of its check; empty if it is of none.
     """
 
     status: str
@@ -40,6 +41,7 @@ class Reason:
     text: str
     cause: str = ""
     action: str = ""
+    kind: str = ""
 
 
 @dataclass(frozen=True)
@@ -142,9 +144,10 @@ def _unsure_first(reasons: Sequence[Reason]) -> list[Reason]:
 
 
 def _with_other_cameras(reasons: Sequence[Reason]) -> Reason:
-    """The first reason of a cause, and which other cameras have one of the same cause."""
+    """The first reason of a cause, and at which other cameras a check of its kind is not PASS."""
     first = reasons[0]
-    others = dict.fromkeys(name for reason in reasons for name in reason.cameras)
+    alike = (reason for reason in reasons if reason.kind == first.kind)
+    others = dict.fromkeys(name for reason in alike for name in reason.cameras)
     names = [name for name in others if name not in first.cameras]
     also = f" (also noticed at {', '.join(names)})" if names else ""
     return replace(first, text=f"{first.text}{also}")
@@ -203,7 +206,7 @@ def _nearest(verdicts: Mapping[str, Verdict]) -> list[Reason]:
     name, check = max(checks, key=lambda item: item[1].severity)
     kind, status = check.kind or check.name, rig_verdict(doubtful).status
     text = f"no check is beyond its limit; nearest to it is {check.text}"
-    return [Reason(status, (name,), text, cause_of(kind), action_of(kind))]
+    return [Reason(status, (name,), text, cause_of(kind), action_of(kind), kind)]
 
 
 def _reason(checks: Mapping[str, Check]) -> Reason:
@@ -214,7 +217,7 @@ def _reason(checks: Mapping[str, Check]) -> Reason:
     cameras, text, action = tuple(ordered), _sentence(ordered), action_of(kind)
     if parts := _PARTS.search(worst.text):  # several that look wrong are estimated together
         action = _PARTS.sub(parts[0], action)
-    return Reason(worst.status, cameras, text, cause_of(kind), action)
+    return Reason(worst.status, cameras, text, cause_of(kind), action, kind)
 
 
 def _group_sentences(weaknesses: Mapping[str, Sequence[str]]) -> list[Reason]:

@@ -116,12 +116,11 @@ def write_result(
     stale = [output.path for output in outputs if output.is_ours]
     with written_together(folder, last=CALIBRATION_FILE) as new:
         written = [result.save(new)]
+        tables = (new / CORRESPONDENCES_FILE, new / CAMERA_MATCHES_FILE)
+        written += [table for table in tables if table.exists()]
         if data is not None:
             middle = data.frames[len(data.frames) // 2]
             mark = "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
-            if result.camera_matches is not None:
-                written.append(new / CAMERA_MATCHES_FILE)
-            written.insert(1, new / CORRESPONDENCES_FILE)
             written += write_overlays(middle, result.initial_rig, result.rig, new, mark=mark)
         if with_report:
             written.append(write_report(result, new / REPORT_FILE))

@@ -7,7 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -194,6 +194,7 @@ def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) 
 
 def _check(task: JobTask, inputs: _Inputs, progress: Progress) -> JobOutcome:
     from calibgraph.audit import audit_summary, check
+    from calibgraph.audit.check import provenance
     from calibgraph.audit.page import write_audit_report
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
@@ -204,15 +205,18 @@ def _check(task: JobTask, inputs: _Inputs, progress: Progress) -> JobOutcome:
         raise ValueError("a check needs the deployed rig")
     deployed = load_rig(inputs.rig)
     options: dict[str, Any] = {} if settings.frames is None else {"most_frames": None}
+    data = load_dataset(inputs.recordings, deployed, frames=settings.frames)
+    origin = provenance(inputs.rig, data)
     audit = check(
         deployed,
-        load_dataset(inputs.recordings, deployed, frames=settings.frames),
+        data,
         tolerance_deg=settings.tolerance_deg,
         tolerance_cm=settings.tolerance_cm,
         matcher=StructureMatcher(seed=settings.seed, **options),
         seed=settings.seed,
         progress=progress,
     )
+    audit = replace(audit, same_recording=origin.same_recording, deployed_verdict=origin.verdict)
     progress("writing", 0, 1)
     write_audit_report(audit, task.folder / WORK / FILES / REPORT_FILE)
     _write_summary(task, audit_summary(audit))

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from calibgraph.files import describe
+from calibgraph.model.config import Config
 from calibgraph.service.access import Caller
 from calibgraph.service.folders import sync_tree
 from calibgraph.service.jobs import JobRecord, OtherRequestError, new_id
@@ -118,6 +119,13 @@ async def _read(
     return job, hashlib.sha256(digest.encode()).hexdigest()
 
 
+def _hint(kind: JobKind, name: str) -> str:
+    """Where a setting of the solve goes, if a field of a form is named as one."""
+    if "config" not in SETTINGS_OF[kind].model_fields or name not in Config.model_fields:
+        return ""
+    return f"; give it as {SETTINGS}={json.dumps({'config': {name: '...'}})}"
+
+
 def _job_of_form(upload: Upload, kind: JobKind) -> Job:
     """The job of a form: fields are URIs or the settings, files are in the folder already."""
     uris, about = dict[str, str](), dict[str, str]()
@@ -136,7 +144,7 @@ def _job_of_form(upload: Upload, kind: JobKind) -> Job:
             uris[_free_name(name, files | uris.keys())] = text
         else:
             known = ", ".join((*ALLOWED[kind], SETTINGS, *ABOUT, *FORM_SETTINGS[kind]))
-            raise Problem(422, f"unknown field {name[:60]!r}; known are {known}")
+            raise Problem(422, f"unknown field {name[:60]!r}; known are {known}{_hint(kind, name)}")
     given = files | uris.keys()
     for name in REQUIRED[kind]:
         if name not in given:

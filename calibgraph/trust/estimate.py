@@ -34,6 +34,7 @@ class Estimate:
         converged: whether the last pass stopped by its tolerance.
         terms: of the objective.
         held: whether nothing determines it.
+        excluded: whether the settings exclude its correspondences.
         scatter_only: whether it is unknown how large the error is that all frames share.
         tolerance: of the user: rotation [deg] and distance [cm].
         lens: the parameters of lens and clock that were estimated.
@@ -51,6 +52,7 @@ class Estimate:
     converged: bool
     terms: Terms
     held: bool = False
+    excluded: bool = False
     scatter_only: bool = False
     tolerance: tuple[float, float] = TOLERANCE
     lens: tuple[LensEstimate, ...] = ()

@@ -53,11 +53,13 @@ class Evidence:
         guess: the rig as it was first guessed.
         measure_posteriors: the posteriors by the images, of the (6, 6) covariances by the matches
             and of groups of cameras that move together; none where there are no images.
+        excluded: cameras that the user excluded; the solution may have excluded more.
     """
 
     solution: Solution
     guess: Rig
     measure_posteriors: MeasurePosteriors = no_posteriors
+    excluded: tuple[str, ...] = ()
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -71,7 +73,7 @@ class Evidence:
 
     @cached_property
     def _without_pairs(self) -> Evidence:
-        return Evidence(self.solution.without_pairs(), self.guess)
+        return Evidence(self.solution.without_pairs(), self.guess, excluded=self.excluded)
 
     @property
     def findings(self) -> MatcherFindings:
@@ -280,6 +282,7 @@ class Evidence:
             converged=solution.optimum.converged,
             terms=solution.terms,
             held=camera in solution.held,
+            excluded=camera in self.excluded,
             scatter_only=not self.findings.states_common_error,
             tolerance=solution.config.tolerance,
             lens=solution.lens.get(camera, ()),

@@ -32,7 +32,8 @@ class RunEvidence:
     @cached_property
     def solution(self) -> Evidence:
         """The evidence of the last round's solution."""
-        return Evidence(self.run.solution, self.run.guess, self._measure_posteriors)
+        run = self.run
+        return Evidence(run.solution, run.guess, self._measure_posteriors, run.excluded)
 
     def grade_by_images(self, checks: Checks) -> Checks:
         """Checks on images, without a FAIL where those of the run's matcher WARN at most."""

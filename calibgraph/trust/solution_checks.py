@@ -25,19 +25,25 @@ def estimate_checks(evidence: Evidence) -> Checks:
 
 def check_estimate(estimate: Estimate) -> list[Check]:
     """The checks of one camera's estimate, from a batch solve or while driving."""
+    excluded, used = estimate.excluded, f"{estimate.used} usable correspondences, too few"
+    kind = "excluded" if excluded else ""
     if estimate.held:
         text = (
-            f"{estimate.used} usable correspondences, too few, and nothing ties it to another "
-            "camera: it is left at its guess; check that its images show something sharp, that the "
-            "cloud lies where T_camera_lidar looks, and its name"
+            f"{'excluded by the settings' if excluded else used}, and nothing ties it to another "
+            "camera: it is left at its guess"
         )
-        return [Check("correspondences", "FAIL", text, estimate.used)]
+        if not excluded:
+            text += (
+                "; check that its images show something sharp, that the cloud lies where "
+                "T_camera_lidar looks, and its name"
+            )
+        return [Check("correspondences", "FAIL", text, estimate.used, kind=kind)]
     if estimate.residuals is None:
         text = (
-            f"{estimate.used} usable correspondences, too few: determined by other cameras alone, "
-            "through relative_poses, which have to be right, or what they see in common"
+            f"{'excluded by the settings' if excluded else used}: determined by other cameras "
+            "alone, through relative_poses, which have to be right, or what they see in common"
         )
-        return [Check("correspondences", "WARN", text, estimate.used)]
+        return [Check("correspondences", "WARN", text, estimate.used, kind=kind)]
     return [check for function in ESTIMATE_CHECKS for check in function(estimate)]
 
 

@@ -39,6 +39,8 @@ def test_solve_then_evaluate(solved: CommandRun, call: Call) -> None:
     assert "PASS" in solved.stderr
     assert "p_camera = T_camera_lidar * p_lidar" in solved.stderr
     out, truth = solved.folder, solved.folder.parent / "truth.yaml"
+    named = solved.stderr.partition("written:\n")[2].split()
+    assert sorted(map(Path, named)) == sorted(out.iterdir())
     code, stdout, _ = call("evaluate", out, truth, "--json")
     assert code == 0
     errors = json.loads(stdout)

@@ -57,13 +57,20 @@ def test_sentences_that_differ_in_a_number_are_one_reason() -> None:
     )  # fmt: skip
 
 
-def test_checks_of_one_cause_are_one_reason_that_names_its_own_cameras_and_the_others() -> None:
+def test_checks_of_one_cause_are_one_reason_that_names_its_own_cameras_alone() -> None:
     summary = summarize({"left": of_kinds("own_clouds"), "right": of_kinds("time_offset")})
     (reason,) = summary.reasons
     assert (reason.cause, reason.cameras) == ("time", ("left",))
-    assert reason.text.endswith(" (also noticed at right)")
+    assert reason.text == "own_clouds is odd"
     assert [other.text for other in summary.others] == ["time_offset is odd"]
     assert summary.actions == (CAUSES["time"].action,)
+
+
+def test_cameras_with_a_check_of_the_same_kind_in_other_words_are_named() -> None:
+    other = Check("own_clouds", "WARN", "own_clouds is missing", kind="own_clouds")
+    found = summarize({"left": of_kinds("own_clouds"), "right": Verdict((other,))})
+    (reason,) = found.reasons
+    assert reason.text == "own_clouds is odd (also noticed at right)"
 
 
 def test_of_many_causes_the_worst_three_are_shown_and_the_others_folded() -> None:

@@ -33,6 +33,19 @@ def test_a_job_is_acknowledged_with_its_place(make_server: Make, small: Problem)
     assert answer.json()["state"] == "queued"
 
 
+def test_a_setting_of_the_solve_as_a_field_is_told_where_it_goes(
+    make_server: Make, small: Problem
+) -> None:
+    client, field = make_server(), {"tolerance_deg": "0.3"}
+    answer = client.post("/v1/solves", files=small.files, data=field)
+    assert answer.status_code == 422
+    told = answer.json()["detail"].partition("settings=")[2]
+    given = json.dumps({"config": {"tolerance_deg": 0.3}})
+    assert told == given.replace("0.3", '"..."')
+    data = {"settings": given, "report": "false"}
+    assert client.post("/v1/solves", files=small.files, data=data).status_code == 202
+
+
 def test_a_result_is_that_of_the_library(
     working: TestClient, solved: str, small: Problem, tmp_path: Path
 ) -> None:

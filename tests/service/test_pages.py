@@ -9,7 +9,7 @@ from pathlib import Path
 from starlette.testclient import TestClient
 
 from calibgraph.service.requests import CalibrationSettings
-from tests.conftest import SAMPLE
+from tests.conftest import SAMPLE, CommandRun
 from tests.service.conftest import Make, Problem, make_tokens, service_folder
 
 
@@ -90,14 +90,20 @@ def test_reading_is_not_enough_for_a_form(
     assert client.post("/new/solve", files=small.files).status_code == 403
 
 
-def test_a_check_has_its_page(working: TestClient) -> None:
-    """Of two frames, which cannot tell."""
+def two_frames() -> bytes:
+    """A zip of the sample's first two frames."""
     held = io.BytesIO()
     with zipfile.ZipFile(held, "w") as archive:
         for path in sorted(SAMPLE.rglob("*")):
             if path.is_file() and path.stem in ("rig", "000000", "000001"):
                 archive.write(path, path.relative_to(SAMPLE))
-    files = {"rig": (SAMPLE / "rig.yaml").read_bytes(), "recording": held.getvalue()}
+    return held.getvalue()
+
+
+def test_a_check_has_its_page(working: TestClient, calibrated_sample: CommandRun) -> None:
+    """Of two frames, which cannot tell; the deployed result was made from them."""
+    deployed = (calibrated_sample.folder / "calibration.yaml").read_bytes()
+    files = {"rig": deployed, "recording": two_frames()}
     id = working.post("/v1/checks", files=files, data={"name": "monday"}).json()["id"]
     verdict = working.get(f"/v1/jobs/{id}", params={"wait_s": 60}).json()["verdict"]
     job = working.get(f"/jobs/{id}").text
@@ -108,6 +114,18 @@ def test_a_check_has_its_page(working: TestClient) -> None:
     assert page.text.count("data:image/jpeg") >= 3
     assert "sandbox" in page.headers["content-security-policy"]
     assert working.get(f"/v1/jobs/{id}/exports/ros2").status_code == 404
+    result = working.get(f"/v1/jobs/{id}/result").json()
+    assert result["same_recording"] is True
+    assert result["deployed_verdict"] == "PASS"
+
+
+def test_a_check_of_mounts_is_refused(working: TestClient, calibrated_sample: CommandRun) -> None:
+    result = (calibrated_sample.folder / "calibration.yaml").read_text("utf-8")
+    deployed = result.replace("of: alignment", "of: mount").encode()
+    files = {"rig": deployed, "recording": two_frames()}
+    id = working.post("/v1/checks", files=files).json()["id"]
+    job = working.get(f"/v1/jobs/{id}", params={"wait_s": 60}).json()
+    assert job["state"] == "failed" and "poses of the mount" in job["error"]["detail"]
 
 
 def test_a_browser_signs_in_with_a_token(make_server: Make, tmp_path: Path, small: Problem) -> None:
