@@ -93,7 +93,7 @@ def print_line(text: str) -> None:
         discard_stdout()
         if isinstance(error, BrokenPipeError):
             raise
-        raise FileError("standard output", f"cannot be written to ({error}); restart") from error
+        raise FileError("standard output", f"cannot be written to ({error.strerror}); restart") from error
 
 
 def require_stdout() -> None:
