@@ -93,7 +93,8 @@ def print_line(text: str) -> None:
         discard_stdout()
         if isinstance(error, BrokenPipeError):
             raise
-        raise FileError("standard output", f"cannot be written to ({error}); restart") from error
+        what = f"cannot be written to ({error.strerror}); restart"
+        raise FileError("standard output", what) from error
 
 
 def require_stdout() -> None:
