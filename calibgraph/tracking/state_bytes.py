@@ -10,7 +10,6 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import fields
-from functools import lru_cache
 from itertools import takewhile
 from typing import Annotated, Any, Literal
 
@@ -141,13 +140,9 @@ def _to_array(held: tuple[str, tuple[int, ...], bytes]) -> NDArray[Any]:
     )
 
 
-def _fields(value: Any) -> dict[str, Any]:
-    return {name: getattr(value, name) for name in _names(type(value))}
-
-
-@lru_cache
-def _names(kind: Any) -> tuple[str, ...]:
-    return tuple(one.name for one in fields(kind) if one.init)
+def _fields_of(kind: type) -> Callable[[Any], dict[str, Any]]:
+    names = tuple(one.name for one in fields(kind) if one.init)
+    return lambda value: {name: getattr(value, name) for name in names}
 
 
 _KINDS: tuple[tuple[type, Callable[[Any], Any], Callable[[Any], Any]], ...] = (
@@ -156,7 +151,7 @@ _KINDS: tuple[tuple[type, Callable[[Any], Any], Callable[[Any], Any]], ...] = (
     *((kind, lambda model: model.model_dump(mode="json"), kind.model_validate)
       for kind in (Rig, Config)),
     (Epoch, to_arrays, from_arrays),
-    *((kind, _fields, lambda held, kind=kind: kind(**held))
+    *((kind, _fields_of(kind), lambda held, kind=kind: kind(**held))
       for kind in (State, CameraState, DriftWatch, OutlierFrame, GroupScatter, EpochSummary,
                    Sums, PlaceSums, Optimum, DistortionEvidence, MatcherFindings,
                    VarianceRatios, ResidualHistogram, ResidualScale, Correspondences, CameraBlock,
