@@ -151,7 +151,7 @@ def test_the_lens_is_part_of_an_alignment_and_an_error_of_a_mount(
             mounts[1].T_camera_lidar[name], alignments[1].T_camera_lidar[name]
         )
         shares = mounts[1].marginals.error_sources(mounts[1].covariance)[name].translation
-        assert shares["estimated lenses and clocks"] > 0.9
+        assert shares["uncertain lenses and clocks"] > 0.9
 
 
 def test_a_mount_errs_by_what_is_not_estimated_of_its_lens(
@@ -167,7 +167,7 @@ def test_a_mount_errs_by_what_is_not_estimated_of_its_lens(
             fixed.covariance[ahead, ahead], rel=0.1
         )
         shares = free.marginals.error_sources(free.covariance)[name].translation
-        assert shares["estimated lenses and clocks"] > 0.9
+        assert shares["uncertain lenses and clocks"] > 0.9
 
 
 def test_the_covariance_of_a_mount_is_that_of_its_graph(
