@@ -47,12 +47,12 @@ USUAL = np.array([0.3, 6.5, 3.0])
 """Prior means: log odds by a check that goes through PASS, WARN and FAIL."""
 SPREAD = np.array([1.0, 3.0, 3.0])
 OF_WORST = (WORST, "swapped_cameras")
-"""What the model of runs has a weight of: 120 cases tell those of 40 kinds of checks too badly. A
+"""What the model of runs has a weight of: 127 results tell those of 40 kinds of checks too badly. A
 recording left out is foretold better by the worst check alone; a swap is a likelihood ratio."""
 LAST_OF_WORST = 1.0  # its spread: where it is 0, a FAIL would be no more probable than its limit
-RELIABLE, RELIABLE_SPREAD = np.array([2.0, 0.0]), np.array([0.5, 1.0])
-"""Log odds of values and of error bars. Values count how seldom lenses are wrong, bars do not; and
-a wrong lens that is taken for right is a PASS."""
+HOLDS, HOLDS_SPREAD = np.array([2.0, 0.0]), np.array([0.5, 1.0])
+"""How far values and error bars hold: log odds that a value does, logarithm of the factor of a
+bar's odds. Values count how seldom lenses are wrong, and one that is taken for right is a PASS."""
 INTERCEPT, INTERCEPT_SPREAD = -8.2, 1.0
 FILE = ROOT / "calibgraph" / "trust" / "probability.json"
 
@@ -79,14 +79,14 @@ def fit(samples: Sequence[Sample], level: str = TABLES) -> dict[str, Any]:
         "other": [0.0] * 3 if of_worst else [first, to_fail, last],
         "seen": seen,
         "value_reliability": round(float(expit(found[-2])), 3) if of_worst else 1.0,
-        "bar_reliability": round(float(expit(found[-1])), 3) if of_worst else 1.0,
+        "bar_odds": round(float(np.exp(found[-1])), 3) if of_worst else 1.0,
     }
 
 
 def _most_probable(
     samples: Sequence[Sample], kinds: Sequence[str], spread: Array, *, of_worst: bool
 ) -> Array:
-    """Intercept, weights of the kinds, log odds of reliability."""
+    """Intercept, weights of the kinds, how far values and error bars hold."""
     rows = np.array(
         [[steps(sample.severities.get(kind, 0.0)) for kind in kinds] for sample in samples]
     ).reshape(len(samples), -1)
@@ -95,8 +95,8 @@ def _most_probable(
         for name in ("off", "by_bar", "by_values")
     )
     counts = np.where(off, SHARE_OFF / off.mean(), (1 - SHARE_OFF) / (1 - off.mean()))
-    usual = np.concatenate([[INTERCEPT], np.tile(USUAL, len(kinds)), RELIABLE])
-    spreads = np.concatenate([[INTERCEPT_SPREAD], spread, RELIABLE_SPREAD])
+    usual = np.concatenate([[INTERCEPT], np.tile(USUAL, len(kinds)), HOLDS])
+    spreads = np.concatenate([[INTERCEPT_SPREAD], spread, HOLDS_SPREAD])
 
     def complete(values: Array) -> Array:
         """With the weight that the limit of FAIL gives; tables rely on values and bars."""
@@ -104,13 +104,15 @@ def _most_probable(
         if of_worst:
             values[2] = max(float(logit(FAIL_ABOVE)) - values[0] - values[1], 0.0)
         else:
-            values[-2:] = np.inf
+            values[-2:] = np.inf, 0.0
         return values
 
     def loss(values: Array) -> float:
-        z, (of_values, of_bar) = complete(values), expit(complete(values)[-2:])
+        z = complete(values)
+        odds = np.exp(z[-1]) * by_bar
         right = expit(-(z[0] + rows @ z[1:-2]))  # not grossly wrong
-        p = 1 - right * (1 - of_values * by_values) * (1 - of_bar * by_bar)
+        within = (1 - by_bar) / (1 - by_bar + odds)
+        p = 1 - right * (1 - expit(z[-2]) * by_values) * within
         likelihood = counts * np.log(np.clip(np.where(off, p, 1 - p), 1e-12, 1.0))
         return float(-likelihood.sum() + (((values - usual) / spreads) ** 2).sum() / 2)
 

@@ -116,10 +116,10 @@ def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[ErrorProbab
         expit(model["intercept"] + sum(contributions(s.severities, weights, other).values()))
         for s in samples
     ]
-    of_values, of_bar = model["value_reliability"], model["bar_reliability"]
+    of_values, of_bar = model["value_reliability"], model["bar_odds"]
     return [
         ErrorProbability(
-            1 - (1 - p) * (1 - of_values * s.by_values), s.by_bar, bar_reliability=of_bar
+            1 - (1 - p) * (1 - of_values * s.by_values), s.by_bar, bar_odds=of_bar
         )
         for p, s in zip(grossly, samples, strict=True)
     ]

@@ -24,7 +24,7 @@ ESTIMATED = "estimated lenses and clocks"
 FLAT = "flat evidence of the images"
 
 NEEDED = 0.3
-"""Error bar over tolerance at which 99.5 % of the errors are within, as a PASS needs."""
+"""Error bar over tolerance at which 99 % of the errors are within: about what a PASS needs."""
 
 TIMES = (2, 3, 5, 10, 20, 1000)
 """As many frames, at as many times more places: for these the error bar is predicted."""

@@ -129,20 +129,21 @@ class ErrorProbability:
         by_error_bar: that its error bar allows more than the tolerance.
         tolerance_deg: of the rotation.
         tolerance_cm: of the position.
-        bar_reliability: by which the second counts: it held so far in cases with a known truth.
+        bar_odds: factor of the odds of the second, as it held in cases with a known truth.
     """
 
     by_checks: float
     by_error_bar: float = 0.0
     tolerance_deg: float = TOLERANCE[0]
     tolerance_cm: float = TOLERANCE[1]
-    bar_reliability: float = 1.0
+    bar_odds: float = 1.0
 
     @property
     def probability(self) -> float:
         """The probability of either."""
-        of_bar = self.bar_reliability * self.by_error_bar
-        return 1.0 - (1.0 - self.by_checks) * (1.0 - of_bar)
+        within = 1.0 - self.by_error_bar
+        odds = self.bar_odds * self.by_error_bar
+        return 1.0 - (1.0 - self.by_checks) * within / (within + odds)
 
     @property
     def status(self) -> Status:

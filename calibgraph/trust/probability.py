@@ -59,8 +59,8 @@ def judge(
         model: TABLES or STRUCTURE.
     """
     of_checks = probability_of_checks(checks, model)
-    reliability = _models()[model]["bar_reliability"]
-    found = ErrorProbability(of_checks, beyond, *tolerance, bar_reliability=reliability)
+    odds = _models()[model]["bar_odds"]
+    found = ErrorProbability(of_checks, beyond, *tolerance, bar_odds=odds)
     return Verdict(tuple(checks), found)
 
 
@@ -97,7 +97,8 @@ def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
 
     Checks of the lens and of chance are left out, whose value is a probability, and those that are
     no sign of an error. The worst of all is of checks that can show an error: what counts data, or
-    is the error bar, is in the posterior. If it is known how much is found by chance, they all are.
+    is the error bar, is in the posterior. Where the
+    probability to find as much by chance is known, checks that count data are left out of all.
     """
     worst: dict[str, float] = {}
     for kind, severity in checks:

@@ -13,7 +13,7 @@ from calibgraph.trust.probability import STRUCTURE, WORST
 
 MODEL = {
     "intercept": -8.0, "weights": {"outliers": [0.0, 0.0, 16.0]}, "other": [0.0, 0.0, 0.0],
-    "seen": ["outliers"], "value_reliability": 1.0, "bar_reliability": 1.0,
+    "seen": ["outliers"], "value_reliability": 1.0, "bar_odds": 1.0,
 }  # fmt: skip
 """A check that FAILs makes a result certainly off; no other check says anything."""
 
@@ -103,6 +103,6 @@ def test_error_bars_that_state_too_much_are_relied_on_less() -> None:
     wide = [sample(off=index % 2 == 0, by_bar=0.99) for index in range(40)]
     holds = [sample(off=True, by_bar=0.99) for _ in range(40)]
     right = [sample(off=False) for _ in range(40)]
-    found = [fit([*right, *of], STRUCTURE)["bar_reliability"] for of in (wide, holds)]
-    assert found[0] < 0.8 < found[1]
-    assert fit([*right, *wide])["bar_reliability"] == 1.0
+    found = [fit([*right, *of], STRUCTURE)["bar_odds"] for of in (wide, holds)]
+    assert found[0] < 0.5 < found[1]
+    assert fit([*right, *wide])["bar_odds"] == 1.0

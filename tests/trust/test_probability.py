@@ -101,13 +101,16 @@ def test_a_known_check_just_beyond_its_limit_keeps_from_no_pass_and_an_unknown_o
     assert known < PASS_BELOW <= new
 
 
-def test_a_wide_error_bar_counts_as_far_as_it_is_reliable() -> None:
-    verdict = judge([], 0.9, (0.5, 10.0), STRUCTURE)
-    found = verdict.error_probability
-    assert found is not None and found.by_error_bar == 0.9
-    assert 0.2 < found.bar_reliability < 0.9
-    assert found.probability == pytest.approx(0.9 * found.bar_reliability, abs=1e-3)
-    assert judge([], 0.9, (0.5, 10.0), TABLES).error_probability.probability > 0.9  # type: ignore[union-attr]
+def test_error_bars_of_runs_state_more_than_held_and_a_sure_one_is_sure() -> None:
+    for stated in (0.01, 0.1, 0.9, 0.9999, 1.0):
+        found = judge([], stated, (0.5, 10.0), STRUCTURE).error_probability
+        assert found is not None and found.by_error_bar == stated
+        assert found.probability == pytest.approx(stated, abs=1e-3) or (
+            found.by_checks < found.probability < stated
+        )
+        by_tables = judge([], stated, (0.5, 10.0), TABLES).error_probability
+        assert by_tables is not None and by_tables.probability == pytest.approx(stated, abs=1e-3)
+    assert judge([], 0.9999, (0.5, 10.0), STRUCTURE).error_probability.probability > 0.99  # type: ignore[union-attr]
 
 
 def test_a_wide_error_bar_and_few_frames_are_no_signs_of_an_error_in_runs() -> None:
