@@ -3,8 +3,9 @@ from __future__ import annotations
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
-from calibgraph.parallel import KeyedCache, count_cores
+from calibgraph.parallel import KeyedCache, Threads, count_cores
 
 
 def test_a_value_is_made_once_for_all_threads_that_need_it() -> None:
@@ -40,3 +41,14 @@ def test_values_used_longest_ago_are_dropped_first() -> None:
 
 def test_there_is_a_core() -> None:
     assert count_cores() >= 1
+
+
+def test_an_interrupt_does_not_wait_for_the_work_of_a_pool() -> None:
+    first, done = threading.Event(), threading.Event()
+    with suppress(KeyboardInterrupt), Threads(1) as pool:
+        pool.submit(first.wait, 60.0)
+        waiting = pool.submit(done.set)
+        raise KeyboardInterrupt
+    assert waiting.cancelled()
+    first.set()
+    assert not done.is_set()

@@ -20,6 +20,23 @@ left out. Earlier or oftener, its unit or order is wrong, and slower frames are 
 
 
 @dataclass
+class Stop:
+    """Whether a signal to stop has come; called for the answer.
+
+    Attributes:
+        received: set by the first signal.
+        interrupts: whether that signal is raised, too, as KeyboardInterrupt.
+    """
+
+    received: bool = False
+    interrupts: bool = False
+
+    def __call__(self) -> bool:
+        """Whether it has come."""
+        return self.received
+
+
+@dataclass
 class Run:
     """Frames in, updates out.
 
