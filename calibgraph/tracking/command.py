@@ -18,6 +18,7 @@ from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.clock import require_motion
 from calibgraph.model.config import Config
+from calibgraph.model.places import as_groups
 from calibgraph.model.result_files import OVERLAYS, REPORT_FILE
 from calibgraph.model.rig import Rig
 from calibgraph.outputs import PAGE_MARK, is_marked
@@ -92,7 +93,9 @@ def track(
                 raise FileError("standard input" if str(source[0]) == "-" else source[0], held)
             result = _result(calibrator.tracker, result_of, settings.out / STATE_FOLDER)
     run.report_counts()
-    result = replace(result, initial_rig=settings.rig)  # not where the first batch has located it
+    named = as_groups([*run.places.values()]) if any(run.places) else ()
+    # The guess, not where the first batch has located it.
+    result = replace(result, initial_rig=settings.rig, places=named)
     return result, _write_results(settings.out, result, history if run.updates else None)
 
 

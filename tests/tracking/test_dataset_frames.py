@@ -265,6 +265,18 @@ def test_frames_to_score_are_found_in_linear_time(
     assert given._measure(recorded.rig, numbers, {}, []) and numbers.reads == 1
 
 
+def test_the_result_names_the_places_of_its_frames(
+    world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As that of ``calibrate``."""
+    monkeypatch.setattr(dataset_frames, "PlaceFinder", lambda *_, **__: Odometer())
+    stated = [replace(t, metadata={"place_variance": 8.0}) for t in world.tables]
+    matcher = Given(concatenate(stated))
+    wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
+    result, _ = track(wanted, recorded.folders, notify=lambda _: None)
+    assert result.places == ((0, 1, 2, 3), (4, 5, 6, 7), (8, 9, 10, 11), (12, 13))
+
+
 class Odometer:
     """Finds a new place every four frames; notes what it is shown."""
 
