@@ -127,7 +127,8 @@ def _opened(
     settings: Tracking, source: Sequence[Path], stop: Stop, notify: Notify
 ) -> tuple[Iterator[Item], DurableCalibrator, Callable[[IncrementalCalibrator], Calibration]]:
     """The frames of the source, the durable tracker, and the function that gives its result."""
-    result_of: Callable[[IncrementalCalibrator], Calibration] = IncrementalCalibrator.calibration
+    result_of: Callable[[IncrementalCalibrator], Calibration]
+    result_of = partial(IncrementalCalibrator.calibration, sources=True)
     folder = settings.out / STATE_FOLDER
     if settings.matcher is None:
         items = frames_of(str(source[0]), follow=settings.follow, stop=stop)

@@ -86,20 +86,20 @@ class DatasetDrive:
             notify: called with a sentence if they are left out, or cannot be scored.
         """
         if not self.matcher.image_checks_can_fail:  # may use what the scores do not
-            return tracker.calibration()
+            return tracker.calibration(sources=True)
         try:
             stop.interrupts = True
             if not stop():
-                return tracker.calibration(partial(self._measure, tracker.rig))
+                return tracker.calibration(partial(self._measure, tracker.rig), sources=True)
         except KeyboardInterrupt:
             pass
         except _UNSCORED as error:
             notify(f"warning: the images could not be checked: {error}")
-            return tracker.calibration()
+            return tracker.calibration(sources=True)
         finally:
             stop.interrupts = False
         notify("stopped: the images were not compared with the clouds")
-        return tracker.calibration()
+        return tracker.calibration(sources=True)
 
     def _measure(
         self,

@@ -96,9 +96,11 @@ class IncrementalCalibrator:
         visited = *self._state.places.names[1:], *(f.place for f in self._state.live_frames)
         return tuple(reversed(dict.fromkeys(reversed(visited))))
 
-    def calibration(self, measure: MeasureOnFrames | None = None) -> Calibration:
+    def calibration(
+        self, measure: MeasureOnFrames | None = None, *, sources: bool = False
+    ) -> Calibration:
         """The present estimate as a batch's result; posteriors by images widen its error bars."""
-        return to_calibration(self._state, self._assess(), measure)
+        return to_calibration(self._state, self._assess(), measure, sources=sources)
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:

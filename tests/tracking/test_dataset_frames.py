@@ -275,6 +275,11 @@ def test_the_result_names_the_places_of_its_frames(
     wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
     result, _ = track(wanted, recorded.folders, notify=lambda _: None)
     assert result.places == ((0, 1, 2, 3), (4, 5, 6, 7), (8, 9, 10, 11), (12, 13))
+    for name, found in result.error_sources.items():
+        assert sum(found.translation.values()) == pytest.approx(1.0)
+        assert found.translation["errors that a place shares"] > 0.01
+        assert found.translation_cm == pytest.approx(float(result.sigmas(name)[1].max()), rel=0.01)
+    assert result.error_sources.keys() == result.rig.cameras.keys()
 
 
 class Odometer:
