@@ -105,7 +105,8 @@ def test_a_wide_error_bar_counts_as_far_as_it_is_reliable() -> None:
     verdict = judge([], 0.9, (0.5, 10.0), STRUCTURE)
     found = verdict.error_probability
     assert found is not None and found.by_error_bar == 0.9
-    assert 0.7 < found.probability < 0.9
+    assert 0.2 < found.bar_reliability < 0.9
+    assert found.probability == pytest.approx(0.9 * found.bar_reliability, abs=1e-3)
     assert judge([], 0.9, (0.5, 10.0), TABLES).error_probability.probability > 0.9  # type: ignore[union-attr]
 
 
