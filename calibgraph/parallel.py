@@ -31,9 +31,18 @@ def count_cores() -> int:
         return os.cpu_count() or 1
 
 
+class Threads(ThreadPoolExecutor):
+    """A pool whose work is given up where Ctrl-C ends the body of its ``with``."""
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Wait for its work, but not after an interrupt."""
+        interrupted = kind is not None and not issubclass(kind, Exception)
+        self.shutdown(wait=not interrupted, cancel_futures=interrupted)
+
+
 def core_pool() -> ThreadPoolExecutor:
     """A thread per core, for work that waits for nothing but a core."""
-    return ThreadPoolExecutor(count_cores())
+    return Threads(count_cores())
 
 
 @cache

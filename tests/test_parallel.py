@@ -3,12 +3,13 @@ from __future__ import annotations
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from calibgraph import pipeline
-from calibgraph.parallel import KeyedCache, count_cores, with_own_threads
+from calibgraph.parallel import KeyedCache, Threads, count_cores, with_own_threads
 
 
 def test_a_value_is_made_once_for_all_threads_that_need_it() -> None:
@@ -44,6 +45,17 @@ def test_values_used_longest_ago_are_dropped_first() -> None:
 
 def test_there_is_a_core() -> None:
     assert count_cores() >= 1
+
+
+def test_an_interrupt_does_not_wait_for_the_work_of_a_pool() -> None:
+    first, done = threading.Event(), threading.Event()
+    with suppress(KeyboardInterrupt), Threads(1) as pool:
+        pool.submit(first.wait, 60.0)
+        waiting = pool.submit(done.set)
+        raise KeyboardInterrupt
+    assert waiting.cancelled()
+    first.set()
+    assert not done.is_set()
 
 
 def _blas_threads() -> set[int]:

@@ -14,6 +14,7 @@ from calibgraph.audit.drift_result import (
     Results,
     Trend,
     open_results,
+    pairs_of_one_recording,
 )
 from calibgraph.audit.judgement import (
     CAMERA_AXES,
@@ -98,6 +99,7 @@ def drift(
         tolerance_deg=tolerance_deg,
         tolerance_cm=tolerance_cm,
         false_alarm_rate=FALSE_ALARM_RATE,
+        same_recording=pairs_of_one_recording(opened),
     )  # fmt: skip
 
 

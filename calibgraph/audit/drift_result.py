@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -73,6 +74,7 @@ class Drift:
             cameras; None otherwise.
         tolerance_deg, tolerance_cm: largest deviation per axis that is OK.
         false_alarm_rate: probability of one CHANGED or more in this call if nothing has changed.
+        same_recording: pairs of results that were made from the same files.
     """
 
     results: tuple[str, ...]
@@ -83,6 +85,18 @@ class Drift:
     tolerance_deg: float
     tolerance_cm: float
     false_alarm_rate: float
+    same_recording: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def same_recording_note(self) -> str:
+        """Sentences on results of one recording; empty if there are none."""
+        if not self.same_recording:
+            return ""
+        pairs = "; ".join(" and ".join(pair) for pair in self.same_recording)
+        return (
+            f"Made from one recording: {pairs}. They share its errors, and that they agree shows "
+            "nothing. Give one result of each recording."
+        )
 
     @property
     def status(self) -> DriftStatus:
@@ -112,6 +126,7 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
         "tolerance_cm": drift.tolerance_cm,
         "false_alarm_rate": drift.false_alarm_rate,
         "results": list(drift.results),
+        "same_recording": [list(pair) for pair in drift.same_recording],
         "cameras": {
             name: {
                 "results": {
@@ -168,6 +183,12 @@ def open_results(given: Results, *, own_lenses: bool) -> dict[str, Calibration]:
         seen[extrinsics] = name
         _require_same_rig(names[0], loaded[0], name, result, own_lenses=own_lenses)
     return dict(zip(names, loaded, strict=True))
+
+
+def pairs_of_one_recording(results: Mapping[str, Calibration]) -> tuple[tuple[str, str], ...]:
+    """Pairs of results that were made from some of the same files."""
+    hashes = {name: {*result.inputs.values()} for name, result in results.items()}
+    return tuple((a, b) for a, b in combinations(hashes, 2) if hashes[a] & hashes[b])
 
 
 def _names(given: Sequence[Result]) -> list[str]:

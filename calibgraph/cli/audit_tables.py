@@ -39,6 +39,8 @@ def print_audit(console: Console, audit: Audit, page: Path | None = None) -> Non
 def print_drift(console: Console, drift: Drift) -> None:
     """Print the status with its reasons, the deviations and what would have been detected."""
     _print_status(console, drift.status, "drift: does one of the results deviate from the others?")
+    if drift.same_recording:
+        print_plain(console, f"  {drift.same_recording_note}")
     for line in _reasons(drift):
         print_plain(console, f"  {line}")
     console.print(_deviation_table(drift))

@@ -73,8 +73,8 @@ def match(
         run = match_in_rounds(
             data, matcher=chosen, time_limit_s=matching.limit_s, progress=progress
         )
-    found = run.correspondences
-    replace(found, metadata={**found.metadata, WRITTEN_KEY: MATCH}).save(out)
+        found = run.correspondences
+        replace(found, metadata={**found.metadata, WRITTEN_KEY: MATCH}).save(out)
     _print_frames_used(len(run.dataset.frames), data)
     _print_table_and_exit(run.correspondences, out, as_json=as_json)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import logging
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -35,6 +36,13 @@ if TYPE_CHECKING:
 MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
 _MAX_WHOLE = 2**63 - 1
 MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
+
+_log = logging.getLogger(__name__)
+
+WITHOUT_METADATA = (
+    "CSV holds no metadata, so that places, errors that frames share and what the images said "
+    "(calibgraph_images) are not known; .parquet keeps them"
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -208,8 +216,13 @@ class Correspondences:
         return dict(zip(self.cameras, counts.tolist(), strict=True))
 
     def save(self, path: Path | str) -> None:
-        """Write the table as Parquet, or as CSV if the name ends in .csv, atomically."""
+        """Write the table as Parquet, or as CSV if the name ends in .csv, atomically.
+
+        CSV has no place for the metadata: a warning is logged.
+        """
         write_table(self.to_arrow(), Path(path))
+        if Path(path).suffix == ".csv" and self.metadata:
+            _log.warning("%s: %s", path, WITHOUT_METADATA)
 
     def to_arrow(self) -> pa.Table:
         """The table in the file format's columns, its metadata in the schema."""

@@ -18,6 +18,7 @@ from calibgraph.model.error_sources import (
     COMMON,
     ELEVATION,
     ESTIMATED,
+    FLAT,
     LENSES,
     MATCHES,
     MOTION,
@@ -37,6 +38,29 @@ Variances = dict[str, Array]
 _DISTORTIONS = ELEVATION, STRETCH, MOTION
 _NOTHING = 1e-8  # share of a variance: rounding of a difference
 _DIFFERENCE = 5e-3  # of the log of a variance
+
+
+def sources_by_camera(
+    joint: Array,
+    total: Array,
+    parts: Variances,
+    forecast: Mapping[int, Array],
+    *,
+    numbers: Mapping[str, int],
+) -> dict[str, ErrorSources]:
+    """Per camera, the sources of its error bar.
+
+    Args:
+        joint: (6 N, 6 N) the reported covariance, which may be wider than that of the matches.
+        total: (6 N,) variances by the matches.
+        parts: of these, as of :func:`sources_of_error`.
+        forecast: likewise.
+        numbers: of the cameras.
+    """
+    flat = np.diag(joint) - total
+    forecast = {times: variance + flat / times for times, variance in forecast.items()}
+    total, parts = total + flat, {**parts, FLAT: flat}
+    return {n: sources_of_error(total, parts, forecast, number) for n, number in numbers.items()}
 
 
 def sources_of_error(

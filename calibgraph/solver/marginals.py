@@ -16,7 +16,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.error_sources import COMMON, FLAT, PAIRS, TIMES, UNMODELLED, ErrorSources
+from calibgraph.model.error_sources import COMMON, PAIRS, TIMES, UNMODELLED, ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
@@ -26,7 +26,7 @@ from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
 from calibgraph.solver.error_shares import (
     predict_variances,
-    sources_of_error,
+    sources_by_camera,
     variances_by_source,
 )
 from calibgraph.solver.objective import Objective, Transforms
@@ -146,14 +146,8 @@ class Marginals:
             forecast = {times: fixed + (total - fixed) / times for times in TIMES}
         else:
             parts, forecast = variances_by_source(self.errors), predict_variances(self.errors)
-        flat = np.diag(joint) - total
-        forecast = {times: variance + flat / times for times, variance in forecast.items()}
-        total, parts = total + flat, {**parts, FLAT: flat}
-        return {
-            name: sources_of_error(total, parts, forecast, number)
-            for number, name in enumerate(self.cameras)
-            if name not in held
-        }
+        numbers = {n: k for k, n in enumerate(self.cameras) if n not in held}
+        return sources_by_camera(joint, total, parts, forecast, numbers=numbers)
 
     @property
     def _sandwich_parts(self) -> dict[str, Array]:

@@ -26,6 +26,7 @@ from calibgraph.tracking.noise import median
 from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.shown_frames import groups_by_frames
+from calibgraph.tracking.sources import error_sources
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
 from calibgraph.tracking.window import Window
@@ -265,7 +266,11 @@ def second_moments(assessment: Assessment) -> Array:
 
 
 def to_calibration(
-    state: State, assessment: Assessment, measure: MeasureOnFrames | None = None
+    state: State,
+    assessment: Assessment,
+    measure: MeasureOnFrames | None = None,
+    *,
+    sources: bool = False,
 ) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     assessment, images = with_images(state, assessment, measure)
@@ -290,5 +295,6 @@ def to_calibration(
         timings_s={},
         terms="full",
         config=state.config,
+        error_sources=error_sources(state, known) if sources else {},
         lens=assessment.lens,
     )

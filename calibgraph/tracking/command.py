@@ -11,13 +11,14 @@ from functools import partial
 from pathlib import Path
 from types import FrameType
 
-from calibgraph.errors import DatasetError, FileError
+from calibgraph.errors import CalibrationError, DatasetError, FileError
 from calibgraph.io.bags import BagOptions
 from calibgraph.io.dataset import load_dataset
 from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.clock import require_motion
 from calibgraph.model.config import Config
+from calibgraph.model.places import as_groups
 from calibgraph.model.result_files import OVERLAYS, REPORT_FILE
 from calibgraph.model.rig import Rig
 from calibgraph.outputs import PAGE_MARK, is_marked
@@ -26,9 +27,9 @@ from calibgraph.tracking.dataset_frames import DatasetDrive
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.history import History
 from calibgraph.tracking.preload import warm_up_tracker
-from calibgraph.tracking.run import Notify, Run
+from calibgraph.tracking.run import Notify, Run, Stop
 from calibgraph.tracking.streams import Item, frames_of
-from calibgraph.tracking.tracker import IncrementalCalibrator
+from calibgraph.tracking.tracker import UNSOLVABLE, IncrementalCalibrator
 
 STATE_FOLDER, PICTURE = "state", "track.png"
 _TOGETHER = 50  # frames of a table that are read before they are taken in
@@ -90,10 +91,25 @@ def track(
             if calibrator.tracker.frame is None and not stop():
                 held = f"held no frame that could be used ({run.refused} left out); check it"
                 raise FileError("standard input" if str(source[0]) == "-" else source[0], held)
-            result = result_of(calibrator.tracker)
+            result = _result(calibrator.tracker, result_of, settings.out / STATE_FOLDER)
     run.report_counts()
-    result = replace(result, initial_rig=settings.rig)  # not where the first batch has located it
+    named = as_groups([*run.places.values()]) if any(run.places) else ()
+    # The guess, not where the first batch has located it.
+    result = replace(result, initial_rig=settings.rig, places=named)
     return result, _write_results(settings.out, result, history if run.updates else None)
+
+
+def _result(
+    tracker: IncrementalCalibrator, of: Callable[[IncrementalCalibrator], Calibration], state: Path
+) -> Calibration:
+    try:
+        return of(tracker)
+    except UNSOLVABLE as error:
+        why = str(error).strip().partition("\n")[0]
+        raise CalibrationError(
+            f"after frame {tracker.frame} the error bar cannot be solved for ({why}); all updates "
+            f"are in {state}, and the same command goes on from there with more frames"
+        ) from error
 
 
 def _write_results(folder: Path, result: Calibration, history: History | None) -> list[Path]:
@@ -108,10 +124,11 @@ def _write_results(folder: Path, result: Calibration, history: History | None) -
 
 
 def _opened(
-    settings: Tracking, source: Sequence[Path], stop: Callable[[], bool], notify: Notify
+    settings: Tracking, source: Sequence[Path], stop: Stop, notify: Notify
 ) -> tuple[Iterator[Item], DurableCalibrator, Callable[[IncrementalCalibrator], Calibration]]:
     """The frames of the source, the durable tracker, and the function that gives its result."""
-    result_of: Callable[[IncrementalCalibrator], Calibration] = IncrementalCalibrator.calibration
+    result_of: Callable[[IncrementalCalibrator], Calibration]
+    result_of = partial(IncrementalCalibrator.calibration, sources=True)
     folder = settings.out / STATE_FOLDER
     if settings.matcher is None:
         items = frames_of(str(source[0]), follow=settings.follow, stop=stop)
@@ -154,16 +171,18 @@ def _first_rig(drive: DatasetDrive, guess: Rig, notify: Notify) -> Rig:
 
 
 @contextmanager
-def _stopped_by_signals() -> Iterator[Callable[[], bool]]:
-    """In the body, the first SIGTERM or SIGINT only sets the flag that is returned.
+def _stopped_by_signals() -> Iterator[Stop]:
+    """In the body, the first SIGTERM or SIGINT sets the flag, and ends what may be interrupted.
 
     A second one has its usual effect: a blocked output may delay the reaction to the first.
     """
-    received: list[int] = []
+    stop = Stop()
 
-    def receive(number: int, _: FrameType | None) -> None:
-        received.append(number)
+    def receive(_: int, __: FrameType | None) -> None:
+        stop.received = True
         restore()
+        if stop.interrupts:
+            raise KeyboardInterrupt
 
     def restore() -> None:
         for kind, handler in before.items():
@@ -171,6 +190,6 @@ def _stopped_by_signals() -> Iterator[Callable[[], bool]]:
 
     before = {kind: signal.signal(kind, receive) for kind in (signal.SIGTERM, signal.SIGINT)}
     try:
-        yield lambda: bool(received)
+        yield stop
     finally:
         restore()

@@ -25,11 +25,12 @@ from calibgraph.progress import no_progress
 from calibgraph.solver.joint import solve_joint
 from calibgraph.tracking.frame_order import with_place
 from calibgraph.tracking.place_sums import MOST_PLACES
+from calibgraph.tracking.run import Stop
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
 from calibgraph.tracking.tracker import IncrementalCalibrator
 from calibgraph.trust.pose_posterior import PosePosterior, measure_posteriors
 
-_UNSCORED = (CalibrationError, OSError, np.linalg.LinAlgError, cv2.error)
+_UNSCORED = (CalibrationError, OSError, np.linalg.LinAlgError, cv2.error, RuntimeError)
 """What reading and scoring images raises: a result after a long drive is not lost by it."""
 
 MOST_AGAIN = 200
@@ -74,26 +75,31 @@ class DatasetDrive:
         self,
         tracker: IncrementalCalibrator,
         *,
-        stop: Callable[[], bool],
+        stop: Stop,
         notify: Callable[[str], None],
     ) -> Calibration:
         """The estimate, with its error bar and verdict by the images of its last frames, too.
 
         Args:
             tracker: at the end of the drive.
-            stop: whether the result is wanted at once, without the images.
+            stop: whether the result is wanted at once, without the images; it interrupts them.
             notify: called with a sentence if they are left out, or cannot be scored.
         """
         if not self.matcher.image_checks_can_fail:  # may use what the scores do not
-            return tracker.calibration()
-        if stop():
-            notify("stopped: the images were not compared with the clouds")
-            return tracker.calibration()
+            return tracker.calibration(sources=True)
         try:
-            return tracker.calibration(partial(self._measure, tracker.rig))
+            stop.interrupts = True
+            if not stop():
+                return tracker.calibration(partial(self._measure, tracker.rig), sources=True)
+        except KeyboardInterrupt:
+            pass
         except _UNSCORED as error:
             notify(f"warning: the images could not be checked: {error}")
-            return tracker.calibration()
+            return tracker.calibration(sources=True)
+        finally:
+            stop.interrupts = False
+        notify("stopped: the images were not compared with the clouds")
+        return tracker.calibration(sources=True)
 
     def _measure(
         self,

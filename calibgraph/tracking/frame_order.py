@@ -169,7 +169,7 @@ def with_place(table: Correspondences, place: str | int | None) -> Correspondenc
     Raises:
         CorrespondenceError: if it is no name, or the lists are wrong.
     """
-    name = _place_of(table) if place is None else _place_name(place)
+    name = place_of(table) if place is None else _place_name(place)
     kept = {key: value for key, value in table.metadata.items() if key not in (PLACE, PLACES)}
     kept |= {PLACE: name} if name else {}
     return table if kept == table.metadata else replace(table, metadata=kept)
@@ -192,7 +192,7 @@ def with_metadata_per_frame(table: Correspondences) -> Correspondences:
     return table if kept == table.metadata else replace(table, metadata=kept)
 
 
-def _place_of(table: Correspondences) -> str:
+def place_of(table: Correspondences) -> str:
     """The name of a frame's place: its own, or the first number of its list; empty if unknown."""
     if PLACE in table.metadata:
         return _place_name(table.metadata[PLACE])

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 
-from calibgraph.errors import MotionError
+from calibgraph.errors import CorrespondenceError, MotionError
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.frame_group import in_groups, update_all
+from calibgraph.tracking.frame_order import place_of
 from calibgraph.tracking.history import History
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
 from calibgraph.tracking.update import Update, json_lines
@@ -17,6 +20,23 @@ Notify = Callable[[str], None]
 MOTION_FRAMES = 100
 """Once in so many frames, a motion that no vehicle has is an outlier of the odometry: its frame is
 left out. Earlier or oftener, its unit or order is wrong, and slower frames are wrong unseen."""
+
+
+@dataclass
+class Stop:
+    """Whether a signal to stop has come; called for the answer.
+
+    Attributes:
+        received: set by the first signal.
+        interrupts: whether that signal is raised, too, as KeyboardInterrupt.
+    """
+
+    received: bool = False
+    interrupts: bool = False
+
+    def __call__(self) -> bool:
+        """Whether it has come."""
+        return self.received
 
 
 @dataclass
@@ -35,6 +55,7 @@ class Run:
         refused: input that was not a frame, or a frame that was left out.
         skipped: frames at the beginning that an earlier run had taken in already.
         sound: how many updates have come since a motion that no vehicle has.
+        places: by name, the frames of each; where none has a name, all are of one.
     """
 
     calibrator: DurableCalibrator
@@ -46,6 +67,7 @@ class Run:
     refused: int = 0
     skipped: int = 0
     sound: int = 0
+    places: dict[str, list[int]] = field(default_factory=dict)
 
     def follow(self, items: Iterable[Item], *, every: int, stop: Callable[[], bool]) -> None:
         """Update with each frame until there are no more, or ``stop()``.
@@ -83,11 +105,13 @@ class Run:
 
     def _take(self, frames: Sequence[StreamFrame], known: int | None) -> None:
         """Update with frames, but for those that an earlier run has, or that are refused."""
+        tables = {one.frame: one.table for one in frames}
         if known is not None and not self.updates:
             old = [one.frame for one in frames if one.frame <= known]
             if old and not self.skipped:
                 self.notify(f"frame {old[0]} and others up to {known} are known: skipped")
             self.skipped += len(old)
+            self._add_to_places(map(tables.__getitem__, old))
             frames = frames[len(old) :]
         for found in update_all(self.calibrator, frames):
             if isinstance(found, Refused):
@@ -96,6 +120,12 @@ class Run:
                 self.updates += len(found)
                 self.sound += len(found)
                 self._report(found)
+                self._add_to_places(tables[update.frame] for update in found)
+
+    def _add_to_places(self, tables: Iterable[Correspondences]) -> None:
+        for table in filter(len, tables):
+            with suppress(CorrespondenceError):  # of an earlier run, which has left it out
+                self.places.setdefault(place_of(table), []).append(int(table.frame[0]))
 
     def _refuse(self, message: str, *, by_motion: bool = False) -> None:
         if by_motion and self.sound < MOTION_FRAMES:

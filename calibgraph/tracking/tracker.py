@@ -46,7 +46,7 @@ from calibgraph.tracking.step_detection import detect_small_step, detect_step
 from calibgraph.tracking.stream_tables import StreamFrame
 from calibgraph.tracking.update import Update, make_updates
 
-_UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
+UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
 
 
 class IncrementalCalibrator:
@@ -91,19 +91,16 @@ class IncrementalCalibrator:
         return self._state.frame
 
     @property
-    def place(self) -> str:
-        """Name of the place of the last frame; empty if it is not known."""
-        return self._state.live_frames[-1].place if self._state.live_frames else ""
-
-    @property
     def places(self) -> tuple[str, ...]:
         """Names of the places that are kept apart, the last visited last."""
         visited = *self._state.places.names[1:], *(f.place for f in self._state.live_frames)
         return tuple(reversed(dict.fromkeys(reversed(visited))))
 
-    def calibration(self, measure: MeasureOnFrames | None = None) -> Calibration:
+    def calibration(
+        self, measure: MeasureOnFrames | None = None, *, sources: bool = False
+    ) -> Calibration:
         """The present estimate as a batch's result; posteriors by images widen its error bars."""
-        return to_calibration(self._state, self._assess(), measure)
+        return to_calibration(self._state, self._assess(), measure, sources=sources)
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -169,7 +166,7 @@ class IncrementalCalibrator:
             self._resume(start)
             for earlier in since:
                 self._repeat(earlier)
-            if isinstance(error, _UNSOLVABLE):
+            if isinstance(error, UNSOLVABLE):
                 raise unsolvable(frames[0].number, error) from error
             raise
 
@@ -208,8 +205,8 @@ class IncrementalCalibrator:
         self._state, used = absorb(self._state, self._closed, blocks, len(group))
         taken = []
         for one, own in zip(group, used, strict=True):
-            self._state = count_repeats(self._state, one.table, one.table)
-            self._state, events = count_absent(self._state, own, one)
+            again = count_repeats(self._state, one.table, one.table)
+            self._state, events = count_absent(again, own, one)
             taken.append((one, events, own))
         taken[-1][1].extend(self._end_frames(len(group)))
         return make_updates(self._state, self._assess(), taken)

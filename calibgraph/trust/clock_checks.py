@@ -14,10 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibgraph.arrays import Array
-from calibgraph.errors import CalibrationError, DatasetError
+from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.io.frame import Frame, ScanSteps, seconds_between, twist_by_scans
+from calibgraph.io.frame import ScanSteps, seconds_between
 from calibgraph.io.kept_frames import KeptFrame
 from calibgraph.matching.run import with_motion
 from calibgraph.model.clock import at_pixels, clock_of
@@ -35,18 +34,15 @@ from calibgraph.trust.lens_parameter import (
     LensParameter,
     check_parameter,
 )
+from calibgraph.trust.motion_checks import INTERVAL_S, MAX_FRAMES, register_neighbours
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import limit
 from factors import FreeLens
 from factors.free_lens import CLOCK, OFFSET
 
 USUAL_SIGMA_S = 0.002  # of an offset, where the rig states none: of sensors that are synchronised
-INTERVAL_S = 0.1  # between clouds, where they have no stamps
-MAX_STEPS = 10  # between the numbers of neighbouring clouds, if it is clouds that they count
-MAX_FRAMES = 10  # evenly spread: bounds the time
 MIN_FRAMES = 4  # with fewer, a single frame decides
 _TOLD_S, _TOLD_CM = 0.01, 0.1  # whose effect is told, if it has one
-_JERK, _JERK_M_S = 0.2, 1.0  # share and size by which the speeds to both neighbours may differ
 
 
 def offset_checks(evidence: Evidence) -> Checks:
@@ -150,36 +146,9 @@ def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
         if twist is not None:
             frames.append(frame)
         elif (
-            isinstance(frame, KeptFrame) and (found := _register(dataset, frame, steps)) is not None
+            isinstance(frame, KeptFrame)
+            and (found := register_neighbours(dataset, frame, steps)) is not None
         ):
             frames.append(replace(frame, twist=found))
             registered = True
     return dataset.only(frames) if len(frames) >= MIN_FRAMES else None, registered
-
-
-def _register(dataset: Dataset, frame: Frame, steps: ScanSteps) -> Array | None:
-    """(6,) the twist by both neighbours, if they are as far away as of one drive."""
-    near = [dataset.neighbour(frame, sign) for sign in (-1, 1)]
-    known = [(other, _later_s(frame, other)) for other in near if other is not None]
-    if len(known) < len(near) or not all(later_s for _, later_s in known):
-        return None
-    try:
-        before, after = (twist_by_scans(frame, [one], steps) for one in known)
-    except DatasetError:  # they do not fit
-        return None
-    jerk = np.linalg.norm(after[3:] - before[3:])
-    if jerk > _JERK * np.linalg.norm(after[3:]) + _JERK_M_S:
-        return None
-    return np.asarray((before + after) / 2)
-
-
-def _later_s(frame: Frame, other: Frame) -> float:
-    """How much later a neighbour was recorded: by stamps, or by the numbers of both clouds."""
-    by_stamps = seconds_between(frame, other)
-    if by_stamps is not None:
-        return by_stamps
-    stems = frame.cloud_path.stem, other.cloud_path.stem
-    steps = int(stems[1]) - int(stems[0]) if all(map(str.isdecimal, stems)) else 0
-    if not 0 < abs(steps) <= MAX_STEPS:  # other numbers, such as times
-        steps = 1 if other.index > frame.index else -1
-    return INTERVAL_S * steps

@@ -11,7 +11,6 @@ Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -23,7 +22,7 @@ from calibgraph.matching.structure.consensus import displaced_z_score, score_dis
 from calibgraph.matching.structure.shift_scores import ShiftScores
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.parallel import core_pool
+from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress, no_progress
 from calibgraph.trust.frame_scores import WIDE, FrameScorer, Images
 from calibgraph.trust.lens_evidence import measure_lens
@@ -73,7 +72,7 @@ def measure_image_evidence(
     report = progress or no_progress
     frames = spread_out(dataset.frames, MAX_FRAMES)
     evidence = {}
-    with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
+    with core_pool() as cores, Threads(len(rig.cameras)) as pool:
         scorer = FrameScorer(dataset, frames, cores)
         measure = partial(_measure_camera, scorer, seed=seed, places=places)
         if extrinsics_only:

@@ -20,6 +20,7 @@ from calibgraph.model.rig import Camera, Rig
 from calibgraph.model.verdict import Check
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.joined_clouds import displacement_of_parts
+from calibgraph.trust.motion_checks import motion_doubts
 from calibgraph.trust.thresholds import threshold
 
 _log = logging.getLogger(__name__)
@@ -133,6 +134,7 @@ def check_inputs(data: Dataset, rig: Rig, *, at_guess: bool = True) -> tuple[str
     """
     known = data.frames[0].twist_per_s is not None
     doubts = _check_at_guess(data, rig) if at_guess else find_implausible(rig)
+    doubts += motion_doubts(data)
     for text in doubts:
         _log.warning(text)
     return (*unused_times(rig, is_known=known), *doubts)

@@ -13,7 +13,6 @@ mean, not the sum: with that the truth is as likely under it as by one camera al
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -26,7 +25,7 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.consensus import FAR, log_likelihood
 from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
 from calibgraph.model.rig import Rig
-from calibgraph.parallel import core_pool
+from calibgraph.parallel import Threads, core_pool
 from calibgraph.trust.frame_scores import FrameScorer
 from calibgraph.trust.probability import probability_beyond
 from calibgraph.trust.tempering import sample_posterior
@@ -123,7 +122,7 @@ def measure_posteriors(
         asked: per camera, (4, 4) T_camera_lidar in question, for ``log_ratio``.
         seed: of the samples.
     """
-    with core_pool() as cores, ThreadPoolExecutor(max(len(groups), 1)) as pool:
+    with core_pool() as cores, Threads(max(len(groups), 1)) as pool:
         scorer = FrameScorer(dataset, spread_out(dataset.frames, MAX_FRAMES), cores)
 
         def likelihood_of(name: str) -> Callable[[Array], Array]:

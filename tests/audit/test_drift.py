@@ -191,6 +191,16 @@ def test_a_copy_and_a_single_result_are_refused() -> None:
         calibgraph.drift([one])
 
 
+def test_results_of_one_recording_are_named() -> None:
+    rng = np.random.default_rng(12)
+    files = [{"a": "1", "b": "2"}, {"a": "3"}, {"elsewhere/b": "2"}, {}, {}]
+    given = [replace(draw(rng), inputs=each) for each in files]
+    found = calibgraph.drift(given)
+    assert found.same_recording == (("result 1", "result 3"),)
+    assert found.same_recording_note.startswith("Made from one recording: result 1 and result 3.")
+    assert calibgraph.drift(given[1:3]).same_recording_note == ""
+
+
 @pytest.mark.parametrize("days", [[0.0], [0.0, np.nan], [1e308, -1e308]])
 def test_there_is_a_day_for_each_result(days: list[float]) -> None:
     with pytest.raises(ValueError, match="expected 2 numbers up to 1e"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,11 @@ from calibgraph import (
     Correspondences,
     FileError,
     load_correspondences,
+    simulate_correspondences,
+    solve,
 )
 from calibgraph.io.correspondence_tables import from_arrow
+from tests.conftest import make_pair
 from tests.model.tables import table, to_arrow
 
 
@@ -243,3 +247,24 @@ def test_changed_bytes_of_a_table_are_not_taken_for_numbers(tmp_path: Path) -> N
     path.write_bytes(data)
     with pytest.raises(FileError, match="cannot be read as Parquet"):
         load_correspondences(path)
+
+
+def test_csv_says_that_it_holds_no_metadata(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """When it is written, if there is any, and when it is solved."""
+    rig = make_pair()
+    simulated = simulate_correspondences(rig, frames=6, matches=40)
+    given = (
+        (simulated, "csv", 1),
+        (replace(simulated, metadata={}), "csv", 0),
+        (simulated, "parquet", 0),
+    )
+    for one, suffix, expected in given:
+        caplog.clear()
+        one.save(tmp_path / f"table.{suffix}")
+        assert len(caplog.records) == expected
+    for suffix, expected in (("csv", 1), ("parquet", 0)):
+        result = solve(rig, tmp_path / f"table.{suffix}")
+        told = [text for text in result.warnings if "CSV holds no metadata" in text]
+        assert len(told) == expected

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -16,6 +16,7 @@ import pytest
 
 from calibgraph import (
     Calibration,
+    CalibrationError,
     Config,
     Correspondences,
     DatasetError,
@@ -74,7 +75,7 @@ def recorded(world: World, tmp_path: Path) -> Dataset:
             suffix = ".npy" if place == "lidar" else ".png"
             path = folder / place / f"{number:03d}{suffix}"
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(b"")
+            path.write_bytes(str(number).encode())
     shutil.copy(world.rig, folder / "rig.yaml")
     return load_dataset(folder)
 
@@ -156,44 +157,45 @@ def test_flat_images_widen_the_result_at_the_end_and_its_verdict(
     assert "no images" in narrow.verdict.images_note and not wide.verdict.images_note
 
 
-def test_images_that_cannot_be_read_at_the_end_leave_the_result_without_them(
+@pytest.fixture
+def follow(
     world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The files are empty."""
+) -> Callable[[], tuple[Calibration, list[str]]]:
+    """Tracks the dataset, whose files hold no images, with a matcher whose images count."""
     monkeypatch.setattr(RunEvidence, "_measure_posteriors", no_posteriors)
     monkeypatch.setattr(Given, "image_checks_can_fail", True, raising=False)
-    notes: list[str] = []
-    matcher = Given(concatenate(world.tables))
-    wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
-    result, _ = track(wanted, recorded.folders, notify=notes.append)
-    assert any(note.startswith("warning: the images could not be checked") for note in notes)
-    assert result.covariance["left"] is not None and result.verdict.images_note
+
+    def run() -> tuple[Calibration, list[str]]:
+        notes: list[str] = []
+        matcher = Given(concatenate(world.tables))
+        wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
+        result, (saved, *_) = track(wanted, recorded.folders, notify=notes.append)
+        assert saved.is_file() and result.covariance["left"] is not None
+        assert result.verdict.images_note
+        return result, notes
+
+    return run
 
 
-@pytest.mark.parametrize("error", [np.linalg.LinAlgError, cv2.error])
+@pytest.mark.parametrize("error", [None, np.linalg.LinAlgError, cv2.error, RuntimeError])
 def test_images_that_cannot_be_scored_at_the_end_leave_the_result_without_them(
-    error: type[Exception],
-    world: World,
-    recorded: Dataset,
-    tmp_path: Path,
+    error: type[Exception] | None,
+    follow: Callable[[], tuple[Calibration, list[str]]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def fail(*_: object, **__: object) -> None:
+        assert error is not None
         raise error("not positive definite")
 
-    monkeypatch.setattr(RunEvidence, "_measure_posteriors", no_posteriors)
-    monkeypatch.setattr(dataset_frames, "measure_posteriors", fail)
-    monkeypatch.setattr(Given, "image_checks_can_fail", True, raising=False)
-    notes: list[str] = []
-    matcher = Given(concatenate(world.tables))
-    wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
-    result, (saved, *_) = track(wanted, recorded.folders, notify=notes.append)
-    assert saved.is_file() and result.covariance["left"] is not None
-    assert "warning: the images could not be checked: not positive definite" in notes
+    if error is not None:
+        monkeypatch.setattr(dataset_frames, "measure_posteriors", fail)
+    why = "" if error is None else "not positive definite"
+    _, notes = follow()
+    assert any(n.startswith(f"warning: the images could not be checked: {why}") for n in notes)
 
 
 def test_after_a_signal_the_result_is_written_without_the_images(
-    world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    follow: Callable[[], tuple[Calibration, list[str]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given: list[str] = []
 
@@ -206,15 +208,38 @@ def test_after_a_signal_the_result_is_written_without_the_images(
         raise AssertionError("images are scored")
 
     monkeypatch.setattr(command, "print_line", write)
-    monkeypatch.setattr(RunEvidence, "_measure_posteriors", no_posteriors)
     monkeypatch.setattr(dataset_frames, "measure_posteriors", score)
-    monkeypatch.setattr(Given, "image_checks_can_fail", True, raising=False)
-    notes: list[str] = []
-    matcher = Given(concatenate(world.tables))
-    wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
-    result, (saved, *_) = track(wanted, recorded.folders, notify=notes.append)
-    assert saved.is_file() and len(given) == FRAMES - 2 and result.verdict.images_note
+    _, notes = follow()
+    assert len(given) == FRAMES - 2
     assert "stopped: the images were not compared with the clouds" in notes
+
+
+def test_a_signal_while_images_are_scored_ends_that(
+    follow: Callable[[], tuple[Calibration, list[str]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def score(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+        raise AssertionError("it went on")
+
+    monkeypatch.setattr(dataset_frames, "measure_posteriors", score)
+    _, notes = follow()
+    assert "stopped: the images were not compared with the clouds" in notes
+
+
+def test_a_result_that_cannot_be_solved_for_is_one_error_and_the_updates_stay(
+    follow: Callable[[], tuple[Calibration, list[str]]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("\nIndeterminant linear system detected\nwhile working near x0")
+
+    with monkeypatch.context() as patched, pytest.raises(CalibrationError) as caught:
+        patched.setattr(DatasetDrive, "result", fail)
+        follow()
+    assert f"after frame {FRAMES - 1} " in str(caught.value) and "\n" not in str(caught.value)
+    assert (tmp_path / "out" / "state").is_dir()
+    follow()
 
 
 class Numbers(list[int]):
@@ -238,6 +263,23 @@ def test_frames_to_score_are_found_in_linear_time(
     given = DatasetDrive(recorded, to_full_matcher(Given(world.tables[0])), Config())
     numbers = Numbers([5, 2])
     assert given._measure(recorded.rig, numbers, {}, []) and numbers.reads == 1
+
+
+def test_the_result_names_the_places_of_its_frames(
+    world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As that of ``calibrate``."""
+    monkeypatch.setattr(dataset_frames, "PlaceFinder", lambda *_, **__: Odometer())
+    stated = [replace(t, metadata={"place_variance": 8.0}) for t in world.tables]
+    matcher = Given(concatenate(stated))
+    wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
+    result, _ = track(wanted, recorded.folders, notify=lambda _: None)
+    assert result.places == ((0, 1, 2, 3), (4, 5, 6, 7), (8, 9, 10, 11), (12, 13))
+    for name, found in result.error_sources.items():
+        assert sum(found.translation.values()) == pytest.approx(1.0)
+        assert found.translation["errors that a place shares"] > 0.01
+        assert found.translation_cm == pytest.approx(float(result.sigmas(name)[1].max()), rel=0.01)
+    assert result.error_sources.keys() == result.rig.cameras.keys()
 
 
 class Odometer:

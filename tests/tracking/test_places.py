@@ -351,7 +351,7 @@ def test_within_an_epoch_the_window_holds_the_graph_of_its_last_frame() -> None:
 def place_after(table: Correspondences, place: str | int | None = None) -> str:
     tracker = IncrementalCalibrator(pair_of())
     tracker.update(table, place=place)
-    return tracker.place
+    return tracker.places[-1]
 
 
 def test_the_callers_place_counts_before_that_of_the_table() -> None:
@@ -408,7 +408,7 @@ def test_places_are_there_after_a_restart(tmp_path: Path, cut: int) -> None:
             calibrator.update(table, place=frame // 4 % 3)
     with DurableCalibrator(folder, pair_of(), config) as calibrator:
         last = (cut - 1) // 4
-        assert calibrator.tracker.place == str(last % 3)
+        assert calibrator.tracker.places[-1] == str(last % 3)
         assert calibrator.tracker.places == tuple(str(n % 3) for n in range(last - 2, last + 1))
         for frame, table in enumerate(tables):
             expected = whole.update(table, place=frame // 4 % 3)

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from copy import copy
 from dataclasses import asdict
 from functools import partial
@@ -36,7 +36,7 @@ from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import STAGE1, MatcherFindings
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.parallel import core_pool
+from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress
 from calibgraph.solver.camera_twist import free_fields_px
 from factors import displace
@@ -133,7 +133,7 @@ class StructureMatcher:
         self._require_structure(cache, frames, rig)
         if self.search_range is None:
             return Start(rig)
-        with core_pool() as cores, ThreadPoolExecutor(len(rig.cameras)) as pool:
+        with core_pool() as cores, Threads(len(rig.cameras)) as pool:
             candidates = locate_cameras(
                 rig,
                 load_camera_frames(cache, frames, rig, cores),
