@@ -25,6 +25,7 @@ RIG, CONFIG, STATE = "rig.yaml", "config.json", "state"
 
 _MOST_OPEN = 256
 _THREADS = 8  # most of an update's time it waits for the disk
+_COLLECT_AFTER = 10_000  # new objects: what an update makes is freed without the collector
 
 
 @dataclass
@@ -159,6 +160,7 @@ def main() -> None:
 
     warm_up_tracker()
     gc.freeze()  # what is loaded by now stays: each full collection would visit it
+    gc.set_threshold(_COLLECT_AFTER)
     trackers, pool = _Trackers(), ThreadPoolExecutor(_THREADS)
 
     def answer(requests: list[TrackerRequest], note: Note) -> None:

@@ -145,9 +145,10 @@ class ClosedPlaces:
     def _closed_sums(self) -> Sums:
         return sum_closed_epochs(self.state)
 
-    @cached_property
-    def _priors(self) -> gtsam.NonlinearFactorGraph:
-        return pose_priors(self.state)
+    def _priors(self, dropped: Rows = ()) -> gtsam.NonlinearFactorGraph:
+        """Priors and relative poses without some: the fit has those of its own."""
+        same = dropped == self.contradicting
+        return self.fit.linear.model.pose_graph if same else pose_priors(self.state, dropped)
 
     def all_sums(self, state: State) -> Sums:
         """(n,) over the summaries and all live frames."""
@@ -160,7 +161,7 @@ class ClosedPlaces:
         sums = self.all_sums(state).pose
         for camera, own in (more or {}).items():
             sums = sums.replace_at(camera, sums[camera] + own)
-        return equation_5(self._priors, state.references, sums)
+        return equation_5(self._priors(), state.references, sums)
 
     @property
     def shows_ratios(self) -> bool:
@@ -231,7 +232,7 @@ class ClosedPlaces:
     def _pose_graph(self, kept: Rows, dropped: Rows) -> gtsam.NonlinearFactorGraph:
         """The same with the priors, without some relative poses."""
         if (kept, dropped) not in self._pose_graphs:
-            graph = join(pose_priors(self.state, dropped), self._summary(kept))
+            graph = join(self._priors(dropped), self._summary(kept))
             self._pose_graphs[kept, dropped] = graph
         return self._pose_graphs[kept, dropped]
 

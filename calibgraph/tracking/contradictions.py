@@ -65,7 +65,9 @@ def pose_priors(state: State, dropped: Rows = ()) -> gtsam.NonlinearFactorGraph:
         state: of the tracker.
         dropped: further relative poses that take no part.
     """
-    rig = state.rig.model_copy(update={"relative_poses": pairs_without(state, dropped)})
+    rig, pairs = state.rig, pairs_without(state, dropped)
+    if len(pairs) < len(rig.relative_poses):
+        rig = rig.model_copy(update={"relative_poses": pairs})
     return objective_graph(rig, {}, poses_by_name(state), state.config, terms="full")
 
 

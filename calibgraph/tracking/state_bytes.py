@@ -30,10 +30,11 @@ from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.camera_state import CameraState
+from calibgraph.tracking.epoch_arrays import from_arrays, to_arrays
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.frame_order import Incoming
-from calibgraph.tracking.live_frames import Epoch, LiveFrame, OutlierFrame
+from calibgraph.tracking.live_frames import Epoch, OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
 from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.optimum import Optimum
@@ -44,7 +45,7 @@ from factors import Lens, ProjectionBlock
 
 Kind = Literal["state", "input", "history"]
 
-_VERSION = 10
+_VERSION = 11
 """Earlier ones held other sums, or were of another encoding."""
 
 _DIGEST = hashlib.sha256().digest_size
@@ -139,8 +140,9 @@ def _to_array(held: tuple[str, tuple[int, ...], bytes]) -> NDArray[Any]:
     )
 
 
-def _fields(value: Any) -> dict[str, Any]:
-    return {one.name: getattr(value, one.name) for one in fields(value) if one.init}
+def _fields_of(kind: type) -> Callable[[Any], dict[str, Any]]:
+    names = tuple(one.name for one in fields(kind) if one.init)
+    return lambda value: {name: getattr(value, name) for name in names}
 
 
 _KINDS: tuple[tuple[type, Callable[[Any], Any], Callable[[Any], Any]], ...] = (
@@ -148,9 +150,10 @@ _KINDS: tuple[tuple[type, Callable[[Any], Any], Callable[[Any], Any]], ...] = (
     (gtsam.Pose3, gtsam.Pose3.matrix, gtsam.Pose3),
     *((kind, lambda model: model.model_dump(mode="json"), kind.model_validate)
       for kind in (Rig, Config)),
-    *((kind, _fields, lambda held, kind=kind: kind(**held))
-      for kind in (State, CameraState, DriftWatch, Epoch, LiveFrame, OutlierFrame, GroupScatter,
-                   EpochSummary, Sums, PlaceSums, Optimum, DistortionEvidence, MatcherFindings,
+    (Epoch, to_arrays, from_arrays),
+    *((kind, _fields_of(kind), lambda held, kind=kind: kind(**held))
+      for kind in (State, CameraState, DriftWatch, OutlierFrame, GroupScatter, EpochSummary,
+                   Sums, PlaceSums, Optimum, DistortionEvidence, MatcherFindings,
                    VarianceRatios, ResidualHistogram, ResidualScale, Correspondences, CameraBlock,
                    ProjectionBlock, Lens, Event, Size, Offsets, Incoming)),
 )  # fmt: skip

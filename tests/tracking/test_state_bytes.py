@@ -53,15 +53,15 @@ def test_a_file_that_is_no_saved_tracker_is_refused_in_one_line(pair: Rig, tmp_p
     IncrementalCalibrator(pair).save(path)
     data = path.read_bytes()
     head = data.index(b"\n") + 1
-    assert data[:head] == b"calibgraph-tracker-state/10\n"
+    assert data[:head] == b"calibgraph-tracker-state/11\n"
     for wrong, match in (
         (data[:-1], "is damaged: its checksum is wrong"),
         (data[:-9] + bytes(9), "is damaged: its checksum is wrong"),
         (data[:head], "is damaged: its checksum is wrong"),
-        (b"", "begins with '', expected 'calibgraph-tracker-state/10'"),
+        (b"", "begins with '', expected 'calibgraph-tracker-state/11'"),
         (
-            b"calibgraph-tracker-state/11\n" + data[head:],
-            "begins with 'calibgraph-tracker-state/11'",
+            b"calibgraph-tracker-state/12\n" + data[head:],
+            "begins with 'calibgraph-tracker-state/12'",
         ),
         (b"calibgraph-tracker-file/1\n" + data[head:], "begins with 'calibgraph-tracker-file/1'"),
         (b"x\x9c\xed\x00" + bytes(100), "begins with 'x', expected"),
