@@ -46,8 +46,6 @@ from calibgraph.tracking.step_detection import detect_small_step, detect_step
 from calibgraph.tracking.stream_tables import StreamFrame
 from calibgraph.tracking.update import Update, make_updates
 
-_UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
-
 
 class IncrementalCalibrator:
     """All cameras' extrinsics, updated frame by frame.
@@ -169,7 +167,7 @@ class IncrementalCalibrator:
             self._resume(start)
             for earlier in since:
                 self._repeat(earlier)
-            if isinstance(error, _UNSOLVABLE):
+            if isinstance(error, RuntimeError | np.linalg.LinAlgError):  # of gtsam and numpy
                 raise unsolvable(frames[0].number, error) from error
             raise
 
