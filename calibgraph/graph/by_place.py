@@ -93,64 +93,33 @@ class QuadraticByPlace:
     Attributes:
         places: (p,) the places that have correspondences, in rising order.
         T_lidar_camera: per such place, the minimum.
-        information: (p, 6, 6) in the tangent there, positive definite.
+        information: (p, d, d) in the tangent there, positive definite: of the pose, d is 6; with a
+            time offset that is a variable, 7.
+        offsets: (p, d - 6) at the minima, in the units of the variables.
+        keys: (p,) of these variables; empty if there are none.
     """
 
     places: Numbers
     T_lidar_camera: Sequence[gtsam.Pose3]
     information: Array
+    offsets: Array
+    keys: Sequence[int] = ()
 
     def with_variance(self, factor: float) -> QuadraticByPlace:
         """Multiply the variance of the matches."""
         return replace(self, information=self.information / factor)
 
     def sums(self, T_camera_cloud: Array) -> BlockSums:
-        """H, b and c of every place at a pose of its own, (P, 4, 4), stacked."""
+        """H, b and c of every place at a pose of its own, (P, 4, 4), stacked; without offsets."""
         count = len(T_camera_cloud)
-        hessian, step = np.zeros((count, 6, 6)), np.zeros((count, 6))
+        found = BlockSums(np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros(count))
         for row, place in enumerate(self.places):
-            here = to_T_lidar_camera(T_camera_cloud[place])
-            step[place] = self.T_lidar_camera[row].localCoordinates(here)
-        hessian[self.places] = self.information
-        gradient = np.einsum("pij,pj->pi", hessian, step)
-        return BlockSums(hessian, gradient, np.einsum("pi,pi->p", gradient, step))
+            one = self._sums(row, T_camera_cloud[place], self.offsets[row])
+            found.hessian[place], found.gradient[place] = one.hessian, one.gradient
+            found.cost[place] = one.cost
+        return found
 
-    def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
-        """The quadratic of one place, a stock factor on the variables of these keys."""
-        return [
-            gtsam.BetweenFactorPose3(
-                cloud,
-                matched,
-                self.T_lidar_camera[row],
-                gtsam.noiseModel.Gaussian.Information(self.information[row]),
-            )
-            for row in map(int, np.flatnonzero(self.places == place))
-        ]
-
-
-@dataclass(frozen=True, eq=False)
-class LateQuadraticByPlace:
-    """As ``QuadraticByPlace``, of a camera whose time offset is a variable.
-
-    Attributes:
-        places: as there.
-        T_lidar_camera: as there.
-        offsets: (p,) at the minima, in the units of the variable.
-        information: (p, 7, 7) of poses and offset there.
-        keys: (p,) of its variables.
-    """
-
-    places: Numbers
-    T_lidar_camera: Sequence[gtsam.Pose3]
-    offsets: Array
-    information: Array
-    keys: Sequence[int]
-
-    def with_variance(self, factor: float) -> LateQuadraticByPlace:
-        """Multiply the variance of the matches."""
-        return replace(self, information=self.information / factor)
-
-    def sums(self, T_camera_cloud: Array, values: Array) -> list[BlockSums]:
+    def sums_in_time(self, T_camera_cloud: Array, values: Array) -> list[BlockSums]:
         """H, b and c of every place with correspondences, by pose and offset.
 
         Args:
@@ -166,10 +135,22 @@ class LateQuadraticByPlace:
         return BlockSums(self.information[row], gradient, step @ gradient)
 
     def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
-        """The quadratic of one place: a factor on its cloud, its camera and the time offset."""
+        """The quadratic of one place, on the variables of these keys and its offset.
+
+        Without an offset it is a stock factor.
+        """
+        rows = map(int, np.flatnonzero(self.places == place))
+        if self.keys:
+            return [
+                free_lens_sums_factor((cloud, matched, self.keys[row]), partial(self._sums, row), 1)
+                for row in rows
+            ]
+        noise = gtsam.noiseModel.Gaussian.Information
         return [
-            free_lens_sums_factor((cloud, matched, self.keys[row]), partial(self._sums, row), 1)
-            for row in map(int, np.flatnonzero(self.places == place))
+            gtsam.BetweenFactorPose3(
+                cloud, matched, self.T_lidar_camera[row], noise(self.information[row])
+            )
+            for row in rows
         ]
 
 

@@ -30,7 +30,6 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
     BlockByPlace,
-    LateQuadraticByPlace,
     PairByPlace,
     QuadraticByPlace,
     SummarizedByPlace,
@@ -58,7 +57,7 @@ from factors import (
     robust_noise,
 )
 
-Data = BlockByPlace | QuadraticByPlace | LateQuadraticByPlace | SummarizedByPlace | FreeLensByPlace
+Data = BlockByPlace | QuadraticByPlace | SummarizedByPlace | FreeLensByPlace
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import LateQuadraticByPlace, PairByPlace
+from calibgraph.graph.by_place import PairByPlace, QuadraticByPlace
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, paired_key
 from calibgraph.model.geometry import adjoints, invert_each
-from factors import pair_run_sums
+from factors import BlockSums, pair_run_sums
 
 
 @dataclass(eq=False)
@@ -56,8 +57,15 @@ class LinearData:
         places, T_camera_cloud = block.places, np.tile(np.eye(4), (len(clouds), 1, 1))
         keys = [matched_at_key(int(place), number) for place in places]
         T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
-        if isinstance(block, FreeLensByPlace | LateQuadraticByPlace):
-            self._add_free_lens(block, keys, values, T_camera_cloud[places])
+        if isinstance(block, FreeLensByPlace):
+            lens = [block.key] * len(keys)
+            free = block.sums(T_camera_cloud[places], values.atVector(block.key))
+            self._add_free_lens(places, (keys, lens), free, T_camera_cloud[places])
+            return
+        if isinstance(block, QuadraticByPlace) and block.keys:
+            offsets = np.array([*map(values.atVector, block.keys)])
+            free = block.sums_in_time(T_camera_cloud[places], offsets)
+            self._add_free_lens(places, (keys, block.keys), free, T_camera_cloud[places])
             return
         sums = block.sums(T_camera_cloud)
         by_cloud = -adjoints(T_camera_cloud)[places]
@@ -75,20 +83,14 @@ class LinearData:
 
     def _add_free_lens(
         self,
-        block: FreeLensByPlace | LateQuadraticByPlace,
-        keys: list[int],
-        values: gtsam.Values,
+        places: NDArray[np.int64],
+        keys: tuple[Sequence[int], Sequence[int]],
+        sums: Sequence[BlockSums],
         T_camera_cloud: Array,
     ) -> None:
         """The same with a free lens, on o_p^-1 a_cp and s_c, or e_cp."""
-        if isinstance(block, LateQuadraticByPlace):
-            lenses = block.keys
-            sums = block.sums(T_camera_cloud, np.array([*map(values.atVector, lenses)]))
-        else:
-            lenses = [block.key] * len(keys)
-            sums = block.sums(T_camera_cloud, values.atVector(block.key))
         by_cloud = -adjoints(T_camera_cloud)
-        for number, (place, key) in enumerate(zip(block.places, keys, strict=True)):
+        for number, (place, key, lens_key) in enumerate(zip(places, *keys, strict=True)):
             one, size = sums[number], len(sums[number].gradient)
             chain = np.hstack(
                 [np.vstack([by_cloud[number], np.zeros((size - 6, 6))]), np.eye(size)]
@@ -98,7 +100,7 @@ class LinearData:
             self.cost += float(one.cost)
             self.graph.push_back(
                 gtsam.HessianFactor(
-                    cloud_at_key(int(place)), key, lenses[number],
+                    cloud_at_key(int(place)), key, lens_key,
                     hessian[cloud, cloud], hessian[cloud, pose], hessian[cloud, lens], pull[cloud],
                     hessian[pose, pose], hessian[pose, lens], pull[pose],
                     hessian[lens, lens], pull[lens], float(one.cost),

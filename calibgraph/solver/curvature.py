@@ -66,6 +66,12 @@ def convex_hessian(hessian: Array, otherwise: Array) -> Array:
     return hessian if _is_positive_definite(hessian) else otherwise
 
 
+def positive_part(matrix: Array) -> Array:
+    """The positive semidefinite matrix nearest to a symmetric one."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
 def _is_positive_definite(hessian: Array) -> bool:
     try:
         np.linalg.cholesky(hessian)

@@ -23,7 +23,7 @@ from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.curvature import FittedObjective
+from calibgraph.solver.curvature import FittedObjective, positive_part
 from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import FreeLensBlock
@@ -102,7 +102,7 @@ def lens_term_of(
     of_matches = MATCH_SHARE * counts[0] if any(findings.systematic_sigmas) else 0.0
     shared = within.efficiency * max(findings.place_variance * within.alike, of_matches)
     whole = within.efficiency**2 * (covariance @ scatter @ covariance) + shared * covariance
-    excess = _positive((whole - in_graph)[6:, 6:])
+    excess = positive_part((whole - in_graph)[6:, 6:])
     compensating = np.asarray(-np.linalg.solve(hessian[:6, :6], hessian[:6, 6:]))
     return LensTerm(lens, excess, np.zeros((len(excess), 0)), compensating)
 
@@ -197,12 +197,6 @@ def _allow_for_few_frames(scatter: Array, hessian: Array, matches: float, frames
     usual = 1 + known.frame_correlation * (matches / frames - 1)
     own = scatter + prior * usual * hessian / frames
     return np.asarray(own * frames / (prior + frames - 1))
-
-
-def _positive(matrix: Array) -> Array:
-    """The positive part of a symmetric matrix."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def moved_lenses(lenses: Lenses, fit: LatentPoseFit | None) -> tuple[Lenses, float]:

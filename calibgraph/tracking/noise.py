@@ -18,6 +18,7 @@ from calibgraph.arrays import Array
 from calibgraph.model.config import Config
 from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.residual_scale import ResidualScale, iterate_spread, scale_from
+from calibgraph.tracking.cause import squared_sigmas
 
 _EDGES = np.concatenate([[0.0], np.geomspace(1e-5, 1e5, 2304)])  # 1 % wide
 _RESIDUALS_KEPT = 1 - 1 / 2000  # from frame to frame
@@ -115,11 +116,11 @@ class GroupScatter:
             more = self.open_epochs + 1
             return replace(self, open_sum=total, open_frames=number, open_epochs=more)
         scaled = total / np.sqrt(max(number, 1))
-        size = _KEPT * self.size + min(_squared(scaled, noise), _UNUSUAL) / len(noise)
+        size = _KEPT * self.size + min(squared_sigmas(scaled, noise), _UNUSUAL) / len(noise)
         if self.last is None:
             return replace(GroupScatter(self.span), last=scaled, size=size)
         apart = (scaled - self.last) / np.sqrt(2)
-        apart = apart * min(1.0, np.sqrt(_UNUSUAL / max(_squared(apart, noise), 1e-12)))
+        apart = apart * min(1.0, np.sqrt(_UNUSUAL / max(squared_sigmas(apart, noise), 1e-12)))
         return GroupScatter(
             self.span,
             scatter=_KEPT * self.scatter + np.outer(apart, apart),
@@ -132,10 +133,6 @@ class GroupScatter:
 def no_groups() -> tuple[GroupScatter, ...]:
     """No sums, for each span."""
     return tuple(GroupScatter(span) for span in SPANS)
-
-
-def _squared(score: Array, noise: Array) -> float:
-    return float(score @ np.linalg.solve(noise, score))
 
 
 def inflation(groups: Sequence[GroupScatter]) -> float:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import LateQuadraticByPlace
+from calibgraph.graph.by_place import QuadraticByPlace
 from calibgraph.graph.lens import LensTerm
 from calibgraph.graph.variables import seen_lens_key
 from calibgraph.model.findings import MatcherFindings
@@ -169,7 +169,7 @@ def late_quadratic(
     camera: int,
     places: Numbers,
     chosen: Sequence[tuple[gtsam.Pose3, float, Array]],
-) -> LateQuadraticByPlace:
+) -> QuadraticByPlace:
     """The matches of a camera, by T_lidar_camera, offset [s] and (7, 7) information at places."""
     assert state.offsets is not None
     lens = state.offsets.variable(state.rig, camera)
@@ -179,7 +179,7 @@ def late_quadratic(
     information = np.array([units @ one @ units for _, _, one in chosen]).reshape(-1, 7, 7)
     poses = [pose for pose, _, _ in chosen]
     keys = [seen_lens_key(camera)] * len(places)
-    return LateQuadraticByPlace(places, poses, away_s / sigma, information, keys)
+    return QuadraticByPlace(places, poses, information, away_s[:, None] / sigma, keys)
 
 
 def _units(sigma_s: float) -> Array:

@@ -17,7 +17,7 @@ from operator import itemgetter
 import gtsam
 import numpy as np
 
-from calibgraph.graph.by_place import LateQuadraticByPlace
+from calibgraph.graph.by_place import QuadraticByPlace
 from calibgraph.graph.lens import LensTerm, walk_graph
 from calibgraph.graph.variables import MOST_CAMERAS, seen_lens_at_key, seen_lens_key
 from calibgraph.tracking.offset_sums import after_offset_walk
@@ -89,8 +89,8 @@ def _latest(times: Times) -> int:
 
 
 def at_own_times(
-    camera: int, matches: LateQuadraticByPlace, names: Sequence[str], times: Times
-) -> LateQuadraticByPlace:
+    camera: int, matches: QuadraticByPlace, names: Sequence[str], times: Times
+) -> QuadraticByPlace:
     """A camera's quadratics at places of some names, each on the offset of its own time."""
     now = _latest(times)
     keys = [
@@ -101,7 +101,7 @@ def at_own_times(
 
 
 def walk_of(
-    camera: int, matches: LateQuadraticByPlace, names: Sequence[str], times: Times, *, step: float
+    camera: int, matches: QuadraticByPlace, names: Sequence[str], times: Times, *, step: float
 ) -> Walk:
     """The walk of the offsets of these quadratics, with its variance over a frame."""
     at = {key: times[names[place]] for place, key in zip(matches.places, matches.keys, strict=True)}

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
     BlockByPlace,
-    LateQuadraticByPlace,
+    QuadraticByPlace,
     SummarizedByPlace,
 )
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
@@ -141,7 +141,7 @@ class PlaceData:
         kept, cameras = [frame for frame in frames if frame.place in places], dict[int, Data]()
         for camera, one in enumerate(state.cameras):
             quadratic = by_place(state, camera, earlier.get(camera, {}), [*places])
-            if isinstance(quadratic, LateQuadraticByPlace):
+            if quadratic.keys:
                 cameras[camera] = quadratic
                 continue
             own = None if one.summary.walk else inliers_of(kept, camera)
@@ -167,7 +167,7 @@ class PlaceData:
         """The same of closed places, each at the time offset of its own time."""
         cameras = {
             camera: at_own_times(camera, own, self.names, times)
-            if isinstance(own, LateQuadraticByPlace)
+            if isinstance(own, QuadraticByPlace) and own.keys
             else own
             for camera, own in self.cameras.items()
         }
@@ -191,7 +191,7 @@ def place_model(
     for camera, matches in data.cameras.items():
         within = seen.within(sums, camera, chosen)
         held: Data = matches
-        if isinstance(matches, LateQuadraticByPlace):
+        if isinstance(matches, QuadraticByPlace) and matches.keys:
             rows = np.flatnonzero(sums.frames[:, camera])
             order, frames = in_order_of_time(times, [sums.names[row] for row in rows])
             own = seen.within(sums, camera, rows[order])

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.solver.curvature import positive_part
 from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.sums import Sums
@@ -150,13 +151,7 @@ class PlaceSums:
             camera: by its place in the rig.
             own: its sums, discounted by its walk.
         """
-        reweighted = _without_negative(own.hessian)
+        reweighted = positive_part(own.hessian)
         part = own.change(score=np.zeros_like(own.score), reweighted=reweighted)
         none = Sums.zeros(len(self.means), width=own.width)
         return self.without(camera).add({name: none.replace_at(camera, part)})
-
-
-def _without_negative(hessian: Array) -> Array:
-    """The nearest positive semidefinite matrix."""
-    values, vectors = np.linalg.eigh(hessian)
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)

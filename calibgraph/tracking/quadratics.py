@@ -11,7 +11,6 @@ from scipy.linalg import block_diag
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
     BlockByPlace,
-    LateQuadraticByPlace,
     QuadraticByPlace,
     SummarizedByPlace,
 )
@@ -26,7 +25,7 @@ from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
 
-Data = BlockByPlace | QuadraticByPlace | LateQuadraticByPlace | SummarizedByPlace
+Data = BlockByPlace | QuadraticByPlace | SummarizedByPlace
 Quadratics = dict[int, dict[str, tuple[gtsam.Pose3, float, Array]]]
 """Per camera and name of a place: T_lidar_camera and time offset [s] at the minimum; (d, d)
 information."""
@@ -39,14 +38,15 @@ def by_place(
     camera: int,
     known: Mapping[str, tuple[gtsam.Pose3, float, Array]],
     names: Sequence[str],
-) -> QuadraticByPlace | LateQuadraticByPlace:
+) -> QuadraticByPlace:
     """The quadratics of a camera at those of some places where it has one."""
     places = np.array([place for place, name in enumerate(names) if name in known], dtype=np.int64)
     chosen = [known[names[place]] for place in places]
     if state.offsets is not None and chosen:
         return late_quadratic(state, camera, places, chosen)
     information = np.array([one for _, _, one in chosen]).reshape(-1, 6, 6)
-    return QuadraticByPlace(places, [pose for pose, _, _ in chosen], information)
+    poses, none = [pose for pose, _, _ in chosen], np.zeros((len(chosen), 0))
+    return QuadraticByPlace(places, poses, information, none)
 
 
 def quadratics_of(
@@ -102,7 +102,6 @@ def linearized(names: Sequence[str], cameras: Mapping[int, Data], fit: LatentPos
     values, count, found = fit.linear.values, len(names), Quadratics()
     clouds = poses_of(values, map(cloud_at_key, range(count)))
     for camera, matches in cameras.items():
-        assert not isinstance(matches, LateQuadraticByPlace)  # it is no nearer there
         places, T_camera_cloud = matches.places, np.tile(np.eye(4), (count, 1, 1))
         keys = [matched_at_key(int(place), camera) for place in places]
         T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]

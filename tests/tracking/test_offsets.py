@@ -22,7 +22,7 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
-from calibgraph.graph.by_place import LateQuadraticByPlace
+from calibgraph.graph.by_place import QuadraticByPlace
 from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, seen_lens_key
 from calibgraph.model.geometry import twist_between
@@ -233,7 +233,7 @@ def test_the_quadratic_of_a_late_camera_is_its_factors() -> None:
     A = rng.normal(size=(7, 20))
     pose = gtsam.Pose3.Expmap(rng.normal(size=6))
     place, value = np.array([0]), rng.normal(size=1)
-    late_one = LateQuadraticByPlace(place, [pose], value, (A @ A.T)[None], [seen_lens_key(0)])
+    late_one = QuadraticByPlace(place, [pose], (A @ A.T)[None], value[None], [seen_lens_key(0)])
     keys = cloud_at_key(0), matched_at_key(0, 0), seen_lens_key(0)
     values = gtsam.Values()
     values.insert(keys[0], gtsam.Pose3())
@@ -245,7 +245,7 @@ def test_the_quadratic_of_a_late_camera_is_its_factors() -> None:
     linear = graph.linearize(values)
     hessian = linear.hessian(to_ordering([keys[1], keys[2], keys[0]]))[0]
     assert hessian[:7, :7] == pytest.approx(A @ A.T, rel=1e-9)
-    (sums,) = late_one.sums(pose.inverse().matrix()[None], value)
+    (sums,) = late_one.sums_in_time(pose.inverse().matrix()[None], value[None])
     assert sums.hessian == pytest.approx(A @ A.T, rel=1e-9)
     assert graph.error(values) == pytest.approx(float(sums.cost), abs=1e-12)
 

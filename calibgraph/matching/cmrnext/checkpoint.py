@@ -5,13 +5,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import BaseModel, Field, StrictBool
 from torch import Tensor
 
 from calibgraph.errors import FileError
-from calibgraph.files import sha256, write_atomically
+from calibgraph.files import checked_model, sha256, write_atomically
 from calibgraph.matching.cmrnext.architecture import (
     Architecture,
     recognize_architecture,
@@ -31,14 +32,22 @@ DOWNLOAD = (
     "own with calibgraph train"
 )
 
-_NUMBERS = {
-    "max_depth": (1.0, 10_000.0, True),
-    "max_r": (0.0, 180.0, False),
-    "max_t": (0.0, 1000.0, False),
-    "systematic_rotation_rad": (0.0, 10.0, False),
-    "systematic_translation_m": (0.0, 1000.0, False),
-}  # least, most, and whether the key is required
-_SWITCHES = {"use_reflectance": True, "normalize_images": True, "half_resolution": False}
+_Number = Annotated[float, Field(strict=True, ge=0)]
+
+
+class _Config(BaseModel):
+    """The keys of a config that anything depends on."""
+
+    max_depth: Annotated[_Number, Field(ge=1, le=10_000)]
+    max_r: Annotated[_Number, Field(le=180)] | None = None
+    max_t: Annotated[_Number, Field(le=1000)] | None = None
+    systematic_rotation_rad: Annotated[_Number, Field(le=10)] | None = None
+    systematic_translation_m: Annotated[_Number, Field(le=1000)] | None = None
+    use_reflectance: StrictBool
+    normalize_images: StrictBool
+    half_resolution: StrictBool | None = None
+
+
 _MAX_TEXT, _MAX_INTEGER = 200, 2**53
 
 
@@ -129,7 +138,7 @@ def _to_checkpoint(
 ) -> Checkpoint:
     try:
         config = _plain(given)
-        _require_sound(config)
+        checked_model(_Config, config, path)
         shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
         architecture = recognize_architecture(shapes, reflectance=config["use_reflectance"])
         require_config_agrees(architecture, config)
@@ -188,22 +197,6 @@ def _is_plain(value: Any) -> bool:
     if isinstance(value, (int, float)):
         return math.isfinite(value) if isinstance(value, float) else abs(value) <= _MAX_INTEGER
     return value is None
-
-
-def _require_sound(config: Mapping[str, Any]) -> None:
-    """Check the keys of the config that anything depends on."""
-    for key, (least, most, required) in _NUMBERS.items():
-        value: Any = config.get(key)
-        if value is None and not required:
-            continue
-        if type(value) not in (int, float) or not least <= value <= most:
-            raise ValueError(
-                f"its config has {key!r} = {value!r}, expected a number from {least} to {most}"
-            )
-    for key, required in _SWITCHES.items():
-        value = config.get(key)
-        if not isinstance(value, bool) and (required or value is not None):
-            raise ValueError(f"its config has {key!r} = {value!r}, expected true or false")
 
 
 def _copy_state(architecture: Architecture, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
