@@ -27,6 +27,7 @@ from calibgraph.trust.inputs import (
     Finding,
     count_points_in_view,
     describe_out_of_view,
+    describe_repeats,
     explain_guess,
     find_doubts,
 )
@@ -188,22 +189,11 @@ def _examine_frame(frame: Frame, rig: Rig) -> tuple[NDArray[np.float32] | None, 
     return cloud, problems
 
 
-def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> Iterator[Finding]:
-    """Frames with the same cloud or image: they are not independent."""
+def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> list[Finding]:
+    """Frames with the same cloud or image."""
     hashes = map_on_cores(hash_source, [path for _, path in sources])
-    first: dict[str, str] = {}
-    repeated = [
-        (first[digest], name)
-        for (name, _), digest in zip(sources, hashes, strict=True)
-        if first.setdefault(digest, name) != name
-    ]
-    if repeated:
-        others = f", and {len(repeated) - 1} more repeat one" if repeated[1:] else ""
-        yield Finding(
-            "warning",
-            f"frames {repeated[0][0]} and {repeated[0][1]} have the same {what}{others}; leave "
-            "repeats out",
-        )
+    text = describe_repeats(what, zip((name for name, _ in sources), hashes, strict=True))
+    return [Finding("warning", text)] if text else []
 
 
 def _examine_places(data: Dataset) -> Iterator[Finding]:

@@ -8,13 +8,13 @@ import tempfile
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_origin
+from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ValidationError, ValidationInfo, field_validator
 
 from calibgraph.errors import FileError
-from calibgraph.yaml_text import UnusualInt, describe_value, parse_yaml, yaml_text
+from calibgraph.yaml_text import describe_value, parse_yaml, yaml_text
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -184,7 +184,7 @@ def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> 
 
 
 class StrictNumbers(BaseModel):
-    """A model whose numbers are decimal, and none of YAML's truth values: ``true`` is not 1 px."""
+    """A model whose numbers are none of YAML's truth values: ``true`` is not 1 px."""
 
     @field_validator("*", mode="before")
     @classmethod
@@ -192,9 +192,6 @@ class StrictNumbers(BaseModel):
         wanted = cls.model_fields[info.field_name or ""].annotation
         if wanted is not bool and holds_truth_value(value):
             raise ValueError(f"expected no truth value, found {describe_value(value)}")
-        unusual = _unusual_number(value)
-        if unusual and get_origin(wanted) is not Literal:
-            raise ValueError(f"expected a decimal number, found {unusual[:60]}")
         return value
 
 
@@ -203,13 +200,6 @@ def holds_truth_value(value: object) -> bool:
     if isinstance(value, (list, tuple)):
         return any(map(holds_truth_value, value))
     return isinstance(value, (bool, np.bool_))
-
-
-def _unusual_number(value: object) -> str:
-    """The first number of another base, or of a list, as it is written; empty if there is none."""
-    if isinstance(value, (list, tuple)):
-        return next(filter(None, map(_unusual_number, value)), "")
-    return value.text if isinstance(value, UnusualInt) else ""
 
 
 def commented_defaults(model: type[BaseModel]) -> str:

@@ -22,7 +22,6 @@ DOT_MARK = "// calibgraph graph"
 VIEW_MARK = "calibgraph-view"
 WEIGHTS_MARK = "calibgraph-cmrnext/1"
 WINDOW_WEIGHTS_MARK = "calibgraph-window-weights/1"
-_DATA_FOLDERS = ("cameras", "lidar", "velodyne", "image_2", "image_3")
 
 
 @dataclass(frozen=True)
@@ -89,24 +88,6 @@ def require_writable(outputs: Iterable[Output], read: Iterable[Path] = ()) -> No
                 f"was not written by calibgraph {output.by}, and would be replaced; move it, or "
                 "choose another --out",
             )
-
-
-def require_outside_dataset(path: Path, datasets: Iterable[Path]) -> None:
-    """Check that a file or folder is not written among the images and clouds of a dataset.
-
-    There it would be taken for one of them, and the dataset refused from then on.
-
-    Raises:
-        FileError: if it is.
-    """
-    written = path.resolve()
-    for folder in datasets:
-        for part in _DATA_FOLDERS:
-            if written.is_relative_to(folder.resolve() / part):
-                raise FileError(
-                    path, f"is among the data of {folder}, and would be read as such; choose "
-                    "another --out"
-                )  # fmt: skip
 
 
 def yaml_mark(command: str) -> str:

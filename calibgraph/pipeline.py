@@ -24,6 +24,7 @@ from calibgraph.model.geometry import pair_covariances
 from calibgraph.model.lens_estimate import with_sigmas
 from calibgraph.model.rig import Rig
 from calibgraph.overlaps import refine_with_camera_pairs
+from calibgraph.parallel import with_own_threads
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds
 from calibgraph.solver.joint import solve_joint
@@ -37,6 +38,7 @@ from calibgraph.trust.run_evidence import RunEvidence
 _log = logging.getLogger(__name__)
 
 
+@with_own_threads
 def calibrate(
     dataset: Datasets,
     rig: Rig | None = None,
@@ -91,6 +93,7 @@ def calibrate(
     )
 
 
+@with_own_threads
 def solve(
     rig: Rig,
     table: Correspondences | Path | str,

@@ -16,7 +16,7 @@ from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
-from calibgraph.matching.frame_choice import choose_frames
+from calibgraph.matching.frame_choice import choose_frames, without_copies
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.places import find_places
 from calibgraph.matching.protocol import Matcher
@@ -68,7 +68,9 @@ def match_in_rounds(
     """
     config = config or Config()
     full = find_matcher(matcher, seed=config.seed).with_estimate(config.estimate)
-    data, guess = _open(dataset, rig, full.most_frames)
+    chosen, guess = _open(dataset, rig, full.most_frames)
+    data = without_copies(keep_frames(chosen))
+    _log.info("%d frames, cameras %s", len(data.frames), ", ".join(guess.cameras))
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
     with watch("inputs"):
         require_known_motion(data, full, config.estimate)
@@ -102,6 +104,7 @@ def match_in_rounds(
     run = MatchingRun(
         data, full, guess, table, solution, tuple(rounds), watch, missed,
         warnings=warnings, is_late=out_of_time, excluded=config.excluded_cameras,
+        copies=len(chosen.frames) - len(data.frames),
     )  # fmt: skip
     if not out_of_time():
         with watch("match_again"):
@@ -148,8 +151,6 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
         data = choice.dataset
         if choice.text:
             _log.info(choice.text)
-    data = keep_frames(data)
-    _log.info("%d frames, cameras %s", len(data.frames), ", ".join(guess.cameras))
     return data, guess
 
 

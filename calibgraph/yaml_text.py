@@ -128,27 +128,16 @@ class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
             )
 
 
-class UnusualInt(int):
-    """A whole number that other programs may take for another one, or for a text."""
-
-    text = ""
-
-
 def _construct_number(loader: Any, node: yaml.ScalarNode) -> Any:
-    """An int or float; ``10:40``, to YAML 1.1 a number of base 60, is a text, as to YAML 1.2."""
-    if ":" in node.value:
+    """A decimal number; ``10:40``, ``0x10``, ``010`` are texts: programs read them differently."""
+    if _NOT_DECIMAL.match(node.value):
         return loader.construct_yaml_str(node)
-    if not node.tag.endswith(":int"):
-        return loader.construct_yaml_float(node)
-    number = loader.construct_yaml_int(node)
-    if not _UNUSUAL.match(node.value):
-        return number
-    unusual = UnusualInt(number)
-    unusual.text = node.value
-    return unusual
+    if node.tag.endswith(":int"):
+        return loader.construct_yaml_int(node)
+    return loader.construct_yaml_float(node)
 
 
-_UNUSUAL = re.compile(r"[-+]?0.|.*_")
+_NOT_DECIMAL = re.compile(r".*[:_]|[-+]?0[0-9a-z]")
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _construct_number)
 _Loader.add_constructor("tag:yaml.org,2002:float", _construct_number)
@@ -173,7 +162,6 @@ _Dumper.add_representer(list, _represent_sequence)
 _Dumper.add_representer(tuple, _represent_sequence)
 _Dumper.add_representer(np.ndarray, lambda dumper, data: _represent_sequence(dumper, data.tolist()))
 _Dumper.add_multi_representer(np.floating, lambda dumper, data: dumper.represent_float(float(data)))
-_Dumper.add_multi_representer(UnusualInt, lambda dumper, data: dumper.represent_int(int(data)))
 _Dumper.add_multi_representer(
     np.signedinteger, lambda dumper, data: dumper.represent_int(int(data))
 )

@@ -5,10 +5,11 @@ else beside the source. Where nothing can be written, kernels are compiled in me
 on standard error (by ``logging``) reports it once.
 
 numba compares the source file of a kernel alone, and not what the file imports. So the cache is one
-of the files that define what the kernels of a file use, of the options below, and of the versions
-of Python, numpy and numba: a change of any of them begins another, a change elsewhere keeps it, and
-environments with other versions do not overwrite each other's code while it is in use. A kernel
-may enclose numbers, but no other kernel: numba would not find its code again.
+of all files with kernels in the folder of a kernel and in this one, of the options below, and of
+the versions of Python, numpy and numba: a change of any of them begins another, a change elsewhere
+keeps it, and environments with other versions do not overwrite each other's code while it is in
+use. A kernel uses kernels and constants of these files alone. It may enclose numbers, but no other
+kernel: numba would not find its code again.
 """
 
 import hashlib
@@ -27,8 +28,6 @@ from typing import Any
 import numba
 import numpy as np
 import platformdirs
-
-from factors.kernel_source import source_files
 
 _UNUSED_S = 7 * 86400.0  # a folder of code that no process has used for so long is removed
 _COMMON: Any = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
@@ -98,11 +97,18 @@ def _name(function: Callable[..., Any], options: Mapping[str, Any]) -> str:
 
 
 @cache
+def with_kernels(folder: Path) -> tuple[Path, ...]:
+    """The files of a folder that define kernels."""
+    files = sorted(folder.glob("*.py"))
+    return tuple(file for file in files if b"@compiled" in file.read_bytes())
+
+
+@cache
 def _folder(module: str) -> Path | None:
     """Where the code of the kernels of a module is kept; None if nothing can be written."""
     versions = f"{numba.__version__} {np.__version__} {sys.version} {sorted(_COMMON.items())}"
-    digest = hashlib.sha256(versions.encode())
-    for file in source_files(module):
+    digest, own = hashlib.sha256(versions.encode()), Path(str(sys.modules[module].__file__))
+    for file in sorted({own, *with_kernels(own.parent), *with_kernels(Path(__file__).parent)}):
         digest.update(file.read_bytes())
     name, chosen = f"{module}-{digest.hexdigest()[:16]}", _config.CACHE_DIR
     user, beside = platformdirs.user_cache_path("calibgraph"), Path(__file__).parent / "__pycache__"

@@ -16,7 +16,20 @@ from numba import prange
 from numba.core.errors import NumbaWarning
 
 from factors.compiled import compiled
-from factors.kernel_projection import project, project_pinhole, project_rays
+from factors.kernel_projection import (
+    FAST,
+    MATRICES,
+    ROWS,
+    RU,
+    RV,
+    TILE,
+    X,
+    Y,
+    Z,
+    project,
+    project_pinhole,
+    project_rays,
+)
 from factors.kernel_sums import (
     apply_weights,
     scale_residuals,
@@ -28,7 +41,6 @@ from factors.kernel_sums import (
     whiten,
 )
 from factors.lens_kernels import LIMIT, PINHOLE, is_projectable
-from factors.tile import FAST, MATRICES, ROWS, RU, RV, TILE, X, Y, Z
 
 # Open3D brings an older libtbb than numba uses; numba then takes another library, as good.
 warnings.filterwarnings("ignore", "The TBB threading layer requires", NumbaWarning)

@@ -1,5 +1,8 @@
 """The forward pass over a tile: residuals and their derivatives, by the kind of lens.
 
+A tile is a (ROWS, TILE) array: a few hundred correspondences whose intermediate values stay in the
+cache. Each row holds one quantity, so that the loops over it vectorize.
+
 Two things would keep the compiler from vectorizing the loops: an index that may be negative, hence
 the rows that are taken out before a loop, and Python's exception on a division by zero, hence
 ``error_model="numpy"``.
@@ -7,7 +10,23 @@ the rows that are taken out before a loop, and Python's exception on a division 
 
 from factors.compiled import compiled
 from factors.lens_kernels import MIN_DEPTH_M, project_one, project_radtan, subtract_columns
-from factors.tile import FAST, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z
+
+FAST = {"reassoc", "contract", "nsz", "arcp"}
+"""The arithmetic that LLVM may assume; NaN and infinity keep their meaning."""
+
+TILE = 256
+"""Correspondences in a tile: its intermediate values fill the first-level cache."""
+
+(RU, RV, UX, UY, UZ, VX, VY, VZ, X, Y, Z, PSI, PRODUCT) = range(13)
+"""Rows of a tile: the residual, the derivatives of u and v by the point, the point in the camera
+frame, the loss' weight psi, and scratch for products."""
+ROWS = 13
+
+(A, B, W) = (X, Y, Z)
+"""Of an undistorted pinhole, in place of the point: x/z, y/z and 1/z."""
+
+MATRICES = 3
+"""Rows of the whitening if it is matrices; 1 if it is numbers, 0 if there is none."""
 
 
 @compiled(part=True, fastmath=FAST)

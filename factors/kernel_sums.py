@@ -3,8 +3,26 @@
 import math
 
 from factors.compiled import compiled
+from factors.kernel_projection import (
+    FAST,
+    PRODUCT,
+    PSI,
+    RU,
+    RV,
+    UX,
+    UY,
+    UZ,
+    VX,
+    VY,
+    VZ,
+    A,
+    B,
+    W,
+    X,
+    Y,
+    Z,
+)
 from factors.loss import CAUCHY, loss_and_weight
-from factors.tile import FAST, PRODUCT, PSI, RU, RV, UX, UY, UZ, VX, VY, VZ, A, B, W, X, Y, Z
 
 _SMALL = 1e-100  # far from the smallest float by more than four factors
 

@@ -59,7 +59,6 @@ def test_a_number_in_the_place_of_a_mapping_names_no_class(pair: Rig, tmp_path: 
         ("a: !!int abc", "not valid YAML"),
         ("a: !!int ''", "not valid YAML"),
         ("a: " + "9" * 5000, "not valid YAML"),
-        ("format: 0x" + "f" * 5000, "too many digits"),
         ("[" * 20_000, "not valid YAML|too deeply"),
         ("{a: " * 1000, "not valid YAML|too deeply"),
         ("a: " + "[" * 40_000 + "]" * 40_000, "too deeply"),  # the parser would end the process
@@ -163,22 +162,27 @@ def test_an_input_that_cannot_be_read_meanwhile_keeps_its_name(tmp_path: Path) -
     assert caught.value.filename == str(tmp_path / "gone")
 
 
-@pytest.mark.parametrize("number", ["0x10", "-0x10", "0b11", "0640", "1_000"])
-def test_numbers_that_programs_read_differently_are_refused_as_values(
-    number: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("number", ["0x10", "-0x10", "0b11"])
+def test_numbers_of_another_base_are_refused_as_values(number: str, tmp_path: Path) -> None:
     path, text = tmp_path / "rig.yaml", (SAMPLE / "rig.yaml").read_text()
     for pattern in (r"(fx: )[0-9.]+", r"(width_px: )[0-9]+", r"(distortion: \[)"):
         changed, count = re.subn(pattern, rf"\g<1>{number}", text, count=1)
         path.write_text(changed)
-        with pytest.raises(FileError, match=f"expected a decimal number, found {number}$"):
+        with pytest.raises(FileError, match=f"Input should be a valid .*, found '{number}'$"):
             load_rig(path)
         assert count == 1
 
 
+def test_zeros_in_front_of_a_number_make_it_no_octal_one(tmp_path: Path) -> None:
+    path, text = tmp_path / "rig.yaml", (SAMPLE / "rig.yaml").read_text()
+    path.write_text(re.sub(r"(fx: )[0-9.]+", r"\g<1>0640", text))
+    assert {camera.intrinsics_px.fx for camera in load_rig(path).cameras.values()} == {640.0}
+
+
 def test_numbers_of_another_base_elsewhere_do_no_harm() -> None:
     content = parse_yaml("serial: 0x10\nlist: [007]\n", "some.yaml")
-    assert parse_yaml(yaml_text(content), "some.yaml") == content == {"serial": 16, "list": [7]}
+    expected = {"serial": "0x10", "list": ["007"]}
+    assert parse_yaml(yaml_text(content), "some.yaml") == content == expected
 
 
 @pytest.mark.parametrize(
@@ -202,4 +206,4 @@ def test_numbers_of_base_60_are_texts() -> None:
     found = parse_yaml(text, "rig.yaml")
     assert found["frames"] == "10:40"
     assert found["negative"] == "-1:30.5"
-    assert found["plain"] == [12, -3, 1.5e-3, 16, float("inf")]
+    assert found["plain"] == [12, -3, 1.5e-3, "0x10", float("inf")]

@@ -4,7 +4,11 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-from calibgraph.parallel import KeyedCache, count_cores
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from calibgraph import pipeline
+from calibgraph.parallel import KeyedCache, count_cores, with_own_threads
 
 
 def test_a_value_is_made_once_for_all_threads_that_need_it() -> None:
@@ -40,3 +44,34 @@ def test_values_used_longest_ago_are_dropped_first() -> None:
 
 def test_there_is_a_core() -> None:
     assert count_cores() >= 1
+
+
+def _blas_threads() -> set[int]:
+    libraries = threadpool_info()
+    return {library["num_threads"] for library in libraries if library["user_api"] == "blas"}
+
+
+def test_blas_takes_one_thread_while_a_function_has_its_own() -> None:
+    with threadpool_limits(2, user_api="blas"):
+        assert with_own_threads(_blas_threads)() == {1}
+        assert _blas_threads() == {2}
+
+
+def test_blas_has_its_threads_again_after_an_error() -> None:
+    with threadpool_limits(2, user_api="blas"):
+        with pytest.raises(ZeroDivisionError):
+            with_own_threads(divmod)(1, 0)
+        assert _blas_threads() == {2}
+
+
+def test_calibrations_have_threads_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = list[set[int]]()
+
+    def match(*arguments: object, **options: object) -> None:
+        seen.append(_blas_threads())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "match_in_rounds", match)
+    with threadpool_limits(2, user_api="blas"), pytest.raises(KeyboardInterrupt):
+        pipeline.calibrate("nowhere")
+    assert seen == [{1}]

@@ -9,9 +9,8 @@ for the motorway), scenes or seeds with them. ``--write`` writes the weights int
 model without cases keeps its own. Without ``--tune`` the package's weights are judged,
 or those of another version: ``--weights probability.json``.
 
-A result counts as off beyond 0.5 deg or 10 cm. Results that are off, and the others, count alike in
-the fit; the intercept is that of one result in ten that is off, as if users made so many mistakes,
-and the tables are weighted so. Weights are the most probable ones under a normal prior
+A result counts as off beyond 0.5 deg or 10 cm. Fit and tables are weighted as if one result in ten
+were off: as if users made so many mistakes. Weights are the most probable ones under a normal prior
 about values that are the same for all checks: one that has seen too little keeps nearly those.
 A kind of check that no case had makes a FAIL by itself from its limit of WARN on.
 """
@@ -51,8 +50,10 @@ OF_WORST = (WORST, "swapped_cameras")
 """What the model of runs has a weight of: 120 cases tell those of 40 kinds of checks too badly. A
 recording left out is foretold better by the worst check alone; a swap is a likelihood ratio."""
 LAST_OF_WORST = 1.0  # its spread: where it is 0, a FAIL would be no more probable than its limit
-RELIABLE, RELIABLE_SPREAD = 2.0, 1.0  # log odds
-INTERCEPT, INTERCEPT_SPREAD = -6.0, 1.0
+RELIABLE, RELIABLE_SPREAD = np.array([2.0, 0.0]), np.array([0.5, 1.0])
+"""Log odds of values and of error bars. Values count how seldom lenses are wrong, bars do not; and
+a wrong lens that is taken for right is a PASS."""
+INTERCEPT, INTERCEPT_SPREAD = -8.2, 1.0
 FILE = ROOT / "calibgraph" / "trust" / "probability.json"
 
 
@@ -85,7 +86,7 @@ def fit(samples: Sequence[Sample], level: str = TABLES) -> dict[str, Any]:
 def _most_probable(
     samples: Sequence[Sample], kinds: Sequence[str], spread: Array, *, of_worst: bool
 ) -> Array:
-    """Intercept where one result in ten is off, weights of the kinds, log odds of reliability."""
+    """Intercept, weights of the kinds, log odds of reliability."""
     rows = np.array(
         [[steps(sample.severities.get(kind, 0.0)) for kind in kinds] for sample in samples]
     ).reshape(len(samples), -1)
@@ -93,10 +94,9 @@ def _most_probable(
         np.array([getattr(sample, name) for sample in samples])
         for name in ("off", "by_bar", "by_values")
     )
-    counts = np.where(off, 0.5 / off.mean(), 0.5 / (1 - off.mean()))
-    one_in_ten = float(logit(SHARE_OFF))
-    usual = np.concatenate([[INTERCEPT + one_in_ten], np.tile(USUAL, len(kinds)), [RELIABLE] * 2])
-    spreads = np.concatenate([[INTERCEPT_SPREAD], spread, [RELIABLE_SPREAD] * 2])
+    counts = np.where(off, SHARE_OFF / off.mean(), (1 - SHARE_OFF) / (1 - off.mean()))
+    usual = np.concatenate([[INTERCEPT], np.tile(USUAL, len(kinds)), RELIABLE])
+    spreads = np.concatenate([[INTERCEPT_SPREAD], spread, RELIABLE_SPREAD])
 
     def complete(values: Array) -> Array:
         """With the weight that the limit of FAIL gives; tables rely on values and bars."""
@@ -109,7 +109,7 @@ def _most_probable(
 
     def loss(values: Array) -> float:
         z, (of_values, of_bar) = complete(values), expit(complete(values)[-2:])
-        right = expit(-(z[0] - one_in_ten + rows @ z[1:-2]))  # not grossly wrong
+        right = expit(-(z[0] + rows @ z[1:-2]))  # not grossly wrong
         p = 1 - right * (1 - of_values * by_values) * (1 - of_bar * by_bar)
         likelihood = counts * np.log(np.clip(np.where(off, p, 1 - p), 1e-12, 1.0))
         return float(-likelihood.sum() + (((values - usual) / spreads) ** 2).sum() / 2)

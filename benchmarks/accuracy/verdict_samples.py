@@ -19,6 +19,7 @@ from calibgraph.trust.probability import (
     probability_beyond,
     probability_by_values,
     worst_severities,
+    worst_sign,
 )
 
 Array = np.ndarray
@@ -105,7 +106,7 @@ def drop(sample: Sample, kinds: Collection[str]) -> Sample:
     """The sample without some kinds of checks."""
     left_out = {*kinds, WORST}
     kept = {kind: value for kind, value in sample.severities.items() if kind not in left_out}
-    return replace(sample, severities={**kept, WORST: max(kept.values(), default=0.0)})
+    return replace(sample, severities={**kept, WORST: worst_sign(kept)})
 
 
 def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[ErrorProbability]:

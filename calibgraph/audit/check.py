@@ -29,6 +29,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Status
 from calibgraph.model.versions import package_versions
 from calibgraph.overlaps import refine_with_camera_pairs
+from calibgraph.parallel import with_own_threads
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, assign_places
 from calibgraph.trust.competing_solution import competing_solution_checks
@@ -55,6 +56,7 @@ DOUBTS: tuple[Callable[[Evidence], Checks], ...] = (
 """Checks of the measurement; a FAIL of one makes it unusable. None compares it with its guess."""
 
 
+@with_own_threads
 def check(
     rig: Rig,
     dataset: Datasets,

@@ -74,10 +74,7 @@ def init(
         force: Replace the file, and the values in it.
     """
     from calibgraph.guessing.template import write_rig_template
-    from calibgraph.outputs import require_outside_dataset
 
-    if out is not None:
-        require_outside_dataset(out, [dataset])
     with checked_arguments():
         words = parse_names("--mount", mount)
         path = write_rig_template(dataset, out, mountings=words, forward=forward, replace=force)

@@ -162,11 +162,9 @@ def doctor(
     from calibgraph.doctor import diagnose
     from calibgraph.files import require_place_for_folder
     from calibgraph.io.rigs import load_rig
-    from calibgraph.outputs import require_outside_dataset
 
     if out is not None:
         require_place_for_folder(out)
-        require_outside_dataset(out, dataset)
     bag = chosen.bag
     with checked_arguments(), progress_bar("reading"):
         guess = load_rig(chosen.rig) if chosen.rig else None

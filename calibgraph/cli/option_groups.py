@@ -78,7 +78,6 @@ class MatchingOptions(DatasetOptions):
         iterations: Iterations of each network's recurrent update (default: 12).
         half_resolution: Halve the images or not (default: as stored with the weights, else from
             1400 px width on).
-        occlusion_filter: Leave out points that nearer surfaces occlude.
         batch: Images per batch (default: 1 on a CPU, 4 on a GPU).
     """
 
@@ -95,7 +94,6 @@ class MatchingOptions(DatasetOptions):
     half_resolution: Annotated[
         bool | None, _cmrnext_option("--half-resolution/--full-resolution")
     ] = None
-    occlusion_filter: Annotated[bool | None, _cmrnext_option()] = None
     batch: Annotated[int | None, _cmrnext_option(min=1)] = None
 
     @property

@@ -17,7 +17,6 @@ from calibgraph.outputs import (
     Output,
     marked_yaml,
     png_mark,
-    require_outside_dataset,
     require_writable,
 )
 
@@ -118,10 +117,6 @@ def keep_files(command: Callable[..., None]) -> Callable[..., None]:
         files = [file for name, each in writes.items() for file in each.outputs(given[name], given)]
         read = [value for name, value in given.items() if files and name not in writes]
         require_writable(files, [path for each in read for path in _files_at(each)])
-        for output in files:
-            require_outside_dataset(
-                output.path, (path for each in read for path in _folders_at(each))
-            )
         command(**given)
 
     return run
@@ -141,13 +136,6 @@ def _files_at(value: object) -> Iterator[Path]:
             yield rig
         else:
             yield from (file for suffix in TABLE_SUFFIXES for file in path.glob(f"*{suffix}"))
-
-
-def _folders_at(value: object) -> Iterator[Path]:
-    """The folders that an argument names."""
-    items = value if isinstance(value, (list, tuple)) else [value]
-    named = (Path(item) for item in items if isinstance(item, (str, Path)))
-    yield from (path for path in named if _exists(path) and path.is_dir())
 
 
 def _exists(path: Path) -> bool:

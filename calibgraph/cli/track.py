@@ -45,7 +45,7 @@ def track(
     Args:
         rig (RIG): Rig with the initial guess.
         source (SOURCE...): Table of correspondences (.parquet, .csv), a growing folder of them, or
-            - for standard input (an Arrow IPC stream, or a JSON line per frame). With --matcher:
+            - for standard input (a JSON line per frame). With --matcher:
             dataset folders, KITTI sequences or ROS bags of one rig, as one drive.
         out (DIR): Folder for the state, the result and a picture. A state in it is resumed.
         every: Take every N-th frame only.

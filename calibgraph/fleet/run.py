@@ -1,7 +1,7 @@
 """A manifest from its rows to the rows of its results: ``run_fleet``, all of them or a shard."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field
@@ -17,14 +17,6 @@ from calibgraph.progress import Progress, no_progress
 
 _READERS = 16  # threads that look at inputs: a listing of an object store takes 50 ms
 _STATE = ("vehicle", "recording", "status", "verdict", "error_kind", "input_hash", "versions")
-
-
-_ARRAYS = (
-    ("JOB_COMPLETION_INDEX", "JOB_COMPLETIONS", ""),  # Kubernetes sets no count
-    ("AWS_BATCH_JOB_ARRAY_INDEX", "AWS_BATCH_JOB_ARRAY_SIZE", ""),
-    ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_COUNT", "SLURM_ARRAY_TASK_MIN"),
-)
-"""Per scheduler, the variables of the index, the number of processes, and the first index."""
 
 
 @dataclass(frozen=True)
@@ -49,42 +41,17 @@ class Shard:
         return bucket % self.count == self.index
 
 
-def shard_from(text: str | None, environment: Mapping[str, str]) -> Shard:
-    """The shard of a text ``i/n`` or ``auto/n``, else the scheduler's array's, else all.
+def shard_from(text: str) -> Shard:
+    """The shard of a text ``i/n``.
 
     Raises:
-        CalibrationError: if it is neither, or the scheduler gave an index without a count.
+        CalibrationError: if it is none.
     """
-    index, slash, count = (text or "auto/").partition("/")
-    if not slash:
-        raise CalibrationError(f"--shard {text}: expected i/n, as 0/8, or auto/8")
-    if index == "auto":
-        found = _of_array(environment)
-        if found is None:
-            if text is None:
-                return Shard()
-            names = ", ".join(name for name, _, _ in _ARRAYS)
-            raise CalibrationError(f"--shard {text}: none of {names} is set; give i/n")
-        name, index, given = found
-        count = count or given
-        if not count:
-            raise CalibrationError(
-                f"{name} is {index}, but the number of shards is not known; give --shard auto/n"
-            )
+    index, _, count = text.partition("/")
     try:
         return Shard(int(index), int(count))
     except ValueError:
-        raise CalibrationError(f"--shard {index}/{count}: expected two whole numbers") from None
-
-
-def _of_array(environment: Mapping[str, str]) -> tuple[str, str, str] | None:
-    """The variable of the index, the index from 0, and the count or an empty text."""
-    for name, size, first in _ARRAYS:
-        index = environment.get(name, "")
-        if index.isdecimal():
-            start = environment.get(first, "0")
-            return name, str(int(index) - int(start)), environment.get(size, "")
-    return None
+        raise CalibrationError(f"--shard {text}: expected i/n, as 0/8") from None
 
 
 @dataclass(frozen=True)

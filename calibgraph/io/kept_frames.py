@@ -77,7 +77,7 @@ class KeptFrame(Frame):
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of the cloud and the images, by path."""
-        return self.frame.hashes()
+        return self.derive_for_all(("hashes", self.index), self.frame.hashes)
 
     def entry(self) -> dict[str, Any]:
         """The frame's number and files, as a result keeps them."""

@@ -43,6 +43,18 @@ class _Candidate:
     view: tuple[int, View] | None
 
 
+def without_copies(dataset: Dataset) -> Dataset:
+    """The dataset with one of the frames that have the same cloud and the same images.
+
+    A search would take what one frame shows by chance for the agreement of many.
+    """
+    contents = map_on_cores(lambda frame: tuple(frame.hashes().values()), dataset.frames)
+    kept = dict[tuple[str, ...], Frame]()
+    for content, frame in zip(contents, dataset.frames, strict=True):
+        kept.setdefault(content, frame)
+    return dataset if len(kept) == len(contents) else dataset.only([*kept.values()])
+
+
 def choose_frames(dataset: Dataset, rig: Rig, most: int) -> FrameChoice:
     """Choose frames spread over the recording; all of them if there are no more.
 

@@ -33,6 +33,12 @@ _ESTIMATED_AS = {
 
 # fmt: off
 CAUSES: dict[str, Cause] = {
+    "repeats": Cause(
+        "frames that repeat others",
+        "See why the named images or clouds repeat, and leave the repeats out.",
+        {"repeated frames": "", "repeated_frames": "Take frames while the vehicle drives.",
+         "stuck": "See why the same points come again: a LiDAR that stands, too, measures others."},
+    ),
     "guess": Cause(
         "the guess, or its convention",
         "Correct the guess: T_camera_lidar maps LiDAR points to x right, y down, z ahead, in "
@@ -58,7 +64,7 @@ CAUSES: dict[str, Cause] = {
     "time": Cause(
         "images and clouds of different times",
         "Pair each image with the cloud of its own instant: correct the time stamps or the offset.",
-        {"own_clouds": "", "clouds of another time": "", "repeated frames": "",
+        {"own_clouds": "", "clouds of another time": "",
          **dict.fromkeys(("time_offset", "lens_time_offset"), "Correct the time stamps, or "
                          "estimate the time of the images: --estimate offset."),
          "time_prior": "Check that the stamps of images and clouds, and the motion, are right. "
@@ -129,7 +135,6 @@ CAUSES: dict[str, Cause] = {
          "correspondences_used": "Give at least 50 matches.",
          "frames": "Record at least 5 frames, 10 s apart.",
          "difference between even and odd frames": "Record at least 5 frames, 10 s apart.",
-         "repeated_frames": "Take frames while the vehicle drives.",
          "image evidence": _STRUCTURE,
          "images": "Calibrate again from images and clouds.",
          "common_error": "State the error that all frames share (0 if none): common_deg and "

@@ -12,6 +12,7 @@ from calibgraph.model.threshold import in_unit
 
 MATCHES = "scatter of the matches"
 PLACES = "errors that a place shares"
+UNMODELLED = f"{PLACES}, which the preset does not model"
 COMMON = "common error of the matcher"
 ELEVATION = "LiDAR's elevation offset"
 STRETCH = "LiDAR's elevation scale"
@@ -19,6 +20,7 @@ MOTION = "LiDAR's motion during a scan"
 PAIRS = "images of camera pairs"
 PRIORS = "priors and relative poses"
 LENSES = "uncertain lenses and clocks"
+ESTIMATED = "estimated lenses and clocks"
 FLAT = "flat evidence of the images"
 
 NEEDED = 0.3
@@ -29,6 +31,16 @@ TIMES = (2, 3, 5, 10, 20, 1000)
 
 MOST_TIMES = TIMES[-1]
 """Stands for any number of frames, and is no advice."""
+
+_ADVICE = {
+    UNMODELLED: "Leave --preset out: auto weighs the errors that frames of a place share, and is "
+    "surer; the presets of the paper do not.",
+    LENSES: "State how well lenses and clocks are known (intrinsics_sigma_px, distortion_sigma, "
+    "time_offset_sigma_s), or calibrate them with a target.",
+    ESTIMATED: "Estimate fewer parts of the lens (--estimate), state how well it is known "
+    "(intrinsics_sigma_px, distortion_sigma), or calibrate it with a target.",
+}
+"""Where most of the error bar is of one of these sources."""
 
 _MOST = 0.5  # share of a source that is most of the error bar
 _MENTIONED = 0.05  # share of a source: smaller ones are left out of the sentence
@@ -77,11 +89,9 @@ class ErrorSources:
                 "Record frames at more places, of walls, poles or vehicles: these images hardly "
                 f"tell poses {in_unit(bar.sigma, bar.unit, 2)} apart."
             )
-        if bar.shares.get(LENSES, 0.0) > _MOST:
-            return (
-                "Estimate fewer parts of the lens (--estimate), state how well it is known "
-                "(intrinsics_sigma_px, distortion_sigma), or calibrate it with a target."
-            )
+        for source, advice in _ADVICE.items():
+            if bar.shares.get(source, 0.0) > _MOST:
+                return advice
         enough = (times for times, both in self.forecast.items() if _is_enough(both, tolerance))
         times = next(enough, MOST_TIMES)
         if times < MOST_TIMES:

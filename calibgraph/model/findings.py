@@ -5,32 +5,29 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError
 
 from calibgraph.errors import CorrespondenceError
+from calibgraph.files import describe
 from calibgraph.model.error_components import UNKNOWN, error_components
 
-_FINITE = ("z_score", "found", "missed", "chance")
 _OF_ONE_SEARCH = ("found", "missed", "chance")
-_PER_CAMERA = (*_FINITE, "start_dependence", "memorization", "failed_share")
+_PER_CAMERA = ("z_score", *_OF_ONE_SEARCH, "start_dependence", "memorization", "failed_share")
 _FORMER_KEYS = {"contrast": "z_score", "recall": "memorization"}
 IMAGES = "calibgraph_images"
 """Key of what the images said of a result; its content is of ``calibgraph.trust.image_record``."""
-STAGE1, _SOURCES = "stage1", ("pnp", "rig")
-_NUMBERS = {
-    "range_rotation_deg": 180.0,
-    "range_translation_m": 100.0,
-    "systematic_rotation_rad": math.pi,
-    "systematic_translation_m": 100.0,
-    "camera_share": 1.0,
-    "elevation_rad": math.pi,
-    "elevation_stretch": 1.0,
-    "scan_motion_m": 100.0,
-    "place_rotation_rad": math.pi,
-    "place_translation_m": 100.0,
-    "place_variance": 1e6,
-}
+STAGE1 = "stage1"
 _COMMON = {"systematic_rotation_rad", "systematic_translation_m"}
+
+
+_Number = Annotated[float, Field(strict=True)]
+_Finite = Annotated[_Number, Field(allow_inf_nan=False)]
+_Positive = Annotated[_Number, Field(ge=0)]
+_Angle = Annotated[_Positive, Field(le=math.pi)]
+_Length = Annotated[_Positive, Field(le=100)]
+_Share = Annotated[_Positive, Field(le=1)]
 
 
 @dataclass(frozen=True)
@@ -62,25 +59,25 @@ class MatcherFindings:
             frame's matches if they were independent.
     """
 
-    z_score: Mapping[str, float] = field(default_factory=dict)
-    start_dependence: Mapping[str, float] = field(default_factory=dict)
-    memorization: Mapping[str, float] = field(default_factory=dict)
-    failed_share: Mapping[str, float] = field(default_factory=dict)
-    found: Mapping[str, float] = field(default_factory=dict)
-    missed: Mapping[str, float] = field(default_factory=dict)
-    chance: Mapping[str, float] = field(default_factory=dict)
-    stage1: str = "pnp"
-    range_rotation_deg: float | None = None
-    range_translation_m: float | None = None
-    systematic_rotation_rad: float | None = None
-    systematic_translation_m: float | None = None
-    camera_share: float = 0.5
-    elevation_rad: float = 0.0
-    elevation_stretch: float = 0.0
-    scan_motion_m: float = 0.0
-    place_rotation_rad: float = 0.0
-    place_translation_m: float = 0.0
-    place_variance: float = 0.0
+    z_score: Mapping[str, _Finite] = field(default_factory=dict)
+    start_dependence: Mapping[str, _Number] = field(default_factory=dict)
+    memorization: Mapping[str, _Number] = field(default_factory=dict)
+    failed_share: Mapping[str, _Number] = field(default_factory=dict)
+    found: Mapping[str, _Finite] = field(default_factory=dict)
+    missed: Mapping[str, _Finite] = field(default_factory=dict)
+    chance: Mapping[str, _Finite] = field(default_factory=dict)
+    stage1: Literal["pnp", "rig"] = "pnp"
+    range_rotation_deg: Annotated[_Positive, Field(le=180)] | None = None
+    range_translation_m: _Length | None = None
+    systematic_rotation_rad: _Angle | None = None
+    systematic_translation_m: _Length | None = None
+    camera_share: _Share = 0.5
+    elevation_rad: _Angle = 0.0
+    elevation_stretch: _Share = 0.0
+    scan_motion_m: _Length = 0.0
+    place_rotation_rad: _Angle = 0.0
+    place_translation_m: _Length = 0.0
+    place_variance: Annotated[_Positive, Field(le=1e6)] = 0.0
 
     @staticmethod
     def from_metadata(metadata: Mapping[str, Any]) -> MatcherFindings:
@@ -92,16 +89,14 @@ class MatcherFindings:
             CorrespondenceError: if a value is not a number in its range.
         """
         former = {_FORMER_KEYS[key]: metadata[key] for key in _FORMER_KEYS if key in metadata}
-        metadata = {**former, **metadata}
-        values: dict[str, Any] = {key: _by_camera(metadata, key) for key in _PER_CAMERA}
-        for key, largest in _NUMBERS.items():
-            if key in metadata:
-                values[key] = _number(key, metadata[key], largest)
-        if STAGE1 in metadata:
-            values[STAGE1] = _source(metadata[STAGE1])
+        stated = {**former, **metadata}
+        values = {key: stated[key] for key in _KEYS & stated.keys() if stated[key] is not None}
         if not _COMMON & values.keys():
             values = _prior_of(metadata.get("matcher")) | values
-        return MatcherFindings(**values)
+        try:
+            return _READER.validate_python(values) if values else MatcherFindings()
+        except ValidationError as error:
+            raise CorrespondenceError(f"metadata {describe(error)}") from error
 
     def to_metadata(self) -> dict[str, Any]:
         """As keys of the metadata; findings without a value have no key."""
@@ -138,6 +133,10 @@ class MatcherFindings:
     def bend_sigmas(self) -> tuple[float, float, float]:
         """Scan distortion: elevation offset [rad], elevation scale, uncompensated motion [m]."""
         return self.elevation_rad, self.elevation_stretch, self.scan_motion_m
+
+
+_KEYS = {item.name for item in fields(MatcherFindings)}
+_READER = TypeAdapter(MatcherFindings)
 
 
 def joined_metadata(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -177,8 +176,10 @@ def _joined_images(records: Sequence[Any]) -> dict[str, list[str]]:
 
 def _size(value: Any) -> float:
     """Infinite for what is no number, so that it is kept, and refused when it is read."""
-    number = _to_float(value)
-    return number if isinstance(number, float) else math.inf
+    try:
+        return float(value) if isinstance(value, (int, float)) else math.inf
+    except OverflowError:
+        return math.inf
 
 
 def _prior_of(matcher: object) -> dict[str, float]:
@@ -186,47 +187,3 @@ def _prior_of(matcher: object) -> dict[str, float]:
     known = error_components().matchers
     named = isinstance(matcher, str) and matcher in known and matcher != UNKNOWN
     return vars(known[str(matcher)]) if named else {}
-
-
-def _by_camera(metadata: Mapping[str, Any], key: str) -> dict[str, float]:
-    values = metadata.get(key) or {}
-    if not isinstance(values, dict):
-        raise CorrespondenceError(
-            f"metadata {key!r} must map camera names to numbers, found {values!r}"
-        )
-    for camera, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise CorrespondenceError(
-                f"metadata {key!r} must map camera names to numbers, found {values!r}",
-                camera=camera,
-            )
-        if key in _FINITE and not math.isfinite(_to_float(value)):
-            raise CorrespondenceError(
-                f"metadata {key!r} must be finite, found {_to_float(value)!r}", camera=camera
-            )
-    return {camera: _to_float(value) for camera, value in values.items()}
-
-
-def _number(key: str, value: Any, largest: float) -> float:
-    number = _to_float(value)
-    if isinstance(value, bool) or not (isinstance(number, float) and 0 <= number <= largest):
-        raise CorrespondenceError(
-            f"metadata {key!r} must be a number from 0 to {largest:.3g}, found {number!r}"
-        )
-    return number
-
-
-def _source(value: Any) -> str:
-    if value not in _SOURCES:
-        raise CorrespondenceError(
-            f"metadata {STAGE1!r} must be {' or '.join(_SOURCES)}, found {value!r:.40}"
-        )
-    return str(value)
-
-
-def _to_float(value: Any) -> Any:
-    """A whole number as a float, infinite if it is too large; anything else as it is."""
-    try:
-        return float(value) if isinstance(value, int) else value
-    except OverflowError:
-        return math.inf if value > 0 else -math.inf

@@ -17,7 +17,7 @@ MOST = 3
 """Reasons and actions that are shown; the others are folded."""
 
 _CANNOT_TELL = "cannot tell: "
-_OF_DATA = ("error bar", "data")  # causes
+_OF_DATA = ("error bar", "data", "repeats")  # causes
 _WORST_FIRST: tuple[Status, ...] = ("FAIL", "WARN", "PASS")
 _PARTS = re.compile(r"--estimate [a-z,]+")
 _NUMBER = re.compile(r"(-?\d+(?:\.\d+)?)")

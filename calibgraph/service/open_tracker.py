@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import time
 from collections.abc import Iterator, Sequence
@@ -11,13 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calibgraph.errors import FileError
-from calibgraph.service.tracker_request import ARROW, FramesTaken, Refusal, TrackerRequest
+from calibgraph.service.tracker_request import FramesTaken, Refusal, TrackerRequest
 
 if TYPE_CHECKING:
     from calibgraph.tracking.durable import DurableCalibrator
     from calibgraph.tracking.history import History
-    from calibgraph.tracking.streams import Item, Refused, StreamFrame
+    from calibgraph.tracking.streams import Refused, StreamFrame
     from calibgraph.tracking.update import Update
 
 HISTORY = "history.state"
@@ -115,13 +113,14 @@ def take_frames(tracker: OpenTracker, request: TrackerRequest) -> FramesTaken | 
         OSError: if they cannot be written; then abandon the tracker, and open it anew.
     """
     from calibgraph.tracking.frame_group import in_groups
+    from calibgraph.tracking.stream_lines import frames_of_lines
     from calibgraph.tracking.update import json_lines
 
     wrong = _first_of_no_vehicle(request)
     if wrong is not None:
         return Refusal(422, f"{wrong.message}; none of these frames was taken in")
     taken = _Taken()
-    groups = in_groups(_items(request, taken.refused), min(_TOGETHER, _WRITE_FRAMES))
+    groups = in_groups(frames_of_lines([request.body], "frames"), min(_TOGETHER, _WRITE_FRAMES))
     while _take_by_one_write(tracker, groups, taken):
         pass
     lines = ", ".join(json_lines(taken.updates))
@@ -131,12 +130,13 @@ def take_frames(tracker: OpenTracker, request: TrackerRequest) -> FramesTaken | 
 
 def _first_of_no_vehicle(request: TrackerRequest) -> Refused | None:
     """The first frame with a motion of no vehicle; a body that states motions is read twice."""
-    from calibgraph.model.table_columns import TWIST
+    from calibgraph.tracking.stream_lines import frames_of_lines
     from calibgraph.tracking.streams import Refused
 
-    if not any(key in request.body for key in (b"twist_per_s", TWIST[0].encode())):
+    if b"twist_per_s" not in request.body:
         return None
-    found = (item for item in _items(request, []) if isinstance(item, Refused))
+    items = frames_of_lines([request.body], "frames")
+    found = (item for item in items if isinstance(item, Refused))
     return next((item for item in found if item.by_motion), None)
 
 
@@ -174,17 +174,3 @@ def _take(calibrator: DurableCalibrator, group: list[StreamFrame] | Refused, tak
             taken.refused.append(found.message)
         else:
             taken.updates += found
-
-
-def _items(request: TrackerRequest, refused: list[str]) -> Iterator[Item]:
-    """The frames of a body; a stream that breaks off is refused after its whole frames."""
-    from calibgraph.tracking.stream_lines import frames_of_lines
-    from calibgraph.tracking.stream_tables import frames_of_batches
-
-    try:
-        if request.content_type == ARROW:
-            yield from frames_of_batches(io.BytesIO(request.body), "frames")
-        else:
-            yield from frames_of_lines([request.body], "frames")
-    except FileError as error:
-        refused.append(str(error))

@@ -19,7 +19,7 @@ from calibgraph.service.routes_jobs import utc
 from calibgraph.service.settings import MAX_JSON_BYTES
 from calibgraph.service.state import Service, State
 from calibgraph.service.submission import parse_json
-from calibgraph.service.tracker_request import ARROW, Action, TrackerRequest
+from calibgraph.service.tracker_request import Action, TrackerRequest
 from calibgraph.yaml_text import yaml_text
 
 router = APIRouter(prefix="/v1/trackers")
@@ -31,7 +31,6 @@ _FRAMES_BODY = {
         "required": True,
         "content": {
             "application/x-ndjson": {"schema": {"type": "string", "format": "binary"}},
-            ARROW: {"schema": {"type": "string", "format": "binary"}},
         },
     }
 }
@@ -180,13 +179,13 @@ def list_trackers(state: State, caller: Reader) -> list[TrackerAnswer]:
     openapi_extra=_FRAMES_BODY,
 )
 async def add_frames(id: TrackerId, request: Request, state: State, caller: Submitter) -> Response:
-    """Take in frames: JSON lines, or an Arrow IPC stream. What is answered is on disk."""
+    """Take in frames, as JSON lines. What is answered is on disk."""
     await run_in_threadpool(find_tracker, state, caller, id)
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if media not in (*_LINES, ARROW):
-        raise Problem(415, f"send {_LINES[0]}, a frame a line, or {ARROW}")
+    if media not in _LINES:
+        raise Problem(415, f"send {_LINES[0]}, a frame a line")
     body = await state.memory.read(request, caller.tenant, state.settings.frames_bytes)
-    frames = TrackerRequest("frames", str(state.folder.of_tracker(id)), body, media)
+    frames = TrackerRequest("frames", str(state.folder.of_tracker(id)), body)
     taken = await state.trackers.answer(id, caller.tenant, frames)
     state.metrics.frames.inc(taken.count)
     return Response(taken.body, media_type="application/json")

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 Action = Literal["create", "frames", "state", "plot", "remove", "close all"]
-ARROW = "application/vnd.apache.arrow.stream"
 
 
 @dataclass(frozen=True)
@@ -14,7 +13,6 @@ class TrackerRequest:
     action: Action
     folder: str
     body: bytes = b""
-    content_type: str = ""
     config: str = "{}"
 
 

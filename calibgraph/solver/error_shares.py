@@ -17,6 +17,7 @@ from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.model.error_sources import (
     COMMON,
     ELEVATION,
+    ESTIMATED,
     LENSES,
     MATCHES,
     MOTION,
@@ -126,7 +127,9 @@ def _of_shared(linear: Linearization) -> Variances:
     ends = dict(zip(keys, np.cumsum(sizes), strict=True))
     hessian = join_linear(linear.shared, linear.left_by_places).hessian(to_ordering(keys))[0]
     covariance = np.linalg.inv(hessian)[: 6 * len(model.cameras)]
-    found = dict.fromkeys((COMMON, PAIRS, LENSES, *_DISTORTIONS, PRIORS), np.zeros(len(covariance)))
+    found = dict.fromkeys(
+        (COMMON, PAIRS, LENSES, ESTIMATED, *_DISTORTIONS, PRIORS), np.zeros(len(covariance))
+    )
     for number in range(linear.shared.size()):
         factor = linear.shared.at(number)
         if isinstance(factor, gtsam.HessianFactor):
@@ -140,7 +143,8 @@ def _of_shared(linear: Linearization) -> Variances:
                 found[name] = found[name] + part
             continue
         source = PAIRS if "n" in letters else COMMON if letters & {"m", "o", "y"} else PRIORS
-        source = LENSES if letters & {"l", "b"} and "m" not in letters else source
+        if "m" not in letters and letters & {"l", "b"}:
+            source = ESTIMATED if "l" in letters else LENSES
         found[source] = found[source] + (moved**2).sum(axis=1)
     return found
 

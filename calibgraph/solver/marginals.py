@@ -16,7 +16,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.error_sources import COMMON, FLAT, PAIRS, PLACES, TIMES, ErrorSources
+from calibgraph.model.error_sources import COMMON, FLAT, PAIRS, TIMES, UNMODELLED, ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
@@ -165,7 +165,7 @@ class Marginals:
             for findings in (self.findings, no_places)
         )
         between = np.diag(error_between(T_camera_lidar, inliers.pairs))
-        return {COMMON: common, PLACES: every - common, PAIRS: between}
+        return {COMMON: common, UNMODELLED: every - common, PAIRS: between}
 
     @cached_property
     def shared_variance_ratio(self) -> float:

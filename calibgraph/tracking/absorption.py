@@ -236,6 +236,29 @@ def add_to_totals(state: State, frames: Sequence[LiveFrame]) -> State:
     )
 
 
+def count_repeats(state: State, given: Correspondences, new: Correspondences) -> State:
+    """The state with the frames in a row counted, per camera, that repeat the one before them.
+
+    Args:
+        state: of the tracker.
+        given: the correspondences of a frame.
+        new: those of cameras that do not repeat.
+    """
+    if given is new and not any(one.counts.get("repeated") for one in state.cameras):
+        return state
+    again = np.setdiff1d(given.camera_index, new.camera_index)
+    for number in np.unique(given.camera_index).tolist():
+        name = given.cameras[number]
+        camera = state.names.index(name)
+        counts = state.cameras[camera].counts
+        before = counts.get("repeated", 0)
+        repeated = before + 1 if number in again else 0
+        if repeated != before:
+            one = changed(state.cameras[camera], counts={**counts, "repeated": repeated})
+            state = state.with_camera(camera, one)
+    return state
+
+
 def count_absent(state: State, used: Collection[int], frame: Incoming) -> tuple[State, list[Event]]:
     """The state with the frames without usable matches counted; events ``blind`` and ``back``.
 

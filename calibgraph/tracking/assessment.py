@@ -14,7 +14,7 @@ from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
 from calibgraph.model.lens_estimate import LensEstimate, with_sigmas
 from calibgraph.model.rig import RelativePose, Rig
-from calibgraph.model.verdict import Check, Verdict
+from calibgraph.model.verdict import Check, Status, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.lens_estimates import estimates_of
@@ -182,8 +182,15 @@ def _verdict(
     return Verdict((*check_estimate(estimate), *_recent_checks(state, one, lens)))
 
 
+def _stuck_check(one: CameraState, status: Status) -> Check:
+    text = f"the last {one.counts['repeated'] + 1} frames with matches have the same points"
+    return Check("stuck", status, f"{text}: its stream is stuck, or sends them again")
+
+
 def _start_check(state: State, one: CameraState) -> Verdict:
     needed = state.config.tracking.start_frames
+    if one.counts.get("repeated", 0) >= len(one.waiting) > 0:
+        return Verdict((_stuck_check(one, "FAIL"),))
     waiting = (f"{len(one.waiting)} of {needed} frames with matches",)
     return Verdict(
         tuple(
@@ -196,7 +203,10 @@ def _start_check(state: State, one: CameraState) -> Verdict:
 def _recent_checks(state: State, one: CameraState, lens: tuple[LensEstimate, ...]) -> list[Check]:
     """Checks of a camera's last frames."""
     checks = []
-    if one.absent >= state.config.tracking.blind_frames:
+    limit = state.config.tracking.blind_frames
+    if one.counts.get("repeated", 0) >= limit:
+        checks.append(_stuck_check(one, "WARN"))
+    elif one.absent >= limit:
         text = f"no usable matches in the last {one.absent} frames"
         checks.append(Check("blind frames", "WARN", text, one.absent))
     if one.summary.walk:

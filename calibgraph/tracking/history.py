@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from calibgraph.arrays import Array
 from calibgraph.files import write_bytes
@@ -25,42 +24,7 @@ if TYPE_CHECKING:
 _MOST_EVENTS = 1000
 _POSE = 6
 _NUMBERS = 7  # of a camera: its pose and its time offset
-_ENTRY_AXES = 3  # update, camera, number
-
-
-class _Saved(BaseModel):
-    """What a file holds of a :class:`History`."""
-
-    model_config = ConfigDict(
-        strict=True, arbitrary_types_allowed=True, revalidate_instances="always"
-    )
-
-    most: int = Field(ge=2)
-    stride: int = Field(ge=1)
-    updates: int = Field(ge=0)
-    origins: dict[str, np.ndarray]
-    begun: tuple[str, ...]
-    frames: np.ndarray
-    entries: np.ndarray
-    events: tuple[Event, ...]
-
-    @field_validator("entries")
-    @classmethod
-    def _with_offsets(cls, entries: Array) -> Array:
-        """Earlier files have none: pose and its sigmas alone."""
-        if entries.ndim != _ENTRY_AXES or entries.shape[-1] != 2 * _POSE:
-            return entries
-        return np.insert(entries, [_POSE, 2 * _POSE], np.nan, axis=-1)
-
-    @model_validator(mode="after")
-    def _check_arrays(self) -> Self:
-        entries, n = self.entries, self.frames.size
-        alike = {(T.shape, T.dtype.str) for T in self.origins.values()} <= {((4, 4), "<f8")}
-        whole = (self.frames.shape, self.frames.dtype.str) == ((n,), "<i8") and n <= self.most
-        shape = n, len(self.origins), 2 * _NUMBERS
-        if not (alike and whole and (entries.shape, entries.dtype.str) == (shape, "<f8")):
-            raise ValueError("its arrays contradict each other")
-        return self
+_SAVED = "most", "stride", "updates", "origins", "begun", "frames", "entries", "events"
 
 
 class History:
@@ -176,7 +140,7 @@ class History:
 
     def save(self, path: Path) -> None:
         """Write the history to a file, atomically; see :meth:`load`."""
-        content = {name: getattr(self, f"_{name}") for name in _Saved.model_fields}
+        content = {name: getattr(self, f"_{name}") for name in _SAVED}
         held = {name: content[name][: self._held] for name in ("frames", "entries")}
         write_bytes(path, encode({**content, **held, "begun": [*self._begun]}, "history"))
 
@@ -184,17 +148,18 @@ class History:
     def load(path: Path) -> History:
         """The history of a file that :meth:`save` wrote; an empty one if there is none.
 
-        A file that cannot be read gives an empty history too: it is for the eye alone.
+        A file that is damaged or of another version gives an empty history too: it is for the eye
+        alone.
         """
-        try:
-            saved = _Saved.model_validate(decode(path.read_bytes(), "history"))
-            rooms = {
-                name: _room(getattr(saved, name), saved.most) for name in ("frames", "entries")
-            }
-        except (OSError, StateError, ValueError, MemoryError):
-            return History()
         history = History()
-        content = {**dict(saved), **rooms, "begun": {*saved.begun}, "held": len(saved.frames)}
+        try:
+            saved = decode(path.read_bytes(), "history")
+        except (OSError, StateError):
+            return history
+        if saved["entries"].shape[-1] == 2 * _POSE:  # of a version without time offsets
+            saved["entries"] = np.insert(saved["entries"], [_POSE, 2 * _POSE], np.nan, axis=-1)
+        rooms = {name: _room(saved[name], saved["most"]) for name in ("frames", "entries")}
+        content = {**saved, **rooms, "begun": {*saved["begun"]}, "held": len(saved["frames"])}
         vars(history).update({f"_{name}": value for name, value in content.items()})
         return history
 

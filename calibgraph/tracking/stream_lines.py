@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import accumulate
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -28,7 +27,7 @@ from pydantic_core import from_json
 
 from calibgraph.errors import CorrespondenceError, MotionError
 from calibgraph.files import describe
-from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.table_columns import COORDINATES, INFORMATION, as_confidence
 from calibgraph.tracking.frame_order import LONGEST_PLACE, with_place
@@ -105,57 +104,27 @@ class FrameLine(BaseModel):
             CorrespondenceError: if a value is out of its range.
         """
         metadata = {**header, **self.metadata}
-        table = self._table(metadata) if self.cameras else _EMPTY.with_metadata(metadata)
+        parts = [self._of_camera(*item) for item in self.cameras.items()] or [_EMPTY]
+        table = concatenate(parts).with_metadata(metadata)
         return StreamFrame(self.frame, with_place(table, self.place))
 
-    def _table(self, metadata: dict[str, Any]) -> Correspondences:
-        """The rows of all cameras, in the order of the line."""
-        names, parts = tuple(sorted(self.cameras)), [*self.cameras.values()]
-        counts = [len(part.u_px) for part in parts]
-        given, n = set[str]().union(*(part.model_fields_set for part in parts)), sum(counts)
+    def _of_camera(self, name: str, columns: CameraColumns) -> Correspondences:
+        """The rows of one camera."""
+        n, given = len(columns.u_px), columns.model_fields_set
         stamped, twist = "stamp_ns" in self.model_fields_set, self.twist_per_s
-        try:
-            return Correspondences(
-                cameras=names,
-                camera_index=np.repeat([*map(names.index, self.cameras)], counts).astype(np.int32),
-                frame=np.full(n, self.frame, np.int64),
-                pixels_px=np.concatenate([part.array(COORDINATES[:2]) for part in parts]),
-                points_lidar_m=np.concatenate([part.array(COORDINATES[2:]) for part in parts]),
-                confidence=_confidence(parts),
-                information_px=_information(parts) if INFORMATION[0] in given else None,
-                stamp_ns=np.full(n, self.stamp_ns, np.int64) if stamped else None,
-                point_index=_indices(parts) if "point_index" in given else None,
-                twist_per_s=None if twist is None else np.tile(twist, (n, 1)),
-                metadata=metadata,
-            )
-        except CorrespondenceError as error:  # of a row: the lists of a camera have numbers
-            before = dict(zip(self.cameras, accumulate(counts, initial=0), strict=False))
-            raise error.after(-before.get(error.camera or "", 0)) from None
-
-
-def _confidence(parts: Sequence[CameraColumns]) -> NDArray[np.float32]:
-    """(n,) of all rows; 1 where a camera states none."""
-    return as_confidence(np.concatenate([
-        np.array(part.confidence, np.float64) if "confidence" in part.model_fields_set
-        else np.ones(len(part.u_px))
-        for part in parts
-    ]))  # fmt: skip
-
-
-def _information(parts: Sequence[CameraColumns]) -> NDArray[np.float64]:
-    """(n, 3) of all rows; the identity where a camera states none."""
-    return np.concatenate([
-        part.array(INFORMATION) if INFORMATION[0] in part.model_fields_set
-        else np.tile([1.0, 0.0, 1.0], (len(part.u_px), 1))
-        for part in parts
-    ])  # fmt: skip
-
-
-def _indices(parts: Sequence[CameraColumns]) -> NDArray[np.int64]:
-    """(n,) number of each row's point, or -1."""
-    return np.concatenate(
-        [np.array(part.point_index or [-1] * len(part.u_px), np.int64) for part in parts]
-    )
+        indexed = any("point_index" in each.model_fields_set for each in self.cameras.values())
+        return Correspondences(
+            cameras=(name,),
+            camera_index=np.zeros(n, np.int32),
+            frame=np.full(n, self.frame, np.int64),
+            pixels_px=columns.array(COORDINATES[:2]),
+            points_lidar_m=columns.array(COORDINATES[2:]),
+            confidence=as_confidence(columns.confidence if "confidence" in given else np.ones(n)),
+            information_px=columns.array(INFORMATION) if INFORMATION[0] in given else None,
+            stamp_ns=np.full(n, self.stamp_ns, np.int64) if stamped else None,
+            point_index=np.array(columns.point_index or [-1] * n, np.int64) if indexed else None,
+            twist_per_s=None if twist is None else np.tile(twist, (n, 1)),
+        )
 
 
 def frames_of_lines(chunks: Iterable[bytes], where: str) -> Iterator[Item]:

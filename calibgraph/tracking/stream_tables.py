@@ -1,4 +1,4 @@
-"""Frames of correspondences from Arrow data: a Parquet or CSV file, or an Arrow IPC stream."""
+"""Frames of correspondences from a Parquet or CSV file."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def frames_of_table(path: Path) -> Iterator[Item]:
         FileError: wherever the file turns out not to be readable.
     """
     for table in _parts_of_file(require_file(path)):
-        yield from frames_in(table, str(path), ascending=True)
+        yield from _frames_in(table, str(path))
 
 
 def require_plausible_motion(path: Path) -> None:
@@ -175,17 +175,17 @@ def require_schema(where: Path | str, schema: pa.Schema) -> None:
         raise FileError(where, str(error)) from error
 
 
-def frames_in(table: pa.Table, where: str, *, ascending: bool) -> Iterator[Item]:
-    """The frames of a table with a checked schema, ascending or as they first appear."""
+def _frames_in(table: pa.Table, where: str) -> Iterator[Item]:
+    """The frames of a table with a checked schema, in ascending order."""
     if table["frame"].null_count:
         count = table["frame"].null_count
         yield refused(where, f"column 'frame' is empty in {count} rows; fill in or drop them")
         table = table.filter(table["frame"].is_valid())
-    for rows in _split_by_frame(table, ascending=ascending):
+    for rows in _split_by_frame(table):
         yield _frame_or_refused(rows, where)
 
 
-def _split_by_frame(table: pa.Table, *, ascending: bool) -> Iterator[pa.Table]:
+def _split_by_frame(table: pa.Table) -> Iterator[pa.Table]:
     if not len(table):
         return
     frames = table["frame"].to_numpy()
@@ -195,8 +195,8 @@ def _split_by_frame(table: pa.Table, *, ascending: bool) -> Iterator[pa.Table]:
     lengths = np.diff(starts, append=len(frames))
     if (order[1:] < order[:-1]).any():
         table = table.take(order)
-    for group in range(len(starts)) if ascending else np.argsort(order[starts]):
-        yield table.slice(starts[group], lengths[group])
+    for start, length in zip(starts, lengths, strict=True):
+        yield table.slice(start, length)
 
 
 def _frame_or_refused(rows: pa.Table, where: str) -> Item:
@@ -207,46 +207,3 @@ def _frame_or_refused(rows: pa.Table, where: str) -> Item:
     except CorrespondenceError as error:
         found = f"frame {number} is left out; among its rows, {error}"
         return refused(where, found, by_motion=isinstance(error, MotionError))
-
-
-def frames_of_batches(file: Any, where: str) -> Iterator[Item]:
-    """The frames of an Arrow IPC stream with the columns of the Parquet file.
-
-    Every record batch holds one or several whole frames, which are given in the order in which they
-    first appear. A frame without rows cannot be expressed.
-
-    Args:
-        file: with ``read``, ``close`` and ``closed``.
-        where: the name of the file in messages.
-
-    Raises:
-        FileError: wherever the stream turns out not to be readable.
-    """
-    for number, batch in enumerate(_batches(file, where), start=1):
-        yield from _frames_of_batch(batch, f"{where}, batch {number}")
-
-
-def _batches(file: Any, where: str) -> Iterator[pa.RecordBatch]:
-    import pyarrow as pa
-    from pyarrow import ipc
-
-    count = 0
-    try:
-        with ipc.open_stream(pa.PythonFile(file, mode="r")) as reader:
-            require_schema(where, reader.schema)
-            for count, batch in enumerate(reader, start=1):  # noqa: B007 - for the message
-                yield batch
-    except (pa.ArrowException, OSError, ValueError) as error:
-        message = f"the Arrow stream breaks off after {count} batches ({error}); send it again"
-        raise FileError(where, message) from error
-
-
-def _frames_of_batch(batch: pa.RecordBatch, where: str) -> Iterator[Item]:
-    import pyarrow as pa
-
-    try:
-        batch.validate(full=True)
-    except pa.ArrowException as error:
-        yield refused(where, f"is damaged ({error}); send it again")
-        return
-    yield from frames_in(pa.Table.from_batches([batch]), where, ascending=False)

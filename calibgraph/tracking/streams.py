@@ -11,6 +11,7 @@ import stat
 import sys
 import time
 from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,7 +22,6 @@ from calibgraph.tracking.stream_tables import (
     Item,
     Refused,
     StreamFrame,
-    frames_of_batches,
     frames_of_table,
     require_plausible_motion,
 )
@@ -34,14 +34,10 @@ POLL_S = 0.2
 QUIET_S = 2.0
 """A file that has not changed for this long is complete, or will never be."""
 
-MAX_READ_BYTES = 256 * 2**20
-"""Of one part of an Arrow message: a damaged length must not fill the memory."""
-
 _CHUNK_BYTES = 2**16
 _STANDARD_INPUT = "standard input"
-_ARROW_STREAM = b"\xff\xff\xff\xff"
 _DATASET = "to track a dataset, say what matches its frames: --matcher structure"
-_FILES_NOT_STREAMS = {b"PAR1": "a Parquet file", b"ARROW1": "an Arrow file"}
+_NOT_LINES = {b"PAR1": "a Parquet file", b"\xff\xff\xff\xff": "an Arrow stream"}
 
 
 def frames_of(
@@ -185,86 +181,38 @@ def _is_table_name(path: Path) -> bool:
 
 
 def frames_of_input(file: BinaryIO, *, stop: Callable[[], bool]) -> Iterator[Item]:
-    """The frames of an Arrow IPC stream or of JSON lines; the first bytes show which it is.
+    """The frames of JSON lines.
 
     Args:
         file: for example standard input: if it has a descriptor, waiting for it can be stopped.
         stop: called while waiting, every ``POLL_S``; True ends the input.
 
     Raises:
-        FileError: wherever the stream turns out not to be readable.
+        FileError: if the stream turns out not to be readable.
     """
-    feed = _Feed(file, stop)
-    if feed.starts_with(_ARROW_STREAM):
-        yield from frames_of_batches(feed, _STANDARD_INPUT)
-        return
-    for mark, kind in _FILES_NOT_STREAMS.items():
-        if feed.starts_with(mark):
-            raise FileError(_STANDARD_INPUT, f"is {kind}; send an Arrow stream or JSON lines")
-    yield from frames_of_lines(iter(feed.some, b""), _STANDARD_INPUT)
+    chunks = _chunks(file, stop)
+    first = next(chunks, b"")
+    for mark, kind in _NOT_LINES.items():
+        if first.startswith(mark):
+            raise FileError(_STANDARD_INPUT, f"is {kind}; send a line of JSON per frame")
+    yield from frames_of_lines(chain([first], chunks), _STANDARD_INPUT)
 
 
-class _Feed:
-    """The bytes of a file as they come, until it ends or is to be stopped.
-
-    It has the methods of a Python file that Arrow needs.
-    """
-
-    closed = False
-
-    def __init__(self, file: BinaryIO, stop: Callable[[], bool]) -> None:
-        self._read_some: Callable[[int], bytes | None] = getattr(file, "read1", file.read)
-        self._ready = _poll(file)
-        self._stop = stop
-        self._held = b""
-
-    def starts_with(self, mark: bytes) -> bool:
-        """Whether the bytes begin with a mark; reads no more of them than that takes."""
-        while len(self._held) < len(mark) and mark.startswith(self._held):
-            more = self._wait_for_some(_CHUNK_BYTES)
-            if not more:
-                break
-            self._held += more
-        return self._held.startswith(mark)
-
-    def some(self, most_bytes: int = _CHUNK_BYTES) -> bytes:
-        """At least one byte, at most so many, or none at the end."""
-        if self._held:
-            some, self._held = self._held[:most_bytes], self._held[most_bytes:]
-            return some
-        return self._wait_for_some(most_bytes)
-
-    def read(self, size_bytes: int) -> bytes:
-        """So many bytes, fewer only at the end.
-
-        Raises:
-            FileError: if they are too many.
-        """
-        if size_bytes > MAX_READ_BYTES:
-            found = f"a message of {size_bytes} bytes, expected at most {MAX_READ_BYTES}"
-            raise FileError(_STANDARD_INPUT, f"holds {found}; send smaller batches")
-        read = bytearray()
-        while len(read) < size_bytes:
-            some = self.some(min(size_bytes - len(read), _CHUNK_BYTES))
-            if not some:
-                break
-            read += some
-        return bytes(read)
-
-    def close(self) -> None:
-        """Nothing: the file belongs to the caller."""
-
-    def _wait_for_some(self, most_bytes: int) -> bytes:
-        while not self._stop():
-            if self._ready is not None and not self._ready.poll(1000 * POLL_S):
-                continue
-            try:
-                some = self._read_some(most_bytes)
-            except (OSError, ValueError) as error:
-                raise FileError(_STANDARD_INPUT, f"cannot be read ({error}); restart") from error
-            if some is not None:
-                return some
-        return b""
+def _chunks(file: BinaryIO, stop: Callable[[], bool]) -> Iterator[bytes]:
+    """The bytes of a file as they come, until it ends or is to be stopped."""
+    read: Callable[[int], bytes | None] = getattr(file, "read1", file.read)
+    ready = _poll(file)
+    while not stop():
+        if ready is not None and not ready.poll(1000 * POLL_S):
+            continue
+        try:
+            some = read(_CHUNK_BYTES)
+        except (OSError, ValueError) as error:
+            raise FileError(_STANDARD_INPUT, f"cannot be read ({error}); restart") from error
+        if some:
+            yield some
+        elif some is not None:
+            return
 
 
 def _poll(file: BinaryIO) -> select.poll | None:

@@ -22,6 +22,7 @@ from calibgraph.tracking.absorption import (
     begin_frame,
     blocks_by_camera,
     count_absent,
+    count_repeats,
     select_agreeing,
 )
 from calibgraph.tracking.assessment import Assessment, MeasureOnFrames, assess, to_calibration
@@ -137,6 +138,7 @@ class IncrementalCalibrator:
         new = without_repeats(self._state, one.table)
         blocks = blocks_by_camera(self._state, new)
         with self._undone_on_error([one]):
+            self._state = count_repeats(self._state, one.table, new)
             return self._take(one, new, blocks)
 
     def update_together(self, frames: Sequence[StreamFrame]) -> list[Update]:
@@ -206,6 +208,7 @@ class IncrementalCalibrator:
         self._state, used = absorb(self._state, self._closed, blocks, len(group))
         taken = []
         for one, own in zip(group, used, strict=True):
+            self._state = count_repeats(self._state, one.table, one.table)
             self._state, events = count_absent(self._state, own, one)
             taken.append((one, events, own))
         taken[-1][1].extend(self._end_frames(len(group)))

@@ -33,7 +33,7 @@ from calibgraph.trust.rematch_checks import (
     going_on_checks,
     last_round_checks,
     rematch_checks,
-    repeated_cloud_checks,
+    repeated_file_checks,
     time_limit_checks,
 )
 from calibgraph.trust.run_evidence import RunEvidence
@@ -70,7 +70,7 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
 RUN_CHECKS: tuple[Callable[[RunEvidence], Checks], ...] = (
     last_round_checks,          # have the rounds of matching converged?
     range_checks,               # is the result within the matcher's range?
-    repeated_cloud_checks,      # are the frames independent?
+    repeated_file_checks,       # are the frames independent?
     rematch_checks,             # does matching from a displaced start end here?
     going_on_checks,            # did the rounds end elsewhere first?
     time_limit_checks,          # was anything left out for lack of time?

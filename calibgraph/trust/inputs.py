@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -34,6 +34,22 @@ class Finding:
 
     level: Level
     text: str
+
+
+def describe_repeats(what: str, digests: Iterable[tuple[str, str]]) -> str:
+    """A line on frames with the same cloud or image, which are not independent; empty if none are.
+
+    Args:
+        what: the cloud, or the image of a camera.
+        digests: the name of each frame, and a digest of what it has.
+    """
+    first: dict[str, str] = {}
+    repeated = [(first[d], name) for name, d in digests if first.setdefault(d, name) != name]
+    if not repeated:
+        return ""
+    others = f", and {len(repeated) - 1} more repeat one" if repeated[1:] else ""
+    one, other = repeated[0]
+    return f"frames {one} and {other} have the same {what}{others}; leave repeats out"
 
 
 def find_doubts(rig: Rig, frame: Frame, cloud: Cloud) -> list[str]:

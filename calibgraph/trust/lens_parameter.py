@@ -144,7 +144,8 @@ class LensParameter:
         What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
         wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. An
         aspect ratio or skew as no lens has it counts also if set free it moves the camera little:
-        matches from rounds have followed it.
+        matches from rounds have followed it. Beyond the default tolerance it counts as far as half
+        of it, as an angle, is beyond the default, too.
         """
         if not math.isfinite(self.sigma):  # not determined
             return 0.0
@@ -158,7 +159,10 @@ class LensParameter:
         after = _share_beyond(tolerated, gain**2 * self.size, gain * self.sigma)
         before = _share_beyond(tolerated, 0.0, spreads)
         if self.name in SHAPES:
-            after[1] = before[1] = 1.0
+            wider = min(one / usual for one, usual in zip(tolerance, TOLERANCE, strict=True)) - 1
+            half = math.radians(TOLERANCE[0]) * max(wider, 0.0) / (self.units[0] / 2)
+            after[1] = _share_beyond(half, gain[1] ** 2 * self.size, gain[1] * self.sigma)
+            before[1] = _share_beyond(half, 0.0, spreads[1])
         if_wrong = max(is_wrong * after[1] - share * before[1], 0.0)
         return float(if_wrong + (1 - is_wrong) * max(after[0] - before[0], 0.0))
 

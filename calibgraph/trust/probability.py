@@ -1,11 +1,11 @@
 """The probability that a result is off by more than the tolerance, from which verdicts are cut.
 
 Three ways to be off. Grossly, in a way that checks notice: a logistic model of how bad the worst
-check is, and single ones besides, which can only grow as a check gets worse. By a wrong lens, or by
-a pose that a search found by chance: checks whose value is a probability. And by the error bar
-itself, if it is wide beside the tolerance. The last two hold as far as they did in the cases fitted
-to. The weights are fitted by ``benchmarks.accuracy.probability``, on results that were made wrong
-on purpose and right ones, and kept in ``probability.json`` with how they were got.
+sign of an error is, and single checks besides, which can only grow as a check gets worse. By a
+wrong lens, or by a pose that a search found by chance: checks whose value is a probability. And by
+the error bar itself, if it is wide beside the tolerance. The last two hold as far as they did in
+the cases fitted to. The weights are fitted by ``benchmarks.accuracy.probability``, on results that
+were made wrong on purpose and right ones, and kept in ``probability.json``, with how they were got.
 """
 
 from __future__ import annotations
@@ -95,8 +95,9 @@ def probability_by_values(values: Sequence[tuple[str, Status, float | None]]) ->
 def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
     """The worst of (kind, severity) pairs per kind of check, and of all, as ``WORST``.
 
-    Checks of the lens are left out, as is the check of the stated error, no sign of an error; and,
-    if it is known how much is found by chance, all that count data: few are no sign either.
+    Checks of the lens and of chance are left out, whose value is a probability, and those that are
+    no sign of an error. The worst of all is of checks that can show an error: what counts data, or
+    is the error bar, is in the posterior. If it is known how much is found by chance, they all are.
     """
     worst: dict[str, float] = {}
     for kind, severity in checks:
@@ -104,7 +105,13 @@ def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
     left_out = {*LENS_KINDS, COMMON_ERROR, CHANCE, FLAT_EVIDENCE, WENT_ON, IMAGES_ELSEWHERE}
     left_out |= ABOUT_THE_DATA if CHANCE in worst else frozenset()
     kept = {kind: severity for kind, severity in worst.items() if kind not in left_out}
-    return {**kept, WORST: max(kept.values(), default=0.0)}
+    return {**kept, WORST: worst_sign(kept)}
+
+
+def worst_sign(severities: Mapping[str, float]) -> float:
+    """The worst severity, by kind, of those that can show an error."""
+    signs = (value for kind, value in severities.items() if kind not in ABOUT_THE_DATA)
+    return max(signs, default=0.0)
 
 
 def contributions(

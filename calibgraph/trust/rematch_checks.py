@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.run import Rematch
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.verdict import TOLERANCE, WENT_ON, Check
 from calibgraph.trust.evidence import Checks
+from calibgraph.trust.inputs import describe_repeats
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import threshold
 
@@ -31,25 +32,29 @@ def last_round_checks(evidence: RunEvidence) -> Checks:
     }
 
 
-def repeated_cloud_checks(evidence: RunEvidence) -> Checks:
-    """Whether two frames have the same cloud: a recording's fault, or copies."""
-    checks = check_repeated_clouds(evidence.run.dataset, evidence.hashes)
-    return {name: checks for name in evidence.solution.cameras}
+def repeated_file_checks(evidence: RunEvidence) -> Checks:
+    """How many frames were copies, and whether others have the same cloud or image of a camera."""
+    run, cameras = evidence.run, evidence.solution.cameras
+    checks = check_repeated_files(run.dataset, evidence.hashes, cameras)
+    if run.copies:
+        share = run.copies / (run.copies + len(run.dataset.frames))
+        check = threshold("repeated_frames").check(share)
+        checks = {name: [check, *each] for name, each in checks.items()}
+    return checks
 
 
-def check_repeated_clouds(dataset: Dataset, hashes: Mapping[str, str]) -> list[Check]:
-    """The first two frames with the same cloud, if any."""
-    names: dict[str, str] = {}
-    for frame in dataset.frames:
-        digest = hashes[str(frame.cloud_path)]
-        if digest in names:
-            text = (
-                f"frames {names[digest]} and {frame.name} have the same cloud; remove one, or give "
-                "each image the cloud of its own time"
-            )
-            return [Check("repeated frames", "WARN", text)]
-        names[digest] = frame.name
-    return []
+def check_repeated_files(
+    dataset: Dataset, hashes: Mapping[str, str], cameras: Sequence[str]
+) -> dict[str, list[Check]]:
+    """Per camera, a check of the first kind of file that frames have in common, if any."""
+    frames = [(f.name, f.image_paths, hashes[str(f.cloud_path)]) for f in dataset.frames]
+    of_clouds = describe_repeats("cloud", [(name, digest) for name, _, digest in frames])
+    checks: dict[str, list[Check]] = {}
+    for camera in cameras:
+        images = [(n, hashes[str(paths[camera])]) for n, paths, _ in frames if camera in paths]
+        text = describe_repeats(f"image of {camera}", images) or of_clouds
+        checks[camera] = [Check("repeated frames", "WARN", text)] if text else []
+    return checks
 
 
 def rematch_checks(evidence: RunEvidence) -> Checks:

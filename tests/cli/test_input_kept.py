@@ -176,15 +176,3 @@ def test_the_table_of_another_result_is_refused(simulated: Path, solved: Path, c
     shutil.copy(table, out / "correspondences.parquet")
     assert "is not the table of" in error_line(*call("report", out))
     assert load_rig(out).cameras  # the extrinsics can be used without the table
-
-
-@pytest.mark.parametrize("command", ["calibrate", "doctor"])
-@pytest.mark.parametrize("part", ["cameras/left", "cameras/left/below", "lidar"])
-def test_nothing_is_written_among_the_images_and_clouds_of_a_dataset(
-    command: str, part: str, tmp_path: Path, call: Call
-) -> None:
-    data = Path(shutil.copytree(SAMPLE, tmp_path / "data"))
-    before = sorted(data.rglob("*"))
-    message = error_line(*call(command, data, "--out", data / part))
-    assert f"{data / part}" in message and "is among the data of" in message
-    assert sorted(data.rglob("*")) == before

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -15,16 +14,14 @@ from typing import Any
 import pytest
 from numba import prange
 
-from factors.compiled import compiled
-from factors.kernel_source import source_files
+from factors.compiled import compiled, with_kernels
 from tests.conftest import ROOT
 
 PACKAGES = "calibgraph", "factors"
 IMPORT = "from factors.compiled import compiled"
 MAIN = """
 from factors.compiled import compiled
-from kernels.constants import HALF
-from kernels.helper import twice
+from kernels.helper import HALF, twice
 from kernels.other import NAME
 OFFSET = 2 * HALF
 
@@ -34,27 +31,12 @@ def kernel(x):
 """
 HELPER = """
 from factors.compiled import compiled
+HALF = {half}
 
 @compiled()
 def twice(x):
     return {factor} * x
 """
-CHAIN = {  # what the kernels of main use is in all but last
-    "__init__": "",
-    "main": "from factors.compiled import compiled\nfrom kernels.a import A\n"
-    "from kernels.last import LAST\n@compiled()\ndef kernel(x):\n    return A * x\nL = LAST",
-    "a": "import kernels.b as other\nTWO = 2\ndef scale():\n    return TWO * other.B\nA = scale()",
-    "b": "try:\n    from .c import C\nexcept ImportError:\n    C = 1\n(B, _) = (C, 0)",
-    "c": "from kernels import d\nclass K:\n    value = d.D\nC = K.value",
-    "d": "from kernels.e import E\nD = [0]\nD[0] = E",
-    "e": "from kernels.f import *\nE = F",
-    "f": "F = 3",
-    "last": "LAST = 5",
-}
-SOURCES = (
-    "import kernels.main; from factors.kernel_source import source_files\n"
-    "print(*sorted(file.stem for file in source_files('kernels.main')))"
-)
 CALL = "from kernels.main import kernel\nprint(kernel(3.0), sum(kernel.stats.cache_hits.values()))"
 LOSS = (
     "import numpy as np; from factors.loss import loss_and_weight as kernel\n"
@@ -158,84 +140,70 @@ def test_a_change_of_a_callee_or_a_constant_is_noticed_and_one_elsewhere_is_not(
     (folder / "main.py").write_text(MAIN)
     cases = ((2, 1, "a", 0), (2, 5, "a", 0), (7, 5, "a", 0), (7, 5, "b", 1), (2, 1, "c", 1))
     for factor, offset, name, hits in cases:  # the last is the first: its code is kept too
-        (folder / "helper.py").write_text(HELPER.format(factor=float(factor)))
-        (folder / "constants.py").write_text(f"HALF = {offset / 2}")
+        helper = HELPER.format(factor=float(factor), half=offset / 2)
+        (folder / "helper.py").write_text(helper)
         (folder / "other.py").write_text(f"NAME = {name!r}")
         shutil.rmtree(folder / "__pycache__", ignore_errors=True)  # Python compares times
         found = run(CALL, path=tmp_path, NUMBA_CACHE_DIR=cache)
         assert found == (f"{factor * 3.0 + offset} {hits}", "")
 
 
-def test_what_kernels_use_is_followed_through_all_kinds_of_definitions_and_imports(
-    tmp_path: Path,
-) -> None:
-    (tmp_path / "kernels").mkdir()
-    for name, text in CHAIN.items():
-        (tmp_path / "kernels" / f"{name}.py").write_text(text)
-    assert run(SOURCES, path=tmp_path)[0] == "a b c d e f main"
+KERNEL_FILES = [
+    file
+    for package in PACKAGES
+    for folder in (ROOT / package, *(ROOT / package).rglob("*/"))
+    for file in with_kernels(folder)
+]
 
 
-@pytest.mark.parametrize(
-    ("imported", "decorator"),
-    [("import factors.compiled as c", "c.compiled"), (f"{IMPORT} as jit", "jit")],
-)
-def test_where_the_decorator_has_another_name_all_that_the_module_uses_is_followed(
-    imported: str, decorator: str, tmp_path: Path
-) -> None:
-    (tmp_path / "kernels").mkdir()
-    main = CHAIN["main"].replace(IMPORT, imported).replace("@compiled", f"@{decorator}")
-    assert IMPORT not in main.splitlines() and "@compiled" not in main
-    for name, text in {**CHAIN, "main": main}.items():
-        (tmp_path / "kernels" / f"{name}.py").write_text(text)
-    found = run(SOURCES, path=tmp_path)[0].split()
-    assert {*found} >= {*"abcdef", "main", "last"}
-
-
-def test_constants_are_assigned_in_their_own_module_and_not_by_functions() -> None:
-    """So the sources of a kernel are all that determines it; decorators have the known name."""
-    for file in (file for folder in PACKAGES for file in (ROOT / folder).rglob("*.py")):
-        assert departures(ast.parse(file.read_bytes())) == [], file
+@pytest.mark.parametrize("file", KERNEL_FILES, ids=lambda file: file.stem)
+def test_kernels_use_names_of_files_with_kernels_here_or_in_factors_alone(file: Path) -> None:
+    """So the files of the cache are all that determines their code."""
+    counted = {*with_kernels(file.parent), *with_kernels(ROOT / "factors")}
+    modules = {".".join(each.relative_to(ROOT).with_suffix("").parts) for each in counted}
+    assert foreign_names(ast.parse(file.read_bytes()), modules) == set()
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "from factors import loss\nloss.K = 2",
-        "import factors.loss as other\nother.K[0] += 2",
-        "def change():\n    global K\n    K = 2",
-        f"{IMPORT} as jit",
-        "import factors.compiled as c\n@c.compiled()\ndef kernel():\n    pass",
+        "from factors.block import K\n@compiled()\ndef kernel(x):\n    return K * x",
+        "from factors.block import K\nTWO = 2 * K\n@compiled()\ndef kernel(x):\n    return TWO * x",
+        "@compiled()\ndef kernel(x):\n    global K\n    return x",
     ],
 )
-def test_a_constant_changed_from_elsewhere_is_found(text: str) -> None:
-    assert departures(ast.parse(text))
+def test_a_name_from_elsewhere_is_found(text: str) -> None:
+    assert foreign_names(ast.parse(text), {"factors.loss"})
 
 
-def departures(module: ast.Module) -> list[str]:
-    """What sources do not follow: ``global``, changes of what is imported, other decorators."""
-    nodes = [*ast.walk(module)]
-    imported = {
-        (alias.asname or alias.name).partition(".")[0]
-        for node in nodes
-        if isinstance(node, ast.ImportFrom | ast.Import)
-        for alias in node.names
-        if (getattr(node, "module", None) or alias.name).partition(".")[0] in PACKAGES
-    }
-    return [
-        ast.unparse(node)
-        for node in nodes
-        if isinstance(node, ast.Global)
-        or (isinstance(node, ast.Attribute) and node.attr == "compiled")
-        or (isinstance(node, ast.alias) and node.name == "compiled" and node.asname)
-        or (isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store))
-        and re.split(r"[.\[]", ast.unparse(node))[0] in imported
-    ]
+def foreign_names(module: ast.Module, known: set[str]) -> set[str]:
+    """Names in kernels, or in what defines their constants, that are from other modules of ours."""
+    used, defined, imported = set[str](), dict[str, set[str]](), set[str]()
+    for statement in module.body:
+        names = [node for node in ast.walk(statement) if isinstance(node, ast.Name)]
+        loaded = {node.id for node in names if isinstance(node.ctx, ast.Load)}
+        if isinstance(statement, ast.ImportFrom):
+            source = statement.module or ""
+            if source.partition(".")[0] in PACKAGES and source not in {*known, "factors.compiled"}:
+                imported |= {alias.asname or alias.name for alias in statement.names}
+        elif isinstance(statement, ast.FunctionDef):
+            used |= set().union(*(_used_by(node) for node in ast.walk(statement)))
+        elif not isinstance(statement, ast.ClassDef):
+            defined |= {node.id: loaded for node in names if isinstance(node.ctx, ast.Store)}
+    while more := {name for each in used for name in defined.get(each, set())} - used:
+        used |= more
+    changed = {"global" for node in ast.walk(module) if isinstance(node, ast.Global)}
+    return (used & imported) | changed
 
 
-def test_the_sums_depend_on_kernels_and_on_the_layout_of_their_tiles_alone() -> None:
-    found = {file.stem for file in source_files("factors.kernel")}
-    assert found >= {"kernel", "kernel_sums", "lens_kernels", "loss", "tile"}
-    assert not found & {"__init__", "block", "lens", "compiled", "projection"}
+def _used_by(node: ast.AST) -> set[str]:
+    """The names in a kernel, without its annotations and decorators; none of other functions."""
+    if not isinstance(node, ast.FunctionDef):
+        return set()
+    decorators = [name.id for each in node.decorator_list for name in ast.walk(each)
+                  if isinstance(name, ast.Name)]  # fmt: skip
+    body = [name.id for each in node.body for name in ast.walk(each) if isinstance(name, ast.Name)]
+    return {*body} if "compiled" in decorators else set()
 
 
 def test_code_that_no_process_has_used_for_a_week_is_removed(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calibgraph import Dataset, Frame, Rig, dataset_from_arrays
-from calibgraph.matching.frame_choice import CANDIDATES, choose_frames
+from calibgraph.matching.frame_choice import CANDIDATES, choose_frames, without_copies
 from calibgraph.rounds import _open
 from tests.conftest import make_camera
 
@@ -106,3 +106,15 @@ def test_the_choice_is_logged_and_the_others_stay_known(caplog: pytest.LogCaptur
         few, _ = _open(data, RIG, 4)
     assert caplog.messages[0].startswith("4 of 12 frames are matched (--frames chooses others)")
     assert len(few.frames) == 4 and len(few.recorded) == 12
+
+
+def test_copies_of_a_frame_are_left_out() -> None:
+    """Those with the same cloud and images; not where one of them changes."""
+    data = drive([0, 50, 0, 50, 0])
+    assert [frame.index for frame in without_copies(data).frames] == [0, 1]
+    data = drive([0, 50])
+    assert without_copies(data) is data
+    frozen = dataset_from_arrays(
+        RIG, [CLOUD, CLOUD + 1], {n: [WALL[:HEIGHT, :WIDTH]] * 2 for n in RIG.cameras}
+    )
+    assert without_copies(frozen) is frozen

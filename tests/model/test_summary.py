@@ -6,9 +6,19 @@ import ast
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 import calibgraph
 from calibgraph.model.causes import CAUSES, cause_of
-from calibgraph.model.error_sources import COMMON, LENSES, MATCHES, MOST_TIMES, ErrorSources
+from calibgraph.model.error_sources import (
+    COMMON,
+    ESTIMATED,
+    LENSES,
+    MATCHES,
+    MOST_TIMES,
+    UNMODELLED,
+    ErrorSources,
+)
 from calibgraph.model.summary import MOST, summarize
 from calibgraph.model.verdict import COMMON_ERROR, Check, ErrorProbability, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS
@@ -146,13 +156,21 @@ def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
     assert summarize(unsure, sources={"left": few}).actions == ("Record 3 times as many frames.",)
 
 
-def test_a_wide_bar_of_an_estimated_lens_advises_on_the_lens() -> None:
-    lens = replace(
-        WIDE, rotation={LENSES: 0.9, COMMON: 0.1}, translation={LENSES: 0.9, COMMON: 0.1}
-    )
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        (ESTIMATED, "Estimate fewer parts of the lens (--estimate)"),
+        (LENSES, "State how well lenses and clocks are known"),
+        (UNMODELLED, "Leave --preset out"),
+    ],
+)
+def test_a_wide_bar_advises_on_its_largest_source(source: str, expected: str) -> None:
+    """The lenses of a mount are uncertain though nothing of them is estimated."""
+    shares = {source: 0.9, COMMON: 0.1}
+    wide = replace(WIDE, rotation=shares, translation=shares)
     unsure = {"left": Verdict((), ErrorProbability(0.0, 0.1))}
-    (action,) = summarize(unsure, sources={"left": lens}).actions
-    assert action.startswith("Estimate fewer parts of the lens (--estimate)")
+    (action,) = summarize(unsure, sources={"left": wide}).actions
+    assert action.startswith(expected)
 
 
 def test_a_failed_camera_has_no_error_bar_and_no_advice_about_it() -> None:

@@ -21,7 +21,7 @@ CHECKS = (
 HOOKS = """
 import schemathesis
 
-@schemathesis.serializer("application/vnd.apache.arrow.stream", "application/x-ndjson")
+@schemathesis.serializer("application/x-ndjson")
 def as_bytes(context, value):
     return value if isinstance(value, bytes) else str(value).encode()
 """

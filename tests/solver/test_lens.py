@@ -231,7 +231,7 @@ def test_the_rig_gets_the_lens_and_without_the_flag_keeps_its_own(
     for name, camera in found.rig.cameras.items():
         assert camera.intrinsics_px.fx == pytest.approx(found.lens[name][0].value, rel=1e-9)
         assert found.initial_rig.cameras[name] == wrong.cameras[name]
-        assert "uncertain lenses and clocks" in found.error_sources[name].translation
+        assert "estimated lenses and clocks" in found.error_sources[name].translation
 
 
 @pytest.mark.parametrize("name", ["fisheye", "omni"])

@@ -1,4 +1,4 @@
-"""Tables, Arrow streams and JSON lines for the tests of streams."""
+"""Tables and JSON lines for the tests of streams."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from pyarrow import ipc
 
 from calibgraph import Correspondences
 from calibgraph.tracking.streams import Refused, StreamFrame, frames_of
@@ -36,15 +35,6 @@ def spoilt(given: pa.Table, column: str, row: int, value: object) -> pa.Table:
     values = given[column].to_pylist()
     values[row] = value
     return given.set_column(index, column, pa.array(values))
-
-
-def arrow_stream(*tables: pa.Table) -> bytes:
-    """An Arrow IPC stream with one record batch per table."""
-    out = io.BytesIO()
-    with ipc.new_stream(out, tables[0].schema) as writer:
-        for one in tables:
-            writer.write_table(one)
-    return out.getvalue()
 
 
 def camera(n: int = 1, **changes: Any) -> dict[str, Any]:

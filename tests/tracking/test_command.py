@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import sys
@@ -11,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
-from pyarrow import ipc, parquet
+from pyarrow import parquet
 
 from calibgraph import (
     Correspondences,
@@ -65,7 +63,7 @@ def test_the_report_of_a_result_that_is_replaced_does_not_stay(
     assert {path.name for path in out.iterdir()} == {"state", "calibration.yaml", "track.png"}
 
 
-@pytest.mark.parametrize("kind", ["lines", "arrow", "by camera", "csv", "folder"])
+@pytest.mark.parametrize("kind", ["lines", "by camera", "csv", "folder"])
 def test_every_source_gives_the_same_lines(
     kind: str, world: World, call: Call, piped: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -73,13 +71,6 @@ def test_every_source_gives_the_same_lines(
     whole = concatenate(world.tables)
     if kind == "lines":
         code, text, _ = piped(world.rig, as_lines(world.tables), *out)
-    elif kind == "arrow":
-        stream = io.BytesIO()
-        arrow = [to_arrow(table) for table in world.tables]
-        with ipc.new_stream(stream, arrow[0].schema) as writer:
-            for batch in (*arrow[:3], pa.concat_tables(arrow[3:])):
-                writer.write_table(batch.combine_chunks())
-        code, text, _ = piped(world.rig, stream.getvalue(), *out)
     else:
         source = tmp_path / "given"
         if kind == "folder":
@@ -97,7 +88,7 @@ def test_every_source_gives_the_same_lines(
             parquet.write_table(to_arrow(whole.select(rows)), source, row_group_size=100)
         code, text, _ = call("track", world.rig, source, *out)
     assert code == 0
-    assert text.splitlines() == (world.lines if kind in ("lines", "arrow") else world.file_lines)
+    assert text.splitlines() == (world.lines if kind == "lines" else world.file_lines)
 
 
 def test_every_nth_frame_is_taken_also_after_a_restart(

@@ -61,7 +61,7 @@ def wrong_lines(good: Correspondences) -> dict[str, bytes]:
         "expected keys with values, as in {key: value}": b"[1, 2]",
         "is not JSON": b"\xff\xfe\xfa",
         "unknown key": line(time=3),
-        "metadata 'systematic_rotation_rad'": line(metadata={"systematic_rotation_rad": "much"}),
+        "metadata systematic_rotation_rad": line(metadata={"systematic_rotation_rad": "much"}),
         "differ in length": b'{"frame": 7, "cameras": {"left": {"u_px": [1], "v_px": [],'
         b' "x_m": [], "y_m": [], "z_m": []}}}',
     }

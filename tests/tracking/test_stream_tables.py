@@ -1,4 +1,4 @@
-"""Frames of Parquet and CSV files, and of Arrow streams."""
+"""Frames of Parquet and CSV files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pyarrow import parquet
 from calibgraph import concatenate
 from calibgraph.tracking.streams import StreamFrame, frames_of
 from tests.tracking.stream_data import (
-    arrow_stream,
     of_bytes,
     outcomes,
     spoilt,
@@ -123,7 +122,7 @@ def test_a_file_that_is_no_table_is_refused_in_one_line(tmp_path: Path) -> None:
         "holds no rows": good.slice(0, 0),
         "must hold whole numbers": spoilt(good, "frame", 0, 0.5),
         "must hold numbers": spoilt(good, "u_px", 0, "1"),
-        "metadata 'systematic_rotation_rad'": good.replace_schema_metadata(
+        "metadata systematic_rotation_rad": good.replace_schema_metadata(
             {"matcher": '{"systematic_rotation_rad": -1}'}
         ),
         "the metadata has the wrong type": good.replace_schema_metadata({"matcher": "no JSON"}),
@@ -160,96 +159,13 @@ def test_a_damaged_row_group_ends_the_table_after_the_good_ones(tmp_path: Path) 
     assert "cannot be read as Parquet" in str(refused)
 
 
-# Arrow
-
-
-@pytest.mark.parametrize("strings", [False, True])
-def test_an_arrow_stream_gives_whole_batches_frame_by_frame(strings: bool) -> None:
-    both = concatenate([table([4, 2], camera="left"), table([4, 2], camera="right")])
-    batches = [to_arrow(both), to_arrow(table([1], metadata={"matcher": "m"}))]
-    if strings:
-        batches = [b.set_column(0, "camera", b["camera"].cast("string")) for b in batches]
-    batches[0] = batches[0].replace_schema_metadata(batches[1].schema.metadata)
-    frames = [f for f in of_bytes(arrow_stream(*batches)) if isinstance(f, StreamFrame)]
-    assert [f.frame for f in frames] == [4, 2, 1]
-    assert [f.table.counts() for f in frames[:2]] == [{"left": 1, "right": 1}] * 2
-    assert frames[2].table.metadata == {"matcher": "m"}
-
-
-def test_a_wrong_value_in_an_arrow_stream_refuses_its_frame_alone() -> None:
-    wrong = spoilt(to_arrow(table([0, 1, 2])), "u_px", 1, np.inf)
-    first, refused, *others = outcomes(of_bytes(arrow_stream(wrong, to_arrow(table([3])))))
-    assert (first, others) == (0, [2, 3])
-    assert str(refused).startswith("standard input, batch 1: frame 1 is left out")
-
-
-def test_a_null_in_the_dictionary_of_cameras_refuses_its_frame_alone() -> None:
-    cameras = pa.DictionaryArray.from_arrays([0, 1, 0], ["left", None])
-    (first, refused, last) = outcomes(
-        of_bytes(arrow_stream(to_arrow(table([0, 1, 2])).set_column(0, "camera", cameras)))
-    )
-    assert (first, last) == (0, 2)
-    assert "frame 1 is left out; among its rows, row 0: column 'camera' is empty" in str(refused)
-
-
-def test_a_wrong_schema_ends_an_arrow_stream_in_one_line() -> None:
-    good = to_arrow(table([0, 1]))
-    ends = pa.RunEndEncodedArray.from_arrays([2], [1.0])
-    for message, arrow in {
-        "column 'u_px' is missing": good.drop_columns(["u_px"]),
-        "unknown column 'weight'": good.append_column("weight", pa.array([1.0, 2.0])),
-        "column 'frame' must hold whole numbers": spoilt(good, "frame", 0, 0.5),
-        "column 'u_px' must hold numbers, found run_end_encoded": good.set_column(
-            2, "u_px", pa.chunked_array([ends])
-        ),
-        "column 'frame' must hold whole numbers, found list": good.set_column(
-            1, "frame", pa.array([[1], [2]])
-        ),
-        "column 'camera' must hold text, found bool": good.set_column(
-            0, "camera", pa.array([True] * 2)
-        ),
-        "has a column twice": good.append_column("u_px", pa.array([1.0, 2.0])),
-        "metadata": good.replace_schema_metadata({"matcher": "[" * 100_000}),
-    }.items():
-        (refused,) = outcomes(of_bytes(arrow_stream(arrow, arrow)))
-        assert str(refused).startswith("standard input: ")
-        assert message in str(refused)
-
-
-def test_a_broken_arrow_stream_gives_what_came_and_one_refusal() -> None:
-    """Cut at every byte: all whole batches before the cut, then nothing or one line."""
-    data = arrow_stream(to_arrow(table([0])), to_arrow(table([1])))
-    seen = set()
-    for cut in range(4, len(data)):
-        *frames, last = [*outcomes(of_bytes(data[:cut])), None]
-        refusals = [item for item in frames if isinstance(item, str)]
-        assert last is None
-        assert len(refusals) <= 1
-        assert [item for item in frames if item not in refusals] in ([], [0], [0, 1])
-        seen.add(tuple(item for item in frames if item not in refusals))
-    assert seen == {(), (0,), (0, 1)}
-
-
-def test_flipped_bytes_in_an_arrow_stream_raise_nothing() -> None:
-    rng = np.random.default_rng(0)
-    data = np.frombuffer(arrow_stream(to_arrow(table([0])), to_arrow(table([1]))), np.uint8)
-    for _ in range(400):
-        flipped = data.copy()
-        flipped[rng.integers(4, len(data), rng.integers(1, 4))] = rng.integers(256)
-        for item in of_bytes(flipped.tobytes()):
-            assert isinstance(item, StreamFrame) or "\n" not in item.message
-
-
-def test_a_damaged_length_in_an_arrow_stream_takes_no_memory() -> None:
-    endless = b"\xff\xff\xff\xff" + (2**30).to_bytes(4, "little") + bytes(1000)
-    (refused,) = outcomes(of_bytes(endless))
-    assert "a message of 1073741824 bytes, expected at most" in str(refused)
+# Standard input
 
 
 def test_a_file_that_is_no_stream_is_named(tmp_path: Path) -> None:
     path = tmp_path / "table.parquet"
     table([0]).save(path)
     assert outcomes(of_bytes(path.read_bytes())) == [
-        "standard input: is a Parquet file; send an Arrow stream or JSON lines"
+        "standard input: is a Parquet file; send a line of JSON per frame"
     ]
-    assert "is an Arrow file" in str(outcomes(of_bytes(b"ARROW1\0\0"))[0])
+    assert "is an Arrow stream" in str(outcomes(of_bytes(b"\xff\xff\xff\xff\0"))[0])

@@ -14,20 +14,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-import pyarrow as pa
 import pytest
-from pyarrow import ipc
 
 from calibgraph import FileError
 from calibgraph.tracking import streams
 from calibgraph.tracking.streams import StreamFrame, frames_of
 from tests.tracking.stream_data import (
-    arrow_stream,
     line,
     outcomes,
-    spoilt,
     table,
-    to_arrow,
 )
 
 # Folders
@@ -163,23 +158,7 @@ def test_a_complete_line_is_given_while_the_next_is_being_written(
         assert "is not JSON" in str(outcomes([next(frames)])[0])
 
 
-def test_a_complete_arrow_batch_is_given_before_the_next_comes(
-    pipe: tuple[BinaryIO, BinaryIO],
-) -> None:
-    reader, writer = pipe
-    one = to_arrow(table([0]))
-    frames = frames_of("-", stdin=reader)
-    with ipc.new_stream(pa.PythonFile(writer, mode="w"), one.schema) as arrow:
-        for number in range(3):
-            arrow.write_table(spoilt(one, "frame", 0, number))
-            assert outcomes([next(frames)]) == [number]
-    writer.close()
-    assert outcomes(frames) == []
-
-
-@pytest.mark.parametrize(
-    "begin", [b"", line(1), line(1) + b'{"half', arrow_stream(to_arrow(table([1])))[:-8]]
-)
+@pytest.mark.parametrize("begin", [b"", line(1), line(1) + b'{"half'])
 def test_a_waiting_stream_ends_when_it_is_stopped(
     begin: bytes, pipe: tuple[BinaryIO, BinaryIO]
 ) -> None:
@@ -203,11 +182,7 @@ def test_a_stopped_stream_gives_no_more_of_what_it_has() -> None:
     assert outcomes(frames) == []
 
 
-@pytest.mark.parametrize(
-    "begin",
-    [line(1), pytest.param(arrow_stream(to_arrow(table([1])))[:-8], marks=pytest.mark.slow)],
-)
-def test_a_signal_ends_the_waiting_for_standard_input(begin: bytes) -> None:
+def test_a_signal_ends_the_waiting_for_standard_input() -> None:
     program = """
         import signal, sys
         from calibgraph.tracking.streams import frames_of
@@ -222,7 +197,7 @@ def test_a_signal_ends_the_waiting_for_standard_input(begin: bytes) -> None:
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     ) as process:  # fmt: skip
         assert process.stdin and process.stdout and process.stderr
-        process.stdin.write(begin)
+        process.stdin.write(line(1))
         process.stdin.flush()
         assert b"StreamFrame(frame=1" in process.stdout.readline()
         process.send_signal(signal.SIGTERM)

@@ -333,8 +333,23 @@ def test_a_frozen_sensor_adds_nothing_and_is_blind(pair: Rig, noise_px: float) -
     after = update.covariance["left"]
     assert after is not None
     assert (np.diag(after) > 0.9 * np.diag(before)).all()  # 38 new frames would leave a quarter
+    (check,) = [c for c in update.verdicts["left"].checks if c.name in ("stuck", "blind frames")]
+    assert check.text.startswith("the last 39 frames with matches have the same points")
     events = [event.kind for event in tracker.update(moved_on(tables[-1], 50)).events]
     assert "back" in events
+    names = [check.name for check in tracker.calibration().camera_verdicts["left"].checks]
+    assert "stuck" not in names
+
+
+def test_a_stream_that_is_stuck_from_the_beginning_is_named(pair: Rig) -> None:
+    """It is not told to keep driving."""
+    (table,) = drive(lambda _: pair, 1)
+    tables = [replace(table, frame=np.full(len(table), number)) for number in range(4)]
+    tracker, _ = tracked(pair, tables)
+    result = tracker.calibration()
+    assert result.verdict.status == "FAIL"
+    assert result.summary.reasons[0].text.startswith("the last 4 frames with matches have the same")
+    assert result.summary.actions[0].startswith("See why the same points come again")
 
 
 def moved_on(table: Correspondences, number: int) -> Correspondences:

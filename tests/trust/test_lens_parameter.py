@@ -88,6 +88,15 @@ def test_a_shape_that_no_lens_has_counts_though_it_hardly_moves_the_camera() -> 
     assert estimate("focal length", 0.03, 0.002, 0.1).probability() < 1e-6  # noqa: PLR2004
 
 
+def test_a_shape_counts_by_the_tolerance_of_the_user() -> None:
+    """Half of 3 % is 0.86 deg: beyond 0.5 deg and twice that, within four times."""
+    found = estimate("skew", 0.03, 0.002, 0.1)
+    by_tolerance = [found.probability((0.5 * k, 10.0 * k)) for k in (0.5, 1.0, 2.0, 4.0)]
+    assert by_tolerance[0] == by_tolerance[1] == found.probability()
+    assert by_tolerance[2] > 0.9 and by_tolerance[3] < 0.005  # noqa: PLR2004
+    assert found.probability((2.0, 10.0)) == found.probability()
+
+
 def test_a_parameter_that_moves_the_camera_beyond_any_length_is_wrong() -> None:
     assert estimate("focal length", 1.0, 1e-3, 1e10).probability() > 0.9  # noqa: PLR2004
     assert estimate("focal length", 1e100, 1e-3, 1e10).probability() > 0.9  # noqa: PLR2004

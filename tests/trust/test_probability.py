@@ -105,8 +105,18 @@ def test_a_wide_error_bar_counts_as_far_as_it_is_reliable() -> None:
     verdict = judge([], 0.9, (0.5, 10.0), STRUCTURE)
     found = verdict.error_probability
     assert found is not None and found.by_error_bar == 0.9
-    assert 0.7 < found.probability < 0.9
+    assert 0.2 < found.bar_reliability < 0.9
+    assert found.probability == pytest.approx(0.9 * found.bar_reliability, abs=1e-3)
     assert judge([], 0.9, (0.5, 10.0), TABLES).error_probability.probability > 0.9  # type: ignore[union-attr]
+
+
+def test_a_wide_error_bar_and_few_frames_are_no_signs_of_an_error_in_runs() -> None:
+    rows = {"sigma_translation": 60.0, "frames": 1.0, "focal_sensitivity": 90.0}
+    checks = [threshold(kind).check(value) for kind, value in rows.items()]
+    assert {check.status for check in checks} > {"FAIL"}
+    assert probability_of_checks(checks, STRUCTURE) == probability_of_checks([], STRUCTURE)
+    wide = judge(checks, 0.9, (0.5, 10.0), STRUCTURE)
+    assert (wide.status, wide.cannot_tell) == ("WARN", True)
 
 
 def test_a_wide_error_bar_is_as_probably_off_as_draws_from_it() -> None:

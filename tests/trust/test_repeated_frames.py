@@ -1,27 +1,50 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import calibgraph
 from calibgraph import CorrespondenceError, Correspondences, Rig, concatenate, solve
-from calibgraph.files import sha256
+from calibgraph.model.verdict import Verdict
+from calibgraph.pipeline import hash_inputs
 from calibgraph.solver.repeats import number_repeats
-from calibgraph.trust.rematch_checks import check_repeated_clouds
+from calibgraph.trust.rematch_checks import check_repeated_files, repeated_file_checks
 from tests.conftest import SAMPLE
 from tests.trust.conftest import simulated
 
 
-def test_frames_with_the_same_cloud_are_reported() -> None:
+def test_frames_with_the_same_cloud_or_image_are_reported() -> None:
+    data = calibgraph.load_dataset(SAMPLE).select("0:3")
+    hashes = {path: digest for frame in data.frames for path, digest in frame.hashes().items()}
+    assert check_repeated_files(data, hashes, ["left"]) == {"left": []}
+    copy = replace(data.frames[0], index=3, name="copy")
+    copied = replace(data, frames=(*data.frames, copy))
+    (check,) = check_repeated_files(copied, hashes, ["left"])["left"]
+    assert check.status == "WARN" and "000000 and copy have the same image of left" in check.text
+    image = {"left": data.frames[0].image_paths["left"]}
+    frozen = [replace(frame, image_paths=frame.image_paths | image) for frame in data.frames]
+    found = check_repeated_files(replace(data, frames=frozen), hashes, ["left", "front_left"])
+    (check,) = found["left"]
+    assert check.text == (
+        "frames 000000 and 000001 have the same image of left, and 1 more repeat one; leave "
+        "repeats out"
+    )
+    assert found["front_left"] == []
+
+
+def test_copies_that_were_left_out_are_data_that_are_missing() -> None:
     data = calibgraph.load_dataset(SAMPLE).select("0:2")
-    copy = replace(data.frames[0], index=2, name="copy")
-    data = replace(data, frames=(*data.frames, copy))
-    hashes = {str(frame.cloud_path): sha256(frame.cloud_path) for frame in data.frames}
-    (check,) = check_repeated_clouds(data, hashes)
-    assert check.status == "WARN" and "000000 and copy have the same cloud" in check.text
-    assert check_repeated_clouds(replace(data, frames=data.frames[:2]), hashes) == []
+    for left_out, expected in ((6, "WARN"), (1, "PASS")):
+        run = SimpleNamespace(dataset=data, copies=left_out)
+        solution = SimpleNamespace(cameras=("left",))
+        evidence: Any = SimpleNamespace(run=run, hashes=hash_inputs(data), solution=solution)
+        (check,) = repeated_file_checks(evidence)["left"]
+        assert (check.kind, check.status) == ("repeated_frames", expected)
+        assert Verdict((check,)).cannot_tell == (expected == "WARN")
 
 
 def copies(table: Correspondences, number: int) -> Correspondences:

@@ -73,19 +73,17 @@ class FlowMatcher:
         iterations: of the recurrent update.
         half_resolution: whether images are halved; None: as the weights choose, or from
             ``HALVED_FROM_PX`` on.
-        occlusion_filter: leave out points behind nearer ones.
     """
 
     checkpoint: Checkpoint
     model: CmrNext
     iterations: int
     half_resolution: bool | None
-    occlusion_filter: bool
 
     def match(self, jobs: Sequence[MatchingJob]) -> list[Correspondences]:
         """Match a batch of images of one size; the tables do not depend on a frame's pose."""
         halved = self._halves(jobs[0].camera)
-        lidar_images = [self._render(job) for job in jobs]
+        lidar_images = [LidarImage.render(j.cloud, j.T_camera_lidar, j.view) for j in jobs]
         full, coarse = self._flow(jobs, lidar_images, halved)
         cell = CELL * (1 + halved)
         return [
@@ -99,10 +97,6 @@ class FlowMatcher:
             return self.half_resolution
         trained = self.checkpoint.config.get("half_resolution")
         return trained if isinstance(trained, bool) else camera.width_px >= HALVED_FROM_PX
-
-    def _render(self, job: MatchingJob) -> LidarImage:
-        lidar = LidarImage.render(job.cloud, job.T_camera_lidar, job.view)
-        return lidar.without_occluded() if self.occlusion_filter else lidar
 
     def _flow(
         self, jobs: Sequence[MatchingJob], lidar_images: Sequence[LidarImage], halved: bool

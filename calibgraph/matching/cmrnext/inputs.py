@@ -32,9 +32,6 @@ _STD = np.array([0.229, 0.224, 0.225], dtype=np.float32)
 _MARGIN_PX = 0.1  # as in the published training: at the left and upper edge
 _MAX_BYTE = 255.0
 
-_OCCLUDER_RADIUS_PX = 10
-_OCCLUDER_SHARE, _OCCLUDER_M = 0.9, 0.5  # how much nearer an occluder is
-
 
 class View:
     """A camera without its distortion: a pinhole of the same resolution, centre and size."""
@@ -141,20 +138,6 @@ class LidarImage:
             depth_m=self.depth_m[rows],
             intensity=self.intensity[rows],
         )
-
-    def without_occluded(self) -> LidarImage:
-        """The points without those that have nearer points in all four quadrants around them."""
-        radius = _OCCLUDER_RADIUS_PX
-        depth = self.rasterize(self.depth_m)
-        depth[depth == 0] = np.inf
-        farthest = np.zeros_like(depth)
-        for anchor in ((0, 0), (0, radius), (radius, 0), (radius, radius)):
-            window = np.ones((radius + 1, radius + 1), np.uint8)
-            nearest = cv2.erode(depth, window, anchor=anchor, borderValue=float("inf"))
-            farthest = np.maximum(farthest, nearest)
-        rows, columns = self.cells.T
-        limit = _OCCLUDER_SHARE * self.depth_m - _OCCLUDER_M
-        return self.select(farthest[rows, columns] >= limit)
 
     def rasterize(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(height, width) image of one value per point, zero where there is no point."""

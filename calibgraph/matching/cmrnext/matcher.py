@@ -47,7 +47,6 @@ class CmrNextMatcher:
         iterations: of the recurrent update.
         half_resolution: whether images are halved; None: as the weights choose, or from 1400
             pixels width on.
-        occlusion_filter: leave out points behind nearer ones.
         batch: images at once; None: 1 on a CPU, 4 on a GPU.
         seed: of PnP.
 
@@ -70,7 +69,6 @@ class CmrNextMatcher:
         device: str = "auto",
         iterations: int = 12,
         half_resolution: bool | None = None,
-        occlusion_filter: bool = False,
         batch: int | None = None,
         seed: int = 0,
     ) -> None:
@@ -84,7 +82,6 @@ class CmrNextMatcher:
         self.start_from = start_from
         self.iterations = iterations
         self.half_resolution = half_resolution
-        self.occlusion_filter = occlusion_filter
         self.batch = batch or _BATCH[self.device.type]
         self.seed = seed
         loaded = {path: self._load(path) for path in dict.fromkeys(map(str, weights))}
@@ -140,7 +137,6 @@ class CmrNextMatcher:
             checkpoint.network(self.device),
             iterations=self.iterations,
             half_resolution=self.half_resolution,
-            occlusion_filter=self.occlusion_filter,
         )
 
     def _batches(self, dataset: Dataset, rig: Rig) -> Iterator[list[MatchingJob]]:
@@ -211,7 +207,6 @@ class CmrNextMatcher:
             "start_from": self.start_from,
             "iterations": self.iterations,
             "half_resolution": self.half_resolution,
-            "occlusion_filter": self.occlusion_filter,
             "device": self.device.type,
             "seed": self.seed,
             "confidence": "uncalibrated" if last.architecture.uncertainty == "none"

@@ -1,4 +1,4 @@
-"""The network's inputs: projection, occlusion, halving, encoding, padding, distortion."""
+"""The network's inputs: projection, halving, encoding, padding, distortion."""
 
 from __future__ import annotations
 
@@ -42,36 +42,6 @@ def test_points_behind_and_beside_are_not_rendered() -> None:
     in_camera = np.array([[0, 0, -5, 1], [50, 0, 5, 1], [0, 0, 2000, 1], [0, 0, 5, 1.0]])
     cloud = (in_camera @ np.linalg.inv(camera.T_camera_lidar).T).astype(np.float32)
     assert LidarImage.render(cloud, camera.T_camera_lidar, View(camera)).point_index.tolist() == [3]
-
-
-def test_points_behind_nearer_ones_are_left_out() -> None:
-    """A screen of points at 5 m with gaps, a wall at 20 m behind it and beside it; and a slope."""
-    camera = make_camera()
-    view = View(camera)
-    rows, columns = np.mgrid[100:200:6, 300:500:6].reshape(2, -1)
-    screen = np.column_stack([columns, rows, np.full(len(rows), 5.0)])
-    wall_rows, wall_columns = np.mgrid[103:200:6, 303:900:6].reshape(2, -1)
-    wall = np.column_stack([wall_columns, wall_rows, np.full(len(wall_rows), 20.0)])
-    image = np.concatenate([screen, wall])
-    k = camera.intrinsics_px
-    plane = (image[:, :2] + 0.5 - [k.cx, k.cy]) / [k.fx, k.fy]
-    in_camera = np.column_stack([plane * image[:, 2:], image[:, 2], np.ones(len(image))])
-    cloud = (in_camera @ np.linalg.inv(camera.T_camera_lidar).T).astype(np.float32)
-    kept = LidarImage.render(cloud, camera.T_camera_lidar, view).without_occluded()
-    is_wall = kept.point_index >= len(screen)
-    assert np.count_nonzero(~is_wall) == len(screen)
-    behind = (image[:, 0] > 310) & (image[:, 0] < 480) & (image[:, 1] > 110) & (image[:, 1] < 185)
-    assert not (behind & (image[:, 2] == 20))[kept.point_index].any()
-    beside = (image[:, 0] > 520) & (image[:, 2] == 20)
-    assert np.count_nonzero(beside[kept.point_index]) == np.count_nonzero(beside)
-
-
-def test_the_ground_does_not_occlude_itself() -> None:
-    camera = make_camera()
-    x, y = np.meshgrid(np.geomspace(4, 60, 400), np.linspace(-15, 15, 400))
-    cloud = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.7), x.ravel()])
-    lidar = LidarImage.render(cloud.astype(np.float32), camera.T_camera_lidar, View(camera))
-    assert len(lidar.without_occluded().depth_m) > 0.99 * len(lidar.depth_m)
 
 
 def test_halving_takes_the_mean_of_pixels_with_points() -> None:
