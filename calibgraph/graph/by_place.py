@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import gtsam
 import numpy as np
@@ -59,7 +59,7 @@ class BlockByPlace:
         """(P,) number of frames of each place."""
         return np.bincount(self.place_of_frame, minlength=len(self.edges) - 1)
 
-    @property
+    @cached_property
     def places(self) -> Numbers:
         """(p,) the places that have correspondences, in rising order."""
         return np.flatnonzero(np.diff(self.edges))
@@ -166,7 +166,7 @@ class SummarizedByPlace:
     earlier: QuadraticByPlace
     recent: BlockByPlace
 
-    @property
+    @cached_property
     def places(self) -> Numbers:
         """(p,) the places that have either, in rising order."""
         return np.union1d(self.earlier.places, self.recent.places)

@@ -11,7 +11,7 @@ import numpy as np
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import PLACES
-from calibgraph.solver.repeats import REPEATED_SHARE, hash_numbers
+from calibgraph.solver.repeats import REPEATED_SHARE, Hashes, hash_numbers, point_hashes
 from calibgraph.solver.shared_error import with_common_error
 from calibgraph.tracking.offsets import with_motion_in_use
 from calibgraph.tracking.state import State
@@ -223,24 +223,19 @@ def without_repeats(state: State, table: Correspondences) -> Correspondences:
         state: before the frame.
         table: of the frame.
     """
-    repeated = [
-        name
-        for camera, name in enumerate(state.names)
-        if name in table.cameras and _repeats(state, camera, table)
-    ]
-    if not repeated:
-        return table
-    numbers = [table.cameras.index(name) for name in repeated]
-    return table.select(~np.isin(table.camera_index, numbers))
+    hashes, repeated = point_hashes(table.points_lidar_m), list[int]()
+    for camera, name in enumerate(state.names):
+        number = table.cameras.index(name) if name in table.cameras else -1
+        if _repeats(_last_hashes(state, camera), hashes[table.camera_index == number]):
+            repeated.append(number)
+    return table.select(~np.isin(table.camera_index, repeated)) if repeated else table
 
 
-def _repeats(state: State, camera: int, table: Correspondences) -> bool:
+def _repeats(last: list[int] | None, hashes: Hashes) -> bool:
     """Whether a camera's points are those of the last frame that it has any of."""
-    last, own = _last_hashes(state, camera), table.cameras.index(state.names[camera])
-    points = table.points_lidar_m[table.camera_index == own]
-    if last is None or not len(points):
+    if last is None or not len(hashes):
         return False
-    return sum(map({*hash_numbers(points)}.__contains__, last)) > REPEATED_SHARE * len(last)
+    return sum(map({*hashes.tolist()}.__contains__, last)) > REPEATED_SHARE * len(last)
 
 
 def _last_hashes(state: State, camera: int) -> list[int] | None:

@@ -22,6 +22,7 @@ def changed(one: Item, /, **changes: Any) -> Item:
     values = vars(new)
     values.update(vars(one))
     values.update(changes)
-    for name in values.keys() - known.keys():  # values of cached properties
-        del values[name]
+    if len(values) > len(known):  # values of cached properties
+        for name in values.keys() - known.keys():
+            del values[name]
     return new
