@@ -118,9 +118,7 @@ def doubts(model: dict[str, Any], samples: Sequence[Sample]) -> list[ErrorProbab
     ]
     of_values, of_bar = model["value_reliability"], model["bar_odds"]
     return [
-        ErrorProbability(
-            1 - (1 - p) * (1 - of_values * s.by_values), s.by_bar, bar_odds=of_bar
-        )
+        ErrorProbability(1 - (1 - p) * (1 - of_values * s.by_values), s.by_bar, bar_odds=of_bar)
         for p, s in zip(grossly, samples, strict=True)
     ]
 
