@@ -8,7 +8,7 @@ from functools import cache, wraps
 from threading import Lock
 from typing import Any, Generic, ParamSpec, TypeVar
 
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import OpenBLASController, ThreadpoolController
 
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
@@ -65,18 +65,54 @@ def map_on_cores(function: Callable[..., Result], *arguments: Sequence[Any]) -> 
 
 
 def with_own_threads(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """The function, in whose time BLAS takes one thread: it has a thread per core of its own.
+    """Run the function with BLAS limited to one thread.
 
-    The threads of OpenBLAS wait for the next of our small products without sleep, for which half as
-    many processor seconds again went, and took the cores from ours.
+    OpenBLAS threads spin between small products; that cost 50 % more processor time.
     """
 
     @wraps(function)
     def run(*arguments: Parameters.args, **options: Parameters.kwargs) -> Result:
-        with _controller().limit(limits=1, user_api="blas"):
+        with _one_blas_thread:
             return function(*arguments, **options)
 
     return run
+
+
+class _OneBlasThread:
+    """The limit of BLAS, which is the process's: the first to enter sets it, the last lifts it."""
+
+    def __init__(self) -> None:
+        self.lock, self._inside = Lock(), 0
+        self._lift: Callable[[], None] = lambda: None
+
+    def __enter__(self) -> None:
+        with self.lock:
+            if not self._inside:
+                limit = _in_any_thread(lambda: _controller().limit(limits=1, user_api="blas"))
+                self._lift = limit.restore_original_limits
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self.lock:
+            self._inside -= 1
+            if not self._inside:
+                _in_any_thread(self._lift)
+
+
+def _in_any_thread(change: Callable[[], Result]) -> Result:
+    """Change the limit, which otherwise only the thread can that changed it first."""
+    OpenBLASController.clear_controlling_thread(force=True)
+    try:
+        return change()
+    finally:
+        OpenBLASController.clear_controlling_thread(force=True)
+
+
+_one_blas_thread = _OneBlasThread()
+_lock = _one_blas_thread.lock
+os.register_at_fork(  # a child would find it held for good
+    before=_lock.acquire, after_in_child=_lock.release, after_in_parent=_lock.release
+)
 
 
 @cache

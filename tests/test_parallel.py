@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 
 import pytest
@@ -73,6 +73,27 @@ def test_blas_has_its_threads_again_after_an_error() -> None:
     with threadpool_limits(2, user_api="blas"):
         with pytest.raises(ZeroDivisionError):
             with_own_threads(divmod)(1, 0)
+        assert _blas_threads() == {2}
+
+
+def test_calls_that_overlap_leave_blas_its_threads() -> None:
+    """The first to begin is the first to end, while the other goes on."""
+    entered, over = threading.Event(), threading.Event()
+
+    def wait() -> set[int]:
+        entered.set()
+        assert over.wait(60.0)
+        return _blas_threads()
+
+    def begin_another() -> Future[set[int]]:
+        other = pool.submit(with_own_threads(wait))
+        assert entered.wait(60.0)
+        return other
+
+    with threadpool_limits(2, user_api="blas"), ThreadPoolExecutor(1) as pool:
+        other = with_own_threads(begin_another)()
+        over.set()
+        assert other.result() == {1}
         assert _blas_threads() == {2}
 
 
