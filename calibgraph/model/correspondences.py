@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import logging
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -20,12 +19,15 @@ from calibgraph.model.places import KEYS, Places
 from calibgraph.model.table_columns import (
     COORDINATES,
     INFORMATION,
+    MAX_INFORMATION,
     OPTIONAL_WHOLE,
     TABLE_FORMAT,
     TWIST,
     TWIST_RULE,
     as_confidence,
     beyond_vehicles,
+    check_whole,
+    is_information,
     rows_where,
     write_table,
 )
@@ -34,15 +36,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
-_MAX_WHOLE = 2**63 - 1
-MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
-
-_log = logging.getLogger(__name__)
-
-WITHOUT_METADATA = (
-    "CSV holds no metadata, so that places, errors that frames share and what the images said "
-    "(calibgraph_images) are not known; .parquet keeps them"
-)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -132,10 +125,7 @@ class Correspondences:
         n = len(pixels)
         whole = {"frame": frame, "stamp_ns": stamp_ns, "point_index": point_index}
         for name, numbers in whole.items():
-            if numbers is not None and n and np.asarray(numbers).dtype.kind not in "iu":
-                raise CorrespondenceError(f"{name} must hold whole numbers, found {numbers!r}")
-            if numbers is not None and n and np.asarray(numbers).max() > _MAX_WHOLE:
-                raise CorrespondenceError(f"{name} holds a number beyond 64 bits")
+            check_whole(name, numbers)
         one = isinstance(camera, str) and n > 0  # not sorted, as the names of many rows are
         of_rows = np.asarray([camera] if one else np.broadcast_to(np.asarray(camera), n))
         names, index = np.unique(of_rows, return_inverse=True)
@@ -221,8 +211,6 @@ class Correspondences:
         CSV has no place for the metadata: a warning is logged.
         """
         write_table(self.to_arrow(), Path(path))
-        if Path(path).suffix == ".csv" and self.metadata:
-            _log.warning("%s: %s", path, WITHOUT_METADATA)
 
     def to_arrow(self) -> pa.Table:
         """The table in the file format's columns, its metadata in the schema."""
@@ -259,11 +247,8 @@ class Correspondences:
             i = self.information_px
             good = (np.abs(i) < MAX_INFORMATION).all(axis=1)
             self._require(good, "information", i, f"be finite and below {MAX_INFORMATION:g}")
-            determinant = i[:, 0] * i[:, 2] - i[:, 1] ** 2
-            tolerance = 1e-6 * np.maximum(i[:, 0], i[:, 2]) ** 2
-            positive = (i[:, [0, 2]] >= 0).all(axis=1) & (determinant >= -tolerance)
-            good = positive & (i[:, 0] + i[:, 2] > MIN_INFORMATION)
-            self._require(good, "information", i, "be positive semidefinite and not zero")
+            rule = "be positive semidefinite and not zero"
+            self._require(is_information(i), "information", i, rule)
 
     def _require(self, good: Any, what: str, found: NDArray[Any], rule: str) -> None:
         if not good.all():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,11 +24,41 @@ TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_m_s", "vy_m_s", "vz_m_s")
 MAX_TWIST = 6.0, 100.0  # rad/s and m/s: beyond those of a vehicle; swapped ones are seen
 TWIST_RULE = "be under 6 rad/s, then under 100 m/s (rotation first, in radians)"
 
+MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
+
 OPTIONAL_WHOLE = ("stamp_ns", "point_index")
 _WHOLE = ("frame", *OPTIONAL_WHOLE)
 _REQUIRED = ("camera", "frame", *COORDINATES)
 _COLUMNS = (*_REQUIRED, "confidence", *OPTIONAL_WHOLE, *INFORMATION, *TWIST)
 _TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
+
+WITHOUT_METADATA = (
+    "CSV holds no metadata, so that places, errors that frames share and what the images said "
+    "(calibgraph_images) are not known; .parquet keeps them"
+)
+
+_log = logging.getLogger(__name__)
+
+
+def check_whole(name: str, values: ArrayLike | None) -> None:
+    """Check that a column holds whole numbers of 64 bits, if there is one.
+
+    Raises:
+        CorrespondenceError: if it does not.
+    """
+    array = np.asarray([] if values is None else values)
+    if array.size and array.dtype.kind not in "iu":
+        raise CorrespondenceError(f"{name} must hold whole numbers, found {values!r}")
+    if array.size and array.max() >= 2**63:
+        raise CorrespondenceError(f"{name} holds a number beyond 64 bits")
+
+
+def is_information(uu_uv_vv: Array) -> NDArray[np.bool_]:
+    """(n,) whether (n, 3) i_uu, i_uv, i_vv are positive semidefinite matrices and not zero."""
+    uu, uv, vv = uu_uv_vv.T
+    determinant, tolerance = uu * vv - uv**2, 1e-6 * np.maximum(uu, vv) ** 2
+    good: NDArray[np.bool_] = (uu >= 0) & (vv >= 0) & (determinant >= -tolerance)
+    return good & (uu + vv > MIN_INFORMATION)
 
 
 def beyond_vehicles(twist_per_s: Array) -> NDArray[np.bool_]:
@@ -38,7 +69,10 @@ def beyond_vehicles(twist_per_s: Array) -> NDArray[np.bool_]:
 
 
 def write_table(arrow: pa.Table, path: Path) -> None:
-    """Write a table as Parquet, or as CSV if the name ends in .csv, atomically."""
+    """Write a table as Parquet, or as CSV if the name ends in .csv, atomically.
+
+    A warning is logged where CSV loses the metadata of a matcher.
+    """
     from pyarrow import csv, parquet
 
     def write(part: Path) -> None:
@@ -48,6 +82,9 @@ def write_table(arrow: pa.Table, path: Path) -> None:
             parquet.write_table(arrow, part, write_page_checksum=True)
 
     write_atomically(path, write)
+    said = (arrow.schema.metadata or {}).get(b"matcher", b"{}")
+    if path.suffix == ".csv" and said != b"{}":
+        _log.warning("%s: %s", path, WITHOUT_METADATA)
 
 
 def check_schema(schema: pa.Schema) -> None:
