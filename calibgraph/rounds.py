@@ -39,7 +39,7 @@ from calibgraph.rematch import rematch
 from calibgraph.solver.joint import solve_joint, solve_without_failing
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
-from calibgraph.trust.inputs import check_inputs
+from calibgraph.trust.inputs import check_inputs, describe_copies
 
 Datasets = Dataset | Path | str | Sequence[Path | str]
 AnyMatcher = Matcher | Correspondences | Path | str
@@ -69,7 +69,10 @@ def match_in_rounds(
     config = config or Config()
     full = find_matcher(matcher, seed=config.seed).with_estimate(config.estimate)
     chosen, guess = _open(dataset, rig, full.most_frames)
-    data = without_copies(keep_frames(chosen))
+    choice = without_copies(keep_frames(chosen))
+    data = choice.dataset
+    if choice.copies:
+        _log.info(describe_copies(choice.copies))
     _log.info("%d frames, cameras %s", len(data.frames), ", ".join(guess.cameras))
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
     with watch("inputs"):
@@ -104,7 +107,7 @@ def match_in_rounds(
     run = MatchingRun(
         data, full, guess, table, solution, tuple(rounds), watch, missed,
         warnings=warnings, is_late=out_of_time, excluded=config.excluded_cameras,
-        copies=len(chosen.frames) - len(data.frames),
+        copies=choice.copies,
     )  # fmt: skip
     if not out_of_time():
         with watch("match_again"):

@@ -1,6 +1,6 @@
 """Choose the frames of a long recording that are matched: distant places, sharp and bright."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -22,10 +22,17 @@ a lens is covered, and more would take longer than the matching."""
 
 @dataclass(frozen=True, eq=False)
 class FrameChoice:
-    """Some frames of a dataset."""
+    """Some frames of a dataset.
+
+    Attributes:
+        dataset: these frames.
+        text: how they were chosen; empty for all of them.
+        copies: names of the frames that were left out as copies, each with that of its original.
+    """
 
     dataset: Dataset
     text: str = ""
+    copies: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,16 +50,27 @@ class _Candidate:
     view: tuple[int, View] | None
 
 
-def without_copies(dataset: Dataset) -> Dataset:
+def without_copies(dataset: Dataset) -> FrameChoice:
     """The dataset with one of the frames that have the same cloud and the same images.
 
     A search would take what one frame shows by chance for the agreement of many.
     """
-    contents = map_on_cores(lambda frame: tuple(frame.hashes().values()), dataset.frames)
-    kept = dict[tuple[str, ...], Frame]()
-    for content, frame in zip(contents, dataset.frames, strict=True):
-        kept.setdefault(content, frame)
-    return dataset if len(kept) == len(contents) else dataset.only([*kept.values()])
+    contents = map_on_cores(_content, dataset.frames)
+    kept = dict[Hashable, Frame]()
+    originals = [kept.setdefault(*each) for each in zip(contents, dataset.frames, strict=True)]
+    pairs = zip(dataset.frames, originals, strict=True)
+    copies = tuple((frame.name, first.name) for frame, first in pairs if frame is not first)
+    return FrameChoice(dataset.only([*kept.values()]) if copies else dataset, copies=copies)
+
+
+def _content(frame: Frame) -> Hashable:
+    """Equal for copies; a frame with a file that cannot be read is none."""
+    try:
+        hashes = frame.hashes()
+    except (CalibrationError, OSError):
+        return frame.index
+    images = sorted((name, hashes[str(path)]) for name, path in frame.image_paths.items())
+    return hashes[str(frame.cloud_path)], *images
 
 
 def choose_frames(dataset: Dataset, rig: Rig, most: int) -> FrameChoice:

@@ -58,7 +58,7 @@ class MatchingRun:
         went_on: per camera whose rounds went on from where its images agree better, how far that
             was [deg, cm].
         excluded: cameras that the user excluded.
-        copies: number of frames that were left out as copies of others.
+        copies: names of the frames that were left out as copies, each with that of its original.
     """
 
     dataset: Dataset
@@ -75,7 +75,7 @@ class MatchingRun:
     is_late: Callable[[], bool] = lambda: False
     went_on: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     excluded: tuple[str, ...] = ()
-    copies: int = 0
+    copies: tuple[tuple[str, str], ...] = ()
 
 
 def require_known_motion(data: Dataset, matcher: FullMatcher, parts: Sequence[LensPart]) -> None:

@@ -21,6 +21,7 @@ ABOUT_THE_DATA = frozenset(
     {
         COMMON_ERROR,
         "beyond_tolerance",
+        "copies",  # left out
         "correspondences",
         "correspondences_used",
         "difference between even and odd frames",  # too few frames to split

@@ -53,6 +53,16 @@ def describe_repeats(what: str, digests: Iterable[tuple[str, str]]) -> str:
     return f"frames {one} and {other} have the same {what}{others}; leave repeats out"
 
 
+def describe_copies(copies: Iterable[tuple[str, str]]) -> str:
+    """A line on frames that were left out as copies; empty without any.
+
+    Args:
+        copies: the name of each, and of the frame that it is a copy of.
+    """
+    named = [(name, first) for copy, first in copies for name in (first, copy)]
+    return describe_repeats("cloud and images", named)
+
+
 def find_doubts(rig: Rig, frame: Frame, cloud: Cloud) -> list[str]:
     """Warnings about the values of a rig and about a frame's cloud.
 

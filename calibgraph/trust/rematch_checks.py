@@ -9,7 +9,7 @@ from calibgraph.matching.run import Rematch
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.verdict import TOLERANCE, WENT_ON, Check
 from calibgraph.trust.evidence import Checks
-from calibgraph.trust.inputs import describe_repeats
+from calibgraph.trust.inputs import describe_copies, describe_repeats
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import threshold
 
@@ -33,12 +33,11 @@ def last_round_checks(evidence: RunEvidence) -> Checks:
 
 
 def repeated_file_checks(evidence: RunEvidence) -> Checks:
-    """How many frames were copies, and whether others have the same cloud or image of a camera."""
+    """Which frames were copies, and whether others have the same cloud or image of a camera."""
     run, cameras = evidence.run, evidence.solution.cameras
     checks = check_repeated_files(run.dataset, evidence.hashes, cameras)
     if run.copies:
-        share = run.copies / (run.copies + len(run.dataset.frames))
-        check = threshold("repeated_frames").check(share)
+        check = Check("copies", "WARN", describe_copies(run.copies), len(run.copies))
         checks = {name: [check, *each] for name, each in checks.items()}
     return checks
 

@@ -111,10 +111,21 @@ def test_the_choice_is_logged_and_the_others_stay_known(caplog: pytest.LogCaptur
 def test_copies_of_a_frame_are_left_out() -> None:
     """Those with the same cloud and images; not where one of them changes."""
     data = drive([0, 50, 0, 50, 0])
-    assert [frame.index for frame in without_copies(data).frames] == [0, 1]
+    choice = without_copies(data)
+    assert [frame.index for frame in choice.dataset.frames] == [0, 1]
+    names = [frame.name for frame in data.frames]
+    assert choice.copies == tuple((names[k], names[k % 2]) for k in (2, 3, 4))
     data = drive([0, 50])
-    assert without_copies(data) is data
+    assert without_copies(data).dataset is data
     frozen = dataset_from_arrays(
         RIG, [CLOUD, CLOUD + 1], {n: [WALL[:HEIGHT, :WIDTH]] * 2 for n in RIG.cameras}
     )
-    assert without_copies(frozen) is frozen
+    assert without_copies(frozen).dataset is frozen
+
+
+def test_equal_files_of_other_cameras_are_no_copy(tmp_path: Path) -> None:
+    """Two frames with one cloud, and the same bytes from one camera and from another."""
+    path = tmp_path / "same"
+    path.write_bytes(b"same")
+    frames = tuple(Frame(k, n, path, {n: path}) for k, n in enumerate(("front", "rear")))
+    assert without_copies(Dataset(RIG, frames, ())).copies == ()

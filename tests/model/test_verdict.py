@@ -108,7 +108,7 @@ def test_a_rig_cannot_tell_if_none_of_its_cameras_looks_odd() -> None:
 
 
 def test_kinds_of_checks_of_the_data_are_those_of_the_table_or_have_no_number() -> None:
-    without_a_row = {"correspondences", "image evidence", "terms", COMMON_ERROR, WENT_ON}
+    without_a_row = {"copies", "correspondences", "image evidence", "terms", COMMON_ERROR, WENT_ON}
     without_a_row |= {IMAGES_ELSEWHERE}
     names = {"difference between even and odd frames"}
     assert threshold("halves_rotation").name in names

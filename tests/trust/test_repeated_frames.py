@@ -9,6 +9,7 @@ import pytest
 
 import calibgraph
 from calibgraph import CorrespondenceError, Correspondences, Rig, concatenate, solve
+from calibgraph.model.causes import action_of
 from calibgraph.model.verdict import Verdict
 from calibgraph.pipeline import hash_inputs
 from calibgraph.solver.repeats import number_repeats
@@ -36,15 +37,19 @@ def test_frames_with_the_same_cloud_or_image_are_reported() -> None:
     assert found["front_left"] == []
 
 
-def test_copies_that_were_left_out_are_data_that_are_missing() -> None:
+def test_copies_that_were_left_out_are_named_and_are_data_that_are_missing() -> None:
     data = calibgraph.load_dataset(SAMPLE).select("0:2")
-    for left_out, expected in ((6, "WARN"), (1, "PASS")):
-        run = SimpleNamespace(dataset=data, copies=left_out)
-        solution = SimpleNamespace(cameras=("left",))
-        evidence: Any = SimpleNamespace(run=run, hashes=hash_inputs(data), solution=solution)
-        (check,) = repeated_file_checks(evidence)["left"]
-        assert (check.kind, check.status) == ("repeated_frames", expected)
-        assert Verdict((check,)).cannot_tell == (expected == "WARN")
+    run = SimpleNamespace(dataset=data, copies=(("a", "000000"), ("b", "000000")))
+    solution = SimpleNamespace(cameras=("left",))
+    evidence: Any = SimpleNamespace(run=run, hashes=hash_inputs(data), solution=solution)
+    (check,) = repeated_file_checks(evidence)["left"]
+    assert (check.name, check.status, check.value) == ("copies", "WARN", 2)
+    assert check.text == (
+        "frames 000000 and a have the same cloud and images, and 1 more repeat one; leave repeats "
+        "out"
+    )
+    assert Verdict((check,)).cannot_tell
+    assert action_of("copies") == "Leave the copies out."
 
 
 def copies(table: Correspondences, number: int) -> Correspondences:
