@@ -16,7 +16,7 @@ from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
-from calibgraph.matching.frame_choice import choose_frames, without_copies
+from calibgraph.matching.frame_choice import FrameChoice, choose_frames, without_copies
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.places import find_places
 from calibgraph.matching.protocol import Matcher
@@ -67,14 +67,12 @@ def match_in_rounds(
     as of :func:`calibgraph.calibrate`.
     """
     config = config or Config()
-    full = find_matcher(matcher, seed=config.seed).with_estimate(config.estimate)
-    chosen, guess = _open(dataset, rig, full.most_frames)
-    choice = without_copies(keep_frames(chosen))
-    data = choice.dataset
-    if choice.copies:
-        _log.info(describe_copies(choice.copies))
-    _log.info("%d frames, cameras %s", len(data.frames), ", ".join(guess.cameras))
     watch, rounds, out_of_time = Stopwatch(), list[RoundSummary](), _deadline(time_limit_s)
+    full = find_matcher(matcher, seed=config.seed).with_estimate(config.estimate)
+    with watch("choose_frames"):
+        choice, guess = _open(dataset, rig, full.most_frames)
+    data = keep_frames(choice.dataset)
+    _log.info("%d frames, cameras %s", len(data.frames), ", ".join(guess.cameras))
     with watch("inputs"):
         require_known_motion(data, full, config.estimate)
         warnings = check_inputs(data, guess, at_guess=full.stage1 == "rig")
@@ -145,16 +143,17 @@ def assign_places(run: MatchingRun) -> MatchingRun:
     return replace(run, correspondences=table, solution=solution)
 
 
-def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[Dataset, Rig]:
+def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[FrameChoice, Rig]:
     """The frames that the matcher is given, and the initial guess."""
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     guess = rig if rig is not None else data.rig
-    if most_frames is not None:
+    if most_frames is None:
+        choice = without_copies(data)
+    else:
         choice = choose_frames(data, guess, most_frames)
-        data = choice.dataset
-        if choice.text:
-            _log.info(choice.text)
-    return data, guess
+    for text in filter(None, (choice.text, describe_copies(choice.copies))):
+        _log.info(text)
+    return choice, guess
 
 
 def find_stationary(data: Dataset, rig: Rig) -> Places:

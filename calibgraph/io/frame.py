@@ -107,7 +107,11 @@ class Frame:
         return make()
 
     def hashes(self) -> dict[str, str]:
-        """SHA-256 of the cloud and the images, by path."""
+        """SHA-256 of the cloud and the images, by path; computed once."""
+        return self._hashes
+
+    @cached_property
+    def _hashes(self) -> dict[str, str]:
         paths = (self.cloud_path, *self.image_paths.values())
         return {str(path): hash_source(path) for path in paths}
 

@@ -74,14 +74,15 @@ def _content(frame: Frame) -> Hashable:
 
 
 def choose_frames(dataset: Dataset, rig: Rig, most: int) -> FrameChoice:
-    """Choose frames spread over the recording; all of them if there are no more.
+    """Choose frames spread over the recording, without copies; all if there are no more.
 
     While the vehicle stands, one is taken. Of neighbours, that with the clearest images is: the
     largest product over the cameras of their images' mean gradient.
     """
-    if len(dataset.frames) <= most:
-        return FrameChoice(dataset)
-    frames = spread_out(dataset.frames, CANDIDATES * most)
+    unique = without_copies(dataset.spread_out(CANDIDATES * most))
+    frames = unique.dataset.frames
+    if len(frames) <= most:
+        return unique
     candidates = map_on_cores(_examine, frames, [rig] * len(frames))
     scores = _scores(candidates)
     places = list(_places(candidates))
@@ -97,7 +98,8 @@ def choose_frames(dataset: Dataset, rig: Rig, most: int) -> FrameChoice:
     standing, unread = len(frames) - len(places), int(np.isneginf(scores).sum())
     text += f"; in {standing} the vehicle stands where it stood" if standing else ""
     text += f"; {unread} have an image that cannot be read" if unread else ""
-    return FrameChoice(dataset.only([frames[number] for number in sorted(chosen)]), text)
+    kept = dataset.only([frames[number] for number in sorted(chosen)])
+    return FrameChoice(kept, text, unique.copies)
 
 
 def _examine(frame: Frame, rig: Rig) -> _Candidate:

@@ -29,8 +29,13 @@ WALL = cv2.resize(
 )  # fmt: skip
 
 
-def drive(at_px: list[int], spoilt: dict[int, str] | None = None) -> Dataset:
-    """Frames along a wall, of which the front camera's images of some are spoilt."""
+def drive(
+    at_px: list[int], spoilt: dict[int, str] | None = None, *, copies: bool = False
+) -> Dataset:
+    """Frames along a wall, of which the front camera's images of some are spoilt.
+
+    Clouds differ, unless those of frames at one place are to be copies.
+    """
     images: dict[str, list[np.ndarray]] = {"front": [], "rear": []}
     for number, place in enumerate(at_px):
         view = np.ascontiguousarray(WALL[:HEIGHT, place : place + WIDTH])
@@ -41,7 +46,8 @@ def drive(at_px: list[int], spoilt: dict[int, str] | None = None) -> Dataset:
         elif how == "dark":
             view = view // 20
         images["front"].append(view)
-    return dataset_from_arrays(RIG, [CLOUD] * len(at_px), images)
+    clouds = [CLOUD + (0 if copies else number) for number in range(len(at_px))]
+    return dataset_from_arrays(RIG, clouds, images)
 
 
 def chosen(data: Dataset, most: int) -> list[int]:
@@ -85,10 +91,17 @@ def test_an_image_that_cannot_be_read_is_left_out() -> None:
     assert choice.text.endswith("1 have an image that cannot be read")
 
 
-def test_few_frames_are_all_taken_and_none_is_read() -> None:
-    frames = tuple(Frame(k, str(k), Path("none"), {}) for k in range(3))
-    data = Dataset(RIG, frames, ())
-    assert choose_frames(data, RIG, 3).dataset is data
+def test_few_frames_are_all_taken() -> None:
+    data = drive([0, 50, 100])
+    assert chosen(data, 3) == [0, 1, 2]
+
+
+def test_no_copy_takes_the_place_of_another_frame() -> None:
+    """Of 12 frames, each three times, 12 are wanted."""
+    data = drive([100 * (k // 3) for k in range(36)], copies=True)
+    choice = choose_frames(data, RIG, 12)
+    assert [frame.index for frame in choice.dataset.frames] == list(range(0, 36, 3))
+    assert len(choice.copies) == 24
 
 
 def test_a_covered_camera_does_not_choose() -> None:
@@ -103,14 +116,15 @@ def test_a_covered_camera_does_not_choose() -> None:
 def test_the_choice_is_logged_and_the_others_stay_known(caplog: pytest.LogCaptureFixture) -> None:
     data = drive([100 * k for k in range(12)])
     with caplog.at_level(logging.INFO, logger="calibgraph"):
-        few, _ = _open(data, RIG, 4)
+        choice, _ = _open(data, RIG, 4)
+    few = choice.dataset
     assert caplog.messages[0].startswith("4 of 12 frames are matched (--frames chooses others)")
     assert len(few.frames) == 4 and len(few.recorded) == 12
 
 
 def test_copies_of_a_frame_are_left_out() -> None:
     """Those with the same cloud and images; not where one of them changes."""
-    data = drive([0, 50, 0, 50, 0])
+    data = drive([0, 50, 0, 50, 0], copies=True)
     choice = without_copies(data)
     assert [frame.index for frame in choice.dataset.frames] == [0, 1]
     names = [frame.name for frame in data.frames]
