@@ -151,8 +151,10 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
         choice = without_copies(data)
     else:
         choice = choose_frames(data, guess, most_frames)
-    for text in filter(None, (choice.text, describe_copies(choice.copies))):
-        _log.info(text)
+    if choice.text:
+        _log.info(choice.text)
+    if choice.copies:
+        _log.info(describe_copies(choice.copies))
     return choice, guess
 
 

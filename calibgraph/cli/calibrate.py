@@ -47,7 +47,9 @@ def calibrate(
         )
         result = _warned_of_same_data(result, matching.rig)
         written = write_result(result, out, data)
-    _print_frames_used(len(result.frames), data)
+    checks = next(iter(result.camera_verdicts.values())).checks
+    copies = next((check.value for check in checks if check.name == "copies"), None)
+    _print_frames_used(len(result.frames), data, int(copies or 0))
     _print_and_exit(result, written, as_json=as_json)
 
 
@@ -75,7 +77,7 @@ def match(
         )
         found = run.correspondences
         replace(found, metadata={**found.metadata, WRITTEN_KEY: MATCH}).save(out)
-    _print_frames_used(len(run.dataset.frames), data)
+    _print_frames_used(len(run.dataset.frames), data, len(run.copies))
     _print_table_and_exit(run.correspondences, out, as_json=as_json)
 
 
@@ -150,13 +152,14 @@ def _warned_of_same_data(result: Calibration, rig: Path | None) -> Calibration:
     return replace(result, warnings=(*result.warnings, text))
 
 
-def _print_frames_used(used: int, data: Dataset) -> None:
+def _print_frames_used(used: int, data: Dataset, copies: int) -> None:
     """Print how many frames were matched, unless all were."""
+    text = f"{used} of {len(data.frames)} frames"
+    if used + copies < len(data.frames):
+        text += ", spread over them, the clearest of neighbours; --frames takes others"
+    if copies:
+        text += f"; {copies} {'copies' if copies > 1 else 'copy'} left out"
     if used < len(data.frames):
-        text = (
-            f"{used} of {len(data.frames)} frames, spread over them, the clearest of neighbours; "
-            "--frames takes others"
-        )
         print_plain(terminal(), text)
 
 
