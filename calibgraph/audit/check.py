@@ -1,5 +1,6 @@
 """``check``: is the calibration that is deployed still right?"""
 
+import logging
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from calibgraph.files import load_model
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.frame import hash_source
 from calibgraph.io.kept_frames import keep_frames
+from calibgraph.matching.frame_choice import CANDIDATES, without_copies
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
@@ -36,6 +38,7 @@ from calibgraph.trust.competing_solution import competing_solution_checks
 from calibgraph.trust.evidence import Checks, Evidence, concatenate
 from calibgraph.trust.guess import point_distance_checks
 from calibgraph.trust.image_evidence import measure_image_evidence
+from calibgraph.trust.inputs import describe_copies
 from calibgraph.trust.intrinsics import intrinsics_checks
 from calibgraph.trust.matcher_checks import matcher_checks
 from calibgraph.trust.pair_agreement import pair_agreement_checks
@@ -43,6 +46,8 @@ from calibgraph.trust.rematch_checks import last_round_checks
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
 from calibgraph.trust.thresholds import threshold
+
+_log = logging.getLogger(__name__)
 
 DOUBTS: tuple[Callable[[Evidence], Checks], ...] = (
     point_distance_checks,
@@ -92,7 +97,8 @@ def check(
     tolerance, report = Tolerance(tolerance_deg, tolerance_cm), progress or no_progress
     full, watch = find_matcher(matcher, seed=seed), Stopwatch()
     deployed = rig.model_copy(update={"relative_poses": ()})
-    data = _open(dataset, deployed, full)
+    with watch("choose_frames"):
+        data = _open(dataset, deployed, full)
     matching = Matching(keep_frames(data), deployed, full, Config(seed=seed), report)
     try:
         run = match_from_deployed(matching, watch)
@@ -118,9 +124,13 @@ def check(
 
 
 def _open(dataset: Datasets, deployed: Rig, matcher: FullMatcher) -> Dataset:
-    """The frames that the matcher is given."""
+    """The frames that the matcher is given, without copies, which are logged."""
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, deployed)
-    return data if matcher.most_frames is None else data.spread_out(matcher.most_frames)
+    most = matcher.most_frames
+    choice = without_copies(data if most is None else data.spread_out(CANDIDATES * most))
+    if choice.copies:
+        _log.warning(describe_copies(choice.copies))
+    return choice.dataset if most is None else choice.dataset.spread_out(most)
 
 
 def _judge(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -158,3 +159,12 @@ def test_a_camera_that_moved_during_the_recording_is_not_ok(tmp_path: Path) -> N
     assert moved.status == "CANNOT TELL"
     assert "frames 000003, 000004, 000005 fit another extrinsic better" in moved.reason
     assert {audit.cameras[name].status for name in ("front_right", "left")} == {"OK"}
+
+
+def test_copies_of_a_frame_are_left_out_and_named(caplog: pytest.LogCaptureFixture) -> None:
+    data = calibgraph.load_dataset(SAMPLE, TRUTH)
+    copied = [replace(data.frames[0], index=100 + k, name=f"copy{k}") for k in range(2)]
+    data = replace(data, frames=(*data.frames, *copied))
+    table = simulate_correspondences(TRUTH, frames=6)
+    assert calibgraph.check(TRUTH, data, matcher=table).frames == 6
+    assert "frames 000000 and copy0 have the same cloud and images, and 1 more" in caplog.text
