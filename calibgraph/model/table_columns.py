@@ -57,8 +57,9 @@ def is_information(uu_uv_vv: Array) -> NDArray[np.bool_]:
     """(n,) whether (n, 3) i_uu, i_uv, i_vv are positive semidefinite matrices and not zero."""
     uu, uv, vv = uu_uv_vv.T
     determinant, tolerance = uu * vv - uv**2, 1e-6 * np.maximum(uu, vv) ** 2
-    good: NDArray[np.bool_] = (uu >= 0) & (vv >= 0) & (determinant >= -tolerance)
-    return good & (uu + vv > MIN_INFORMATION)
+    positive = (uu >= 0) & (vv >= 0) & (determinant >= -tolerance)
+    good: NDArray[np.bool_] = positive & (uu + vv > MIN_INFORMATION)
+    return good
 
 
 def beyond_vehicles(twist_per_s: Array) -> NDArray[np.bool_]:
