@@ -36,7 +36,7 @@ CAUSES: dict[str, Cause] = {
     "repeats": Cause(
         "frames that repeat others",
         "See why the named images or clouds repeat, and leave the repeats out.",
-        {"repeated frames": "", "copies": "Leave the copies out.",
+        {"equal files": "", "copies": "Leave the copies out.",
          "repeated_frames": "Take frames while the vehicle drives.",
          "stuck": "See why the same points come again: a LiDAR that stands, too, measures others."},
     ),

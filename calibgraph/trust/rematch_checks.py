@@ -52,7 +52,7 @@ def check_repeated_files(
     for camera in cameras:
         images = [(n, hashes[str(paths[camera])]) for n, paths, _ in frames if camera in paths]
         text = describe_repeats(f"image of {camera}", images) or of_clouds
-        checks[camera] = [Check("repeated frames", "WARN", text)] if text else []
+        checks[camera] = [Check("equal files", "WARN", text)] if text else []
     return checks
 
 

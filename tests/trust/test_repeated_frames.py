@@ -25,7 +25,8 @@ def test_frames_with_the_same_cloud_or_image_are_reported() -> None:
     copy = replace(data.frames[0], index=3, name="copy")
     copied = replace(data, frames=(*data.frames, copy))
     (check,) = check_repeated_files(copied, hashes, ["left"])["left"]
-    assert check.status == "WARN" and "000000 and copy have the same image of left" in check.text
+    assert (check.name, check.status) == ("equal files", "WARN")
+    assert "000000 and copy have the same image of left" in check.text
     image = {"left": data.frames[0].image_paths["left"]}
     frozen = [replace(frame, image_paths=frame.image_paths | image) for frame in data.frames]
     found = check_repeated_files(replace(data, frames=frozen), hashes, ["left", "front_left"])
