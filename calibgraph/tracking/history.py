@@ -156,8 +156,6 @@ class History:
             saved = decode(path.read_bytes(), "history")
         except (OSError, StateError):
             return history
-        if saved["entries"].shape[-1] == 2 * _POSE:  # of a version without time offsets
-            saved["entries"] = np.insert(saved["entries"], [_POSE, 2 * _POSE], np.nan, axis=-1)
         rooms = {name: _room(saved[name], saved["most"]) for name in ("frames", "entries")}
         content = {**saved, **rooms, "begun": {*saved["begun"]}, "held": len(saved["frames"])}
         vars(history).update({f"_{name}": value for name, value in content.items()})
