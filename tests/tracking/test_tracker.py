@@ -350,7 +350,9 @@ def test_a_stream_that_is_stuck_from_the_beginning_is_named(pair: Rig) -> None:
     tracker.update(tables[20])
     result = tracker.calibration()
     assert result.verdict.status == "FAIL"
-    assert result.summary.reasons[0].text.startswith("the last 21 frames with matches have the same")
+    assert result.summary.reasons[0].text.startswith(
+        "the last 21 frames with matches have the same"
+    )
     assert result.summary.actions[0].startswith("See why the same points come again")
 
 
