@@ -33,7 +33,7 @@ from tests.model.tables import table
         ({"metadata": [1]}, "metadata must be a mapping"),
         (
             {"metadata": {"systematic_rotation_rad": 10**400}},
-            "systematic_rotation_rad: expected a number from 0 to 3.14, found 1.*000[.]{3}; correct it",
+            "systematic_rotation_rad: expected a number from 0 to 3.14, found 10.*[.]{3}; correct",
         ),
         ({"metadata": {"systematic_rotation_rad": -(10**400)}}, "found -1000"),
         ({"metadata": {"range_rotation_deg": "20"}}, "range_rotation_deg: expected a number from"),
