@@ -154,10 +154,10 @@ class History:
         history = History()
         try:
             saved = decode(path.read_bytes(), "history")
-        except (OSError, StateError):
+            rooms = {name: _room(saved[name], saved["most"]) for name in ("frames", "entries")}
+            content = {**saved, **rooms, "begun": {*saved["begun"]}, "held": len(saved["frames"])}
+        except (OSError, StateError, AttributeError, KeyError, TypeError, ValueError):
             return history
-        rooms = {name: _room(saved[name], saved["most"]) for name in ("frames", "entries")}
-        content = {**saved, **rooms, "begun": {*saved["begun"]}, "held": len(saved["frames"])}
         vars(history).update({f"_{name}": value for name, value in content.items()})
         return history
 
