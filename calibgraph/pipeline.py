@@ -19,7 +19,7 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
 from calibgraph.model.config import Config, Terms
-from calibgraph.model.correspondences import WITHOUT_METADATA, Correspondences
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pair_covariances
 from calibgraph.model.lens_estimate import with_sigmas
 from calibgraph.model.rig import Rig
@@ -135,16 +135,8 @@ def solve(
     result = to_calibration(evidence, checks)
     motion = solution.correspondences
     unused = unused_times(rig, is_known=motion.twist_per_s is not None)
-    warnings = (*unused, *odd_motions(motion), *_lost_metadata(table))
+    warnings = (*unused, *odd_motions(motion))
     return replace(result, warnings=warnings, timings_s={**result.timings_s, **watch.seconds})
-
-
-def _lost_metadata(table: Correspondences | Path | str) -> list[str]:
-    """A warning, which is logged, about a table whose format has no metadata."""
-    if isinstance(table, Correspondences) or Path(table).suffix != ".csv":
-        return []
-    _log.warning("%s: %s", table, WITHOUT_METADATA)
-    return [f"{table}: {WITHOUT_METADATA}"]
 
 
 def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:

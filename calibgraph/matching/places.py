@@ -36,6 +36,10 @@ MOST_S = 1.0
 """Longest time over which twists are integrated: from the mean of those at both ends the distance
 differs by up to a t^2 / 4, which is 0.75 m at 3 m/s^2."""
 
+FOLLOWS_S, FOLLOWS_NUMBERS = 5.0, 10
+"""Time, or steps of their numbers if they have no stamps, within which a frame may be the next of a
+drive: only there can an unknown motion be a short one."""
+
 Motion = NDArray[np.float64] | None
 """(4, 4) T_later_earlier of the LiDAR; None where the two frames have too little in common."""
 
@@ -64,8 +68,8 @@ class PlaceWalk:
 
     Args:
         most_places: that are remembered, those visited last; None: all.
-        in_sequence: whether frames follow each other closely, as while driving: then a frame after
-            an unknown motion stays at the place before, however unlike the clouds are.
+        in_sequence: whether the frames are of a drive: then a frame that follows the one before
+            closely stays at its place after an unknown motion, however unlike the clouds are.
     """
 
     def __init__(self, most_places: int | None = None, *, in_sequence: bool = False) -> None:
@@ -82,9 +86,8 @@ class PlaceWalk:
             return self._first
         step = _motion_by_clouds(before, frame) if step is None else step
         if step is None:
-            self._find_place(
-                frame, may_stay=self._in_sequence or not _are_comparable(before, frame)
-            )
+            follows = self._in_sequence and _follows(before, frame)
+            self._find_place(frame, may_stay=follows or not _are_comparable(before, frame))
             return self._first
         self._T_now_first = step @ self._T_now_first
         if _distance_m(self._T_now_first) > PLACE_M:
@@ -135,6 +138,17 @@ def _by_poses_or_twists(before: Frame, now: Frame) -> Motion:
     if twists[0] is None or twists[1] is None:
         return None
     return np.asarray(gtsam.Pose3.Expmap(-seconds * (twists[0] + twists[1]) / 2).matrix())
+
+
+def _follows(before: Frame, now: Frame) -> bool:
+    """Whether a frame may be the next of a drive, by stamps or numbers; names tell nothing else."""
+    seconds = seconds_between(before, now)
+    if seconds is not None:
+        return abs(seconds) <= FOLLOWS_S
+    numbers = [frame.name.rpartition("/")[2] for frame in (before, now)]
+    if not all(number.isdecimal() for number in numbers):
+        return True
+    return abs(int(numbers[1]) - int(numbers[0])) <= FOLLOWS_NUMBERS
 
 
 def _motion_by_clouds(before: Frame, now: Frame) -> Motion:

@@ -16,7 +16,6 @@ from calibgraph import (
     FileError,
     load_correspondences,
     simulate_correspondences,
-    solve,
 )
 from calibgraph.io.correspondence_tables import from_arrow
 from tests.conftest import make_pair
@@ -252,9 +251,8 @@ def test_changed_bytes_of_a_table_are_not_taken_for_numbers(tmp_path: Path) -> N
 def test_csv_says_that_it_holds_no_metadata(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """When it is written, if there is any, and when it is solved."""
-    rig = make_pair()
-    simulated = simulate_correspondences(rig, frames=6, matches=40)
+    """When it is written, if there is any."""
+    simulated = simulate_correspondences(make_pair(), frames=6, matches=40)
     given = (
         (simulated, "csv", 1),
         (replace(simulated, metadata={}), "csv", 0),
@@ -264,7 +262,3 @@ def test_csv_says_that_it_holds_no_metadata(
         caplog.clear()
         one.save(tmp_path / f"table.{suffix}")
         assert len(caplog.records) == expected
-    for suffix, expected in (("csv", 1), ("parquet", 0)):
-        result = solve(rig, tmp_path / f"table.{suffix}")
-        told = [text for text in result.warnings if "CSV holds no metadata" in text]
-        assert len(told) == expected

@@ -118,6 +118,27 @@ def test_a_frame_that_cannot_be_read_is_of_the_place_before() -> None:
     assert [finder.first_of_place(frame) for frame in frames] == [frames[0].index] * 2
 
 
+@pytest.mark.parametrize(
+    ("names", "places_found"),
+    [
+        (("000000", "000001"), [0, 0]),
+        (("000000", "000185"), [0, 1]),
+        ((f"{10**15}", f"{10**15 + 10**6}"), [0, 0]),
+        ((f"{10**15}", f"{10**15 + 20 * 10**6}"), [0, 1]),
+        (("here", "there"), [0, 0]),
+    ],
+)
+def test_a_frame_stays_after_an_unknown_motion_if_it_follows_closely(
+    names: tuple[str, str], places_found: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By stamps, or else by numbers: unlike clouds of frames far apart are of other places."""
+    monkeypatch.setattr(places, "align_with_any", aligned_with_none)
+    data, _ = sample()
+    frames = [replace(f, name=name) for f, name in zip(data.frames, names, strict=False)]
+    walk = PlaceWalk(in_sequence=True)
+    assert [walk.first_of_place(frame, None) for frame in frames] == places_found
+
+
 @pytest.mark.parametrize("what", ["find_motion", "find_twist"])
 def test_a_frame_whose_motion_cannot_be_found_is_of_the_place_before(what: str) -> None:
     """Its scan does not fit its neighbours'; frame by frame and in a batch."""
