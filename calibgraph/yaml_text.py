@@ -129,7 +129,15 @@ class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
 
 
 def _construct_number(loader: Any, node: yaml.ScalarNode) -> Any:
-    """A decimal number; ``10:40``, ``0x10``, ``010`` are texts: programs read them differently."""
+    """A decimal number; ``10:40``, ``0x10``, ``010`` are texts: programs read them differently.
+
+    ``1_000`` is refused: a text of it would be taken for a number where one is expected.
+    """
+    if "_" in node.value:
+        raise yaml.MarkedYAMLError(
+            problem=f"expected a decimal number, found {node.value}; a text needs quotes",
+            problem_mark=node.start_mark,
+        )
     if _NOT_DECIMAL.match(node.value):
         return loader.construct_yaml_str(node)
     if node.tag.endswith(":int"):
@@ -137,7 +145,7 @@ def _construct_number(loader: Any, node: yaml.ScalarNode) -> Any:
     return loader.construct_yaml_float(node)
 
 
-_NOT_DECIMAL = re.compile(r".*[:_]|[-+]?0[0-9a-z]")
+_NOT_DECIMAL = re.compile(r".*:|[-+]?0[0-9a-z]")
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _construct_number)
 _Loader.add_constructor("tag:yaml.org,2002:float", _construct_number)

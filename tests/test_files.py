@@ -173,6 +173,14 @@ def test_numbers_of_another_base_are_refused_as_values(number: str, tmp_path: Pa
         assert count == 1
 
 
+def test_a_number_with_underscores_is_refused(tmp_path: Path) -> None:
+    path, text = tmp_path / "rig.yaml", (SAMPLE / "rig.yaml").read_text()
+    path.write_text(re.sub(r"(fx: )[0-9.]+", r"\g<1>1_000", text))
+    with pytest.raises(FileError, match="expected a decimal number, found 1_000; a text needs q"):
+        load_rig(path)
+    assert parse_yaml("day: '2026_11'\n", "some.yaml") == {"day": "2026_11"}
+
+
 def test_zeros_in_front_of_a_number_make_it_no_octal_one(tmp_path: Path) -> None:
     path, text = tmp_path / "rig.yaml", (SAMPLE / "rig.yaml").read_text()
     path.write_text(re.sub(r"(fx: )[0-9.]+", r"\g<1>0640", text))

@@ -45,16 +45,19 @@ def fleet(
         engine (NAME[:ADDRESS]): Where jobs run: processes (here), ray, ray:ADDRESS, dask or
             dask:ADDRESS.
         jobs: Jobs at once. (default: one per core)
-        shard (I/N): Only part I of N, from 0. (default: all)
+        shard (I/N): Only part I of N, from 0; needed in an array of jobs. (default: all)
         timeout_s (SECONDS): Longest time of a job.
         memory_gb (GB): Most memory of a job. (default: no limit)
         fetch_gb (GB): Most bytes of a remote recording.
         allow_missing: Missing recordings become failed rows.
         logs: Keep a log per vehicle below URI/_logs.
     """
+    import os
+
     from calibgraph.fleet.run import run_fleet, shard_from
     from calibgraph.fleet.task import Limits
 
+    part = shard_from(shard, os.environ)
     memory_bytes = None if memory_gb is None else int(memory_gb * 1e9)
     limits = Limits(timeout_s=timeout_s, memory_bytes=memory_bytes, fetch_bytes=fetch_gb * 1e9)
     with _interrupt_on_sigterm(), progress_bar() as progress:
@@ -63,7 +66,7 @@ def fleet(
             out,
             engine=engine,
             slots=jobs,
-            shard=None if shard is None else shard_from(shard),
+            shard=part,
             limits=limits,
             allow_missing=allow_missing,
             logs=logs,

@@ -1,7 +1,7 @@
 """A manifest from its rows to the rows of its results: ``run_fleet``, all of them or a shard."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field
@@ -16,6 +16,7 @@ from calibgraph.fleet.task import Limits, Outcome, release
 from calibgraph.progress import Progress, no_progress
 
 _READERS = 16  # threads that look at inputs: a listing of an object store takes 50 ms
+_ARRAYS = "JOB_COMPLETION_INDEX", "AWS_BATCH_JOB_ARRAY_INDEX", "SLURM_ARRAY_TASK_ID"
 _STATE = ("vehicle", "recording", "status", "verdict", "error_kind", "input_hash", "versions")
 
 
@@ -41,12 +42,20 @@ class Shard:
         return bucket % self.count == self.index
 
 
-def shard_from(text: str) -> Shard:
-    """The shard of a text ``i/n``.
+def shard_from(text: str | None, environment: Mapping[str, str]) -> Shard:
+    """The shard of a text ``i/n``; all without one.
 
     Raises:
-        CalibrationError: if it is none.
+        CalibrationError: if it is none, or is not given in an array of jobs of a scheduler: each
+            process of it would do all.
     """
+    if text is None:
+        if found := [name for name in _ARRAYS if environment.get(name)]:
+            raise CalibrationError(
+                f"{found[0]} is set: state the part of this process of the array, "
+                f"--shard ${found[0]}/N, or --shard 0/1 for all"
+            )
+        return Shard()
     index, _, count = text.partition("/")
     try:
         return Shard(int(index), int(count))

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import describe
 from calibgraph.model.error_components import UNKNOWN, error_components
+from calibgraph.yaml_text import describe_value
 
 _OF_ONE_SEARCH = ("found", "missed", "chance")
 _PER_CAMERA = ("z_score", *_OF_ONE_SEARCH, "start_dependence", "memorization", "failed_share")
@@ -22,12 +24,26 @@ STAGE1 = "stage1"
 _COMMON = {"systematic_rotation_rad", "systematic_translation_m"}
 
 
+def _number(least: float, largest: float, words: str = "") -> PlainValidator:
+    """A check that a value is a number in a range, which the message states."""
+    expected = words or f"a number from {least:g} to {largest:.3g}"
+
+    def check(value: Any) -> float:
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if is_number and least <= value <= largest:
+            return float(value)
+        raise ValueError(
+            f"expected {expected}, found {describe_value(value)}; correct it, or leave it out"
+        )
+
+    return PlainValidator(check)
+
+
 _Number = Annotated[float, Field(strict=True)]
-_Finite = Annotated[_Number, Field(allow_inf_nan=False)]
-_Positive = Annotated[_Number, Field(ge=0)]
-_Angle = Annotated[_Positive, Field(le=math.pi)]
-_Length = Annotated[_Positive, Field(le=100)]
-_Share = Annotated[_Positive, Field(le=1)]
+_Finite = Annotated[float, _number(-sys.float_info.max, sys.float_info.max, "a finite number")]
+_Angle = Annotated[float, _number(0, math.pi)]
+_Length = Annotated[float, _number(0, 100)]
+_Share = Annotated[float, _number(0, 1)]
 
 
 @dataclass(frozen=True)
@@ -67,17 +83,17 @@ class MatcherFindings:
     missed: Mapping[str, _Finite] = field(default_factory=dict)
     chance: Mapping[str, _Finite] = field(default_factory=dict)
     stage1: Literal["pnp", "rig"] = "pnp"
-    range_rotation_deg: Annotated[_Positive, Field(le=180)] | None = None
-    range_translation_m: _Length | None = None
-    systematic_rotation_rad: _Angle | None = None
-    systematic_translation_m: _Length | None = None
+    range_rotation_deg: Annotated[float | None, _number(0, 180)] = None
+    range_translation_m: Annotated[float | None, _number(0, 100)] = None
+    systematic_rotation_rad: Annotated[float | None, _number(0, math.pi)] = None
+    systematic_translation_m: Annotated[float | None, _number(0, 100)] = None
     camera_share: _Share = 0.5
     elevation_rad: _Angle = 0.0
     elevation_stretch: _Share = 0.0
     scan_motion_m: _Length = 0.0
     place_rotation_rad: _Angle = 0.0
     place_translation_m: _Length = 0.0
-    place_variance: Annotated[_Positive, Field(le=1e6)] = 0.0
+    place_variance: Annotated[float, _number(0, 1e6)] = 0.0
 
     @staticmethod
     def from_metadata(metadata: Mapping[str, Any]) -> MatcherFindings:
@@ -90,13 +106,17 @@ class MatcherFindings:
         """
         former = {_FORMER_KEYS[key]: metadata[key] for key in _FORMER_KEYS if key in metadata}
         stated = {**former, **metadata}
-        values = {key: stated[key] for key in _KEYS & stated.keys() if stated[key] is not None}
+        values = {key: stated[key] for key in _KEYS & stated.keys()}
+        for key in values.keys() & {*_PER_CAMERA}:
+            of = values[key] or {}
+            values[key] = {str(name): of[name] for name in of} if isinstance(of, dict) else of
         if not _COMMON & values.keys():
             values = _prior_of(metadata.get("matcher")) | values
         try:
             return _READER.validate_python(values) if values else MatcherFindings()
         except ValidationError as error:
-            raise CorrespondenceError(f"metadata {describe(error)}") from error
+            camera = next((str(name) for name in error.errors()[0]["loc"][1:2]), None)
+            raise CorrespondenceError(f"metadata {describe(error)}", camera=camera) from error
 
     def to_metadata(self) -> dict[str, Any]:
         """As keys of the metadata; findings without a value have no key."""

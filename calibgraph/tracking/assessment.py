@@ -190,7 +190,7 @@ def _stuck_check(one: CameraState, status: Status) -> Check:
 
 def _start_check(state: State, one: CameraState) -> Verdict:
     needed = state.config.tracking.start_frames
-    if one.counts.get("repeated", 0) >= len(one.waiting) > 0:
+    if one.counts.get("repeated", 0) >= state.config.tracking.blind_frames:
         return Verdict((_stuck_check(one, "FAIL"),))
     waiting = (f"{len(one.waiting)} of {needed} frames with matches",)
     return Verdict(
@@ -205,7 +205,8 @@ def _recent_checks(state: State, one: CameraState, lens: tuple[LensEstimate, ...
     """Checks of a camera's last frames."""
     checks = []
     limit = state.config.tracking.blind_frames
-    if one.counts.get("repeated", 0) >= limit:
+    repeated = one.counts.get("repeated", 0)
+    if repeated >= limit > one.absent - repeated:
         checks.append(_stuck_check(one, "WARN"))
     elif one.absent >= limit:
         text = f"no usable matches in the last {one.absent} frames"

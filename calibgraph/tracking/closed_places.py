@@ -146,7 +146,7 @@ class ClosedPlaces:
         return sum_closed_epochs(self.state)
 
     def _priors(self, dropped: Rows = ()) -> gtsam.NonlinearFactorGraph:
-        """Priors and relative poses without some: the fit has those of its own."""
+        """Priors and relative poses without some; those of the fit if it dropped the same."""
         same = dropped == self.contradicting
         return self.fit.linear.model.pose_graph if same else pose_priors(self.state, dropped)
 

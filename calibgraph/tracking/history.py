@@ -154,12 +154,10 @@ class History:
         history = History()
         try:
             saved = decode(path.read_bytes(), "history")
-        except (OSError, StateError):
+            rooms = {name: _room(saved[name], saved["most"]) for name in ("frames", "entries")}
+            content = {**saved, **rooms, "begun": {*saved["begun"]}, "held": len(saved["frames"])}
+        except (OSError, StateError, AttributeError, KeyError, TypeError, ValueError):
             return history
-        if saved["entries"].shape[-1] == 2 * _POSE:  # of a version without time offsets
-            saved["entries"] = np.insert(saved["entries"], [_POSE, 2 * _POSE], np.nan, axis=-1)
-        rooms = {name: _room(saved[name], saved["most"]) for name in ("frames", "entries")}
-        content = {**saved, **rooms, "begun": {*saved["begun"]}, "held": len(saved["frames"])}
         vars(history).update({f"_{name}": value for name, value in content.items()})
         return history
 

@@ -37,7 +37,11 @@ QUIET_S = 2.0
 _CHUNK_BYTES = 2**16
 _STANDARD_INPUT = "standard input"
 _DATASET = "to track a dataset, say what matches its frames: --matcher structure"
-_NOT_LINES = {b"PAR1": "a Parquet file", b"\xff\xff\xff\xff": "an Arrow stream"}
+_NOT_LINES = {
+    b"PAR1": "a Parquet file",
+    b"ARROW1": "an Arrow file",
+    b"\xff\xff\xff\xff": "an Arrow stream",
+}
 
 
 def frames_of(
@@ -192,6 +196,10 @@ def frames_of_input(file: BinaryIO, *, stop: Callable[[], bool]) -> Iterator[Ite
     """
     chunks = _chunks(file, stop)
     first = next(chunks, b"")
+    while any(len(first) < len(mark) and mark.startswith(first) for mark in _NOT_LINES):
+        if not (more := next(chunks, b"")):
+            break
+        first += more
     for mark, kind in _NOT_LINES.items():
         if first.startswith(mark):
             raise FileError(_STANDARD_INPUT, f"is {kind}; send a line of JSON per frame")

@@ -143,9 +143,10 @@ class LensParameter:
 
         What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
         wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. An
-        aspect ratio or skew as no lens has it counts also if set free it moves the camera little:
-        matches from rounds have followed it. Beyond the default tolerance it counts as far as half
-        of it, as an angle, is beyond the default, too.
+        aspect ratio or skew that no lens has counts even if the camera moves little when it is set
+        free: matches from rounds have followed it. At the default tolerance any size of it counts.
+        At a wider one it counts if half of it, as an angle, exceeds what the tolerance adds to the
+        default rotation.
         """
         if not math.isfinite(self.sigma):  # not determined
             return 0.0

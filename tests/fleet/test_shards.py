@@ -13,7 +13,17 @@ def test_every_bucket_is_in_one_shard() -> None:
 
 
 def test_the_shard_is_that_of_the_option() -> None:
-    assert shard_from("2/8") == Shard(2, 8)
+    array = {"SLURM_ARRAY_TASK_ID": "3"}
+    assert shard_from("2/8", array) == Shard(2, 8)
+    assert shard_from(None, {"SLURM_JOB_ID": "3"}) == Shard()
+
+
+@pytest.mark.parametrize(
+    "name", ["SLURM_ARRAY_TASK_ID", "AWS_BATCH_JOB_ARRAY_INDEX", "JOB_COMPLETION_INDEX"]
+)
+def test_a_process_of_an_array_does_not_do_the_whole_manifest(name: str) -> None:
+    with pytest.raises(CalibrationError, match=rf"--shard \${name}/N"):
+        shard_from(None, {name: "0"})
 
 
 @pytest.mark.parametrize(
@@ -27,4 +37,4 @@ def test_the_shard_is_that_of_the_option() -> None:
 )
 def test_a_wrong_shard_is_one_line(text: str, message: str) -> None:
     with pytest.raises(CalibrationError, match=message):
-        shard_from(text)
+        shard_from(text, {})

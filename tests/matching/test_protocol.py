@@ -270,10 +270,22 @@ def test_findings_survive_a_file(truth: Rig, tmp_path: Path) -> None:
     ("metadata", "words"),
     [
         ({"z_score": 17.5}, r"z_score: expected keys with values, .*, found 17.5"),
-        ({"missed": {"left": "far"}}, "missed.left: Input should be a valid number, found 'far'"),
-        ({"range_rotation_deg": 270}, "range_rotation_deg: Input should be .* equal to 180"),
+        ({"missed": {"left": "far"}}, "missed.left: expected a finite number, found 'far'"),
+        (
+            {"range_rotation_deg": 270},
+            "range_rotation_deg: expected a number from 0 to 180, found 270",
+        ),
     ],
 )
 def test_findings_of_another_kind_are_errors(metadata: dict[str, object], words: str) -> None:
     with pytest.raises(CorrespondenceError, match=words):
         MatcherFindings.from_metadata(metadata)
+
+
+def test_findings_that_are_empty_have_no_camera_and_an_error_names_its_camera() -> None:
+    for empty in ([], 0, None, {}):
+        assert MatcherFindings.from_metadata({"z_score": empty}).z_score == {}
+    assert MatcherFindings.from_metadata({"z_score": {3: 5}}).z_score == {"3": 5.0}
+    with pytest.raises(CorrespondenceError, match=r"z_score.left: .*found True") as caught:
+        MatcherFindings.from_metadata({"z_score": {"left": True}})
+    assert caught.value.camera == "left"

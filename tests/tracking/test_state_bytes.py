@@ -155,7 +155,15 @@ def test_a_history_survives_a_file_and_a_damaged_file_gives_an_empty_one(
     loaded = History.load(path)
     assert len(loaded) == 5 and loaded.events == history.events != ()
     whole = path.read_bytes()
-    for wrong in (whole[:-1], b"", whole.replace(b"left", b"lift"), sealed(b"", "state")):
+    parts = decode(whole, "history")
+    other = ({}, {**parts, "frames": None}, {**parts, "most": "2"}, {**parts, "most": 1})
+    for wrong in (
+        whole[:-1],
+        b"",
+        whole.replace(b"left", b"lift"),
+        sealed(b"", "state"),
+        *(encode(content, "history") for content in other),
+    ):
         path.write_bytes(wrong)
         assert len(History.load(path)) == 0
 

@@ -140,11 +140,11 @@ def test_empty_lines_are_skipped_but_counted() -> None:
         (line(metadata=[]), "metadata: expected keys with values, as in {key: value}, found []"),
         (
             line(metadata={"systematic_rotation_rad": "x"}),
-            "systematic_rotation_rad: Input should be a valid number, found 'x'",
+            "systematic_rotation_rad: expected a number from 0 to 3.14, found 'x'; correct it, or",
         ),
         (
             line(metadata={"systematic_rotation_rad": 10**400}),
-            "systematic_rotation_rad: Input should be a valid number, found 1000",
+            "systematic_rotation_rad: expected a number from 0 to 3.14, found 1000",
         ),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -169,3 +170,21 @@ def test_a_file_that_is_no_stream_is_named(tmp_path: Path) -> None:
         "standard input: is a Parquet file; send a line of JSON per frame"
     ]
     assert "is an Arrow stream" in str(outcomes(of_bytes(b"\xff\xff\xff\xff\0"))[0])
+    assert "is an Arrow file" in str(outcomes(of_bytes(b"ARROW1\0\0\0"))[0])
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ([b"PA", b"R1xx\nyy"], "is a Parquet file; send a line of JSON per frame"),
+        ([b"A", b"RRO", b"W1"], "is an Arrow file; send a line of JSON per frame"),
+        ([b"PA", b"R"], "is not JSON"),
+    ],
+)
+def test_a_mark_that_comes_in_parts_is_found(parts: list[bytes], message: str) -> None:
+    class Parts(io.BytesIO):
+        def read1(self, size: int | None = -1, /) -> bytes:
+            return parts.pop(0) if parts else b""
+
+    (found,) = outcomes(frames_of("-", stdin=Parts()))
+    assert message in str(found)

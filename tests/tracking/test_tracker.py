@@ -344,15 +344,33 @@ def test_a_frozen_sensor_adds_nothing_and_is_blind(pair: Rig, noise_px: float) -
 def test_a_stream_that_is_stuck_from_the_beginning_is_named(pair: Rig) -> None:
     """It is not told to keep driving."""
     (table,) = drive(lambda _: pair, 1)
-    tables = [replace(table, frame=np.full(len(table), number)) for number in range(4)]
-    tracker, _ = tracked(pair, tables)
+    tables = [replace(table, frame=np.full(len(table), number)) for number in range(21)]
+    tracker, _ = tracked(pair, tables[:20])
+    assert tracker.calibration().summary.reasons[0].text.startswith("no estimate yet")
+    tracker.update(tables[20])
     result = tracker.calibration()
     assert result.verdict.status == "FAIL"
-    assert result.summary.reasons[0].text.startswith("the last 4 frames with matches have the same")
+    assert result.summary.reasons[0].text.startswith(
+        "the last 21 frames with matches have the same"
+    )
     assert result.summary.actions[0].startswith("See why the same points come again")
 
 
-def moved_on(table: Correspondences, number: int) -> Correspondences:
-    """Matches of points a tenth of a millimetre further: another frame."""
+def test_a_camera_without_matches_after_a_stuck_stream_is_blind(pair: Rig) -> None:
+    tables = drive(lambda _: pair, 12)
+    tracker, _ = tracked(pair, tables)
+    for number in range(12, 80):
+        table = moved_on(tables[-1], number, number - 11)
+        if number < 40:
+            table = replace(table, points_lidar_m=tables[-1].points_lidar_m)
+        else:
+            table = table.select(table.camera_index == table.cameras.index("right"))
+        update = tracker.update(table)
+    names = {check.name for check in update.verdicts["left"].checks}
+    assert "blind frames" in names and "stuck" not in names
+
+
+def moved_on(table: Correspondences, number: int, times: int = 1) -> Correspondences:
+    """Matches of points a tenth of a millimetre, so many times, further: another frame."""
     frame = np.full(len(table), number, dtype=np.int64)
-    return replace(table, frame=frame, points_lidar_m=table.points_lidar_m + 1e-4)
+    return replace(table, frame=frame, points_lidar_m=table.points_lidar_m + 1e-4 * times)
