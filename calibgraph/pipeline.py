@@ -23,7 +23,6 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pair_covariances
 from calibgraph.model.lens_estimate import with_sigmas
 from calibgraph.model.rig import Rig
-from calibgraph.model.table_columns import WITHOUT_METADATA
 from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.parallel import with_own_threads
 from calibgraph.progress import Progress, Stopwatch, no_progress

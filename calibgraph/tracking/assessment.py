@@ -193,12 +193,8 @@ def _start_check(state: State, one: CameraState) -> Verdict:
     if one.counts.get("repeated", 0) >= state.config.tracking.blind_frames:
         return Verdict((_stuck_check(one, "FAIL"),))
     waiting = (f"{len(one.waiting)} of {needed} frames with matches",)
-    return Verdict(
-        tuple(
-            Check("start", "FAIL", f"no estimate yet: {reason}")
-            for reason in one.refused or waiting
-        )
-    )
+    reasons = (f"no estimate yet: {reason}" for reason in one.refused or waiting)
+    return Verdict(tuple(Check("start", "FAIL", reason) for reason in reasons))
 
 
 def _recent_checks(state: State, one: CameraState, lens: tuple[LensEstimate, ...]) -> list[Check]:
