@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from calibgraph import Event, Update
 from calibgraph.errors import FileError
 from calibgraph.tracking.history import History
-from calibgraph.tracking.state_bytes import decode, encode
 
 Array = NDArray[np.float64]
 
@@ -383,17 +382,3 @@ def test_updates_of_another_rig_are_refused_and_change_nothing():
 def test_a_history_of_fewer_than_two_entries_is_refused():
     with pytest.raises(ValueError, match="at least 2"):
         History(1)
-
-
-def test_a_file_from_before_there_were_time_offsets_goes_on(tmp_path: Path):
-    history = drive(History(), 5)
-    history.save(tmp_path / "now")
-    content = decode((tmp_path / "now").read_bytes(), "history")
-    earlier = np.delete(content["entries"], [6, 13], axis=-1)
-    (tmp_path / "earlier").write_bytes(encode({**content, "entries": earlier}, "history"))
-    found = drive(History.load(tmp_path / "earlier"), 5, first=5)
-    expected, curve = drive(history, 5, first=5).curves()["left"], found.curves()["left"]
-    assert expected is not None and curve is not None
-    assert np.array_equal(curve.frames, expected.frames)
-    assert np.array_equal(curve.xi, expected.xi)
-    assert np.array_equal(curve.sigma, expected.sigma)
