@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
+
 from benchmarks.speed.solvers import ring
 from calibgraph import Camera, Intrinsics, Rig, load_rig, perturb, simulate_street
 
 RING = 12
 """Cameras around the LiDAR; fewer are the first of them, from the one ahead to the left."""
 DRAWN_FRAMES = 5
-"""More frames repeat them: their images and clouds are read, matched and kept as any others."""
+"""More frames repeat them, with the points of the clouds in another order: copies are left out."""
 FOCAL_SHARE = 0.58  # of the width: as KITTI's cameras, 82 degrees
 ROTATION_DEG, TRANSLATION_M = 2.0, 0.2  # of the guess
 
@@ -69,5 +71,9 @@ def link_dataset(rendered: Path, folder: Path, cameras: int, frames: int) -> Non
         (folder / part).mkdir(parents=True)
         for frame in range(frames):
             file = files[frame % len(files)]
-            os.link(file, folder / part / f"{frame:06d}{file.suffix}")
+            linked = folder / part / f"{frame:06d}{file.suffix}"
+            if part == "lidar" and frame >= len(files):
+                np.save(linked, np.roll(np.load(file), frame, axis=0))
+            else:
+                os.link(file, linked)
     guess.save(folder / "rig.yaml")

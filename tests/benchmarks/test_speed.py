@@ -101,15 +101,19 @@ def test_finished_cases_are_kept_failed_ones_run_again_and_long_ones_are_left_ou
 
 def test_a_dataset_repeats_the_frames_of_the_first_cameras(tmp_path: Path) -> None:
     rig, rendered = street_rig(3, 640, 480), tmp_path / "rendered"
-    for part in ("lidar/0.npy", *(f"cameras/{name}/{i}.jpg" for name in rig.cameras for i in "01")):
+    for part in (f"cameras/{name}/{i}.jpg" for name in rig.cameras for i in "01"):
         (rendered / part).parent.mkdir(parents=True, exist_ok=True)
         (rendered / part).write_text(part)
+    (rendered / "lidar").mkdir()
+    np.save(rendered / "lidar" / "0.npy", np.arange(12).reshape(3, 4))
     rig.save(rendered / "reference.yaml")
     link_dataset(rendered, tmp_path / "made", 2, 3)
     names = list(load_rig(tmp_path / "made" / "rig.yaml").cameras)
     assert names == list(rig.cameras)[:2]
     texts = [f.read_text() for f in sorted((tmp_path / "made" / "cameras" / names[1]).iterdir())]
     assert texts == [f"cameras/{names[1]}/{i}.jpg" for i in "010"]
+    clouds = [np.load(f)[:, 0].tolist() for f in sorted((tmp_path / "made" / "lidar").iterdir())]
+    assert clouds == [[0, 4, 8], [8, 0, 4], [4, 8, 0]]  # no copies
 
 
 def test_multiply_adds_are_those_of_the_shifts_inside_the_image() -> None:
