@@ -75,8 +75,9 @@ def test_a_file_that_is_no_saved_tracker_is_refused_in_one_line(pair: Rig, tmp_p
 
 
 def sealed(body: bytes, kind: Kind = "state") -> bytes:
-    """With the mark and the checksum of a whole file."""
-    return f"calibgraph-tracker-{kind}/9\n".encode() + sha256(body).digest() + body
+    """With the mark and the checksum of a whole file of this version."""
+    mark = encode({}, "history").partition(b"\n")[0].replace(b"history", kind.encode())
+    return mark + b"\n" + sha256(body).digest() + body
 
 
 def array(dtype: str, shape: list[int], data: bytes) -> msgpack.ExtType:
