@@ -106,7 +106,7 @@ def _squared(camera: Record) -> Array:
 
 
 def left_out(found: Mapping[str, Errors]) -> Table:
-    """A row per rig: its error size, that of the others, and the gain in log density by theirs."""
+    """A row per rig: its error size, the others' size, and what the latter adds to log density."""
     rows = []
     for rig, own in found.items():
         others = np.exp(np.mean([np.log(e.sizes) for r, e in found.items() if r != rig], axis=0))

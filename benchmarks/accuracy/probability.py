@@ -10,7 +10,7 @@ model without cases keeps its own. Without ``--tune`` the package's weights are 
 or those of another version: ``--weights probability.json``.
 
 A result counts as off beyond 0.5 deg or 10 cm. Fit and tables are weighted as if one result in ten
-were off: as if users made so many mistakes. Weights are the most probable ones under a normal prior
+were off, the share assumed for users. Weights are the most probable ones under a normal prior
 about values that are the same for all checks: one that has seen too little keeps nearly those.
 A kind of check that no case had makes a FAIL by itself from its limit of WARN on.
 """
@@ -47,8 +47,8 @@ USUAL = np.array([0.3, 6.5, 3.0])
 """Prior means: log odds by a check that goes through PASS, WARN and FAIL."""
 SPREAD = np.array([1.0, 3.0, 3.0])
 OF_WORST = (WORST, "swapped_cameras")
-"""What the model of runs has a weight of: 127 results tell those of 40 kinds of checks too badly. A
-recording left out is foretold better by the worst check alone; a swap is a likelihood ratio."""
+"""The inputs of the model of runs. 127 results are too few for a weight of each of 40 kinds of
+checks, and the worst alone foretells a left-out recording better. A swap is a likelihood ratio."""
 LAST_OF_WORST = 1.0  # its spread: where it is 0, a FAIL would be no more probable than its limit
 HOLDS, HOLDS_SPREAD = np.array([2.0, 0.0]), np.array([0.5, 1.0])
 """How far values and error bars hold: log odds that a value does, logarithm of the factor of a

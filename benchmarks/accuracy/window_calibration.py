@@ -141,7 +141,7 @@ def own(scores: Scores) -> Scores:
 
 
 def nats(scores: Scores) -> float:
-    """The mean logarithm of the nine middle shifts' softmax over that of all alike."""
+    """Mean log probability of the nine middle shifts, less that under a uniform distribution."""
     found = logsumexp(scores[:, MIDDLE, MIDDLE], axis=(1, 2)) - logsumexp(scores, axis=(1, 2))
     return float(found.mean() + np.log(scores[0].size / 9))
 

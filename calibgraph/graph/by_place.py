@@ -96,7 +96,7 @@ class QuadraticByPlace:
         information: (p, d, d) in the tangent there, positive definite: of the pose, d is 6; with a
             time offset that is a variable, 7.
         offsets: (p, d - 6) at the minima, in the units of the variables.
-        keys: (p,) of these variables; empty if there are none.
+        keys: (p,) of the variables that hold the offsets; empty if there are none.
     """
 
     places: Numbers
