@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.matching.structure.window_kernels import FEATURES, describe_windows, fill_features
+from calibgraph.matching.structure.window_kernels import (
+    FEATURES,
+    ROOM,
+    describe_windows,
+    fill_features,
+)
 from calibgraph.matching.structure.window_weights import WindowNetwork
 
 Rows = NDArray[np.intp]
@@ -119,16 +124,18 @@ def cut_windows(
     """
     windows, reliability = Windows.empty(len(centres)), np.zeros(len(centres))
     windows.members[:], windows.counts[:] = neighbours.of(centres)
+    room = tuple(np.empty((ROOM, windows.members.shape[1])))
     describe_windows(
-        cloud, windows.members, windows.counts, keep_linear,
+        cloud, windows.members, windows.counts, keep_linear, room,
         windows.rays_m, windows.front, windows.basis, reliability,
     )  # fmt: skip
     reliability[windows.counts < MIN_WINDOW_POINTS] = 0.0
     windows.weight[:], windows.features[:] = 1.0, 0.0
     if keep_linear:
         fill_features(
-            cloud, windows.members, windows.counts, windows.front, windows.basis, windows.features
-        )
+            cloud, windows.members, windows.counts, room,
+            windows.front, windows.basis, windows.features,
+        )  # fmt: skip
     return windows, reliability
 
 
