@@ -84,7 +84,7 @@ def _best_of_runs(
 def _number_cells(camera, pixels, sizes, shape, cells):  # type: ignore[no-untyped-def]
     """Fill (n,) the cell that each pixel lies in; pixels outside belong to the edge cells."""
     for i in range(len(camera)):
-        which, number = camera[i], 0
+        which, number = camera[i], np.int64(0)
         for axis in (1, 0):
             place = (pixels[i, axis] + 0.5) / sizes[which, axis] * shape[axis]
             last = shape[axis] - 1.0
