@@ -140,8 +140,8 @@ class ProjectionBlock(RobustBlock):
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
-        sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
-        return unpack_sums(sums.sum(axis=0))
+        found = self.packed_run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks)
+        return unpack_sums(found.sum(axis=0))
 
     def gradients_at_each(self, T_camera_lidar: Array) -> Array:
         """(p, 6) b of the whole block at each of (p, 4, 4) poses."""
@@ -166,12 +166,12 @@ class ProjectionBlock(RobustBlock):
         """(r, p, 28) sums of each run at each pose."""
         count = len(T_camera_lidar)
         poses, each = np.tile(T_camera_lidar, (len(runs), 1, 1)), np.repeat(runs, count, axis=0)
-        return self._run_sums(poses, each, None, wanted).reshape(len(runs), count, 28)
+        return self.packed_run_sums(poses, each, None, wanted).reshape(len(runs), count, 28)
 
     def frame_sums(self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike) -> BlockSums:
         """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked."""
         runs = to_runs(np.asarray(edges, dtype=np.int64))
-        return unpack_sums(self._run_sums(_T_camera_lidar(T_lidar_camera)[None], runs, None))
+        return self.run_sums(_T_camera_lidar(T_lidar_camera)[None], runs)
 
     def run_sums(
         self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None = None
@@ -183,15 +183,16 @@ class ProjectionBlock(RobustBlock):
             runs: (r, 2) its first correspondence, and the one behind its last.
             scales: (r,) of the loss in each run, in place of ``scale``.
         """
-        return unpack_sums(self._run_sums(T_camera_lidar, runs, scales))
+        return unpack_sums(self.packed_run_sums(T_camera_lidar, runs, scales))
 
-    def _run_sums(
+    def packed_run_sums(
         self,
         T_camera_lidar: Array,
         runs: NDArray[np.int64],
-        scales: Array | None,
+        scales: Array | None = None,
         wanted: int = HESSIAN,
     ) -> Array:
+        """(r, 28) as :meth:`run_sums`: 21 of the upper triangle of H, 6 of b, 1 of c."""
         shared = wanted == HESSIAN and len(runs) * len(self) >= _WORTH_SHARING
         shared = shared and int((runs[:, 1] - runs[:, 0]).sum()) >= _WORTH_SHARING
         kernel = accumulate(self.lens.kind, shared=shared)
@@ -258,7 +259,7 @@ class ProjectionBlock(RobustBlock):
 
     def error_and_jacobian(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, Array]:
         """The (7,) error and (7, 6) Jacobian of the block factor."""
-        sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
+        sums = self.packed_run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks)
         error, jacobian, regular = root_of_sums(sums)
         return (error, jacobian.T) if regular else square_root(unpack_sums(sums.sum(axis=0)))
 

@@ -19,10 +19,11 @@ from scipy.optimize import isotonic_regression
 from calibgraph.arrays import Array
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import invert, local_coordinates, retract_all
+from calibgraph.model.geometry import invert, local_coordinates
+from calibgraph.model.pose_kernel import move_damped
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.frame_poses import DAMPING, FrameFits, fit_each_frame, solve_damped
+from calibgraph.solver.frame_poses import DAMPING, FrameFits, fit_each_frame
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread, robust_spreads
 from calibgraph.solver.stage1 import Stage1
 from factors import to_runs
@@ -145,7 +146,8 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
     """
     center, noise = start, frames.noise
     typical = float(np.median(noise))
-    T_lidar_camera, flat = invert(frames.T_camera_lidar), frames.hessians.reshape(-1, 36)
+    T_lidar_camera, sums = invert(frames.T_camera_lidar), np.zeros((len(noise), 28))
+    sums[:, :21], moved = frames.hessians[:, *np.triu_indices(6)], np.empty((1, 4, 4))
     by_chance, own = _CHANCE * np.maximum(noise - typical, 0), frames.spreads**2
     for number in range(_STEPS):
         away = local_coordinates(center, T_lidar_camera)
@@ -154,14 +156,14 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
         apart = np.maximum(shift - by_chance, 0)
         if number <= _SEARCH_STEPS:
             reach = _reach(apart, math.sqrt(typical), widened=number == _SEARCH_STEPS)
-        near = np.clip(_FLAT * (1 - np.sqrt(apart) / reach), 0, 1)
+        near = np.minimum(np.maximum(_FLAT * (1 - np.sqrt(apart) / reach), 0), 1)
         if not near.any():  # no two frames agree
             return start, np.ones(len(near))
         scatter = max(float(near @ (shift - noise) / near.sum()), 0.0)
         weights = near / (own + frames.counts * scatter / 6)
-        hessian = (weights @ flat).reshape(1, 6, 6)
-        step = -solve_damped(hessian, (weights @ products)[None], DAMPING)
-        center = retract_all(center[None], step)[0]
+        sums[:, 21:27] = -products
+        step = move_damped((weights @ sums)[None], DAMPING, math.inf, center[None], moved)
+        center = moved[0].copy()
         if number > _SEARCH_STEPS and np.abs(step).max() < _CONVERGED:
             break
     return center, weights / weights.max()

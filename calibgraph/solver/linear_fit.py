@@ -7,6 +7,7 @@ from its quadratic.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.residual_scale import quantile
 from calibgraph.solver.whitening import upper_root
 from calibgraph.solver.within_place import WEAK
-from factors import ProjectionBlock, unit_diagonal
+from factors import ProjectionBlock
 from factors.block_arrays import whiten
 
 MIN_ROWS = 30  # fewer correspondences do not determine further unknowns
@@ -80,17 +81,27 @@ class LinearFit:
 
     def free(self, *unknowns: int) -> Freed:
         """The fit of the pose and some unknowns, with their numbers; the others are zero."""
-        rows = np.array([*range(6), *(6 + number for number in unknowns)])
-        own, frames = self.hessian[np.ix_(rows, rows)], len(self.gradients)
-        (scaled, units), pulls = unit_diagonal(own), self.gradients[:, rows]
-        inverse = np.linalg.inv(scaled) / np.outer(units, units)
-        values = inverse @ (self.hessian @ self.values)[rows]
-        scatter = with_pseudo_frames(pulls.T @ pulls, own, np.full(len(rows), float(frames)))
-        scatter += _weak(len(rows)) if frames > 1 else np.nan
+        return self.free_each([unknowns])[0]
+
+    def free_each(self, choices: Sequence[Sequence[int]]) -> list[Freed]:
+        """The fits of several choices of as many unknowns: each as :meth:`free`."""
+        rows = np.array([[*range(6), *(6 + number for number in each)] for each in choices])
+        own, size = self.hessian[rows[:, :, None], rows[:, None]], rows.shape[1]
+        diagonal = np.sqrt(np.maximum(np.einsum("fii->fi", own), 0.0))
+        units = np.where(diagonal > 0, diagonal, 1.0)
+        units = units[:, :, None] * units[:, None]
+        inverse = np.linalg.inv(own / units) / units
+        values = (inverse @ (self.hessian @ self.values)[rows, None])[:, :, 0]
+        frames, pulls = len(self.gradients), self.gradients.T[rows]
+        shown = pulls @ pulls.transpose(0, 2, 1)
+        scatter = with_pseudo_frames(shown, own, np.full(size, float(frames)))
+        scatter += _weak(size) if frames > 1 else np.nan
         follow = inverse @ self.hessian[rows, len(self.hessian) - self.considered :]
-        whole = inverse @ scatter @ inverse + self.shared * inverse + follow @ follow.T
-        compensating = np.asarray(-np.linalg.solve(own[:6, :6], own[:6, 6:]))
-        return Freed(values[:6], values[6:], whole[6:, 6:], compensating)
+        whole = inverse @ scatter @ inverse + self.shared * inverse
+        whole = (whole + follow @ follow.transpose(0, 2, 1))[:, 6:, 6:]
+        compensating = -np.linalg.solve(own[:, :6, :6], own[:, :6, 6:])
+        each = zip(values[:, :6], values[:, 6:], whole, compensating, strict=True)
+        return [Freed(*parts) for parts in each]
 
 
 def fit_camera(
@@ -154,7 +165,7 @@ def _linearize(camera: Camera, block: ProjectionBlock, fields_px: Array) -> Arra
 
 def _weak(size: int) -> Array:
     """(6 + k, 6 + k) information of a pose within sight and of unknowns that are nearly free."""
-    return np.diag([*np.diag(WEAK), *[_WEAK] * (size - 6)])
+    return np.diag(np.append(np.diag(WEAK), np.full(size - 6, _WEAK)))
 
 
 def block_of(camera: Camera, table: Correspondences) -> CameraBlock:
