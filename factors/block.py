@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from factors.block_arrays import (
     RobustBlock,
     check_shape,
+    chunks,
     contiguous,
     join_roots,
     read_only,
@@ -39,7 +40,6 @@ from factors.loss import loss_id
 
 Array = NDArray[np.float64]
 
-_CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
 _WORTH_SHARING = 2_000_000  # correspondences (7 ms): below, waiting for busy cores costs more
 _WIDTHS = {"points_lidar_m": 3, "pixels_px": 2, "sqrt_information": 3, "motion": 7}
 _NO_RESIDUALS, _NO_NORMS = np.empty((0, 2)), np.empty((0, 0))
@@ -77,7 +77,7 @@ class ProjectionBlock(RobustBlock):
     motion: Array | None = None
     _columns: Array = field(init=False, repr=False)  # (5, n) x y z u v, or (12, n) with the motion
     _whitening: Array = field(init=False, repr=False)  # (3, n), (1, n) or (0, n), see the kernel
-    _chunks: NDArray[np.int64] = field(init=False, repr=False)  # (c, 2) runs of all, see _CHUNK
+    _chunks: NDArray[np.int64] = field(init=False, repr=False)  # (c, 2) runs of all
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)
@@ -98,7 +98,7 @@ class ProjectionBlock(RobustBlock):
         self.__dict__.update(
             _columns=columns,
             _whitening=columns[:0] if root is None else root[:rows],
-            _chunks=_cut(columns.shape[1]),
+            _chunks=chunks(columns.shape[1]),
             points_lidar_m=columns[:3].T,
             pixels_px=columns[3:5].T,
             motion=columns[5:].T if len(columns) > 5 else None,  # noqa: PLR2004
@@ -195,15 +195,21 @@ class ProjectionBlock(RobustBlock):
         """(r, 28) as :meth:`run_sums`: 21 of the upper triangle of H, 6 of b, 1 of c."""
         shared = wanted == HESSIAN and len(runs) * len(self) >= _WORTH_SHARING
         shared = shared and int((runs[:, 1] - runs[:, 0]).sum()) >= _WORTH_SHARING
-        kernel = accumulate(self.lens.kind, shared=shared)
-        run = one_at_a_time(kernel) if shared else kernel
-        scales = np.array([self.scale]) if scales is None else scales
+        packed, kernel, loss, scale = self._as_kernels_take
+        run = one_at_a_time(accumulate(self.lens.kind, shared=True)) if shared else kernel
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
+        scales = scale if scales is None else scales * self.sigma
         sums: Array = run(
-            self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
-            loss_id(self.loss), scales * self.sigma, contiguous(runs), wanted,
+            packed, contiguous(T_camera_lidar), self._columns, self._whitening, loss, scales,
+            contiguous(runs), wanted,
         )  # fmt: skip
         return sums if self.sigma == 1.0 else sums / self.sigma**2
+
+    @cached_property
+    def _as_kernels_take(self) -> tuple[Array, Any, int, Array]:
+        """The lens, the kernel of its sums, and the loss with its scale."""
+        kernel, scale = accumulate(self.lens.kind), np.array([self.scale * self.sigma])
+        return self.lens.packed, kernel, loss_id(self.loss), scale
 
     def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable."""
@@ -262,14 +268,6 @@ class ProjectionBlock(RobustBlock):
         sums = self.packed_run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks)
         error, jacobian, regular = root_of_sums(sums)
         return (error, jacobian.T) if regular else square_root(unpack_sums(sums.sum(axis=0)))
-
-
-@lru_cache
-def _cut(count: int) -> NDArray[np.int64]:
-    """(c, 2) runs of _CHUNK correspondences at most."""
-    edges = np.arange(0, count + _CHUNK, _CHUNK)
-    edges[-1] = count
-    return to_runs(edges)
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 from scipy.special import expit
 
 from calibgraph.arrays import Array
@@ -184,15 +183,13 @@ def group_tied(
         known: two cameras and the (6, 6) covariance of their relative pose without the cloud. It
             ties them if it is below ``TIED`` of ``REACH`` along every axis.
     """
-    number, tied = {name: i for i, name in enumerate(cameras)}, np.eye(len(cameras))
+    groups = {name: {name} for name in cameras}
     for a, b, covariance in known:
-        if {a, b} <= set(cameras) and (np.sqrt(np.diag(covariance)) < TIED * REACH).all():
-            tied[number[a], number[b]] = 1.0
-    count, labels = connected_components(tied, directed=False)
-    return [
-        tuple(name for name, of in zip(cameras, labels, strict=True) if of == label)
-        for label in range(count)
-    ]
+        if {a, b} <= groups.keys() and (np.sqrt(np.diag(covariance)) < TIED * REACH).all():
+            joined = groups[a] | groups[b]
+            groups |= dict.fromkeys(joined, joined)
+    named = (tuple(name for name in cameras if name in groups[one]) for one in cameras)
+    return [*dict.fromkeys(named)]
 
 
 def no_posteriors(*_: object) -> dict[str, PosePosterior]:
