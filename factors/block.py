@@ -208,8 +208,8 @@ class ProjectionBlock(RobustBlock):
     @cached_property
     def _as_kernels_take(self) -> tuple[Array, Any, int, Array]:
         """The lens, the kernel of its sums, and the loss with its scale."""
-        kernel, scale = accumulate(self.lens.kind), np.array([self.scale * self.sigma])
-        return self.lens.packed, kernel, loss_id(self.loss), scale
+        kernel = accumulate(self.lens.kind, shared=False)
+        return self.lens.packed, kernel, loss_id(self.loss), np.array([self.scale * self.sigma])
 
     def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable."""

@@ -133,22 +133,26 @@ def fit_camera(
     columns = _linearize(camera, block.block, fields_px)
     size, errors = len(columns) - 1, columns[-1].ravel()
     flat, values, left = columns[:-1].reshape(size, -1), np.zeros(size), errors.copy()
-    weighted = np.empty_like(flat)
+    weighted, weak = np.empty_like(flat), _weak(size)
     for _ in range(_MAX_ITERATIONS):
         squares = np.square(left.reshape(2, -1)).sum(axis=0)
         scale = loss_scale or _LOSS_MEDIANS * math.sqrt(quantile(squares, 0.5)) + 1e-12
         weights = np.tile(1.0 / (1.0 + squares / scale**2), 2)
-        np.multiply(flat, weights, out=weighted)
-        hessian, before = weighted @ flat.T + _weak(size), values
-        values = np.linalg.solve(hessian, weighted @ errors)
+        roots = np.sqrt(weights)
+        np.multiply(flat, roots, out=weighted)
+        hessian, before = weighted @ weighted.T + weak, values
+        values = np.linalg.solve(hessian, weighted @ (roots * errors))
         change = (values - before) @ flat
         left -= change
         if np.abs(change).max() < _CONVERGED * scale:
             break
     if not np.isfinite(values).all():  # points where no derivative exists
         return None
-    pulls = (weighted * left).reshape(size, 2, -1).sum(axis=1)
-    gradients = np.add.reduceat(pulls, block.frame_edges[:-1], axis=1).T
+    starts = block.frame_edges[:-1]
+    pulls = np.add.reduceat(
+        weighted * (roots * left), np.append(starts, starts + len(block)), axis=1
+    )
+    gradients = pulls.reshape(size, 2, -1).sum(axis=1).T
     variance = float(weights @ left**2 / weights.sum())
     return LinearFit(values, hessian, gradients, shared_variance * variance, considered)
 

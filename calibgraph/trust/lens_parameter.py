@@ -90,11 +90,12 @@ def units_of(camera: Camera) -> Array:
 def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
     """(6, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
     free, T, k = lens_variable(camera).free, camera.T_camera_lidar, camera.intrinsics_px
-    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    points = (T[:3, :3] @ points_lidar_m.T + T[:3, 3:]).T
     fields = np.empty((len(Free), 2, len(points)))
     free.fill_columns(camera.lens, points, fields[:-1])
-    off_centre = fields[Free.FOCAL] / free.sigmas[Free.FOCAL]
-    fields[-1] = 0.5 * _SKEW_SIGMA * off_centre[::-1] * [[k.fx / k.fy], [k.fy / k.fx]]
+    half = 0.5 * _SKEW_SIGMA / free.sigmas[Free.FOCAL]
+    turned = half * np.array([[k.fx / k.fy], [k.fy / k.fx]])
+    np.multiply(fields[Free.FOCAL, ::-1], turned, out=fields[-1])
     return fields
 
 
