@@ -232,10 +232,11 @@ def fit_latent_poses(
         None if a direction is not determined.
     """
     if isinstance(start, LatentPoseFit):
-        present = start.linear if start.linear.model is model else start.linear.with_model(model)
+        is_known, present = start.linear.model is model, start.linear
+        present = present if is_known else present.with_model(model)
     else:
-        present = Linearization.at(model, start)
-    if not present.is_determined():
+        is_known, present = False, Linearization.at(model, start)
+    if not is_known and not present.is_determined():
         return None
     iterations, converged = 0, False
     while iterations < MAX_ITERATIONS and not converged:

@@ -226,9 +226,13 @@ def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
     counts, ordered = groups[:, 1] - groups[:, 0], confidence[order]
     middles = (ordered[(groups.sum(axis=1) - 1) // 2] + ordered[groups.sum(axis=1) // 2]) / 2
     falling = falling_logarithms(spreads, counts)
-    learnt = np.empty(len(sizes))
-    for rows in (order, np.flatnonzero(~np.isfinite(sizes))):  # in order, places are found faster
-        learnt[rows] = np.exp(np.interp(confidence[rows], middles, falling))
+    in_order = np.exp(np.interp(ordered, middles, falling))  # in order, places are found faster
+    if len(order) == len(sizes):  # they fall
+        learnt = in_order / ((in_order[(len(order) - 1) // 2] + in_order[len(order) // 2]) / 2)
+        found = np.empty(len(sizes))
+        found[order] = learnt
+        return found
+    learnt = np.exp(np.interp(confidence, middles, falling))
     return np.asarray(learnt / np.median(learnt))
 
 
