@@ -135,32 +135,7 @@ def _solve_damped(sums, k, damping, work, steps, i):  # type: ignore[no-untyped-
 
 
 @compiled()
-def move_damped(sums, damping, most_rad, T, moved):  # type: ignore[no-untyped-def]
-    """Fill in (f, 4, 4) T_camera_lidar at the minima of (f, 28) sums; (f, 6) the steps there.
-
-    Steps are tangents of T_lidar_camera, shortened so that none turns by more than an angle about
-    an axis.
-
-    Args:
-        sums: of each pose.
-        damping: added to the diagonal, relative to it.
-        most_rad: that angle.
-        T: (f, 4, 4) T_camera_lidar.
-        moved: filled.
-    """
-    work, steps = np.empty((7, 6)), np.empty((len(sums), 6))
-    for i in range(len(sums)):
-        _solve_damped(sums, i, damping, work, steps, i)
-        turn = max(abs(steps[i, 0]), abs(steps[i, 1]), abs(steps[i, 2]))
-        if turn > most_rad:
-            for k in range(6):
-                steps[i, k] *= most_rad / turn
-        _move(-1.0, steps, i, T, i, moved)
-    return steps
-
-
-@compiled()
-def descend(sums, T, dampings, active, steps, tried, new, tolerance):  # type: ignore[no-untyped-def]
+def descend(sums, T, dampings, active, steps, tried, new, limits):  # type: ignore[no-untyped-def]
     """A step of Levenberg-Marquardt of many poses, each by itself.
 
     Poses that were tried are taken where the cost does not rise; of those that are not done, the
@@ -174,7 +149,8 @@ def descend(sums, T, dampings, active, steps, tried, new, tolerance):  # type: i
         steps: (f, 6) to those that were tried.
         tried: (f, 4, 4) T_camera_lidar.
         new: (a, 28) sums of those that were tried; empty at first.
-        tolerance: relative decrease of the cost at which a pose is done.
+        limits: relative decrease of the cost at which a pose is done; most that a step turns about
+            an axis [rad].
 
     Returns:
         How many are tried next.
@@ -184,7 +160,7 @@ def descend(sums, T, dampings, active, steps, tried, new, tolerance):  # type: i
         k = active[i]
         if len(new):
             gain, size = sums[k, 27] - new[i, 27], 0.0
-            is_done = gain >= 0.0 and gain <= tolerance * sums[k, 27]
+            is_done = gain >= 0.0 and gain <= limits[0] * sums[k, 27]
             for m in range(6):
                 size = max(size, abs(steps[i, m]))
             if gain >= 0.0:
@@ -198,6 +174,10 @@ def descend(sums, T, dampings, active, steps, tried, new, tolerance):  # type: i
                 continue
         active[left] = k
         _solve_damped(sums, k, dampings[k], work, steps, left)
+        turn = max(abs(steps[left, 0]), abs(steps[left, 1]), abs(steps[left, 2]))
+        if turn > limits[1]:
+            for m in range(6):
+                steps[left, m] *= limits[1] / turn
         _move(-1.0, steps, left, T, k, tried)
         left += 1
     return left

@@ -4,13 +4,14 @@
 the spread of every frame's residuals about its own pose, and takes the loss from it.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.model.pose_kernel import MAX_DAMPING, descend, move_damped
+from calibgraph.model.pose_kernel import MAX_DAMPING, descend
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spreads
 from factors import ProjectionBlock, to_runs
@@ -62,13 +63,34 @@ def fit_frames(
     dampings, active = np.full(len(T), _DAMPING), np.arange(len(T))
     steps, tried, new = np.empty((len(T), 6)), np.empty_like(T), sums[:0]
     for _ in range(1 + _MAX_STEPS):
-        count = descend(sums, T, dampings, active, steps, tried, new, tolerance)
+        count = descend(sums, T, dampings, active, steps, tried, new, (tolerance, math.inf))
         if not count:
             break
         new = block.packed_run_sums(tried[:count], runs[active[:count]])
     converged = dampings < MAX_DAMPING
     converged[active[:count]] = False
     return FramePoses(T, unpack_sums(sums).hessian, converged)
+
+
+def move_damped(
+    sums: Array, T_camera_lidar: Array, *, damping: float = DAMPING, most_rad: float = math.inf
+) -> tuple[Array, Array]:
+    """Poses at the minima of quadratic costs; a direction that is free gets no step.
+
+    Args:
+        sums: (f, 28) of each pose, as ``ProjectionBlock.packed_run_sums``.
+        T_camera_lidar: (f, 4, 4).
+        damping: what is added to the diagonal, relative to it.
+        most_rad: that a step turns about an axis; longer ones are shortened.
+
+    Returns:
+        (f, 4, 4) T_camera_lidar; (f, 6) the steps, in the tangent of T_lidar_camera.
+    """
+    count = len(sums)
+    steps, moved = np.empty((count, 6)), np.empty((count, 4, 4))
+    dampings, numbers = np.full(count, damping), np.arange(count)
+    descend(sums, T_camera_lidar, dampings, numbers, steps, moved, sums[:0], (0.0, most_rad))
+    return moved, steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +133,7 @@ def fit_each_frame(block: CameraBlock, T_camera_lidar: Array) -> FrameFits:
         sizes = block.all_sizes(T, runs)[1]
         spreads = np.minimum(np.maximum(robust_spreads(sizes, runs), least), _MAX_SPREAD)
         sums = block.block.packed_run_sums(T, runs, CAUCHY_SCALE_SIGMAS * spreads)
-        moved = np.empty_like(T)
-        move_damped(sums, DAMPING, _MAX_STEP_RAD, T, moved)
-        T = moved
+        T = move_damped(sums, T, most_rad=_MAX_STEP_RAD)[0]
     counts = block.frame_counts.astype(np.float64)
     spreads = _about_common_extrinsic(spreads, counts)
     return FrameFits(

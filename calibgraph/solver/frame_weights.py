@@ -20,10 +20,9 @@ from calibgraph.arrays import Array
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert, local_coordinates
-from calibgraph.model.pose_kernel import move_damped
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.frame_poses import DAMPING, FrameFits, fit_each_frame
+from calibgraph.solver.frame_poses import FrameFits, fit_each_frame, move_damped
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread, robust_spreads
 from calibgraph.solver.stage1 import Stage1
 from factors import to_runs
@@ -147,7 +146,7 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
     center, noise = start, frames.noise
     typical = float(np.median(noise))
     T_lidar_camera, sums = invert(frames.T_camera_lidar), np.zeros((len(noise), 28))
-    sums[:, :21], moved = frames.hessians[:, *np.triu_indices(6)], np.empty((1, 4, 4))
+    sums[:, :21] = frames.hessians[:, *np.triu_indices(6)]
     by_chance, own = _CHANCE * np.maximum(noise - typical, 0), frames.spreads**2
     for number in range(_STEPS):
         away = local_coordinates(center, T_lidar_camera)
@@ -162,8 +161,7 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
         scatter = max(float(near @ (shift - noise) / near.sum()), 0.0)
         weights = near / (own + frames.counts * scatter / 6)
         sums[:, 21:27] = -products
-        step = move_damped((weights @ sums)[None], DAMPING, math.inf, center[None], moved)
-        center = moved[0].copy()
+        (center,), step = move_damped((weights @ sums)[None], center[None])
         if number > _SEARCH_STEPS and np.abs(step).max() < _CONVERGED:
             break
     return center, weights / weights.max()
