@@ -155,7 +155,7 @@ def descend(sums, T, dampings, active, steps, tried, new, limits):  # type: igno
     Returns:
         How many are tried next.
     """
-    work, left = np.empty((7, 6)), 0
+    work, left = np.empty((7, 6)), np.int64(0)
     for i in range(len(new) or len(active)):
         k = active[i]
         if len(new):
