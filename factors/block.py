@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -140,8 +139,8 @@ class ProjectionBlock(RobustBlock):
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
-        found = self.packed_run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks)
-        return unpack_sums(found.sum(axis=0))
+        sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
+        return unpack_sums(sums.sum(axis=0))
 
     def gradients_at_each(self, T_camera_lidar: Array) -> Array:
         """(p, 6) b of the whole block at each of (p, 4, 4) poses."""
@@ -166,12 +165,12 @@ class ProjectionBlock(RobustBlock):
         """(r, p, 28) sums of each run at each pose."""
         count = len(T_camera_lidar)
         poses, each = np.tile(T_camera_lidar, (len(runs), 1, 1)), np.repeat(runs, count, axis=0)
-        return self.packed_run_sums(poses, each, None, wanted).reshape(len(runs), count, 28)
+        return self._run_sums(poses, each, None, wanted).reshape(len(runs), count, 28)
 
     def frame_sums(self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike) -> BlockSums:
         """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked."""
         runs = to_runs(np.asarray(edges, dtype=np.int64))
-        return self.run_sums(_T_camera_lidar(T_lidar_camera)[None], runs)
+        return unpack_sums(self._run_sums(_T_camera_lidar(T_lidar_camera)[None], runs, None))
 
     def run_sums(
         self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None = None
@@ -186,30 +185,29 @@ class ProjectionBlock(RobustBlock):
         return unpack_sums(self.packed_run_sums(T_camera_lidar, runs, scales))
 
     def packed_run_sums(
+        self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None = None
+    ) -> Array:
+        """(r, 28) as :meth:`run_sums`: 21 of the upper triangle of H, 6 of b, 1 of c."""
+        return self._run_sums(T_camera_lidar, runs, scales)
+
+    def _run_sums(
         self,
         T_camera_lidar: Array,
         runs: NDArray[np.int64],
-        scales: Array | None = None,
+        scales: Array | None,
         wanted: int = HESSIAN,
     ) -> Array:
-        """(r, 28) as :meth:`run_sums`: 21 of the upper triangle of H, 6 of b, 1 of c."""
         shared = wanted == HESSIAN and len(runs) * len(self) >= _WORTH_SHARING
         shared = shared and int((runs[:, 1] - runs[:, 0]).sum()) >= _WORTH_SHARING
-        packed, kernel, loss, scale = self._as_kernels_take
-        run = one_at_a_time(accumulate(self.lens.kind, shared=True)) if shared else kernel
+        kernel = accumulate(self.lens.kind, shared=shared)
+        run = one_at_a_time(kernel) if shared else kernel
+        scales = np.array([self.scale]) if scales is None else scales
         # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
-        scales = scale if scales is None else scales * self.sigma
         sums: Array = run(
-            packed, contiguous(T_camera_lidar), self._columns, self._whitening, loss, scales,
-            contiguous(runs), wanted,
+            self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
+            loss_id(self.loss), scales * self.sigma, contiguous(runs), wanted,
         )  # fmt: skip
         return sums if self.sigma == 1.0 else sums / self.sigma**2
-
-    @cached_property
-    def _as_kernels_take(self) -> tuple[Array, Any, int, Array]:
-        """The lens, the kernel of its sums, and the loss with its scale."""
-        kernel = accumulate(self.lens.kind, shared=False)
-        return self.lens.packed, kernel, loss_id(self.loss), np.array([self.scale * self.sigma])
 
     def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable."""
@@ -265,7 +263,7 @@ class ProjectionBlock(RobustBlock):
 
     def error_and_jacobian(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, Array]:
         """The (7,) error and (7, 6) Jacobian of the block factor."""
-        sums = self.packed_run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks)
+        sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
         error, jacobian, regular = root_of_sums(sums)
         return (error, jacobian.T) if regular else square_root(unpack_sums(sums.sum(axis=0)))
 

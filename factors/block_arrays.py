@@ -35,7 +35,6 @@ class RobustBlock:
         """A block with the same attributes, to be changed; faster than ``copy.copy``."""
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__)
-        other.__dict__.pop("_as_kernels_take", None)  # which depends on the loss
         return other
 
     def _check_scale(self) -> None:

@@ -312,6 +312,7 @@ def test_a_block_cannot_be_changed() -> None:
             getattr(block, name)[0] = 0.0
     block.residuals(TRUTH), block.sums(TRUTH), block.error_and_jacobian(TRUTH)
     block.select(np.arange(3)), block.rescale(scale=2.0, sigma=3.0)
+    assert vars(block).keys() == before.keys()
     assert all(vars(block)[name] is value for name, value in before.items())
 
 
