@@ -165,7 +165,7 @@ def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
             )
         ),
         camera_verdicts=verdicts,
-        residuals=evidence.residuals,
+        residuals=Later(lambda: evidence.residuals),
         counts={name: dict(counts) for name, counts in solution.counts.items()},
         timings_s=dict(solution.timings_s),
         terms=solution.terms,

@@ -105,7 +105,7 @@ class Calibration:
     covariance: dict[str, Array | None]
     joint_covariance: Array | None
     camera_verdicts: dict[str, Verdict]
-    residuals: dict[str, Residuals]
+    residuals: Mapping[str, Residuals]
     counts: dict[str, dict[str, int]]
     timings_s: dict[str, float]
     terms: Terms

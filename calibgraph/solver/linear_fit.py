@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -167,6 +168,7 @@ def _linearize(camera: Camera, block: ProjectionBlock, fields_px: Array) -> Arra
     return columns
 
 
+@cache
 def _weak(size: int) -> Array:
     """(6 + k, 6 + k) information of a pose within sight and of unknowns that are nearly free."""
     return np.diag(np.append(np.diag(WEAK), np.full(size - 6, _WEAK)))
