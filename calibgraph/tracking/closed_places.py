@@ -46,7 +46,7 @@ from calibgraph.tracking.quadratics import (
 )
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, equation_5
-from calibgraph.tracking.window import Window
+from calibgraph.tracking.window import ClosedWindow, Window
 
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
 STEPS = 5  # fits, and estimates of the variance ratios between them
@@ -175,7 +175,19 @@ class ClosedPlaces:
         cameras = zip(self.state.cameras, frames, strict=True)
         return all(count >= _SETTLED for one, count in cameras if one.started)
 
-    def with_open_epoch(self, state: State, window: Window | None) -> tuple[Window, Conflicts]:
+    def window(self, state: State) -> ClosedWindow | None:
+        """The whole graph, if this is all of it: no frame has come since its exact optimum.
+
+        With relative poses it is not, as these may contradict the newest frames.
+        """
+        partial = state.drifting or state.offsets is not None or state.rig.relative_poses
+        if not state.is_refined or state.epochs[-1].frames or partial:
+            return None
+        if state.config.preset != "auto" or self.state.sizes != state.sizes:
+            return None
+        return ClosedWindow(self.fit.linear, self.data.names)
+
+    def with_open_epoch(self, state: State, window: Window | ClosedWindow | None) -> tuple[Window, Conflicts]:
         """The whole graph in iSAM2, and the conflicts of relative poses with correspondences.
 
         Args:
@@ -210,7 +222,7 @@ class ClosedPlaces:
             before = changed(model, pose_graph=self._summary(kept))
             conflicts = find_conflicts(state, every, before, start)
         model = changed(model, pose_graph=self._pose_graph(kept, contradicting(conflicts)))
-        if window is not None and window.has_graph_of(model, data.names):
+        if isinstance(window, Window) and window.has_graph_of(model, data.names):
             window.exchange(model)
         else:
             window = Window(model, data.names, _start(state, model, data.names))

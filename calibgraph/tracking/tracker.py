@@ -287,7 +287,7 @@ class IncrementalCalibrator:
     def _close_epoch(self, *, together: bool) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, begin another."""
         state, offsets = self._state, self._state.offsets
-        if self._assessed is not None:
+        if self._assessed is not None and self._assessed[0].epochs[-1].frames:
             state = changed(state, optimum=self._assessed[1].newest(state.optimum))
             offsets = self._assessed[1].offsets(state)
         self._state, events = close_epoch(state, offsets, self._closed.all_sums(state))
