@@ -272,13 +272,7 @@ def _optional(values: ArrayLike | None, dtype: type) -> Any:
 
 
 def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
-    """Concatenate tables; the first gives the metadata, but for findings that differ.
-
-    Raises:
-        ValueError: if there are none.
-    """
-    if not tables:
-        raise ValueError("no tables to concatenate")
+    """Concatenate one or more tables; the first gives the metadata, but for findings that differ."""
     names = tuple(sorted({name for table in tables for name in table.cameras}))
     same = "frame", "pixels_px", "points_lidar_m", "confidence"
     columns: dict[str, Any] = {n: np.concatenate([getattr(t, n) for t in tables]) for n in same}
@@ -295,4 +289,7 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
         if given and all(column is not None for column in given):
             columns[name] = np.concatenate(given)
     known = [table.metadata for table in tables if len(table) or table.metadata] or [{}]
-    return Correspondences(cameras=names, metadata=joined_metadata(known), **columns)
+    joined = copy.copy(tables[0])  # not checked again: rows of valid tables are valid
+    vars(joined).update({**dict.fromkeys(_WIDTHS), **columns, "cameras": names})
+    joined._read(joined_metadata(known))
+    return joined

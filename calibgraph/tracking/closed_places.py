@@ -46,7 +46,7 @@ from calibgraph.tracking.quadratics import (
 )
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, equation_5
-from calibgraph.tracking.window import ClosedWindow, Window
+from calibgraph.tracking.window import AnyWindow, ClosedWindow, Window
 
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
 STEPS = 5  # fits, and estimates of the variance ratios between them
@@ -88,12 +88,6 @@ class ClosedPlaces:
         rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
         data = PlaceData.of(state, earlier_quadratics(state, sums), frames, rows)
         seen = FrameSpread.of(state, sums)
-        return ClosedPlaces._of_data(state, sums, seen, data, fitted=fitted)
-
-    @staticmethod
-    def _of_data(
-        state: State, sums: PlaceSums, seen: FrameSpread, data: PlaceData, *, fitted: bool
-    ) -> ClosedPlaces:
         times = times_of(state)
         data = data.at_own_times(times)
         model = place_model(state, sums, seen, data, times=times)
@@ -107,15 +101,19 @@ class ClosedPlaces:
         return ClosedPlaces(state, sums, seen, data, fit, dropped)
 
     def at_optimum(self, state: State) -> ClosedPlaces:
-        """The same epochs at another optimum, and with other variance ratios."""
+        """The same as :meth:`of` a state with the optimum and the variance ratios found here."""
         data = self.data.with_quadratics(state, earlier_quadratics(state, self.sums))
-        return ClosedPlaces._of_data(state, self.sums, self.seen, data, fitted=False)
+        data, linear = data.at_own_times(times_of(state)), self.fit.linear
+        model = place_model(state, self.sums, self.seen, data, times=times_of(state))
+        model = changed(model, pose_graph=linear.model.pose_graph)
+        values = linear.values if state.offsets is None else _start(state, model, data.names)
+        fit = LatentPoseFit(Linearization.at(model, values), 0, True)
+        return changed(self, state=state, data=data, fit=fit, _pose_graphs={})
 
     def fitted(self, state: State) -> ClosedPlaces:
         """At the optimum for the variance ratios of the state."""
         model = place_model(state, self.sums, self.seen, self.data, times=times_of(state))
-        values = self.fit.linear.values
-        fit, dropped = fit_without_contradictions(state, self.sums, model, values)
+        fit, dropped = fit_without_contradictions(state, self.sums, model, self.fit.linear.values)
         return ClosedPlaces(state, self.sums, self.seen, self.data, fit, dropped)
 
     @property
@@ -175,25 +173,19 @@ class ClosedPlaces:
         cameras = zip(self.state.cameras, frames, strict=True)
         return all(count >= _SETTLED for one, count in cameras if one.started)
 
-    def window(self, state: State) -> ClosedWindow | None:
-        """The whole graph, if this is all of it: no frame has come since its exact optimum.
+    def graph(self, state: State, window: AnyWindow | None) -> tuple[AnyWindow, Conflicts]:
+        """The whole graph, and the conflicts of relative poses with correspondences.
 
-        With relative poses it is not, as these may contradict the newest frames.
+        The window of the frame before, if it is of the same epoch, goes on if its graph allows.
         """
-        partial = state.drifting or state.offsets is not None or state.rig.relative_poses
-        if not state.is_refined or state.epochs[-1].frames or partial:
-            return None
-        if state.config.preset != "auto" or self.state.sizes != state.sizes:
-            return None
-        return ClosedWindow(self.fit.linear, self.data.names)
+        partial = state.drifting or state.offsets is not None or state.config.preset != "auto"
+        begun = state.epochs[-1].frames or not state.is_refined or self.state.sizes != state.sizes
+        if partial or begun or state.rig.relative_poses:  # these may contradict the newest frames
+            return self.with_open_epoch(state, window)
+        return ClosedWindow(self.fit.linear, self.data.names), {}
 
-    def with_open_epoch(self, state: State, window: Window | ClosedWindow | None) -> tuple[Window, Conflicts]:
-        """The whole graph in iSAM2, and the conflicts of relative poses with correspondences.
-
-        Args:
-            state: of the tracker.
-            window: of the frame before, if of the same epoch; it goes on if its graph allows.
-        """
+    def with_open_epoch(self, state: State, window: AnyWindow | None) -> tuple[Window, Conflicts]:
+        """The same in iSAM2."""
         frames = state.epochs[-1].frames
         opened = (*frames, *state.live_frames[-1:])
         touched = {frame.place for frame in opened}

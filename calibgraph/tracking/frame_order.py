@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import index
 
@@ -229,6 +230,13 @@ def without_repeats(state: State, table: Correspondences) -> Correspondences:
         if _repeats(_last_hashes(state, camera), hashes[table.camera_index == number]):
             repeated.append(number)
     return table.select(~np.isin(table.camera_index, repeated)) if repeated else table
+
+
+def share_last_points(state: State, tables: Sequence[Correspondences]) -> bool:
+    """Whether any table has a point of a camera's last frame; else none can repeat it."""
+    hashes = {*hash_numbers(np.concatenate([table.points_lidar_m for table in tables]))}
+    lasts = (_last_hashes(state, camera) for camera in range(len(state.names)))
+    return not all(hashes.isdisjoint(last or ()) for last in lasts)
 
 
 def _repeats(last: list[int] | None, hashes: Hashes) -> bool:

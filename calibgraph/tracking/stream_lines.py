@@ -18,16 +18,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import from_json
 
 from calibgraph.errors import CorrespondenceError, MotionError
 from calibgraph.files import describe
-from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.table_columns import COORDINATES, INFORMATION, as_confidence
 from calibgraph.tracking.frame_order import LONGEST_PLACE, with_place
@@ -69,9 +69,10 @@ class CameraColumns(BaseModel):
             raise ValueError(f"the lists differ in length: {lengths}")
         return self
 
-    def array(self, keys: Sequence[str]) -> NDArray[np.float64]:
-        """(n, k) of some columns."""
-        return np.array([getattr(self, key) for key in keys], np.float64).T.copy()
+    def column(self, key: str, missing: float) -> list[float]:
+        """A column; of one value, where it is not given."""
+        given: list[float] = getattr(self, key)
+        return given if key in self.model_fields_set else [missing] * len(self.u_px)
 
 
 class HeaderLine(BaseModel):
@@ -103,28 +104,37 @@ class FrameLine(BaseModel):
         Raises:
             CorrespondenceError: if a value is out of its range.
         """
-        metadata = {**header, **self.metadata}
-        parts = [self._of_camera(*item) for item in self.cameras.items()] or [_EMPTY]
-        table = concatenate(parts).with_metadata(metadata)
-        return StreamFrame(self.frame, with_place(table, self.place))
+        parts, names = [*self.cameras.values()], tuple(sorted(self.cameras))
+        given = {key for part in parts for key in part.model_fields_set}
+        counts = [len(part.u_px) for part in parts]
+        n, numbers = sum(counts), np.array([*map(names.index, self.cameras)], np.int32)
+        stamped, twist = n > 0 and "stamp_ns" in self.model_fields_set, self.twist_per_s
 
-    def _of_camera(self, name: str, columns: CameraColumns) -> Correspondences:
-        """The rows of one camera."""
-        n, given = len(columns.u_px), columns.model_fields_set
-        stamped, twist = "stamp_ns" in self.model_fields_set, self.twist_per_s
-        indexed = any("point_index" in each.model_fields_set for each in self.cameras.values())
-        return Correspondences(
-            cameras=(name,),
-            camera_index=np.zeros(n, np.int32),
+        def columns(keys: Sequence[str], missing: Sequence[float], kind: type = float) -> Any:
+            every = zip(keys, missing, strict=True)
+            rows = [[*chain(*(part.column(*column) for part in parts))] for column in every]
+            return np.array(rows, kind).T.copy()
+
+        table = Correspondences(
+            cameras=names,
+            camera_index=np.repeat(numbers, counts),
             frame=np.full(n, self.frame, np.int64),
-            pixels_px=columns.array(COORDINATES[:2]),
-            points_lidar_m=columns.array(COORDINATES[2:]),
-            confidence=as_confidence(columns.confidence if "confidence" in given else np.ones(n)),
-            information_px=columns.array(INFORMATION) if INFORMATION[0] in given else None,
+            pixels_px=columns(COORDINATES[:2], [np.nan] * 2),
+            points_lidar_m=columns(COORDINATES[2:], [np.nan] * 3),
+            confidence=as_confidence(columns(["confidence"], [1.0])[:, 0]),
+            information_px=(
+                columns(INFORMATION, [1.0, 0.0, 1.0]) if INFORMATION[0] in given else None
+            ),
             stamp_ns=np.full(n, self.stamp_ns, np.int64) if stamped else None,
-            point_index=np.array(columns.point_index or [-1] * n, np.int64) if indexed else None,
-            twist_per_s=None if twist is None else np.tile(twist, (n, 1)),
+            point_index=(
+                columns(["point_index"], [-1], np.int64)[:, 0]
+                if n and "point_index" in given
+                else None
+            ),
+            twist_per_s=np.tile(twist, (n, 1)) if n and twist is not None else None,
+            metadata={**header, **self.metadata},
         )
+        return StreamFrame(self.frame, with_place(table, self.place))
 
 
 def frames_of_lines(chunks: Iterable[bytes], where: str) -> Iterator[Item]:
@@ -182,13 +192,3 @@ def _parse(line: bytes, where: str, header: Mapping[str, Any]) -> Item | dict[st
         return refused(where, str(error), by_motion=isinstance(error, MotionError))
     except ValueError as error:
         return refused(where, f"is not JSON ({error}); send one frame a line, as JSON")
-
-
-_EMPTY = Correspondences(
-    cameras=(),
-    camera_index=np.empty(0, np.int32),
-    frame=np.empty(0, np.int64),
-    pixels_px=np.empty((0, 2)),
-    points_lidar_m=np.empty((0, 3)),
-    confidence=np.empty(0, np.float32),
-)

@@ -51,6 +51,12 @@ class Update:
     left_out: tuple[str, ...]
     lens: dict[str, tuple[LensEstimate, ...]] = field(default_factory=dict)
 
+    @property
+    def shared(self) -> tuple[int, ...]:
+        """Identities of what frames that are taken in at once share."""
+        parts = self.T_camera_lidar, self.covariance, self.verdicts, self.lens
+        return tuple(id(value) for part in parts for value in part.values())
+
 
 def make_updates(
     state: State,
@@ -98,9 +104,7 @@ def json_lines(updates: Sequence[Update]) -> list[str]:
     estimates: dict[tuple[int, ...], dict[str, str]] = {}
     lines = []
     for update in updates:
-        parts = update.T_camera_lidar, update.covariance, update.verdicts, update.lens
-        shared = tuple(id(value) for part in parts for value in part.values())
-        if shared not in estimates:
+        if (shared := update.shared) not in estimates:
             estimates[shared] = {name: _estimate(update, name) for name in update.T_camera_lidar}
         cameras = ", ".join(
             f"{_json(name)}: {{{text}, {_of_frame(update, name)}}}"

@@ -102,3 +102,6 @@ class ClosedWindow:
     def covariance(self, keys: Sequence[int]) -> Array:
         """Joint marginal of some variables, in their tangents."""
         return self._linear.covariance_of(keys)
+
+
+AnyWindow = Window | ClosedWindow
