@@ -272,7 +272,7 @@ def _optional(values: ArrayLike | None, dtype: type) -> Any:
 
 
 def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
-    """Concatenate one or more tables; the first gives the metadata, but for findings that differ."""
+    """Concatenate tables, at least one: the first gives the metadata but for differing findings."""
     names = tuple(sorted({name for table in tables for name in table.cameras}))
     same = "frame", "pixels_px", "points_lidar_m", "confidence"
     columns: dict[str, Any] = {n: np.concatenate([getattr(t, n) for t in tables]) for n in same}
