@@ -86,9 +86,8 @@ class ClosedPlaces:
         for camera in state.drifting:
             sums = sums.without(camera)
         rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
+        times, seen = times_of(state), FrameSpread.of(state, sums)
         data = PlaceData.of(state, earlier_quadratics(state, sums), frames, rows)
-        seen = FrameSpread.of(state, sums)
-        times = times_of(state)
         data = data.at_own_times(times)
         model = place_model(state, sums, seen, data, times=times)
         values = _start(state, model, data.names)
@@ -102,11 +101,14 @@ class ClosedPlaces:
 
     def at_optimum(self, state: State) -> ClosedPlaces:
         """The same as :meth:`of` a state with the optimum and the variance ratios found here."""
+        if state.offsets is not None:
+            return ClosedPlaces.of(state)
         data = self.data.with_quadratics(state, earlier_quadratics(state, self.sums))
-        data, linear = data.at_own_times(times_of(state)), self.fit.linear
-        model = place_model(state, self.sums, self.seen, data, times=times_of(state))
-        model = changed(model, pose_graph=linear.model.pose_graph)
-        values = linear.values if state.offsets is None else _start(state, model, data.names)
+        blocks = {
+            state.names[camera]: matches.with_variance(self.seen.least(camera))
+            for camera, matches in data.cameras.items()
+        }
+        model, values = self.fit.linear.model.with_blocks(blocks), self.fit.linear.values
         fit = LatentPoseFit(Linearization.at(model, values), 0, True)
         return changed(self, state=state, data=data, fit=fit, _pose_graphs={})
 
@@ -169,8 +171,7 @@ class ClosedPlaces:
     @property
     def is_settled(self) -> bool:
         """Whether an epoch's frames more would hardly change the scatter of frames."""
-        frames = self.sums.frames.sum(axis=0)
-        cameras = zip(self.state.cameras, frames, strict=True)
+        cameras = zip(self.state.cameras, self.sums.frames.sum(axis=0), strict=True)
         return all(count >= _SETTLED for one, count in cameras if one.started)
 
     def graph(self, state: State, window: AnyWindow | None) -> tuple[AnyWindow, Conflicts]:
@@ -236,8 +237,7 @@ class ClosedPlaces:
     def _pose_graph(self, kept: Rows, dropped: Rows) -> gtsam.NonlinearFactorGraph:
         """The same with the priors, without some relative poses."""
         if (kept, dropped) not in self._pose_graphs:
-            graph = join(self._priors(dropped), self._summary(kept))
-            self._pose_graphs[kept, dropped] = graph
+            self._pose_graphs[kept, dropped] = join(self._priors(dropped), self._summary(kept))
         return self._pose_graphs[kept, dropped]
 
     def _split(self, every: PlaceSums, touched: set[str]) -> tuple[Rows, list[int]]:
