@@ -170,6 +170,8 @@ def with_place(table: Correspondences, place: str | int | None) -> Correspondenc
     Raises:
         CorrespondenceError: if it is no name, or the lists are wrong.
     """
+    if place is None and not table.metadata:
+        return table
     name = place_of(table) if place is None else _place_name(place)
     kept = {key: value for key, value in table.metadata.items() if key not in (PLACE, PLACES)}
     kept |= {PLACE: name} if name else {}
@@ -187,6 +189,8 @@ def with_metadata_per_frame(table: Correspondences) -> Correspondences:
     Raises:
         CorrespondenceError: if a finding is wrong.
     """
+    if not table.metadata:
+        return table
     findings = table.findings.to_metadata()
     kept = {key: findings[key] for key in _FINDINGS_PER_FRAME if key in findings}
     kept |= {key: table.metadata[key] for key in (PLACE,) if key in table.metadata}

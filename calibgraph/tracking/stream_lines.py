@@ -52,11 +52,11 @@ class CameraColumns(BaseModel):
     x_m: list[float]
     y_m: list[float]
     z_m: list[float]
-    confidence: list[float] = []
-    i_uu_px: list[float] = []
-    i_uv_px: list[float] = []
-    i_vv_px: list[float] = []
-    point_index: list[Int64] = []
+    confidence: list[float] = Field(default_factory=list)
+    i_uu_px: list[float] = Field(default_factory=list)
+    i_uv_px: list[float] = Field(default_factory=list)
+    i_vv_px: list[float] = Field(default_factory=list)
+    point_index: list[Int64] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _require_whole_table(self) -> Self:
@@ -93,7 +93,7 @@ class FrameLine(BaseModel):
     cameras: Annotated[dict[str, CameraColumns], Field(max_length=MAX_CAMERAS)]
     place: PlaceName | None = None
     twist_per_s: Twist | None = None
-    metadata: dict[str, Any] = {}
+    metadata: dict[str, Any] = Field(default_factory=dict)
 
     def to_frame(self, header: Mapping[str, Any]) -> StreamFrame:
         """The frame with the correspondences of all its cameras.
