@@ -104,37 +104,39 @@ class FrameLine(BaseModel):
         Raises:
             CorrespondenceError: if a value is out of its range.
         """
-        parts, names = [*self.cameras.values()], tuple(sorted(self.cameras))
-        given = {key for part in parts for key in part.model_fields_set}
-        counts = [len(part.u_px) for part in parts]
-        n, numbers = sum(counts), np.array([*map(names.index, self.cameras)], np.int32)
-        stamped, twist = n > 0 and "stamp_ns" in self.model_fields_set, self.twist_per_s
-
-        def columns(keys: Sequence[str], missing: Sequence[float], kind: type = float) -> Any:
-            every = zip(keys, missing, strict=True)
-            rows = [[*chain(*(part.column(*column) for part in parts))] for column in every]
-            return np.array(rows, kind).T.copy()
-
+        counts = [len(camera.u_px) for camera in self.cameras.values()]
+        n, names, twist = sum(counts), tuple(sorted(self.cameras)), self.twist_per_s
+        stamped = n > 0 and "stamp_ns" in self.model_fields_set
+        coordinates = self._columns(COORDINATES, [np.nan] * len(COORDINATES))
+        sure, indexed = not self._has("confidence"), n > 0 and self._has("point_index")
         table = Correspondences(
             cameras=names,
-            camera_index=np.repeat(numbers, counts),
+            camera_index=np.repeat(np.array([*map(names.index, self.cameras)], np.int32), counts),
             frame=np.full(n, self.frame, np.int64),
-            pixels_px=columns(COORDINATES[:2], [np.nan] * 2),
-            points_lidar_m=columns(COORDINATES[2:], [np.nan] * 3),
-            confidence=as_confidence(columns(["confidence"], [1.0])[:, 0]),
-            information_px=(
-                columns(INFORMATION, [1.0, 0.0, 1.0]) if INFORMATION[0] in given else None
+            pixels_px=coordinates[:, :2].copy(),
+            points_lidar_m=coordinates[:, 2:].copy(),
+            confidence=as_confidence(
+                np.ones(n) if sure else self._columns(["confidence"], [1])[:, 0]
             ),
+            information_px=self._columns(INFORMATION, [1, 0, 1])
+            if self._has(INFORMATION[0])
+            else None,
             stamp_ns=np.full(n, self.stamp_ns, np.int64) if stamped else None,
-            point_index=(
-                columns(["point_index"], [-1], np.int64)[:, 0]
-                if n and "point_index" in given
-                else None
-            ),
+            point_index=self._columns(["point_index"], [-1], np.int64)[:, 0] if indexed else None,
             twist_per_s=np.tile(twist, (n, 1)) if n and twist is not None else None,
             metadata={**header, **self.metadata},
         )
         return StreamFrame(self.frame, with_place(table, self.place))
+
+    def _has(self, key: str) -> bool:
+        """Whether a camera gives a column."""
+        return any(key in camera.model_fields_set for camera in self.cameras.values())
+
+    def _columns(self, keys: Sequence[str], missing: Sequence[float], kind: type = float) -> Any:
+        """(n, k) columns of all cameras, with a value of each for those that do not give it."""
+        cameras, every = self.cameras.values(), zip(keys, missing, strict=True)
+        rows = [[*chain(*(camera.column(*column) for camera in cameras))] for column in every]
+        return np.array(rows, kind).T.copy()
 
 
 def frames_of_lines(chunks: Iterable[bytes], where: str) -> Iterator[Item]:
