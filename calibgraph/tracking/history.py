@@ -15,7 +15,7 @@ from calibgraph.report.figure import save_picture
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.history_figure import Curve, history_figure, text_figure
 from calibgraph.tracking.state_bytes import StateError, decode, encode
-from calibgraph.tracking.update import Update
+from calibgraph.tracking.update import Update, shared_parts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,7 +98,7 @@ class History:
     def _entries_of(self, update: Update) -> Array:
         """(n, 14) of the cameras; those of the update before, if it was taken in with this one."""
         before = self._newest
-        if before is None or update.events or update.shared != before[0].shared:
+        if before is None or update.events or shared_parts(update) != shared_parts(before[0]):
             found = np.array([self._entry(update, name) for name in self._origins])
             before = self._newest = update, found
         return before[1]

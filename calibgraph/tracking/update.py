@@ -51,12 +51,6 @@ class Update:
     left_out: tuple[str, ...]
     lens: dict[str, tuple[LensEstimate, ...]] = field(default_factory=dict)
 
-    @property
-    def shared(self) -> tuple[int, ...]:
-        """Identities of what frames that are taken in at once share."""
-        parts = self.T_camera_lidar, self.covariance, self.verdicts, self.lens
-        return tuple(id(value) for part in parts for value in part.values())
-
 
 def make_updates(
     state: State,
@@ -94,6 +88,12 @@ def make_updates(
     ]
 
 
+def shared_parts(update: Update) -> tuple[int, ...]:
+    """Identities of what frames that are taken in at once share."""
+    parts = update.T_camera_lidar, update.covariance, update.verdicts, update.lens
+    return tuple(id(value) for part in parts for value in part.values())
+
+
 def json_line(update: Update) -> str:
     """The update as one line of JSON; units are in the keys, matrices row by row."""
     return json_lines([update])[0]
@@ -104,7 +104,7 @@ def json_lines(updates: Sequence[Update]) -> list[str]:
     estimates: dict[tuple[int, ...], dict[str, str]] = {}
     lines = []
     for update in updates:
-        if (shared := update.shared) not in estimates:
+        if (shared := shared_parts(update)) not in estimates:
             estimates[shared] = {name: _estimate(update, name) for name in update.T_camera_lidar}
         cameras = ", ".join(
             f"{text}, {_of_frame(update, name)}}}" for name, text in estimates[shared].items()
