@@ -272,7 +272,13 @@ def _optional(values: ArrayLike | None, dtype: type) -> Any:
 
 
 def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
-    """Concatenate tables, at least one: the first gives the metadata but for differing findings."""
+    """Concatenate tables; the first gives the metadata, but for findings that differ.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    if not tables:
+        raise ValueError("no tables to concatenate")
     names = tuple(sorted({name for table in tables for name in table.cameras}))
     same = "frame", "pixels_px", "points_lidar_m", "confidence"
     columns: dict[str, Any] = {n: np.concatenate([getattr(t, n) for t in tables]) for n in same}
@@ -280,16 +286,14 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
     found = [number[t.camera_index] if len(t) else t.camera_index for number, t in pairs]
     columns["camera_index"] = np.concatenate(found)
     if any(table.information_px is not None for table in tables):
-        columns["information_px"] = np.concatenate([
-            np.tile([1.0, 0.0, 1.0], (len(t), 1)) if t.information_px is None else t.information_px
-            for t in tables
-        ])  # fmt: skip
+        stated = [(table.information_px, len(table)) for table in tables]
+        parts = [np.tile([1.0, 0.0, 1.0], (n, 1)) if i is None else i for i, n in stated]
+        columns["information_px"] = np.concatenate(parts)
     for name in ("stamp_ns", "point_index", "twist_per_s"):
         given = [getattr(table, name) for table in tables if len(table)]
         if given and all(column is not None for column in given):
             columns[name] = np.concatenate(given)
     known = [table.metadata for table in tables if len(table) or table.metadata] or [{}]
-    joined = copy.copy(tables[0])  # not checked again: rows of valid tables are valid
-    vars(joined).update({**dict.fromkeys(_WIDTHS), **columns, "cameras": names})
-    joined._read(joined_metadata(known))
+    joined = tables[0].with_metadata(joined_metadata(known))
+    vars(joined).update({**dict.fromkeys(_WIDTHS), **columns, "cameras": names})  # as checked
     return joined
