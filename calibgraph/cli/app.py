@@ -7,6 +7,7 @@ CHANGED (``drift``), 2 bad input (one line), 3 the data cannot tell (both), 130 
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import sys
@@ -86,6 +87,7 @@ def main() -> None:
     from calibgraph.errors import CalibrationError
 
     gc.set_threshold(*_COLLECT_AFTER)
+    atexit.register(gc.freeze)  # at its end Python would look for garbage in all objects: 0.3 s
     sys.argv[1:] = _repeat_weights_option(sys.argv[1:])
     try:
         _require_utf8(sys.argv[1:])

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
-from itertools import cycle
+from itertools import islice
 
 from calibgraph.child_process import (
     ChildEndedError,
@@ -43,17 +44,23 @@ def draw_here(diagrams: Diagrams) -> Callable[[], Drawn]:
 
 @contextmanager
 def drawing_processes() -> Iterator[Draw]:
-    """Start processes that draw, in turn, on all cores but one; with one core, draw here.
+    """Start a process per core that draws its share of each camera; with one core, draw here.
 
     They end with the body of the ``with``, and with this process.
     """
-    count = min(_MOST_PROCESSES, count_cores() - 1)
-    if not count:
+    count = min(_MOST_PROCESSES, count_cores())
+    if count == 1:
         yield draw_here
         return
     with ExitStack() as stack:
-        turns = cycle([stack.enter_context(closing(DrawingProcess())) for _ in range(count)])
-        yield lambda diagrams: next(turns).begin(diagrams)
+        processes = [stack.enter_context(closing(DrawingProcess())) for _ in range(count)]
+
+        def begin(diagrams: Diagrams) -> Callable[[], Drawn]:
+            shares = [dict(islice(diagrams.items(), i, None, count)) for i in range(count)]
+            waiting = [process.begin(each) for process, each in zip(processes, shares, strict=True)]
+            return lambda: {name: uri for wait in waiting for name, uri in wait().items()}
+
+        yield begin
 
 
 class DrawingProcess:
@@ -108,11 +115,14 @@ def _answer(diagrams: Diagrams, _: Note) -> Drawn | Exception:
 
 def main() -> None:
     """The child's side."""
+    gc.disable()  # nothing of what is loaded is garbage
     from calibgraph.report.figure import new_figure, to_data_uri
 
     figure = new_figure(1.0)
     figure.add_axes((0.2, 0.2, 0.7, 0.7))
     to_data_uri(figure)  # loads what the first diagram would wait for: half a second
+    gc.freeze()
+    gc.enable()
     answer_requests(_answer)
 
 
