@@ -14,8 +14,9 @@ import pytest
 
 from calibgraph import Calibration
 from calibgraph.errors import CalibrationError
-from calibgraph.report import drawing, write_report
+from calibgraph.report import drawing
 from calibgraph.report.drawing import DrawingProcess, drawing_processes
+from calibgraph.report.html import write_report
 
 _DIES = {"dies": partial(os.kill, 0, signal.SIGKILL)}  # 0: the group of the process that draws
 _HOLDER = """
