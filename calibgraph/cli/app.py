@@ -86,6 +86,7 @@ def main() -> None:
     """Run the command line; errors in the data become one line on stderr and exit code 2."""
     from calibgraph.errors import CalibrationError
 
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # more spin for 0.3 s while they load
     gc.set_threshold(*_COLLECT_AFTER)
     atexit.register(gc.freeze)  # at its end Python would look for garbage in all objects: 0.3 s
     sys.argv[1:] = _repeat_weights_option(sys.argv[1:])
