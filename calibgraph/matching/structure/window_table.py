@@ -52,6 +52,7 @@ class WindowTable:
         self._cloud = rays_m, intensity_rank
         self._rows = mmap_copy(rows[kept].astype(np.int32))
         self._centres = mmap_copy(np.random.default_rng(0).permutation(centres).astype(np.int32))
+        self._centre_rows = mmap_copy(self._rows[self._centres])
         self._slots = mmap_copy(np.full(len(centres), _UNCUT, np.int32))
         self._windows, self._count = Windows.empty(len(centres), mmap_zeros), 0
         self._windows_nbytes = self._windows.nbytes
@@ -71,7 +72,7 @@ class WindowTable:
             max_windows: largest number of centres in view.
             seed: of the choice.
         """
-        chosen = np.flatnonzero(in_view[self._rows[self._centres]])
+        chosen = np.flatnonzero(in_view[self._centre_rows])
         if seed:
             chosen = np.random.default_rng(seed).permutation(chosen)
         windows, slots = self._take(chosen[:max_windows])
@@ -103,7 +104,7 @@ class WindowTable:
     def nbytes(self) -> int:
         """Size in memory, without the cloud."""
         cut = self._count * self._windows_nbytes // max(1, len(self._centres))
-        kept = self._rows.nbytes + self._centres.nbytes + self._slots.nbytes
+        kept = self._rows.nbytes + 3 * self._centres.nbytes
         return cut + kept + self._neighbours.nbytes
 
 
