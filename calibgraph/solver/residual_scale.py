@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,6 +120,7 @@ def iterate_spread(quantile_below: Callable[[float, float], float]) -> float:
     return spread
 
 
+<<<<<<< HEAD
 def _spreads(
     values: Array, runs: NDArray[np.int64], start: tuple[float, float], rounds: int
 ) -> Array:
@@ -128,6 +130,16 @@ def _spreads(
     joined = contiguous(np.concatenate([*ordered, values[:0]]))
     _fill_spreads(joined, contiguous(edges), start, rounds, found)
     return found
+=======
+def _sort_runs(values: Array, runs: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """The sorted values of each run one behind the other, and (r + 1,) where they begin and end."""
+    parts = [values[first:end] for first, end in runs.tolist()]
+    edges = list(accumulate(map(len, parts), initial=0))
+    ordered = np.concatenate([*parts, values[:0]])
+    for first, end in pairwise(edges):
+        ordered[first:end].sort()
+    return contiguous(ordered), contiguous(np.array(edges))
+>>>>>>> main
 
 
 @compiled()
