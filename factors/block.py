@@ -39,11 +39,7 @@ from factors.loss import loss_id
 
 Array = NDArray[np.float64]
 
-<<<<<<< HEAD
-_CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
 _WORTH_RAYS = 2048  # correspondences (4 us a pass): the kernel compiles for a second
-=======
->>>>>>> main
 _WORTH_SHARING = 2_000_000  # correspondences (7 ms): below, waiting for busy cores costs more
 _WIDTHS = {"points_lidar_m": 3, "pixels_px": 2, "sqrt_information": 3, "motion": 7}
 

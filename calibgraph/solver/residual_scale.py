@@ -120,26 +120,17 @@ def iterate_spread(quantile_below: Callable[[float, float], float]) -> float:
     return spread
 
 
-<<<<<<< HEAD
 def _spreads(
     values: Array, runs: NDArray[np.int64], start: tuple[float, float], rounds: int
 ) -> Array:
     """(r,) see :func:`_fill_spreads`."""
-    ordered = [np.sort(values[first:end]) for first, end in runs.tolist()]
-    edges, found = np.cumsum([0, *map(len, ordered)]), np.empty(len(runs))
-    joined = contiguous(np.concatenate([*ordered, values[:0]]))
-    _fill_spreads(joined, contiguous(edges), start, rounds, found)
-    return found
-=======
-def _sort_runs(values: Array, runs: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """The sorted values of each run one behind the other, and (r + 1,) where they begin and end."""
-    parts = [values[first:end] for first, end in runs.tolist()]
+    parts, found = [values[first:end] for first, end in runs.tolist()], np.empty(len(runs))
     edges = list(accumulate(map(len, parts), initial=0))
     ordered = np.concatenate([*parts, values[:0]])
     for first, end in pairwise(edges):
         ordered[first:end].sort()
-    return contiguous(ordered), contiguous(np.array(edges))
->>>>>>> main
+    _fill_spreads(contiguous(ordered), contiguous(np.array(edges)), start, rounds, found)
+    return found
 
 
 @compiled()

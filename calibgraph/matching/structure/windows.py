@@ -17,17 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array, Mask
-<<<<<<< HEAD
+from calibgraph.matching.structure.nearest_rays import NearestRays
 from calibgraph.matching.structure.window_kernels import (
     FEATURES,
     ROOM,
     describe_windows,
     fill_features,
 )
-=======
-from calibgraph.matching.structure.nearest_rays import NearestRays
-from calibgraph.matching.structure.window_kernels import FEATURES, describe_windows, fill_features
->>>>>>> main
 from calibgraph.matching.structure.window_weights import WindowNetwork
 
 Rows = NDArray[np.intp]
@@ -128,14 +124,10 @@ def cut_windows(
         flat, 1 where much varies.
     """
     windows, reliability = Windows.empty(len(centres)), np.zeros(len(centres))
-<<<<<<< HEAD
-    windows.members[:], windows.counts[:] = neighbours.of(centres)
-    room = tuple(np.empty((ROOM, windows.members.shape[1])))
-=======
     even = math.sqrt(WINDOW_POINTS / math.pi) * max(spacing_rad, MIN_SPACING_RAD)
     reach = 2 * math.sin(WINDOW_STRETCH * even / 2)  # as a chord
     windows.members[:], windows.counts[:] = neighbours.of(centres, WINDOW_POINTS, reach)
->>>>>>> main
+    room = tuple(np.empty((ROOM, WINDOW_POINTS)))
     describe_windows(
         cloud, windows.members, windows.counts, keep_linear, room,
         windows.rays_m, windows.front, windows.basis, reliability,
