@@ -20,8 +20,9 @@ def keep_freed_memory() -> None:
     the page faults of ``calibrate``. One arena, or each thread would keep its own.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    for option, value in _MALLOC_OPTIONS.items() if mallopt else ():
-        mallopt(option, value)
+    if mallopt is not None:
+        for option, value in _MALLOC_OPTIONS.items():
+            mallopt(option, value)
 
 
 def mmap_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
