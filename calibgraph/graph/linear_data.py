@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import PairByPlace, QuadraticByPlace
-from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, paired_key
 from calibgraph.model.geometry import adjoints, invert_each
@@ -42,21 +42,27 @@ class LinearData:
             values: of all poses.
         """
         data = LinearData()
-        clouds = poses_of(values, map(cloud_at_key, range(model.places)))
+        clouds = [values.atPose3(cloud_at_key(place)) for place in range(model.places)]
         for number in model.matched:
             data._add_block(model, number, values, clouds)
         for pair in model.pairs:
-            data._add_pair(model, pair, values, clouds)
+            data._add_pair(model, pair, values, np.array([pose.matrix() for pose in clouds]))
         return data
 
     def _add_block(
-        self, model: LatentPoseModel, number: int, values: gtsam.Values, clouds: Array
+        self,
+        model: LatentPoseModel,
+        number: int,
+        values: gtsam.Values,
+        clouds: Sequence[gtsam.Pose3],
     ) -> None:
         """Correspondences of one camera, on o_p^-1 a_cp."""
         block = model.blocks[model.cameras[number]]
         places, T_camera_cloud = block.places, np.tile(np.eye(4), (len(clouds), 1, 1))
-        keys = [matched_at_key(int(place), number) for place in places]
-        T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
+        keys = [matched_at_key(place, number) for place in places.tolist()]
+        pairs = zip(keys, places.tolist(), strict=True)
+        poses = [values.atPose3(key).between(clouds[place]) for key, place in pairs]
+        T_camera_cloud[places] = [pose.matrix() for pose in poses]
         if isinstance(block, FreeLensByPlace):
             lens = [block.key] * len(keys)
             free = block.sums(T_camera_cloud[places], values.atVector(block.key))
@@ -68,7 +74,7 @@ class LinearData:
             self._add_free_lens(places, (keys, block.keys), free, T_camera_cloud[places])
             return
         sums = block.sums(T_camera_cloud)
-        by_cloud = -adjoints(T_camera_cloud)[places]
+        by_cloud = -np.array([pose.AdjointMap() for pose in poses])
         hessian, gradient, cost = sums.hessian[places], sums.gradient[places], sums.cost[places]
         across = by_cloud.transpose(0, 2, 1) @ hessian
         cloud, pull = across @ by_cloud, -np.einsum("pij,pi->pj", by_cloud, gradient)
@@ -134,3 +140,24 @@ class LinearData:
 def poses_of(values: gtsam.Values, keys: Iterable[int]) -> Array:
     """(n, 4, 4) of some poses."""
     return np.array([values.atPose3(key).matrix() for key in keys]).reshape(-1, 4, 4)
+
+
+def marginal_information(
+    graph: gtsam.GaussianFactorGraph, keys: Sequence[int], kept: Sequence[int]
+) -> Array:
+    """The marginal information of some variables.
+
+    Variables are eliminated one by one: with several at a time GTSAM takes a graph for
+    indeterminate as soon as two standard deviations differ by a factor of 4096.
+
+    Args:
+        graph: linear factors.
+        keys: of all its variables, in the order of elimination.
+        kept: keys of these variables.
+
+    Raises:
+        RuntimeError: if one of the others is not determined.
+    """
+    others = to_ordering(key for key in keys if key not in kept)
+    left = graph.eliminatePartialSequential(others)[1]
+    return np.asarray(left.hessian(to_ordering(kept))[0])
