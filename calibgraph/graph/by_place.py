@@ -113,10 +113,12 @@ class QuadraticByPlace:
         """H, b and c of every place at a pose of its own, (P, 4, 4), stacked; without offsets."""
         count = len(T_camera_cloud)
         found = BlockSums(np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros(count))
-        for row, place in enumerate(self.places):
-            one = self._sums(row, T_camera_cloud[place], self.offsets[row])
-            found.hessian[place], found.gradient[place] = one.hessian, one.gradient
-            found.cost[place] = one.cost
+        for row, place in enumerate(self.places.tolist()):
+            T_lidar_camera = to_T_lidar_camera(T_camera_cloud[place])
+            step = self.T_lidar_camera[row].localCoordinates(T_lidar_camera)
+            found.hessian[place] = self.information[row, :6, :6]
+            found.gradient[place] = found.hessian[place] @ step
+            found.cost[place] = step @ found.gradient[place]
         return found
 
     def sums_in_time(self, T_camera_cloud: Array, values: Array) -> list[BlockSums]:

@@ -20,6 +20,7 @@ poses of a camera are equal, and the graph is that of Eq. 5 of the paper.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -91,6 +92,12 @@ class LatentPoseModel:
     def places(self) -> int:
         """Number of places."""
         return len(self.components.at_place)
+
+    def with_blocks(self, blocks: Mapping[str, Data]) -> LatentPoseModel:
+        """The same graph with other data of the same cameras at the same places."""
+        model = copy.copy(self)  # with the graphs that are made, since data are in none of them
+        object.__setattr__(model, "blocks", blocks)
+        return model
 
     @property
     def camera_keys(self) -> list[int]:
@@ -217,10 +224,7 @@ def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
 
 def to_ordering(keys: Iterable[int]) -> gtsam.Ordering:
     """GTSAM's list of keys."""
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    return ordering
+    return gtsam.Ordering([*keys])
 
 
 def _shared_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:

@@ -42,21 +42,27 @@ class LinearData:
             values: of all poses.
         """
         data = LinearData()
-        clouds = poses_of(values, map(cloud_at_key, range(model.places)))
+        clouds = [values.atPose3(cloud_at_key(place)) for place in range(model.places)]
         for number in model.matched:
             data._add_block(model, number, values, clouds)
         for pair in model.pairs:
-            data._add_pair(model, pair, values, clouds)
+            data._add_pair(model, pair, values, np.array([pose.matrix() for pose in clouds]))
         return data
 
     def _add_block(
-        self, model: LatentPoseModel, number: int, values: gtsam.Values, clouds: Array
+        self,
+        model: LatentPoseModel,
+        number: int,
+        values: gtsam.Values,
+        clouds: Sequence[gtsam.Pose3],
     ) -> None:
         """Correspondences of one camera, on o_p^-1 a_cp."""
         block = model.blocks[model.cameras[number]]
         places, T_camera_cloud = block.places, np.tile(np.eye(4), (len(clouds), 1, 1))
-        keys = [matched_at_key(int(place), number) for place in places]
-        T_camera_cloud[places] = invert_each(poses_of(values, keys)) @ clouds[places]
+        keys = [matched_at_key(place, number) for place in places.tolist()]
+        pairs = zip(keys, places.tolist(), strict=True)
+        poses = [values.atPose3(key).between(clouds[place]) for key, place in pairs]
+        T_camera_cloud[places] = [pose.matrix() for pose in poses]
         if isinstance(block, FreeLensByPlace):
             lens = [block.key] * len(keys)
             free = block.sums(T_camera_cloud[places], values.atVector(block.key))
@@ -68,7 +74,7 @@ class LinearData:
             self._add_free_lens(places, (keys, block.keys), free, T_camera_cloud[places])
             return
         sums = block.sums(T_camera_cloud)
-        by_cloud = -adjoints(T_camera_cloud)[places]
+        by_cloud = -np.array([pose.AdjointMap() for pose in poses])
         hessian, gradient, cost = sums.hessian[places], sums.gradient[places], sums.cost[places]
         across = by_cloud.transpose(0, 2, 1) @ hessian
         cloud, pull = across @ by_cloud, -np.einsum("pij,pi->pj", by_cloud, gradient)

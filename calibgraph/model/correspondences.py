@@ -286,13 +286,14 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
     found = [number[t.camera_index] if len(t) else t.camera_index for number, t in pairs]
     columns["camera_index"] = np.concatenate(found)
     if any(table.information_px is not None for table in tables):
-        columns["information_px"] = np.concatenate([
-            np.tile([1.0, 0.0, 1.0], (len(t), 1)) if t.information_px is None else t.information_px
-            for t in tables
-        ])  # fmt: skip
+        stated = [(table.information_px, len(table)) for table in tables]
+        parts = [np.tile([1.0, 0.0, 1.0], (n, 1)) if i is None else i for i, n in stated]
+        columns["information_px"] = np.concatenate(parts)
     for name in ("stamp_ns", "point_index", "twist_per_s"):
         given = [getattr(table, name) for table in tables if len(table)]
         if given and all(column is not None for column in given):
             columns[name] = np.concatenate(given)
     known = [table.metadata for table in tables if len(table) or table.metadata] or [{}]
-    return Correspondences(cameras=names, metadata=joined_metadata(known), **columns)
+    joined = tables[0].with_metadata(joined_metadata(known))
+    vars(joined).update({**dict.fromkeys(_WIDTHS), **columns, "cameras": names})  # as checked
+    return joined

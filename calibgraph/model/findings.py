@@ -104,6 +104,8 @@ class MatcherFindings:
         Raises:
             CorrespondenceError: if a value is not a number in its range.
         """
+        if not metadata:
+            return _NOTHING
         former = {_FORMER_KEYS[key]: metadata[key] for key in _FORMER_KEYS if key in metadata}
         stated = {**former, **metadata}
         values = {key: stated[key] for key in _KEYS & stated.keys()}
@@ -157,6 +159,7 @@ class MatcherFindings:
 
 _KEYS = {item.name for item in fields(MatcherFindings)}
 _READER = TypeAdapter(MatcherFindings)
+_NOTHING = MatcherFindings()
 
 
 def joined_metadata(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -46,6 +46,8 @@ class Places:
         Raises:
             CorrespondenceError: if they are not lists of lists of frame numbers.
         """
+        if not metadata:
+            return NOWHERE
         key = STATIONARY if STATIONARY in metadata else _STATIONARY_BEFORE
         named = _groups(metadata, PLACES) if PLACES in metadata else None
         return Places(_groups(metadata, key), named)

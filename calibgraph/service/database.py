@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy import Engine, func, select
+from sqlalchemy import Engine, select
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, sessionmaker
 
@@ -105,44 +105,44 @@ def _require_ours(engine: sa.Engine, where: str, owner: str) -> None:
 
 
 class TrackerTable:
-    """The trackers of a server."""
+    """The trackers of a server, which alone changes them: what is read is in memory."""
 
     def __init__(self, engine: Engine) -> None:
         self._sessions = sessionmaker(engine, expire_on_commit=False)
+        with self._sessions() as session:
+            query = select(TrackerRecord).order_by(TrackerRecord.number)
+            self._records = {record.id: record for record in session.scalars(query)}
 
     def add(self, id: str, tenant: str, name: str) -> TrackerRecord:
         """Add a tracker; it is durable when this returns."""
         record = TrackerRecord(id=id, tenant=tenant, name=name, created_s=time.time())
         with self._sessions.begin() as session:
             session.add(record)
+        self._records[id] = record
         return record
 
     def get(self, id: str, caller: Caller) -> TrackerRecord | None:
         """A tracker; None if there is none that the caller sees."""
-        with self._sessions() as session:
-            found = session.scalar(select(TrackerRecord).filter_by(id=id))
+        found = self._records.get(id)
         return found if found is not None and caller.sees(found.tenant) else None
 
     def list(self, caller: Caller) -> list[TrackerRecord]:
         """The trackers that a caller sees, the newest first."""
-        query = select(TrackerRecord).order_by(TrackerRecord.number.desc())
-        if caller.scope != "admin":
-            query = query.filter_by(tenant=caller.tenant)
-        with self._sessions() as session:
-            return [*session.scalars(query)]
+        every = [*self._records.values()]
+        return [
+            one for one in every[::-1] if caller.scope == "admin" or caller.tenant == one.tenant
+        ]
 
     def ids(self) -> set[str]:
         """Of all trackers."""
-        with self._sessions() as session:
-            return {*session.scalars(select(TrackerRecord.id))}
+        return {*self._records}
 
     def count(self, tenant: str) -> int:
         """How many a tenant has."""
-        query = select(func.count(TrackerRecord.number)).where(TrackerRecord.tenant == tenant)
-        with self._sessions() as session:
-            return session.scalar(query) or 0
+        return sum(one.tenant == tenant for one in [*self._records.values()])
 
     def remove(self, id: str) -> None:
         """Forget a tracker."""
         with self._sessions.begin() as session:
             session.execute(sa.delete(TrackerRecord).filter_by(id=id))
+        self._records.pop(id, None)

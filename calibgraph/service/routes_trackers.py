@@ -115,7 +115,7 @@ def find_tracker(state: Service, caller: Caller, id: str) -> TrackerRecord:
 
 async def ask_tracker(state: Service, caller: Caller, id: str, action: Action) -> Any:
     """The answer of a tracker that the caller sees."""
-    await run_in_threadpool(find_tracker, state, caller, id)
+    find_tracker(state, caller, id)
     request = TrackerRequest(action, str(state.folder.of_tracker(id)))
     return await state.trackers.answer(id, caller.tenant, request)
 
@@ -151,7 +151,7 @@ async def _create(state: Service, tenant: str, body: TrackerBody) -> TrackerReco
     id = new_id()
     folder = state.folder.of_tracker(id)
     with state.trackers.begin(tenant) as begun:
-        held = await run_in_threadpool(state.tracker_table.count, tenant)
+        held = state.tracker_table.count(tenant)
         if held + begun > state.settings.most_trackers:
             raise Problem(429, f"you have {held} trackers; remove one", {"Retry-After": "60"})
         folder.mkdir(mode=0o700)
@@ -180,7 +180,7 @@ def list_trackers(state: State, caller: Reader) -> list[TrackerAnswer]:
 )
 async def add_frames(id: TrackerId, request: Request, state: State, caller: Submitter) -> Response:
     """Take in frames, as JSON lines. What is answered is on disk."""
-    await run_in_threadpool(find_tracker, state, caller, id)
+    find_tracker(state, caller, id)
     media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media not in _LINES:
         raise Problem(415, f"send {_LINES[0]}, a frame a line")
@@ -210,7 +210,7 @@ async def drift_plot(id: TrackerId, state: State, caller: Reader) -> Response:
 @router.delete("/{id}", status_code=204, responses=documented(404, 422, 429))
 async def remove_tracker(id: TrackerId, state: State, caller: Submitter) -> Response:
     """Remove a tracker and its state."""
-    await run_in_threadpool(find_tracker, state, caller, id)
+    find_tracker(state, caller, id)
     await run_in_threadpool(state.tracker_table.remove, id)
     asked = TrackerRequest("remove", str(state.folder.of_tracker(id)))
     await state.trackers.answer(id, caller.tenant, asked)

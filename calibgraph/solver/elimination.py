@@ -220,23 +220,23 @@ def fit_latent_poses(
     start: gtsam.Values | LatentPoseFit,
     *,
     relative_tolerance: float = TOLERANCE,
+    is_determined: bool = False,
 ) -> LatentPoseFit | None:
-    """Minimize by Gauss-Newton, with steps shortened until they descend.
+    """Minimize by Gauss-Newton with steps that descend; None if a direction is not determined.
 
     Args:
         model: the graph.
         start: values of all its variables, or a fit of the same data, which is continued.
         relative_tolerance: relative change of the cost at which it stops.
-
-    Returns:
-        None if a direction is not determined.
+        is_determined: whether all directions are known to be; else that is tested.
     """
     if isinstance(start, LatentPoseFit):
-        is_known, present = start.linear.model is model, start.linear
-        present = present if is_known else present.with_model(model)
+        present = start.linear
+        is_determined = is_determined or present.model is model
+        present = present if present.model is model else present.with_model(model)
     else:
-        is_known, present = False, Linearization.at(model, start)
-    if not is_known and not present.is_determined():
+        present = Linearization.at(model, start)
+    if not (is_determined or present.is_determined()):
         return None
     iterations, converged = 0, False
     while iterations < MAX_ITERATIONS and not converged:

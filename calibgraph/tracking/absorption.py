@@ -40,18 +40,22 @@ def with_open_frames(state: State, *frames: LiveFrame) -> State:
     return changed(state, epochs=(*state.epochs[:-1], changed(last, frames=(*others, *frames))))
 
 
-def begin_frame(state: State, one: Incoming) -> State:
-    """The state with a frame begun, none of whose matches is absorbed."""
+def begin_frames(state: State, frames: Sequence[Incoming]) -> State:
+    """The state with frames begun, none of whose matches is absorbed."""
+    last, count, in_time = frames[-1], len(state.names), state.offsets is not None
+    found = [one.table.findings for one in frames if len(one.table)]
     state = changed(
         state,
-        frame=one.number,
-        stamp_ns=one.stamp_ns,
-        updates=state.updates + 1,
-        findings=one.table.findings if len(one.table) else state.findings,
+        frame=last.number,
+        stamp_ns=last.stamp_ns,
+        updates=state.updates + len(frames),
+        findings=found[-1] if found else state.findings,
     )
-    place, in_time = one.table.metadata.get(PLACE, ""), state.offsets is not None
-    frame = LiveFrame.empty(one.number, len(state.names), place, in_time=in_time)
-    return with_open_frames(state, frame)
+    empty = (
+        LiveFrame.empty(one.number, count, one.table.metadata.get(PLACE, ""), in_time=in_time)
+        for one in frames
+    )
+    return with_open_frames(state, *empty)
 
 
 def blocks_by_camera(state: State, table: Correspondences) -> dict[int, CameraBlock]:

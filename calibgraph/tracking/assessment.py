@@ -29,7 +29,7 @@ from calibgraph.tracking.shown_frames import groups_by_frames
 from calibgraph.tracking.sources import error_sources
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
-from calibgraph.tracking.window import Window
+from calibgraph.tracking.window import AnyWindow
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.image_posteriors import ImagePosteriors, measured_pairs
 from calibgraph.trust.pose_posterior import PosePosterior, group_tied
@@ -62,7 +62,7 @@ class Assessment:
     T_lidar_camera: tuple[gtsam.Pose3, ...]
     joint_covariance: Array
     verdicts: dict[str, Verdict]
-    window: Window
+    window: AnyWindow
     lens: dict[str, tuple[LensEstimate, ...]]
     pairs: tuple[RelativePose, ...] = ()
 
@@ -80,7 +80,7 @@ class Assessment:
         return None if optimum is None else optimum.updated(newer)
 
 
-def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessment:
+def assess(state: State, closed: ClosedPlaces, window: AnyWindow | None) -> Assessment:
     """Assess the present estimates.
 
     A relative pose that contradicts the correspondences of both its cameras takes no part, as in a
@@ -93,7 +93,7 @@ def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessm
     """
     sums = closed.all_sums(state).pose
     halves = closed.halves + in_its_half(state, state.epochs[-1], len(state.epochs) - 1)
-    window, conflicts = closed.with_open_epoch(state, window)
+    window, conflicts = closed.graph(state, window)
     keys, estimates = window.model.reported_keys, state.T_lidar_camera
     if state.config.preset == "auto":
         estimates = window.T_lidar_camera(keys)
@@ -139,7 +139,7 @@ def with_images(
     return replace(assessment, joint_covariance=joint, verdicts=verdicts), images
 
 
-def _lens_estimates(window: Window) -> dict[str, tuple[LensEstimate, ...]]:
+def _lens_estimates(window: AnyWindow) -> dict[str, tuple[LensEstimate, ...]]:
     model, found = window.model, {}
     for number, term in model.lenses.items():
         keys = [lens_key(number), model.reported_keys[number]]

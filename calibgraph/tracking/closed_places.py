@@ -46,7 +46,7 @@ from calibgraph.tracking.quadratics import (
 )
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, equation_5
-from calibgraph.tracking.window import Window
+from calibgraph.tracking.window import AnyWindow, ClosedWindow, Window
 
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
 STEPS = 5  # fits, and estimates of the variance ratios between them
@@ -86,15 +86,8 @@ class ClosedPlaces:
         for camera in state.drifting:
             sums = sums.without(camera)
         rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
+        times, seen = times_of(state), FrameSpread.of(state, sums)
         data = PlaceData.of(state, earlier_quadratics(state, sums), frames, rows)
-        seen = FrameSpread.of(state, sums)
-        return ClosedPlaces._of_data(state, sums, seen, data, fitted=fitted)
-
-    @staticmethod
-    def _of_data(
-        state: State, sums: PlaceSums, seen: FrameSpread, data: PlaceData, *, fitted: bool
-    ) -> ClosedPlaces:
-        times = times_of(state)
         data = data.at_own_times(times)
         model = place_model(state, sums, seen, data, times=times)
         values = _start(state, model, data.names)
@@ -107,15 +100,22 @@ class ClosedPlaces:
         return ClosedPlaces(state, sums, seen, data, fit, dropped)
 
     def at_optimum(self, state: State) -> ClosedPlaces:
-        """The same epochs at another optimum, and with other variance ratios."""
+        """The same as :meth:`of` a state with the optimum and the variance ratios found here."""
+        if state.offsets is not None:
+            return ClosedPlaces.of(state)
         data = self.data.with_quadratics(state, earlier_quadratics(state, self.sums))
-        return ClosedPlaces._of_data(state, self.sums, self.seen, data, fitted=False)
+        blocks = {
+            state.names[camera]: matches.with_variance(self.seen.least(camera))
+            for camera, matches in data.cameras.items()
+        }
+        model, values = self.fit.linear.model.with_blocks(blocks), self.fit.linear.values
+        fit = LatentPoseFit(Linearization.at(model, values), 0, True)
+        return changed(self, state=state, data=data, fit=fit, _pose_graphs={})
 
     def fitted(self, state: State) -> ClosedPlaces:
         """At the optimum for the variance ratios of the state."""
         model = place_model(state, self.sums, self.seen, self.data, times=times_of(state))
-        values = self.fit.linear.values
-        fit, dropped = fit_without_contradictions(state, self.sums, model, values)
+        fit, dropped = fit_without_contradictions(state, self.sums, model, self.fit.linear.values)
         return ClosedPlaces(state, self.sums, self.seen, self.data, fit, dropped)
 
     @property
@@ -171,17 +171,22 @@ class ClosedPlaces:
     @property
     def is_settled(self) -> bool:
         """Whether an epoch's frames more would hardly change the scatter of frames."""
-        frames = self.sums.frames.sum(axis=0)
-        cameras = zip(self.state.cameras, frames, strict=True)
+        cameras = zip(self.state.cameras, self.sums.frames.sum(axis=0), strict=True)
         return all(count >= _SETTLED for one, count in cameras if one.started)
 
-    def with_open_epoch(self, state: State, window: Window | None) -> tuple[Window, Conflicts]:
-        """The whole graph in iSAM2, and the conflicts of relative poses with correspondences.
+    def graph(self, state: State, window: AnyWindow | None) -> tuple[AnyWindow, Conflicts]:
+        """The whole graph, and the conflicts of relative poses with correspondences.
 
-        Args:
-            state: of the tracker.
-            window: of the frame before, if of the same epoch; it goes on if its graph allows.
+        The window of the frame before, if it is of the same epoch, goes on if its graph allows.
         """
+        partial = state.drifting or state.offsets is not None or state.config.preset != "auto"
+        begun = state.epochs[-1].frames or not state.is_refined or self.state.sizes != state.sizes
+        if partial or begun or state.rig.relative_poses:  # these may contradict the newest frames
+            return self.with_open_epoch(state, window)
+        return ClosedWindow(self.fit.linear, self.data.names), {}
+
+    def with_open_epoch(self, state: State, window: AnyWindow | None) -> tuple[Window, Conflicts]:
+        """The same in iSAM2."""
         frames = state.epochs[-1].frames
         opened = (*frames, *state.live_frames[-1:])
         touched = {frame.place for frame in opened}
@@ -210,7 +215,7 @@ class ClosedPlaces:
             before = changed(model, pose_graph=self._summary(kept))
             conflicts = find_conflicts(state, every, before, start)
         model = changed(model, pose_graph=self._pose_graph(kept, contradicting(conflicts)))
-        if window is not None and window.has_graph_of(model, data.names):
+        if isinstance(window, Window) and window.has_graph_of(model, data.names):
             window.exchange(model)
         else:
             window = Window(model, data.names, _start(state, model, data.names))
@@ -232,8 +237,7 @@ class ClosedPlaces:
     def _pose_graph(self, kept: Rows, dropped: Rows) -> gtsam.NonlinearFactorGraph:
         """The same with the priors, without some relative poses."""
         if (kept, dropped) not in self._pose_graphs:
-            graph = join(self._priors(dropped), self._summary(kept))
-            self._pose_graphs[kept, dropped] = graph
+            self._pose_graphs[kept, dropped] = join(self._priors(dropped), self._summary(kept))
         return self._pose_graphs[kept, dropped]
 
     def _split(self, every: PlaceSums, touched: set[str]) -> tuple[Rows, list[int]]:

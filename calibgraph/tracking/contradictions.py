@@ -40,7 +40,9 @@ def fit_without_contradictions(
         values: near the optimum.
     """
     dropped = contradicting(find_conflicts(state, sums, model, values))
-    fit = fit_latent_poses(replace(model, pose_graph=pose_priors(state, dropped)), values)
+    model = replace(model, pose_graph=pose_priors(state, dropped))
+    was_determined = state.optimum is not None and not state.rig.relative_poses
+    fit = fit_latent_poses(model, values, is_determined=was_determined)
     if fit is None:
         raise RuntimeError("a direction of a camera is not determined")
     return fit, dropped

@@ -69,10 +69,10 @@ def estimates_of_halves(state: State, halves: Sums) -> dict[int, tuple[Array, Ar
 
 def _after_epoch(state: State, sums: Sums, epoch: Epoch) -> Sums:
     """The sums after the random walk of an epoch."""
-    strengths = STRENGTHS[[one.summary.walk for one in state.cameras]]
-    variance = state.walk_variance(strengths, len(epoch.frames))
-    if not variance.any():
+    walks = [one.summary.walk for one in state.cameras]
+    if not any(walks) and state.offsets is None:
         return sums
+    variance = state.walk_variance(STRENGTHS[walks], len(epoch.frames))
     return sums.after_walk(variance, state.all_overconfidence)[0]
 
 

@@ -8,6 +8,7 @@ frame that disagrees with the estimate or repeats another one, an error, a time 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import takewhile
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +18,12 @@ from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.assessment import rig_at
-from calibgraph.tracking.frame_order import Incoming, incoming, without_repeats
+from calibgraph.tracking.frame_order import (
+    Incoming,
+    incoming,
+    share_last_points,
+    without_repeats,
+)
 from calibgraph.tracking.outlier_frames import agreeing_frames
 from calibgraph.tracking.state import State
 from calibgraph.tracking.step_detection import may_have_moved
@@ -127,11 +133,11 @@ def _alike(state: State, frames: Iterable[StreamFrame]) -> list[Incoming]:
         known = {*one.table.cameras} <= {*state.names}
         if not known or (group and _columns(group[0].table) != _columns(one.table)):
             break
-        if without_repeats(state, one.table) is not one.table:
-            break
         group.append(one)
         last = one.number, one.stamp_ns
-    return group
+    if not group or not share_last_points(state, [one.table for one in group]):
+        return group
+    return [*takewhile(lambda one: without_repeats(state, one.table) is one.table, group)]
 
 
 def _columns(table: Correspondences) -> tuple[object, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import index
 
@@ -169,6 +170,8 @@ def with_place(table: Correspondences, place: str | int | None) -> Correspondenc
     Raises:
         CorrespondenceError: if it is no name, or the lists are wrong.
     """
+    if place is None and not table.metadata:
+        return table
     name = place_of(table) if place is None else _place_name(place)
     kept = {key: value for key, value in table.metadata.items() if key not in (PLACE, PLACES)}
     kept |= {PLACE: name} if name else {}
@@ -186,6 +189,8 @@ def with_metadata_per_frame(table: Correspondences) -> Correspondences:
     Raises:
         CorrespondenceError: if a finding is wrong.
     """
+    if not table.metadata:
+        return table
     findings = table.findings.to_metadata()
     kept = {key: findings[key] for key in _FINDINGS_PER_FRAME if key in findings}
     kept |= {key: table.metadata[key] for key in (PLACE,) if key in table.metadata}
@@ -229,6 +234,13 @@ def without_repeats(state: State, table: Correspondences) -> Correspondences:
         if _repeats(_last_hashes(state, camera), hashes[table.camera_index == number]):
             repeated.append(number)
     return table.select(~np.isin(table.camera_index, repeated)) if repeated else table
+
+
+def share_last_points(state: State, tables: Sequence[Correspondences]) -> bool:
+    """Whether any table has a point of a camera's last frame; else none can repeat it."""
+    hashes = {*hash_numbers(np.concatenate([table.points_lidar_m for table in tables]))}
+    lasts = (_last_hashes(state, camera) for camera in range(len(state.names)))
+    return not all(hashes.isdisjoint(last or ()) for last in lasts)
 
 
 def _repeats(last: list[int] | None, hashes: Hashes) -> bool:

@@ -15,7 +15,7 @@ from calibgraph.report.figure import save_picture
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.history_figure import Curve, history_figure, text_figure
 from calibgraph.tracking.state_bytes import StateError, decode, encode
-from calibgraph.tracking.update import Update
+from calibgraph.tracking.update import Update, shared_parts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,6 +47,7 @@ class History:
         self._frames = np.empty(0, dtype=np.int64)
         self._entries = np.empty((0, 0, 2 * _NUMBERS))  # xi, offset, sigmas; NaN: not known
         self._events: tuple[Event, ...] = ()
+        self._newest: tuple[Update, Array] | None = None  # with its entries
 
     def __len__(self) -> int:
         """How many entries are held."""
@@ -74,7 +75,7 @@ class History:
         self._begun |= {e.camera for e in update.events if e.kind == "started" and e.camera}
         self._make_place()
         self._frames[self._held] = update.frame
-        self._entries[self._held] = [self._entry(update, name) for name in self._origins]
+        self._entries[self._held] = self._entries_of(update)
         self._held += 1
         self._updates += 1
 
@@ -93,6 +94,14 @@ class History:
             self._frames[: self._held] = self._frames[::2].copy()
             self._entries[: self._held] = self._entries[::2].copy()
             self._stride *= 2
+
+    def _entries_of(self, update: Update) -> Array:
+        """(n, 14) of the cameras; those of the update before, if it was taken in with this one."""
+        before = self._newest
+        if before is None or update.events or shared_parts(update) != shared_parts(before[0]):
+            found = np.array([self._entry(update, name) for name in self._origins])
+            before = self._newest = update, found
+        return before[1]
 
     def _entry(self, update: Update, name: str) -> Array:
         """(14,) xi in T_camera_lidar = exp(xi) origin, time offset, sigmas; NaN: not known."""

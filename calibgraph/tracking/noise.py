@@ -48,7 +48,10 @@ class ResidualHistogram:
 
     def scale(self, config: Config) -> ResidualScale:
         """The scale of all the residuals, as by :meth:`CameraBlock.scale`."""
-        sigma_px, spread = (iterate_spread(_Quantiles(counts)) for counts in self.counts)
+        of_px, whitened = self.counts
+        sigma_px = spread = iterate_spread(_Quantiles(of_px))
+        if not np.array_equal(of_px, whitened):
+            spread = iterate_spread(_Quantiles(whitened))
         return scale_from(sigma_px, max(spread, self.least), config)
 
 

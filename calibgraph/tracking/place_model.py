@@ -97,6 +97,10 @@ class FrameSpread:
     def _excesses(self) -> list[tuple[float, Array]]:
         return [*map(split_excess, self.covariance)]
 
+    def least(self, camera: int) -> float:
+        """Variance of a camera's matches, of what they do not share, over that of H."""
+        return self._excesses[camera][0]
+
     def within(self, sums: PlaceSums, camera: int, rows: Numbers) -> WithinPlace:
         """As of a batch, of some places."""
         return WithinPlace(

@@ -18,16 +18,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import from_json
 
 from calibgraph.errors import CorrespondenceError, MotionError
 from calibgraph.files import describe
-from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.table_columns import COORDINATES, INFORMATION, as_confidence
 from calibgraph.tracking.frame_order import LONGEST_PLACE, with_place
@@ -52,11 +52,11 @@ class CameraColumns(BaseModel):
     x_m: list[float]
     y_m: list[float]
     z_m: list[float]
-    confidence: list[float] = []
-    i_uu_px: list[float] = []
-    i_uv_px: list[float] = []
-    i_vv_px: list[float] = []
-    point_index: list[Int64] = []
+    confidence: list[float] = Field(default_factory=list)
+    i_uu_px: list[float] = Field(default_factory=list)
+    i_uv_px: list[float] = Field(default_factory=list)
+    i_vv_px: list[float] = Field(default_factory=list)
+    point_index: list[Int64] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _require_whole_table(self) -> Self:
@@ -69,9 +69,10 @@ class CameraColumns(BaseModel):
             raise ValueError(f"the lists differ in length: {lengths}")
         return self
 
-    def array(self, keys: Sequence[str]) -> NDArray[np.float64]:
-        """(n, k) of some columns."""
-        return np.array([getattr(self, key) for key in keys], np.float64).T.copy()
+    def column(self, key: str, missing: float) -> list[float]:
+        """A column; of one value, where it is not given."""
+        given: list[float] = getattr(self, key)
+        return given if key in self.model_fields_set else [missing] * len(self.u_px)
 
 
 class HeaderLine(BaseModel):
@@ -92,7 +93,7 @@ class FrameLine(BaseModel):
     cameras: Annotated[dict[str, CameraColumns], Field(max_length=MAX_CAMERAS)]
     place: PlaceName | None = None
     twist_per_s: Twist | None = None
-    metadata: dict[str, Any] = {}
+    metadata: dict[str, Any] = Field(default_factory=dict)
 
     def to_frame(self, header: Mapping[str, Any]) -> StreamFrame:
         """The frame with the correspondences of all its cameras.
@@ -103,28 +104,39 @@ class FrameLine(BaseModel):
         Raises:
             CorrespondenceError: if a value is out of its range.
         """
-        metadata = {**header, **self.metadata}
-        parts = [self._of_camera(*item) for item in self.cameras.items()] or [_EMPTY]
-        table = concatenate(parts).with_metadata(metadata)
+        counts = [len(camera.u_px) for camera in self.cameras.values()]
+        n, names, twist = sum(counts), tuple(sorted(self.cameras)), self.twist_per_s
+        stamped = n > 0 and "stamp_ns" in self.model_fields_set
+        coordinates = self._columns(COORDINATES, [np.nan] * len(COORDINATES))
+        sure, indexed = not self._has("confidence"), n > 0 and self._has("point_index")
+        table = Correspondences(
+            cameras=names,
+            camera_index=np.repeat(np.array([*map(names.index, self.cameras)], np.int32), counts),
+            frame=np.full(n, self.frame, np.int64),
+            pixels_px=coordinates[:, :2].copy(),
+            points_lidar_m=coordinates[:, 2:].copy(),
+            confidence=as_confidence(
+                np.ones(n) if sure else self._columns(["confidence"], [1])[:, 0]
+            ),
+            information_px=self._columns(INFORMATION, [1, 0, 1])
+            if self._has(INFORMATION[0])
+            else None,
+            stamp_ns=np.full(n, self.stamp_ns, np.int64) if stamped else None,
+            point_index=self._columns(["point_index"], [-1], np.int64)[:, 0] if indexed else None,
+            twist_per_s=np.tile(twist, (n, 1)) if n and twist is not None else None,
+            metadata={**header, **self.metadata},
+        )
         return StreamFrame(self.frame, with_place(table, self.place))
 
-    def _of_camera(self, name: str, columns: CameraColumns) -> Correspondences:
-        """The rows of one camera."""
-        n, given = len(columns.u_px), columns.model_fields_set
-        stamped, twist = "stamp_ns" in self.model_fields_set, self.twist_per_s
-        indexed = any("point_index" in each.model_fields_set for each in self.cameras.values())
-        return Correspondences(
-            cameras=(name,),
-            camera_index=np.zeros(n, np.int32),
-            frame=np.full(n, self.frame, np.int64),
-            pixels_px=columns.array(COORDINATES[:2]),
-            points_lidar_m=columns.array(COORDINATES[2:]),
-            confidence=as_confidence(columns.confidence if "confidence" in given else np.ones(n)),
-            information_px=columns.array(INFORMATION) if INFORMATION[0] in given else None,
-            stamp_ns=np.full(n, self.stamp_ns, np.int64) if stamped else None,
-            point_index=np.array(columns.point_index or [-1] * n, np.int64) if indexed else None,
-            twist_per_s=None if twist is None else np.tile(twist, (n, 1)),
-        )
+    def _has(self, key: str) -> bool:
+        """Whether a camera gives a column."""
+        return any(key in camera.model_fields_set for camera in self.cameras.values())
+
+    def _columns(self, keys: Sequence[str], missing: Sequence[float], kind: type = float) -> Any:
+        """(n, k) columns of all cameras, with a value of each for those that do not give it."""
+        cameras, every = self.cameras.values(), zip(keys, missing, strict=True)
+        rows = [[*chain(*(camera.column(*column) for camera in cameras))] for column in every]
+        return np.array(rows, kind).T.copy()
 
 
 def frames_of_lines(chunks: Iterable[bytes], where: str) -> Iterator[Item]:
@@ -182,13 +194,3 @@ def _parse(line: bytes, where: str, header: Mapping[str, Any]) -> Item | dict[st
         return refused(where, str(error), by_motion=isinstance(error, MotionError))
     except ValueError as error:
         return refused(where, f"is not JSON ({error}); send one frame a line, as JSON")
-
-
-_EMPTY = Correspondences(
-    cameras=(),
-    camera_index=np.empty(0, np.int32),
-    frame=np.empty(0, np.int64),
-    pixels_px=np.empty((0, 2)),
-    points_lidar_m=np.empty((0, 3)),
-    confidence=np.empty(0, np.float32),
-)

@@ -19,7 +19,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.tracking.absorption import (
     absorb,
     at_minimum,
-    begin_frame,
+    begin_frames,
     blocks_by_camera,
     count_absent,
     count_repeats,
@@ -158,8 +158,7 @@ class IncrementalCalibrator:
         """Frames are taken in inside; after an error of any kind nothing of them remains."""
         start, since = self._epoch_start, list(self._since_epoch_start)
         try:
-            for one in frames:
-                self._state = begin_frame(self._state, one)
+            self._state = begin_frames(self._state, frames)
             self._since_epoch_start.append(tuple(frames))
             yield
         except BaseException as error:
@@ -287,7 +286,7 @@ class IncrementalCalibrator:
     def _close_epoch(self, *, together: bool) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, begin another."""
         state, offsets = self._state, self._state.offsets
-        if self._assessed is not None:
+        if self._assessed is not None and self._assessed[0].epochs[-1].frames:
             state = changed(state, optimum=self._assessed[1].newest(state.optimum))
             offsets = self._assessed[1].offsets(state)
         self._state, events = close_epoch(state, offsets, self._closed.all_sums(state))

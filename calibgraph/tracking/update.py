@@ -88,6 +88,12 @@ def make_updates(
     ]
 
 
+def shared_parts(update: Update) -> tuple[int, ...]:
+    """Identities of what frames that are taken in at once share."""
+    parts = update.T_camera_lidar, update.covariance, update.verdicts, update.lens
+    return tuple(id(value) for part in parts for value in part.values())
+
+
 def json_line(update: Update) -> str:
     """The update as one line of JSON; units are in the keys, matrices row by row."""
     return json_lines([update])[0]
@@ -98,16 +104,14 @@ def json_lines(updates: Sequence[Update]) -> list[str]:
     estimates: dict[tuple[int, ...], dict[str, str]] = {}
     lines = []
     for update in updates:
-        parts = update.T_camera_lidar, update.covariance, update.verdicts, update.lens
-        shared = tuple(id(value) for part in parts for value in part.values())
-        if shared not in estimates:
+        if (shared := shared_parts(update)) not in estimates:
             estimates[shared] = {name: _estimate(update, name) for name in update.T_camera_lidar}
         cameras = ", ".join(
-            f"{_json(name)}: {{{text}, {_of_frame(update, name)}}}"
-            for name, text in estimates[shared].items()
+            f"{text}, {_of_frame(update, name)}}}" for name, text in estimates[shared].items()
         )
-        head = f'"frame": {update.frame}, "stamp_ns": {_json(update.stamp_ns)}'
-        events = _json([_event(event) for event in update.events])
+        stamp = "null" if update.stamp_ns is None else update.stamp_ns
+        head = f'"frame": {update.frame}, "stamp_ns": {stamp}'
+        events = _json([*map(_event, update.events)]) if update.events else "[]"
         lines.append(f'{{{head}, "cameras": {{{cameras}}}, "events": {events}}}')
     return lines
 
@@ -120,7 +124,7 @@ def _json(content: Any) -> str:
 
 
 def _estimate(update: Update, name: str) -> str:
-    """The members of a camera's object that hold for all frames."""
+    """A camera's name, and the first members of its object: those that hold for all frames."""
     covariance, verdict = update.covariance[name], update.verdicts[name]
     sigmas = None if covariance is None else np.sqrt(np.diag(covariance))
     content = {
@@ -134,12 +138,12 @@ def _estimate(update: Update, name: str) -> str:
         "actions": list(summarize({name: verdict}).actions),
         **{key: value for one in update.lens.get(name, ()) for key, value in _offset(one).items()},
     }
-    return _json(content)[1:-1]
+    return f"{_json(name)}: {_json(content)[:-1]}"
 
 
 def _of_frame(update: Update, name: str) -> str:
     """The other members."""
-    return f'"used": {update.used.get(name, 0)}, "left_out": {_json(name in update.left_out)}'
+    return f'"used": {update.used.get(name, 0)}, "left_out": {str(name in update.left_out).lower()}'
 
 
 def _offset(one: LensEstimate) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -161,8 +162,10 @@ def _posterior_of(
     likelihood: Callable[[Array], Array], by_matches: Array, seed: int
 ) -> PosePosterior:
     """Near the result or elsewhere, weighed by the evidence of both."""
-    near, of_near = sample_posterior(likelihood, NEAR**2 * by_matches, samples=SAMPLES, seed=seed)
-    far, of_far = sample_posterior(likelihood, np.diag(REACH**2), samples=SAMPLES, seed=seed)
+    sample = partial(sample_posterior, likelihood, samples=SAMPLES, seed=seed)
+    with core_pool() as pool:
+        priors = NEAR**2 * by_matches, np.diag(REACH**2)
+        (near, of_near), (far, of_far) = pool.map(sample, priors)
     return PosePosterior(near, far, float(expit(np.log(ODDS_ELSEWHERE) + of_far - of_near)))
 
 
