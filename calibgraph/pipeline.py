@@ -21,6 +21,7 @@ from calibgraph.model.clock import odd_motions, unused_times
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pair_covariances
+from calibgraph.model.later import Later
 from calibgraph.model.lens_estimate import with_sigmas
 from calibgraph.model.rig import Rig
 from calibgraph.overlaps import refine_with_camera_pairs
@@ -158,19 +159,23 @@ def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
         initial_rig=evidence.guess,
         covariance={name: evidence.covariance_of(name) for name in cameras},
         joint_covariance=evidence.joint_covariance,
-        pair_covariance=pair_covariances(
-            evidence.mount_covariance, solution.T_camera_lidar, solution.held
+        pair_covariance=Later(
+            lambda: pair_covariances(
+                evidence.mount_covariance, solution.T_camera_lidar, solution.held
+            )
         ),
         camera_verdicts=verdicts,
-        residuals=evidence.residuals,
+        residuals=Later(lambda: evidence.residuals),
         counts={name: dict(counts) for name, counts in solution.counts.items()},
         timings_s=dict(solution.timings_s),
         terms=solution.terms,
         config=solution.config,
         stage1_T_camera_lidar=solution.T_hat,
-        weaknesses={n: weaknesses(solution, n, evidence.scatter_of(n)) for n in cameras},
+        weaknesses=Later(
+            lambda: {n: weaknesses(solution, n, evidence.scatter_of(n)) for n in cameras}
+        ),
         prior_share=evidence.prior_shares,
-        error_sources=evidence.error_sources,
+        error_sources=Later(lambda: evidence.error_sources),
         lens=solution.lens,
         lens_covariance=evidence.lens_covariance,
         bootstrap=evidence.bootstrap,

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any
 
 import gtsam
@@ -24,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from factors.block_arrays import (
     RobustBlock,
     check_shape,
+    chunks,
     contiguous,
     join_roots,
     read_only,
@@ -39,7 +39,6 @@ from factors.loss import loss_id
 
 Array = NDArray[np.float64]
 
-_CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
 _WORTH_SHARING = 2_000_000  # correspondences (7 ms): below, waiting for busy cores costs more
 _WIDTHS = {"points_lidar_m": 3, "pixels_px": 2, "sqrt_information": 3, "motion": 7}
 _NO_RESIDUALS, _NO_NORMS = np.empty((0, 2)), np.empty((0, 0))
@@ -77,7 +76,7 @@ class ProjectionBlock(RobustBlock):
     motion: Array | None = None
     _columns: Array = field(init=False, repr=False)  # (5, n) x y z u v, or (12, n) with the motion
     _whitening: Array = field(init=False, repr=False)  # (3, n), (1, n) or (0, n), see the kernel
-    _chunks: NDArray[np.int64] = field(init=False, repr=False)  # (c, 2) runs of all, see _CHUNK
+    _chunks: NDArray[np.int64] = field(init=False, repr=False)  # (c, 2) runs of all
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)
@@ -98,7 +97,7 @@ class ProjectionBlock(RobustBlock):
         self.__dict__.update(
             _columns=columns,
             _whitening=columns[:0] if root is None else root[:rows],
-            _chunks=_cut(columns.shape[1]),
+            _chunks=chunks(columns.shape[1]),
             points_lidar_m=columns[:3].T,
             pixels_px=columns[3:5].T,
             motion=columns[5:].T if len(columns) > 5 else None,  # noqa: PLR2004
@@ -183,7 +182,13 @@ class ProjectionBlock(RobustBlock):
             runs: (r, 2) its first correspondence, and the one behind its last.
             scales: (r,) of the loss in each run, in place of ``scale``.
         """
-        return unpack_sums(self._run_sums(T_camera_lidar, runs, scales))
+        return unpack_sums(self.packed_run_sums(T_camera_lidar, runs, scales))
+
+    def packed_run_sums(
+        self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None = None
+    ) -> Array:
+        """(r, 28) as :meth:`run_sums`: 21 of the upper triangle of H, 6 of b, 1 of c."""
+        return self._run_sums(T_camera_lidar, runs, scales)
 
     def _run_sums(
         self,
@@ -261,14 +266,6 @@ class ProjectionBlock(RobustBlock):
         sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
         error, jacobian, regular = root_of_sums(sums)
         return (error, jacobian.T) if regular else square_root(unpack_sums(sums.sum(axis=0)))
-
-
-@lru_cache
-def _cut(count: int) -> NDArray[np.int64]:
-    """(c, 2) runs of _CHUNK correspondences at most."""
-    edges = np.arange(0, count + _CHUNK, _CHUNK)
-    edges[-1] = count
-    return to_runs(edges)
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:

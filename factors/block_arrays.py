@@ -1,6 +1,7 @@
 """Shared by blocks of correspondences: the scale of the loss, and read-only arrays."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -8,6 +9,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 _Number = TypeVar("_Number", bound=np.generic)
+
+_CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
 
 
 class RobustBlock:
@@ -60,9 +63,13 @@ def contiguous(array: NDArray[_Number]) -> NDArray[_Number]:
     written, it would be compiled a second time.
     """
     flags = array.flags
-    if flags.c_contiguous and not flags.writeable:
+    if not flags.c_contiguous:
+        array = np.ascontiguousarray(array)
+    elif not flags.writeable:
         return array
-    return read_only(np.ascontiguousarray(array))
+    view = array.view()
+    view.setflags(write=False)
+    return view
 
 
 def check_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
@@ -122,3 +129,11 @@ def whiten(columns: Array, root: Array | None) -> None:
         else:
             columns[:, 0] *= s00
         columns[:, 1] *= s11
+
+
+@lru_cache
+def chunks(count: int) -> NDArray[np.int64]:
+    """(c, 2) runs of _CHUNK of so many correspondences at most."""
+    edges = np.arange(0, count + _CHUNK, _CHUNK)
+    edges[-1] = count
+    return to_runs(edges)

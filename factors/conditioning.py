@@ -49,6 +49,21 @@ def smallest_scaled_eigenvalues(hessians: Array) -> Array:
     return np.where(known, values[:, 0], 0.0)
 
 
+def are_regular(hessians: Array, least: float) -> NDArray[np.bool_]:
+    """(f,) whether the :func:`smallest_scaled_eigenvalues` are at least that large.
+
+    The others, whose sum is the size of the matrix at most, multiply to a bound: most matrices are
+    regular by their determinant.
+    """
+    diagonals, size = np.einsum("fii->fi", hessians), hessians.shape[1]
+    others = (size / (size - 1)) ** (size - 1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # of free directions
+        bound = np.linalg.det(hessians) / diagonals.prod(axis=1) / others
+    if (bound >= least).all():
+        return np.ones(len(hessians), dtype=np.bool_)
+    return np.asarray(smallest_scaled_eigenvalues(hessians) >= least)
+
+
 def invert_or_none(hessian: Array, *, least: float = SINGULAR) -> Array | None:
     """The inverse of a positive semidefinite matrix, None where a direction is not determined.
 

@@ -117,20 +117,26 @@ class FreeLens:
                 which :meth:`fill_clock_columns` fills.
         """
         pixels, projectable = lens.project(points_camera_m)
-        off_centre = pixels.T - lens.packed[2:4, None]
+        off_centre = np.empty((2, len(pixels)))
+        np.subtract(pixels.T, lens.packed[2:4, None], out=off_centre)
         fields = {
             FOCAL: off_centre,
-            ASPECT: off_centre * [[0.5], [-0.5]],
+            ASPECT: off_centre,
             CENTRE_X: np.array([[1.0], [0.0]]),
             CENTRE_Y: np.array([[0.0], [1.0]]),
             **dict.fromkeys(CLOCK, np.zeros((1, 1))),
         }
-        plane, squared = _on_plane(lens, points_camera_m.T)
+        plane, squared = _on_plane(lens, np.ascontiguousarray(points_camera_m.T))
         for row, (name, sigma) in enumerate(zip(self.parameters, self.sigmas, strict=True)):
-            field = fields.get(name)
+            field, unit = fields.get(name), np.array([[sigma], [sigma]])
             if field is None:
-                field = lens.packed[:2, None] * _by_coefficient(lens, name, plane, squared)
-            columns[row] = field * (sigma * projectable)
+                field, unit = (
+                    _by_coefficient(lens, name, plane, squared),
+                    unit * lens.packed[:2, None],
+                )
+            np.multiply(field, unit * [[0.5], [-0.5]] if name == ASPECT else unit, out=columns[row])
+        if not projectable.all():
+            columns[:, :, ~projectable] = 0.0
 
     def fill_clock_columns(self, by_time: Array, rows_px: Array, columns: Array) -> None:
         """Derivatives by the values of the clock.
@@ -167,8 +173,10 @@ def _on_plane(lens: Lens, points: Array) -> tuple[Array, Array]:
         return points[:2] * (theta / np.maximum(radius, np.finfo(float).tiny)), theta**2
     depth = z + lens.packed[4] * np.sqrt(x**2 + y**2 + z**2) if lens.kind == OMNIDIRECTIONAL else z
     with np.errstate(divide="ignore", invalid="ignore"):  # of points that are not projectable
-        plane = np.nan_to_num(points[:2] / depth, posinf=0.0, neginf=0.0)
-    return plane, (plane**2).sum(axis=0)
+        plane = points[:2] / depth
+    if not np.isfinite(plane).all():
+        plane[~np.isfinite(plane)] = 0.0
+    return plane, plane[0] * plane[0] + plane[1] * plane[1]
 
 
 def _by_coefficient(lens: Lens, name: str, plane: Array, squared: Array) -> Array:
@@ -178,11 +186,11 @@ def _by_coefficient(lens: Lens, name: str, plane: Array, squared: Array) -> Arra
         return np.stack([2 * a * b, squared + 2 * b**2])
     if name == "p2":
         return np.stack([squared + 2 * a**2, 2 * a * b])
-    over = np.ones_like(squared)
-    if lens.kind == PINHOLE:
-        k4, k5, k6 = lens.packed[9:12]
-        over += squared * (k4 + squared * (k5 + squared * k6))
-    return np.asarray(plane * (squared ** int(name[1]) / over))
+    power = squared ** int(name[1])
+    if lens.kind == PINHOLE and (rational := lens.packed[9:12]).any():
+        k4, k5, k6 = rational
+        power /= 1.0 + squared * (k4 + squared * (k5 + squared * k6))
+    return np.asarray(plane * power)
 
 
 @dataclass(frozen=True, eq=False)

@@ -173,10 +173,10 @@ class Lens:
         Returns:
             (2, n) pixels.
         """
-        points = points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
-        pixels, by_point = self.project_with_jacobian(points)
+        points = T_camera_lidar[:3, :3] @ points_lidar_m.T + T_camera_lidar[:3, 3:]
+        pixels, by_point = self.project_with_jacobian(points.T)
         columns[3:] = by_point.transpose(2, 1, 0)
-        (x, y, z), (by_x, by_y, by_z) = points.T, columns[3:]
+        (x, y, z), (by_x, by_y, by_z) = points, columns[3:]
         # d(exp(xi) p) / d rotation = -[p]x;  g^T (-[p]x) = (p x g)^T.
         columns[0] = y * by_z - z * by_y
         columns[1] = z * by_x - x * by_z

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from calibgraph.io.dataset import Dataset
     from calibgraph.model.calibration import Calibration
     from calibgraph.model.correspondences import Correspondences
+    from calibgraph.report.drawing import Draw
 
 
 def calibrate(
@@ -29,6 +30,20 @@ def calibrate(
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
+    from calibgraph.report.drawing import drawing_processes
+
+    with drawing_processes() as draw:  # at once: they load while this process does
+        result, data, written = _calibrate(dataset, matching, out, solving, draw)
+    checks = next(iter(result.camera_verdicts.values())).checks
+    copies = next((check.value for check in checks if check.name == "copies"), None)
+    _print_frames_used(len(result.frames), data, int(copies or 0))
+    _print_and_exit(result, written, as_json=as_json)
+
+
+def _calibrate(
+    dataset: list[Path], matching: MatchingOptions, out: Path, solving: SolveOptions, draw: Draw
+) -> tuple[Calibration, Dataset, list[Path]]:
+    """The result, the data, and the files that were written."""
     from calibgraph.pipeline import calibrate
     from calibgraph.report.html import write_result
 
@@ -46,11 +61,7 @@ def calibrate(
             progress=progress,
         )
         result = _warned_of_same_data(result, matching.rig)
-        written = write_result(result, out, data)
-    checks = next(iter(result.camera_verdicts.values())).checks
-    copies = next((check.value for check in checks if check.name == "copies"), None)
-    _print_frames_used(len(result.frames), data, int(copies or 0))
-    _print_and_exit(result, written, as_json=as_json)
+        return result, data, write_result(result, out, data, draw=draw)
 
 
 def match(

@@ -29,7 +29,7 @@ def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
     """A result, with its frames where they are now."""
     from calibgraph.io.calibrations import load_calibration
     from calibgraph.io.dataset import load_dataset
-    from calibgraph.report import relocate_frames
+    from calibgraph.report.frames import relocate_frames
 
     loaded = load_calibration(result)
     if not dataset:
@@ -49,7 +49,7 @@ def report(
         out (FILE): Page to write. (default: DIR/report.html)
     """
     from calibgraph.model.result_files import REPORT_FILE
-    from calibgraph.report import write_report
+    from calibgraph.report.html import write_report
 
     loaded = _load_result(result, dataset)
     folder = result if result.is_dir() else result.parent

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import PairByPlace, QuadraticByPlace
-from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, paired_key
 from calibgraph.model.geometry import adjoints, invert_each
@@ -140,3 +140,24 @@ class LinearData:
 def poses_of(values: gtsam.Values, keys: Iterable[int]) -> Array:
     """(n, 4, 4) of some poses."""
     return np.array([values.atPose3(key).matrix() for key in keys]).reshape(-1, 4, 4)
+
+
+def marginal_information(
+    graph: gtsam.GaussianFactorGraph, keys: Sequence[int], kept: Sequence[int]
+) -> Array:
+    """The marginal information of some variables.
+
+    Variables are eliminated one by one: with several at a time GTSAM takes a graph for
+    indeterminate as soon as two standard deviations differ by a factor of 4096.
+
+    Args:
+        graph: linear factors.
+        keys: of all its variables, in the order of elimination.
+        kept: keys of these variables.
+
+    Raises:
+        RuntimeError: if one of the others is not determined.
+    """
+    others = to_ordering(key for key in keys if key not in kept)
+    left = graph.eliminatePartialSequential(others)[1]
+    return np.asarray(left.hessian(to_ordering(kept))[0])

@@ -60,7 +60,7 @@ class Residuals:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
-    """A calibrated rig.
+    """A calibrated rig; what no check needs of it is computed when it is first read.
 
     Attributes:
         rig: the rig with the estimated extrinsics; of lenses and clocks that were estimated, with
@@ -105,16 +105,16 @@ class Calibration:
     covariance: dict[str, Array | None]
     joint_covariance: Array | None
     camera_verdicts: dict[str, Verdict]
-    residuals: dict[str, Residuals]
+    residuals: Mapping[str, Residuals]
     counts: dict[str, dict[str, int]]
     timings_s: dict[str, float]
     terms: Terms
     config: Config
-    pair_covariance: dict[str, Array] = field(default_factory=dict)
+    pair_covariance: Mapping[str, Array] = field(default_factory=dict)
     stage1_T_camera_lidar: dict[str, Array] = field(default_factory=dict)
-    weaknesses: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    weaknesses: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     prior_share: dict[str, float] = field(default_factory=dict)
-    error_sources: dict[str, ErrorSources] = field(default_factory=dict)
+    error_sources: Mapping[str, ErrorSources] = field(default_factory=dict)
     lens: dict[str, tuple[LensEstimate, ...]] = field(default_factory=dict)
     lens_covariance: dict[str, Array] = field(default_factory=dict)
     bootstrap: dict[str, Array] = field(default_factory=dict)
@@ -273,7 +273,7 @@ class Calibration:
             "covariance": dict(self.covariance),
             "joint_covariance": self.joint_covariance,
             "pair_covariance_of": PAIR_TANGENT_SENTENCE,
-            "pair_covariance": self.pair_covariance,
+            "pair_covariance": dict(self.pair_covariance),
             "lens": {name: [vars(one) for one in of] for name, of in self.lens.items()},
             "lens_covariance": {name: self.joint_of_lens(name) for name in self.lens_covariance},
             "bootstrap_covariance": self.bootstrap,

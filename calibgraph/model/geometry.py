@@ -210,8 +210,10 @@ def local_coordinates(T_camera_lidar: Array, T_lidar_camera: Array) -> Array:
 
 def crosses(v: Array) -> Array:
     """(n, 3, 3) matrices of the cross product with (n, 3) vectors."""
-    (x, y, z), zero = v.T, np.zeros(len(v))
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    found = np.zeros((len(v), 3, 3))
+    found[:, 2, 1], found[:, 0, 2], found[:, 1, 0] = x, y, z = v.T
+    found[:, 1, 2], found[:, 2, 0], found[:, 0, 1] = -x, -y, -z
+    return found
 
 
 def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,8 +16,10 @@ from calibgraph.model.rig import Camera
 from calibgraph.model.threshold import Direction, beside, in_unit, is_reachable
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.report import plots
+from calibgraph.report.drawing import Diagrams
+from calibgraph.report.figure import ImageSize
+from calibgraph.report.match_errors import BeforeAfter, ReprojectionErrors
 from calibgraph.report.page_overlays import Overlays, width_on_page
-from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionErrors
 
 _WORST_FIRST = ("FAIL", "WARN", "PASS")
 
@@ -180,6 +183,7 @@ def camera_section(
     overlays: Overlays | None,
     *,
     errors: BeforeAfter | None,
+    diagrams: Mapping[str, str],
 ) -> CameraSection:
     """Collect what the page shows of a camera."""
     camera, verdict = result.rig.cameras[name], result.camera_verdicts[name]
@@ -194,7 +198,7 @@ def camera_section(
         no_error_bar=_why_no_error_bar(result, name),
         overlays=overlays,
         overlay_width_px=width_on_page(camera),
-        diagrams=camera_diagrams(result, name, errors),
+        diagrams=diagrams,
         worked=worked_point(camera, None if errors is None else errors.after),
     )
 
@@ -215,24 +219,25 @@ def _why_no_error_bar(result: Calibration, name: str) -> str:
     return "not by these correspondences" if result.sigmas(name) is None else ""
 
 
-def camera_diagrams(result: Calibration, name: str, errors: BeforeAfter | None) -> dict[str, str]:
-    """Residuals, coverage, error bars and convergence of a camera: data URIs by name."""
-    found: dict[str, str] = {}
-    if errors is not None:
-        camera, after = result.rig.cameras[name], errors.after
-        found["residuals"] = plots.residual_scatter(after, result.residuals[name].sigma_px)
-        found["by_distance"] = plots.residual_by_distance(after)
-        found["over_image"] = plots.residual_map(camera, after)
-        found["coverage"] = plots.coverage(camera, after)
-        found["distances"] = plots.distances(after)
+def camera_diagrams(result: Calibration, name: str, errors: BeforeAfter | None) -> Diagrams:
+    """Residuals, coverage, error bars and convergence of a camera, to be drawn."""
+    found: dict[str, partial[str]] = {}
     before, camera = result.initial_rig.cameras[name], result.rig.cameras[name]
+    if errors is not None:
+        size, after = ImageSize.of(camera), errors.after
+        sigma_px = result.residuals[name].sigma_px
+        found["residuals"] = partial(plots.residual_scatter, after, sigma_px)
+        found["by_distance"] = partial(plots.residual_by_distance, after)
+        found["over_image"] = partial(plots.residual_map, size, after)
+        found["coverage"] = partial(plots.coverage, size, after)
+        found["distances"] = partial(plots.distances, after)
     if name in result.lens and has_other_lens(before, camera):
-        found["lens"] = plots.lens_change(before, camera)
+        found["lens"] = partial(plots.lens_change, before, camera)
     sigmas, bootstrap = result.error_bar(name), result.bootstrap.get(name)
     if sigmas is not None:
         others = None if bootstrap is None else degrees_and_centimetres(bootstrap)
-        found["error_bars"] = plots.error_bars(sigmas, others)
+        found["error_bars"] = partial(plots.error_bars, sigmas, others)
     rounds = [cameras[name] for cameras in result.rounds if name in cameras]
     if len(rounds) > 1:
-        found["convergence"] = plots.convergence(rounds)
+        found["convergence"] = partial(plots.convergence, rounds)
     return found

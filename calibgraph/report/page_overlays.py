@@ -20,8 +20,8 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
 from calibgraph.report.frames import middle_frame
+from calibgraph.report.match_errors import BeforeAfter, ReprojectionErrors
 from calibgraph.report.point_overlay import DEPTH_RANGE_M, depth_colours, draw_points, shrink
-from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionErrors
 
 Image = NDArray[np.uint8]
 

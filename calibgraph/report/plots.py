@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.lens_difference import lens_difference
-from calibgraph.model.rig import Camera
 from calibgraph.report.figure import (
+    ImageSize,
     add_legend,
     image_figure,
     new_figure,
     set_octave_ticks,
     to_data_uri,
 )
-from calibgraph.report.reprojection_errors import ReprojectionErrors
+from calibgraph.report.match_errors import ReprojectionErrors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from calibgraph.model.rig import Camera
 
 # Colours that the colour-blind can tell apart (Okabe and Ito, "Color universal design").
 _INLIER, _OUTLIER, _LINE = "#0072B2", "#D55E00", "#000000"
@@ -77,12 +78,12 @@ def residual_by_distance(errors: ReprojectionErrors) -> str:
     return to_data_uri(figure)
 
 
-def residual_map(camera: Camera, errors: ReprojectionErrors) -> str:
+def residual_map(size: ImageSize, errors: ReprojectionErrors) -> str:
     """The used matches in the image, and the mean residual of each cell as an arrow."""
-    figure, axes = image_figure(camera)
+    figure, axes = image_figure(size)
     inliers = errors.select(errors.is_inlier)
     axes.plot(*_thin(inliers.pixels_px).T, ".", color=_INLIER, markersize=2, alpha=0.35)
-    centres, means, cell_px = mean_residuals(camera, inliers, ARROW_COLUMNS)
+    centres, means, cell_px = mean_residuals(size, inliers, ARROW_COLUMNS)
     factor = arrow_factor(means, cell_px)
     _add_arrows(axes, centres, factor * means)
     title = f"mean residual per cell, drawn {factor:g} times as long"
@@ -92,8 +93,10 @@ def residual_map(camera: Camera, errors: ReprojectionErrors) -> str:
 
 def lens_change(before: Camera, camera: Camera) -> str:
     """How far the estimated lens sees each ray from where the rig's did: arrows, and contours."""
-    figure, axes = image_figure(camera)
-    size, rows = np.array([camera.width_px, camera.height_px]), ARROW_COLUMNS // 2
+    from calibgraph.model.lens_difference import lens_difference
+
+    size, rows = ImageSize.of(camera), ARROW_COLUMNS // 2
+    figure, axes = image_figure(size)
     finer = _CONTOUR_FINENESS * np.array([ARROW_COLUMNS, rows])
     sides = [
         np.linspace(0.0, pixels - 1.0, count) for pixels, count in zip(size, finer, strict=True)
@@ -119,14 +122,14 @@ def _add_arrows(axes: Axes, starts: Array, vectors: Array) -> None:
     )  # fmt: skip
 
 
-def coverage(camera: Camera, errors: ReprojectionErrors) -> str:
+def coverage(size: ImageSize, errors: ReprojectionErrors) -> str:
     """Number of used matches in each cell of the image."""
     from matplotlib.ticker import MaxNLocator
 
-    figure, axes = image_figure(camera, right_in=0.5)
+    figure, axes = image_figure(size, right_in=0.5)
     pixels = errors.select(errors.is_inlier).pixels_px
-    extent = ((-0.5, camera.width_px - 0.5), (-0.5, camera.height_px - 0.5))
-    counts = sum_per_cell(pixels, camera, _COVERAGE_COLUMNS)
+    extent = ((-0.5, size.width_px - 0.5), (-0.5, size.height_px - 0.5))
+    counts = sum_per_cell(pixels, size, _COVERAGE_COLUMNS)
     shown = np.where(counts > 0, counts, np.nan)
     image = axes.imshow(
         shown, extent=(*extent[0], *extent[1][::-1]), cmap="YlGnBu", vmin=0,
@@ -255,30 +258,29 @@ _MIN_PER_CELL = 3  # for a mean
 
 
 def sum_per_cell(
-    pixels_px: Array, camera: Camera, columns: int, values: Array | None = None
+    pixels_px: Array, size: ImageSize, columns: int, values: Array | None = None
 ) -> Array:
     """(rows, columns) sum of (n,) values of the pixels in each cell, or their number.
 
     The cells are about square.
     """
-    size = np.array([camera.width_px, camera.height_px])
-    rows = max(1, round(columns * camera.height_px / camera.width_px))
+    rows = max(1, round(columns * size.height_px / size.width_px))
     u, v = np.clip(pixels_px + 0.5, 0, size).T
     sums = np.histogram2d(v, u, (rows, columns), [(0, size[1]), (0, size[0])], weights=values)[0]
     return np.asarray(sums)
 
 
 def mean_residuals(
-    camera: Camera, errors: ReprojectionErrors, columns: int
+    size: ImageSize, errors: ReprojectionErrors, columns: int
 ) -> tuple[Array, Array, float]:
     """The mean residual of each cell that has at least three.
 
     Returns:
         (m, 2) centres of these cells [px], (m, 2) their means [px], the width of a cell [px].
     """
-    counts = sum_per_cell(errors.pixels_px, camera, columns)
+    counts = sum_per_cell(errors.pixels_px, size, columns)
     full = np.nonzero(counts >= _MIN_PER_CELL)
-    sums = [sum_per_cell(errors.pixels_px, camera, columns, v)[full] for v in errors.vectors_px.T]
-    cell = np.array([camera.width_px / columns, camera.height_px / len(counts)])
+    sums = [sum_per_cell(errors.pixels_px, size, columns, v)[full] for v in errors.vectors_px.T]
+    cell = np.array([size.width_px / columns, size.height_px / len(counts)])
     centres = (np.column_stack(full[::-1]) + 0.5) * cell - 0.5
     return centres, np.column_stack(sums) / counts[full][:, None], float(cell[0])

@@ -105,9 +105,10 @@ class CameraBlock:
     def with_weights(self, weights: Array) -> CameraBlock:
         """The same correspondences, their information times (n,) weights."""
         root = self.block.sqrt_information
-        ones = np.tile(IDENTITY, (len(self.frame), 1)) if root is None else root
-        root = ones * np.sqrt(weights)[:, None]
-        return replace(self, block=self.block.rewhiten(root))
+        columns = np.zeros((3, len(weights))) if root is None else root.T * np.sqrt(weights)
+        if root is None:
+            columns[0] = columns[2] = np.sqrt(weights)
+        return replace(self, block=self.block.rewhiten(columns.T))
 
     def with_scale(self, scale: ResidualScale) -> ProjectionBlock:
         """The projection block with its loss, in units of the residuals' sigma."""

@@ -119,14 +119,14 @@ def with_pseudo_frames(
     to 3 frames 0.8 to 1.1 where half of a match's variance is shared by its frame, less elsewhere.
 
     Args:
-        scatter: (n, n) sum over frames of the outer products of their gradients.
-        hessian: (n, n).
+        scatter: (..., n, n) sum over frames of the outer products of their gradients.
+        hessian: (..., n, n).
         frames: (n,) number of frames behind each row.
         usual: (n, n) the scatter that is usual for as many frames; None if nothing is known.
     """
     vectors = np.linalg.eigh(hessian)[1]
     root = np.maximum(frames, 1.0) ** -0.5
-    of_frame = root[:, None] * root
+    of_frame = np.outer(root, root)
     along = _along(vectors, scatter * of_frame)
     count = np.maximum(frames @ vectors**2, 1.0)
     if usual is None:
@@ -135,13 +135,13 @@ def with_pseudo_frames(
         prior = _along(vectors, usual * of_frame) / PSEUDO_FRAMES
         prior_frames = error_components().prior_frames
         mean = (prior_frames * prior + count * along) / (prior_frames + count - 1.0)
-    allowed: Array = scatter + (vectors * (PSEUDO_FRAMES * mean)) @ vectors.T
-    return allowed
+    spread = vectors * (PSEUDO_FRAMES * mean)[..., None, :]
+    return np.asarray(scatter + spread @ vectors.swapaxes(-1, -2))
 
 
 def _along(vectors: Array, matrix: Array) -> Array:
-    """(n,) v^T M v of each column v."""
-    return np.asarray((vectors * (matrix @ vectors)).sum(axis=0))
+    """(..., n) v^T M v of each column v."""
+    return np.asarray((vectors * (matrix @ vectors)).sum(axis=-2))
 
 
 def data_sigmas(at: FittedObjective) -> Array:

@@ -7,7 +7,7 @@ Schur complement per place.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,7 +17,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.lens import start_lenses
-from calibgraph.graph.linear_data import LinearData
+from calibgraph.graph.linear_data import LinearData, marginal_information, poses_of
 from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
@@ -29,7 +29,8 @@ from calibgraph.graph.variables import (
     matched_key,
     paired_key,
 )
-from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.geometry import invert_each, to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.optimizer import MAX_ITERATIONS
 from factors.conditioning import SINGULAR, unit_diagonal
 
@@ -59,6 +60,14 @@ class Linearization:
     def at(model: LatentPoseModel, values: gtsam.Values) -> Linearization:
         """Linearize the whole graph."""
         return Linearization(model, values, LinearData.at(model, values))
+
+    def with_model(self, model: LatentPoseModel) -> Linearization:
+        """The graph of another model of the same data, at the same values."""
+        other = replace(self, model=model)
+        if model.components is self.model.components:  # that of places is the same
+            model.__dict__.setdefault("place_graph", self.model.place_graph)
+            other.__dict__.update(placed=self.placed, left_by_places=self.left_by_places)
+        return other
 
     @cached_property
     def shared(self) -> gtsam.GaussianFactorGraph:
@@ -102,17 +111,16 @@ class Linearization:
     @cached_property
     def distances(self) -> Array:
         """(P, 1 + N) in sigmas: of o_p from o, of a_cp from m_c; 0 where there are no data."""
-        model, values = self.model, self.values
-        parts, cloud = model.components, values.atPose3(CLOUD)
+        model, values, parts = self.model, self.values, self.model.components
+        cloud, clouds = ([CLOUD], map(cloud_at_key, range(model.places)))
         found = np.zeros((model.places, 1 + len(model.cameras)))
-        clouds = np.broadcast_to(parts.cloud_at_place, (model.places, 6, 6))
-        for place, covariance in enumerate(clouds):
-            step = cloud.between(values.atPose3(cloud_at_key(place)))
-            found[place, 0] = _length(step, covariance)
-        matched = {number: values.atPose3(matched_key(number)) for number in model.matched}
-        for place, number in model.matched_places:
-            step = matched[number].between(values.atPose3(matched_at_key(place, number)))
-            found[place, 1 + number] = _length(step, parts.at_place[place, number])
+        of_clouds = np.broadcast_to(parts.cloud_at_place, (model.places, 6, 6))
+        found[:, 0] = _distances(values, cloud, clouds, of_clouds)
+        places, numbers = np.array(model.matched_places, np.int64).reshape(-1, 2).T
+        matched, at_place = map(matched_key, numbers), map(matched_at_key, places, numbers)
+        found[places, 1 + numbers] = _distances(
+            values, matched, at_place, parts.at_place[places, numbers]
+        )
         return found
 
     @cached_property
@@ -186,6 +194,8 @@ class LatentPoseFit:
     @cached_property
     def of_mount(self) -> LatentPoseFit:
         """The same optimum; the mounts are reported, with the lenses as the rig has them."""
+        if self.linear.model.reported_keys == self.linear.model.camera_keys:
+            return self
         return self.with_model(replace(self.linear.model, of="mount", lens_errors={}))
 
     @cached_property
@@ -202,7 +212,7 @@ class LatentPoseFit:
 
     def with_model(self, model: LatentPoseModel) -> LatentPoseFit:
         """The marginals of another model of the same data, at the same values."""
-        return replace(self, linear=replace(self.linear, model=model))
+        return replace(self, linear=self.linear.with_model(model))
 
 
 def fit_latent_poses(
@@ -222,7 +232,8 @@ def fit_latent_poses(
     """
     if isinstance(start, LatentPoseFit):
         present = start.linear
-        present = present if present.model is model else replace(present, model=model)
+        is_determined = is_determined or present.model is model
+        present = present if present.model is model else present.with_model(model)
     else:
         present = Linearization.at(model, start)
     if not (is_determined or present.is_determined()):
@@ -264,27 +275,6 @@ def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) ->
     return values
 
 
-def marginal_information(
-    graph: gtsam.GaussianFactorGraph, keys: Sequence[int], kept: Sequence[int]
-) -> Array:
-    """The marginal information of some variables.
-
-    Variables are eliminated one by one: with several at a time GTSAM takes a graph for
-    indeterminate as soon as two standard deviations differ by a factor of 4096.
-
-    Args:
-        graph: linear factors.
-        keys: of all its variables, in the order of elimination.
-        kept: keys of these variables.
-
-    Raises:
-        RuntimeError: if one of the others is not determined.
-    """
-    others = to_ordering(key for key in keys if key not in kept)
-    left = graph.eliminatePartialSequential(others)[1]
-    return np.asarray(left.hessian(to_ordering(kept))[0])
-
-
 def join_linear(*graphs: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
     """One graph with the linear factors of all."""
     joined = gtsam.GaussianFactorGraph()
@@ -293,7 +283,10 @@ def join_linear(*graphs: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph
     return joined
 
 
-def _length(step: gtsam.Pose3, covariance: Array) -> float:
-    """Length of a motion in sigmas."""
-    twist = gtsam.Pose3.Logmap(step)
-    return float(np.sqrt(twist @ np.linalg.solve(covariance, twist)))
+def _distances(
+    values: gtsam.Values, one: Iterable[int], other: Iterable[int], covariances: Array
+) -> Array:
+    """(n,) distances in sigmas of poses from others, by their keys."""
+    twists = logarithms(invert_each(poses_of(values, one)) @ poses_of(values, other))
+    along = np.linalg.solve(covariances, twists[:, :, None])[:, :, 0]
+    return np.asarray(np.sqrt((twists * along).sum(axis=1)))

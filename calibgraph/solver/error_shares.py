@@ -14,6 +14,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
+from calibgraph.graph.linear_data import marginal_information
 from calibgraph.model.error_sources import (
     COMMON,
     ELEVATION,
@@ -30,7 +31,7 @@ from calibgraph.model.error_sources import (
     ErrorSources,
 )
 from calibgraph.model.geometry import pose_rows
-from calibgraph.solver.elimination import Linearization, join_linear, marginal_information
+from calibgraph.solver.elimination import Linearization, join_linear
 from calibgraph.solver.error_model import ErrorFit
 
 Variances = dict[str, Array]

@@ -4,25 +4,24 @@
 the spread of every frame's residuals about its own pose, and takes the loss from it.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import retract_all
+from calibgraph.model.pose_kernel import MAX_DAMPING, descend
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spreads
 from factors import ProjectionBlock, to_runs
+from factors.block_sums import unpack_sums
 
 Runs = NDArray[np.int64]
 """(f, 2): the first correspondence of each frame, and the one behind its last."""
 
 _MAX_STEPS = 50  # with a start in the right basin, 4 to 8 are enough
-_DAMPING, _MAX_DAMPING = 1e-5, 1e6  # relative to the diagonal
-_MIN_DAMPING = 1e-12  # with less, frames that leave a direction free would be singular
-_LEAST_SIZE = np.finfo(np.float64).tiny
-_SMALL_STEP = 1e-10  # rad, m: below what residuals of 1e-6 px resolve
+_DAMPING = 1e-5  # relative to the diagonal, at first
 FINE, COARSE = 1e-10, 1e-3
 """Relative decrease of the cost at which a fit stops: at the optimum; as a start for another."""
 DAMPING = 1e-6
@@ -60,44 +59,38 @@ def fit_frames(
         T_camera_lidar: (f, 4, 4) starts.
         tolerance: relative decrease of the cost at which a frame is done.
     """
-    T = T_camera_lidar.copy()
-    sums = block.run_sums(T, runs)
-    hessians, gradients, costs = sums.hessian, sums.gradient, sums.cost
+    T, sums = T_camera_lidar.copy(), block.packed_run_sums(T_camera_lidar, runs)
     dampings, active = np.full(len(T), _DAMPING), np.arange(len(T))
-    for _ in range(_MAX_STEPS):
-        steps = solve_damped(hessians[active], gradients[active], dampings[active])
-        trial = retract_all(T[active], steps)
-        new = block.run_sums(trial, runs[active])
-        gain = costs[active] - new.cost
-        better = gain >= 0
-        done = better & (gain <= tolerance * costs[active])
-        done |= np.abs(steps).max(axis=1, initial=0) < _SMALL_STEP
-        moved = active[better]
-        T[moved], costs[moved] = trial[better], new.cost[better]
-        hessians[moved], gradients[moved] = new.hessian[better], new.gradient[better]
-        dampings[active] *= np.where(better, 0.1, 10.0)
-        np.maximum(dampings, _MIN_DAMPING, out=dampings)
-        active = active[~done & (dampings[active] < _MAX_DAMPING)]
-        if not len(active):
+    steps, tried, new = np.empty((len(T), 6)), np.empty_like(T), sums[:0]
+    for _ in range(1 + _MAX_STEPS):
+        count = descend(sums, T, dampings, active, steps, tried, new, (tolerance, math.inf))
+        if not count:
             break
-    converged = dampings < _MAX_DAMPING
-    converged[active] = False
-    return FramePoses(T, hessians, converged)
+        new = block.packed_run_sums(tried[:count], runs[active[:count]])
+    converged = dampings < MAX_DAMPING
+    converged[active[:count]] = False
+    return FramePoses(T, unpack_sums(sums).hessian, converged)
 
 
-def solve_damped(hessians: Array, gradients: Array, dampings: Array | float) -> Array:
-    """(f, 6) steps to the minima of quadratic costs; a direction that is free gets no step.
+def move_damped(
+    sums: Array, T_camera_lidar: Array, *, damping: float = DAMPING, most_rad: float = math.inf
+) -> tuple[Array, Array]:
+    """Poses at the minima of quadratic costs; a direction that is free gets no step.
 
     Args:
-        hessians: (f, 6, 6).
-        gradients: (f, 6).
-        dampings: of each, or of all: what is added to the diagonal, relative to it; above 1e-15.
+        sums: (f, 28) of each pose, as ``ProjectionBlock.packed_run_sums``.
+        T_camera_lidar: (f, 4, 4).
+        damping: what is added to the diagonal, relative to it.
+        most_rad: that a step turns about an axis; longer ones are shortened.
+
+    Returns:
+        (f, 4, 4) T_camera_lidar; (f, 6) the steps, in the tangent of T_lidar_camera.
     """
-    sizes = np.einsum("fii->fi", hessians)
-    units = np.where(sizes > 0, np.maximum(sizes, _LEAST_SIZE) ** -0.5, 0.0)
-    scaled = hessians * units[:, :, None] * units[:, None, :]
-    np.einsum("fii->fi", scaled)[...] = 1.0 + np.reshape(dampings, (-1, 1))
-    return np.asarray(-units * np.linalg.solve(scaled, (units * gradients)[:, :, None])[:, :, 0])
+    count = len(sums)
+    steps, moved = np.empty((count, 6)), np.empty((count, 4, 4))
+    dampings, numbers = np.full(count, damping), np.arange(count)
+    descend(sums, T_camera_lidar, dampings, numbers, steps, moved, sums[:0], (0.0, most_rad))
+    return moved, steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +132,8 @@ def fit_each_frame(block: CameraBlock, T_camera_lidar: Array) -> FrameFits:
     for _ in range(_OWN_STEPS):
         sizes = block.all_sizes(T, runs)[1]
         spreads = np.minimum(np.maximum(robust_spreads(sizes, runs), least), _MAX_SPREAD)
-        sums = block.block.run_sums(T, runs, CAUCHY_SCALE_SIGMAS * spreads)
-        steps = solve_damped(sums.hessian, sums.gradient, DAMPING)
-        turns = np.abs(steps[:, :3]).max(axis=1)
-        steps *= np.minimum(1.0, _MAX_STEP_RAD / np.maximum(turns, 1e-12))[:, None]
-        T = retract_all(T, steps)
+        sums = block.block.packed_run_sums(T, runs, CAUCHY_SCALE_SIGMAS * spreads)
+        T = move_damped(sums, T, most_rad=_MAX_STEP_RAD)[0]
     counts = block.frame_counts.astype(np.float64)
     spreads = _about_common_extrinsic(spreads, counts)
     return FrameFits(
@@ -151,7 +141,7 @@ def fit_each_frame(block: CameraBlock, T_camera_lidar: Array) -> FrameFits:
         counts=counts,
         spreads=spreads,
         spreads_px=robust_spreads(block.all_sizes(T, runs)[0], runs),
-        hessians=sums.hessian,
+        hessians=unpack_sums(sums).hessian,
         sizes=sizes / np.repeat(spreads, block.frame_counts),
     )
 

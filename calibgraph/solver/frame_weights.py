@@ -19,10 +19,10 @@ from scipy.optimize import isotonic_regression
 from calibgraph.arrays import Array
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import invert, local_coordinates, retract_all
+from calibgraph.model.geometry import invert, local_coordinates
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.frame_poses import DAMPING, FrameFits, fit_each_frame, solve_damped
+from calibgraph.solver.frame_poses import FrameFits, fit_each_frame, move_damped
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread, robust_spreads
 from calibgraph.solver.stage1 import Stage1
 from factors import to_runs
@@ -145,7 +145,8 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
     """
     center, noise = start, frames.noise
     typical = float(np.median(noise))
-    T_lidar_camera, flat = invert(frames.T_camera_lidar), frames.hessians.reshape(-1, 36)
+    T_lidar_camera, sums = invert(frames.T_camera_lidar), np.zeros((len(noise), 28))
+    sums[:, :21] = frames.hessians[:, *np.triu_indices(6)]
     by_chance, own = _CHANCE * np.maximum(noise - typical, 0), frames.spreads**2
     for number in range(_STEPS):
         away = local_coordinates(center, T_lidar_camera)
@@ -154,14 +155,13 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
         apart = np.maximum(shift - by_chance, 0)
         if number <= _SEARCH_STEPS:
             reach = _reach(apart, math.sqrt(typical), widened=number == _SEARCH_STEPS)
-        near = np.clip(_FLAT * (1 - np.sqrt(apart) / reach), 0, 1)
+        near = np.minimum(np.maximum(_FLAT * (1 - np.sqrt(apart) / reach), 0), 1)
         if not near.any():  # no two frames agree
             return start, np.ones(len(near))
         scatter = max(float(near @ (shift - noise) / near.sum()), 0.0)
         weights = near / (own + frames.counts * scatter / 6)
-        hessian = (weights @ flat).reshape(1, 6, 6)
-        step = -solve_damped(hessian, (weights @ products)[None], DAMPING)
-        center = retract_all(center[None], step)[0]
+        sums[:, 21:27] = -products
+        (center,), step = move_damped((weights @ sums)[None], center[None])
         if number > _SEARCH_STEPS and np.abs(step).max() < _CONVERGED:
             break
     return center, weights / weights.max()
@@ -224,9 +224,13 @@ def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
     counts, ordered = groups[:, 1] - groups[:, 0], confidence[order]
     middles = (ordered[(groups.sum(axis=1) - 1) // 2] + ordered[groups.sum(axis=1) // 2]) / 2
     falling = falling_logarithms(spreads, counts)
-    learnt = np.empty(len(sizes))
-    for rows in (order, np.flatnonzero(~np.isfinite(sizes))):  # in order, places are found faster
-        learnt[rows] = np.exp(np.interp(confidence[rows], middles, falling))
+    in_order = np.exp(np.interp(ordered, middles, falling))  # in order, places are found faster
+    if len(order) == len(sizes):  # they fall
+        learnt = in_order / ((in_order[(len(order) - 1) // 2] + in_order[len(order) // 2]) / 2)
+        found = np.empty(len(sizes))
+        found[order] = learnt
+        return found
+    learnt = np.exp(np.interp(confidence, middles, falling))
     return np.asarray(learnt / np.median(learnt))
 
 

@@ -72,7 +72,7 @@ def solve_joint(
     with watch("preprocess"):
         kept = preprocess(rig, table, config)                              # Correspondence
         if config.stage1 is None:
-            config = config.changed(stage1=kept.table.findings.stage1)
+            config = config.model_copy(update={"stage1": kept.table.findings.stage1})
         tied = tying_pairs(camera_matches) if terms in USING_CORRESPONDENCES else []
         held = require_determined(                                         # Preprocessing
             rig, kept.counts, tied, config.excluded_cameras)

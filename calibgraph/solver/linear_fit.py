@@ -7,7 +7,9 @@ from its quadratic.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.residual_scale import quantile
 from calibgraph.solver.whitening import upper_root
 from calibgraph.solver.within_place import WEAK
-from factors import ProjectionBlock, unit_diagonal
+from factors import ProjectionBlock
 from factors.block_arrays import whiten
 
 MIN_ROWS = 30  # fewer correspondences do not determine further unknowns
@@ -80,17 +82,27 @@ class LinearFit:
 
     def free(self, *unknowns: int) -> Freed:
         """The fit of the pose and some unknowns, with their numbers; the others are zero."""
-        rows = np.array([*range(6), *(6 + number for number in unknowns)])
-        own, frames = self.hessian[np.ix_(rows, rows)], len(self.gradients)
-        (scaled, units), pulls = unit_diagonal(own), self.gradients[:, rows]
-        inverse = np.linalg.inv(scaled) / np.outer(units, units)
-        values = inverse @ (self.hessian @ self.values)[rows]
-        scatter = with_pseudo_frames(pulls.T @ pulls, own, np.full(len(rows), float(frames)))
-        scatter += _weak(len(rows)) if frames > 1 else np.nan
+        return self.free_each([unknowns])[0]
+
+    def free_each(self, choices: Sequence[Sequence[int]]) -> list[Freed]:
+        """The fits of several choices of as many unknowns: each as :meth:`free`."""
+        rows = np.array([[*range(6), *(6 + number for number in each)] for each in choices])
+        own, size = self.hessian[rows[:, :, None], rows[:, None]], rows.shape[1]
+        diagonal = np.sqrt(np.maximum(np.einsum("fii->fi", own), 0.0))
+        units = np.where(diagonal > 0, diagonal, 1.0)
+        units = units[:, :, None] * units[:, None]
+        inverse = np.linalg.inv(own / units) / units
+        values = (inverse @ (self.hessian @ self.values)[rows, None])[:, :, 0]
+        frames, pulls = len(self.gradients), self.gradients.T[rows]
+        shown = pulls @ pulls.transpose(0, 2, 1)
+        scatter = with_pseudo_frames(shown, own, np.full(size, float(frames)))
+        scatter += _weak(size) if frames > 1 else np.nan
         follow = inverse @ self.hessian[rows, len(self.hessian) - self.considered :]
-        whole = inverse @ scatter @ inverse + self.shared * inverse + follow @ follow.T
-        compensating = np.asarray(-np.linalg.solve(own[:6, :6], own[:6, 6:]))
-        return Freed(values[:6], values[6:], whole[6:, 6:], compensating)
+        whole = inverse @ scatter @ inverse + self.shared * inverse
+        whole = (whole + follow @ follow.transpose(0, 2, 1))[:, 6:, 6:]
+        compensating = -np.linalg.solve(own[:, :6, :6], own[:, :6, 6:])
+        each = zip(values[:, :6], values[:, 6:], whole, compensating, strict=True)
+        return [Freed(*parts) for parts in each]
 
 
 def fit_camera(
@@ -122,22 +134,26 @@ def fit_camera(
     columns = _linearize(camera, block.block, fields_px)
     size, errors = len(columns) - 1, columns[-1].ravel()
     flat, values, left = columns[:-1].reshape(size, -1), np.zeros(size), errors.copy()
-    weighted = np.empty_like(flat)
+    weighted, weak = np.empty_like(flat), _weak(size)
     for _ in range(_MAX_ITERATIONS):
         squares = np.square(left.reshape(2, -1)).sum(axis=0)
         scale = loss_scale or _LOSS_MEDIANS * math.sqrt(quantile(squares, 0.5)) + 1e-12
         weights = np.tile(1.0 / (1.0 + squares / scale**2), 2)
-        np.multiply(flat, weights, out=weighted)
-        hessian, before = weighted @ flat.T + _weak(size), values
-        values = np.linalg.solve(hessian, weighted @ errors)
+        roots = np.sqrt(weights)
+        np.multiply(flat, roots, out=weighted)
+        hessian, before = weighted @ weighted.T + weak, values
+        values = np.linalg.solve(hessian, weighted @ (roots * errors))
         change = (values - before) @ flat
         left -= change
         if np.abs(change).max() < _CONVERGED * scale:
             break
     if not np.isfinite(values).all():  # points where no derivative exists
         return None
-    pulls = (weighted * left).reshape(size, 2, -1).sum(axis=1)
-    gradients = np.add.reduceat(pulls, block.frame_edges[:-1], axis=1).T
+    starts = block.frame_edges[:-1]
+    pulls = np.add.reduceat(
+        weighted * (roots * left), np.append(starts, starts + len(block)), axis=1
+    )
+    gradients = pulls.reshape(size, 2, -1).sum(axis=1).T
     variance = float(weights @ left**2 / weights.sum())
     return LinearFit(values, hessian, gradients, shared_variance * variance, considered)
 
@@ -152,9 +168,10 @@ def _linearize(camera: Camera, block: ProjectionBlock, fields_px: Array) -> Arra
     return columns
 
 
+@cache
 def _weak(size: int) -> Array:
     """(6 + k, 6 + k) information of a pose within sight and of unknowns that are nearly free."""
-    return np.diag([*np.diag(WEAK), *[_WEAK] * (size - 6)])
+    return np.diag(np.append(np.diag(WEAK), np.full(size - 6, _WEAK)))
 
 
 def block_of(camera: Camera, table: Correspondences) -> CameraBlock:

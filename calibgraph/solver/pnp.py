@@ -15,7 +15,8 @@ from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import MIN_MATCHES
 from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
-from factors import ProjectionBlock, smallest_scaled_eigenvalues, unproject
+from factors import ProjectionBlock, unproject
+from factors.conditioning import are_regular
 
 _REFINEMENTS = 2  # the first with the inliers of PnP, the second with those of the first
 _MAX_SAMPLE = 4000  # matches; chosen, not measured
@@ -201,5 +202,5 @@ def refine_frames(
         places[~found] = 0
         fit = fit_frames(some, places, T_camera_lidar)
         T_camera_lidar = fit.T_camera_lidar
-        found &= smallest_scaled_eigenvalues(fit.hessians) >= _MIN_SCALED_EIGENVALUE
+        found &= are_regular(fit.hessians, _MIN_SCALED_EIGENVALUE)
     return Refined(T_camera_lidar, found, inliers)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,9 +122,12 @@ def iterate_spread(quantile_below: Callable[[float, float], float]) -> float:
 
 def _sort_runs(values: Array, runs: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
     """The sorted values of each run one behind the other, and (r + 1,) where they begin and end."""
-    ordered = [np.sort(values[first:end]) for first, end in runs.tolist()]
-    edges = np.cumsum([0, *map(len, ordered)])
-    return contiguous(np.concatenate([*ordered, values[:0]])), contiguous(edges)
+    parts = [values[first:end] for first, end in runs.tolist()]
+    edges = list(accumulate(map(len, parts), initial=0))
+    ordered = np.concatenate([*parts, values[:0]])
+    for first, end in pairwise(edges):
+        ordered[first:end].sort()
+    return contiguous(ordered), contiguous(np.array(edges))
 
 
 @compiled()

@@ -62,7 +62,8 @@ class VarianceRatios:
 
     def is_near(self, other: VarianceRatios) -> bool:
         """Whether all are the same to some percent."""
-        return np.allclose(astuple(self), astuple(other), rtol=_SETTLED, atol=0.0)
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        return all(abs(one - two) <= _SETTLED * abs(two) for one, two in pairs)
 
 
 class Evidence(NamedTuple):
@@ -87,10 +88,15 @@ def estimate_variance_ratios(fit: LatentPoseFit, present: VarianceRatios) -> Var
         fit: with the present ratios.
         present: the ratios of its model.
     """
-    evidence = squared_displacements(fit)
+    evidence, places = squared_displacements(fit), fit.linear.model.places
+    least = ratios_by_evidence(evidence, places=places, present=present)
+    without = {name: one._replace(free=0.0) for name, one in evidence.items()}
+    most = ratios_by_evidence(without, places=places, present=present)
+    if least.is_near(present) and most.is_near(present):  # whatever the data leave open
+        return most
     for name, t in undetermined(_with_fixed_weights(fit)).items():
         evidence[name] = evidence[name]._replace(free=evidence[name].free - t)
-    return ratios_by_evidence(evidence, places=fit.linear.model.places, present=present)
+    return ratios_by_evidence(evidence, places=places, present=present)
 
 
 def ratios_by_evidence(

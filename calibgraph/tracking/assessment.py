@@ -166,7 +166,7 @@ def _verdict(
     own = covariance[rows, rows]
     estimate = Estimate(
         camera=state.rig.cameras[name],
-        residuals=recent_residuals(one),
+        has_matches=True,
         used=int(one.counts.get("used", 0)),
         frames=int(sums.frames[camera]),
         covariance=None if np.isnan(own).any() else own,

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.calibration import Residuals
 from calibgraph.model.config import Terms
 from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.rig import Camera
@@ -21,7 +20,7 @@ class Estimate:
 
     Attributes:
         camera: lens, and the initial guess.
-        residuals: None if it had no correspondences and was solved through relative poses.
+        has_matches: whether it had correspondences; else it was solved through relative poses.
         used: correspondences in the final solve.
         frames: frames that they come from.
         covariance: (6, 6) of (rotation [rad], translation [m]), or None.
@@ -41,7 +40,7 @@ class Estimate:
     """
 
     camera: Camera
-    residuals: Residuals | None
+    has_matches: bool
     used: int
     frames: int
     covariance: Array | None

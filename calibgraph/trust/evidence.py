@@ -271,7 +271,7 @@ class Evidence:
         sigmas, conflicts = solution.marginals.data_sigmas, solution.marginals.conflicts
         return Estimate(
             camera=solution.rig.cameras[camera],
-            residuals=self.residuals.get(camera),
+            has_matches=camera in solution.objective.blocks,
             used=0 if block is None else len(block.frame),
             frames=0 if block is None else len(block.frame_edges) - 1,
             covariance=self.covariance_by_matches(camera),

@@ -11,6 +11,7 @@ Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -19,7 +20,11 @@ import numpy as np
 
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.consensus import displaced_z_score, score_displaced, z_score
-from calibgraph.matching.structure.shift_scores import ShiftScores
+from calibgraph.matching.structure.shift_scores import (
+    ShiftScores,
+    concatenate_scores,
+    crop_grids,
+)
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import Threads, core_pool
@@ -96,7 +101,8 @@ def _measure_camera(
     scorer: FrameScorer, name: str, camera: Camera, *, seed: int, places: Places
 ) -> ImageEvidence:
     images = scorer.load_images(name, camera)
-    scores = scorer.score_together(images, camera, WIDE)
+    each = scorer.score(images, camera, WIDE)
+    scores = concatenate_scores([one for one in each if one is not None])
     groups = len(scores.weights)
     if groups < MIN_GROUPS:
         return ImageEvidence(groups)
@@ -104,7 +110,7 @@ def _measure_camera(
         groups,
         lens=measure_lens(scorer, images, camera, scores, seed=seed, places=places),
         **_compare_with_displaced(scores),
-        **_compare_with_neighbours(scorer, images, camera),
+        **_compare_with_neighbours(scorer, images, camera, each),
     )
 
 
@@ -119,22 +125,29 @@ def _compare_with_displaced(scores: ShiftScores) -> dict[str, Any]:
     }
 
 
-def _compare_with_neighbours(scorer: FrameScorer, images: Images, camera: Camera) -> dict[str, Any]:
-    """Compare each image's agreement with its own cloud and with its neighbours' clouds."""
-    values = np.array(
-        [
-            [_agreement(s) for s in scorer.score(images, camera, PAIR_LEVEL, offset=offset)]
-            for offset in (-1, 0, 1)
-        ]
-    )  # (3, frames); NaN where there is no such cloud
+def _compare_with_neighbours(
+    scorer: FrameScorer, images: Images, camera: Camera, wide: Sequence[ShiftScores | None]
+) -> dict[str, Any]:
+    """Compare each image's agreement with its own cloud and with its neighbours' clouds.
+
+    Args:
+        scorer: of the frames.
+        images: of the camera.
+        camera: at the result.
+        wide: scores of the images with their own clouds, at ``WIDE``.
+    """
+    before, after = (scorer.score(images, camera, PAIR_LEVEL, offset=offset) for offset in (-1, 1))
+    own = [one and crop_grids(one, camera, PAIR_LEVEL) for one in wide]
+    values = np.array([[_agreement(one) for one in all_of] for all_of in (before, own, after)])
+    # (3, frames); NaN where there is no such cloud
     comparable = np.isfinite(values[1]) & np.isfinite(values[[0, 2]]).any(axis=0)
     if not comparable.any():
         return {}
-    before, own, after = values[:, comparable]
-    margins = [own - before, own - after]
+    before_z, own_z, after_z = values[:, comparable]
+    margins = [own_z - before_z, own_z - after_z]
     worse = int(np.argmin([np.nanmean(m) if np.isfinite(m).any() else np.inf for m in margins]))
     there = np.isfinite(margins[worse])
-    sums = own[there].sum(), (before, after)[worse][there].sum()
+    sums = own_z[there].sum(), (before_z, after_z)[worse][there].sum()
     return {
         "pair_offset": 0 if sums[0] >= sums[1] else (-1, 1)[worse],
         "pair_margin": float((sums[0] - sums[1]) / (max(abs(sums[0]), abs(sums[1])) + 1e-12)),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import groupby
+
 import numpy as np
 
 from calibgraph.model.verdict import Check
 from calibgraph.parallel import map_on_cores
-from calibgraph.solver.linear_fit import fit_camera
+from calibgraph.solver.linear_fit import Freed, LinearFit, fit_camera
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.lens_parameter import (
     RESIDUALS,
@@ -58,11 +60,24 @@ def _check_camera(evidence: Evidence, name: str) -> list[Check]:
     if fit is None:
         return []
     units = units_of(camera)
-    freed = {each: fit.free(*numbers) for each, numbers in _NUMBERS.items()}
-    found = (LensParameter.of(n, units[[*_NUMBERS[n]]], each) for n, each in freed.items())
+    freed = _free_each(fit)
+    found = (LensParameter.of(n, units[[*numbers]], freed[n]) for n, numbers in _NUMBERS.items())
     checks = [check_parameter(each, RESIDUALS, solution.config.tolerance) for each in found]
     # A focal length that is wrong by one percent is easily overlooked.
     compensating = freed["focal length"].compensating
     moved_m = float(np.linalg.norm(compensating[3:, 0])) / (100 * units[Free.FOCAL])
     row = threshold("focal_sensitivity", solution.config.tolerance)
     return [*checks, row.check(100 * moved_m)]
+
+
+def _free_each(fit: LinearFit) -> dict[str, Freed]:
+    """The fit of each parameter; those of as many numbers together."""
+    freed: dict[str, Freed] = {}
+    for _, group in groupby(sorted(_NUMBERS, key=_count), _count):
+        names = [*group]
+        freed |= zip(names, fit.free_each([_NUMBERS[name] for name in names]), strict=True)
+    return freed
+
+
+def _count(name: str) -> int:
+    return len(_NUMBERS[name])

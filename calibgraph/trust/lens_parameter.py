@@ -12,7 +12,9 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 from itertools import product
+from operator import mul
 
 import numpy as np
 from scipy.special import expit, logit, ndtr, softmax
@@ -69,6 +71,7 @@ _NAMES = FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT
 _PARTS: tuple[LensPart, ...] = "focal", "aspect", "centre", "distortion"
 _SKEW_SIGMA = 0.002  # in parts of fx
 _MOST_SIGMAS = 1e6  # enough for any probability
+_TINY = float(np.finfo(float).tiny)
 
 
 def lens_variable(camera: Camera) -> LensVariable:
@@ -87,11 +90,12 @@ def units_of(camera: Camera) -> Array:
 def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
     """(6, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
     free, T, k = lens_variable(camera).free, camera.T_camera_lidar, camera.intrinsics_px
-    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    points = (T[:3, :3] @ points_lidar_m.T + T[:3, 3:]).T
     fields = np.empty((len(Free), 2, len(points)))
     free.fill_columns(camera.lens, points, fields[:-1])
-    off_centre = fields[Free.FOCAL] / free.sigmas[Free.FOCAL]
-    fields[-1] = 0.5 * _SKEW_SIGMA * off_centre[::-1] * [[k.fx / k.fy], [k.fy / k.fx]]
+    half = 0.5 * _SKEW_SIGMA / free.sigmas[Free.FOCAL]
+    turned = half * np.array([[k.fx / k.fy], [k.fy / k.fx]])
+    np.multiply(fields[Free.FOCAL, ::-1], turned, out=fields[-1])
     return fields
 
 
@@ -121,22 +125,23 @@ class LensParameter:
         twist = freed.compensating[:, -count:] @ values
         return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, units)
 
-    @property
+    @cached_property
     def moved(self) -> tuple[float, float]:
         """How far the camera turns [deg] and its centre moves [cm]."""
-        turned, shifted = np.linalg.norm(self.twist.reshape(2, 3), axis=1)
-        return float(np.degrees(turned)), 100 * float(shifted)
+        twist = self.twist.tolist()
+        return math.degrees(math.hypot(*twist[:3])), 100 * math.hypot(*twist[3:])
 
-    @property
+    @cached_property
     def size(self) -> float:
         """The length of the values."""
-        return float(np.linalg.norm(self.values))
+        return math.hypot(*self.values.tolist())
 
-    @property
+    @cached_property
     def sigma(self) -> float:
         """Its standard deviation."""
-        along = self.values / max(self.size, np.finfo(float).tiny)
-        return max(float(np.linalg.norm(along * self.sigmas)), np.finfo(float).tiny)
+        size = max(self.size, _TINY)
+        along = (value / size for value in self.values.tolist())
+        return max(math.hypot(*map(mul, along, self.sigmas.tolist())), _TINY)
 
     def probability(self, tolerance: tuple[float, float] = TOLERANCE) -> float:
         """That the parameter is wrong and displaces the camera beyond a tolerance [deg, cm].
@@ -152,20 +157,28 @@ class LensParameter:
             return 0.0
         moves = max(moved / most for moved, most in zip(self.moved, tolerance, strict=True))
         tolerated = self.size / moves if moves else math.inf
-        spreads, share = np.array([1.0, limit("lens_wrong")]), limit("lens_wrong_share")
-        total = np.hypot(self.sigma, spreads)
-        evidence = -(np.minimum(self.size / total, _MOST_SIGMAS) ** 2) / 2 - np.log(total)
-        is_wrong = float(expit(logit(share) + evidence[1] - evidence[0]))
-        gain = spreads / total
-        after = _share_beyond(tolerated, gain**2 * self.size, gain * self.sigma)
-        before = _share_beyond(tolerated, 0.0, spreads)
+        counted = tolerated
         if self.name in SHAPES:
             wider = min(one / usual for one, usual in zip(tolerance, TOLERANCE, strict=True)) - 1
-            half = math.radians(TOLERANCE[0]) * max(wider, 0.0) / (self.units[0] / 2)
-            after[1] = _share_beyond(half, gain[1] ** 2 * self.size, gain[1] * self.sigma)
-            before[1] = _share_beyond(half, 0.0, spreads[1])
-        if_wrong = max(is_wrong * after[1] - share * before[1], 0.0)
-        return float(if_wrong + (1 - is_wrong) * max(after[0] - before[0], 0.0))
+            counted = math.radians(TOLERANCE[0]) * max(wider, 0.0) / (self.units[0] / 2)
+        wrong, share = limit("lens_wrong"), limit("lens_wrong_share")
+        odds = logit(share) + self._log_density(wrong) - self._log_density(1.0)
+        is_wrong = float(expit(odds))
+        after, before = self._shares_beyond(counted, wrong)
+        if_wrong = max(is_wrong * after - share * before, 0.0)
+        after, before = self._shares_beyond(tolerated, 1.0)
+        return float(if_wrong + (1 - is_wrong) * max(after - before, 0.0))
+
+    def _log_density(self, spread: float) -> float:
+        """The log density of the values among parameters that spread so."""
+        total = math.hypot(self.sigma, spread)
+        return -(min(self.size / total, _MOST_SIGMAS) ** 2) / 2 - math.log(total)
+
+    def _shares_beyond(self, size: float, spread: float) -> tuple[float, float]:
+        """After and before the estimate, how many parameters that spread so are beyond a size."""
+        gain = spread / math.hypot(self.sigma, spread)
+        after = _share_beyond(size, gain**2 * self.size, gain * self.sigma)
+        return after, _share_beyond(size, 0.0, spread)
 
     def describe(self) -> str:
         """The lens that would be right, in words."""
@@ -209,9 +222,9 @@ def _beside_others(name: str, freed: Freed, others: int) -> tuple[Array, Array]:
     return mean, np.tensordot(weights, within + apart, axes=1)
 
 
-def _share_beyond(size: float, mean: Array | float, sigma: Array) -> Array:
-    """The probability that normally distributed numbers are larger than a size."""
-    return np.asarray(ndtr((mean - size) / sigma) + ndtr((-mean - size) / sigma))
+def _share_beyond(size: float, mean: float, sigma: float) -> float:
+    """The probability that a normally distributed number is larger than a size."""
+    return float(ndtr((mean - size) / sigma) + ndtr((-mean - size) / sigma))
 
 
 def _with_sigma(value: float, sigma: float) -> str:

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 from scipy.special import expit
 
 from calibgraph.arrays import Array
@@ -162,8 +162,10 @@ def _posterior_of(
     likelihood: Callable[[Array], Array], by_matches: Array, seed: int
 ) -> PosePosterior:
     """Near the result or elsewhere, weighed by the evidence of both."""
-    near, of_near = sample_posterior(likelihood, NEAR**2 * by_matches, samples=SAMPLES, seed=seed)
-    far, of_far = sample_posterior(likelihood, np.diag(REACH**2), samples=SAMPLES, seed=seed)
+    sample = partial(sample_posterior, likelihood, samples=SAMPLES, seed=seed)
+    with core_pool() as pool:
+        priors = NEAR**2 * by_matches, np.diag(REACH**2)
+        (near, of_near), (far, of_far) = pool.map(sample, priors)
     return PosePosterior(near, far, float(expit(np.log(ODDS_ELSEWHERE) + of_far - of_near)))
 
 
@@ -184,15 +186,13 @@ def group_tied(
         known: two cameras and the (6, 6) covariance of their relative pose without the cloud. It
             ties them if it is below ``TIED`` of ``REACH`` along every axis.
     """
-    number, tied = {name: i for i, name in enumerate(cameras)}, np.eye(len(cameras))
+    groups = {name: {name} for name in cameras}
     for a, b, covariance in known:
-        if {a, b} <= set(cameras) and (np.sqrt(np.diag(covariance)) < TIED * REACH).all():
-            tied[number[a], number[b]] = 1.0
-    count, labels = connected_components(tied, directed=False)
-    return [
-        tuple(name for name, of in zip(cameras, labels, strict=True) if of == label)
-        for label in range(count)
-    ]
+        if {a, b} <= groups.keys() and (np.sqrt(np.diag(covariance)) < TIED * REACH).all():
+            joined = groups[a] | groups[b]
+            groups |= dict.fromkeys(joined, joined)
+    named = (tuple(name for name in cameras if name in groups[one]) for one in cameras)
+    return [*dict.fromkeys(named)]
 
 
 def no_posteriors(*_: object) -> dict[str, PosePosterior]:

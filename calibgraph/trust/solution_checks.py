@@ -38,7 +38,7 @@ def check_estimate(estimate: Estimate) -> list[Check]:
                 "T_camera_lidar looks, and its name"
             )
         return [Check("correspondences", "FAIL", text, estimate.used, kind=kind)]
-    if estimate.residuals is None:
+    if not estimate.has_matches:
         text = (
             f"{'excluded by the settings' if excluded else used}: determined by other cameras "
             "alone, through relative_poses, which have to be right, or what they see in common"

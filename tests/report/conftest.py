@@ -9,7 +9,7 @@ import pytest
 import calibgraph
 from calibgraph import Calibration, MatcherErrors, Rig, perturb, simulate_correspondences
 from calibgraph.model.config import Terms
-from calibgraph.report import write_report
+from calibgraph.report.html import write_report
 from tests.conftest import CommandRun, make_pair
 
 MAX_CHARACTERS = 6_000_000

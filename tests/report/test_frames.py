@@ -11,7 +11,7 @@ import pytest
 import calibgraph
 from calibgraph import Calibration
 from calibgraph.errors import DatasetError
-from calibgraph.report import relocate_frames
+from calibgraph.report.frames import relocate_frames
 from tests.conftest import SAMPLE
 
 

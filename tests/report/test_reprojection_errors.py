@@ -10,6 +10,7 @@ import pytest
 
 from calibgraph import Calibration
 from calibgraph.report.camera_section import worked_point
+from calibgraph.report.figure import ImageSize
 from calibgraph.report.plots import ARROW_COLUMNS, arrow_factor, mean_residuals
 from calibgraph.report.reprojection_errors import constrained, errors_before_after
 from calibgraph.solver.whitening import constrained_error_px
@@ -41,8 +42,8 @@ def test_errors_are_those_at_the_guess_and_at_the_result(
 def test_arrows_are_the_mean_of_their_cell(solved_pair: Calibration) -> None:
     after = errors_before_after(solved_pair)["left"].after
     shifted = replace(after, vectors_px=np.tile([0.5, -0.25], (len(after.frame), 1)))
-    camera = solved_pair.rig.cameras["left"]
-    _, means, cell_px = mean_residuals(camera, shifted, ARROW_COLUMNS)
+    size = ImageSize.of(solved_pair.rig.cameras["left"])
+    _, means, cell_px = mean_residuals(size, shifted, ARROW_COLUMNS)
     assert len(means) > 0
     np.testing.assert_allclose(means, np.tile([0.5, -0.25], (len(means), 1)))
     assert 0.3 * cell_px < arrow_factor(means, cell_px) * np.hypot(0.5, 0.25) <= 0.9 * cell_px

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibgraph import MatcherErrors, Rig, perturb, simulate_correspondences
 from calibgraph.graph.objective import projection_graph
-from calibgraph.solver.frame_poses import fit_frames, solve_damped
+from calibgraph.solver.frame_poses import fit_frames, move_damped
 from calibgraph.solver.optimizer import optimize
 from factors import ProjectionBlock, to_runs
 
@@ -42,9 +42,11 @@ def test_a_frame_without_matches_stays_and_does_not_disturb_the_others(pair: Rig
 
 
 def test_a_free_direction_gets_no_step() -> None:
-    hessian = np.diag([1.0, 2, 0, 4, 5, 6])
-    step = solve_damped(hessian[None], np.array([[1.0, 2, 0, 4, 5, 6]]), 0.0)[0]
-    np.testing.assert_allclose(step, [-1, -1, 0, -1, -1, -1])
+    sums = np.zeros((1, 28))
+    sums[0, :21] = np.diag([1.0, 2, 0, 4, 5, 6])[np.triu_indices(6)]
+    sums[0, 21:27] = 1.0, 2, 0, 4, 5, 6
+    _, step = move_damped(sums, np.eye(4)[None], damping=0.0)
+    np.testing.assert_allclose(step, [[-1, -1, 0, -1, -1, -1]])
 
 
 def test_frames_that_leave_directions_free_do_not_become_singular(pair: Rig) -> None:

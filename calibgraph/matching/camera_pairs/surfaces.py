@@ -40,7 +40,7 @@ def planes_at(rays: Array, points_camera_m: Array) -> Array:
     directions, inverse = directions[near], inverse[near]
     if len(directions) < NEIGHBOURS:
         return np.full((len(rays), 3), np.nan)
-    chords, rows = cKDTree(directions).query(rays, NEIGHBOURS)
+    chords, rows = cKDTree(directions, balanced_tree=False).query(rays, NEIGHBOURS)
     return _fit_planes(rays, directions[rows], inverse[rows], chords)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.matching.structure.directions import scan_angles
+from calibgraph.matching.structure.directions import scan_angles, sphere_angles
 from calibgraph.matching.structure.visibility import find_visible
 from calibgraph.matching.structure.window_table import WindowTable, WindowTables
 from calibgraph.memory import mmap_copy
@@ -29,6 +29,7 @@ class PreparedCloud:
         points_lidar_m: (n, 3) in the LiDAR frame.
         intensity_rank: (n,) ranks in (0, 1], independent of the sensor's scale; all equal without
             intensities.
+        angles: (n, 2) azimuth and elevation [rad] about the LiDAR frame's origin.
         seen_from_origin: whether the points were measured from the LiDAR frame's origin. Clouds
             that join several sensors, or are in a vehicle's frame, were not.
         tables: where the windows of this and other clouds are kept.
@@ -37,6 +38,7 @@ class PreparedCloud:
 
     points_lidar_m: Array
     intensity_rank: Array
+    angles: Array
     seen_from_origin: bool
     tables: WindowTables = field(default_factory=WindowTables)
     identity: object = field(default_factory=object)
@@ -51,10 +53,12 @@ class PreparedCloud:
         far = distance_m > MIN_RANGE_M
         points, distance_m = points[far], distance_m[far]
         intensity = np.nan_to_num(cloud[far, 3].astype(np.float64))
-        hidden = ~find_visible(scan_angles(points), distance_m, ORIGIN_CELL_RAD)
+        angles = sphere_angles(points)
+        hidden = ~find_visible(scan_angles(angles), distance_m, ORIGIN_CELL_RAD)
         return PreparedCloud(
             mmap_copy(points),
             mmap_copy(_ranks(intensity) / max(1, len(intensity))),
+            mmap_copy(angles),
             seen_from_origin=bool(hidden.sum() <= MAX_HIDDEN_FROM_ORIGIN * len(hidden)),
             tables=tables or WindowTables(),
         )
@@ -62,7 +66,7 @@ class PreparedCloud:
     @property
     def nbytes(self) -> int:
         """Size in memory, without its windows."""
-        return self.points_lidar_m.nbytes + self.intensity_rank.nbytes
+        return self.points_lidar_m.nbytes + self.intensity_rank.nbytes + self.angles.nbytes
 
     def viewpoint_lidar_m(self, camera: Camera) -> Array:
         """(3,) from where windows are cut: the LiDAR if it is at the origin, else the camera."""
@@ -89,11 +93,14 @@ class PreparedCloud:
         """
 
         def make() -> WindowTable:
-            points = self.points_lidar_m
+            rays_m, rows = self.points_lidar_m, np.arange(len(usable))
+            if not self.seen_from_origin:
+                rays_m, rows = rays_m - self.viewpoint_lidar_m(camera), np.flatnonzero(usable)
             return WindowTable(
-                points if self.seen_from_origin else points - self.viewpoint_lidar_m(camera),
+                rays_m,
                 self.intensity_rank,
-                np.arange(len(usable)) if self.seen_from_origin else np.flatnonzero(usable),
+                rows,
+                self.angles if self.seen_from_origin else sphere_angles(rays_m[rows]),
                 spacing_rad=spacing_rad,
                 stride_spacings=stride_spacings,
                 keep_linear=fine,

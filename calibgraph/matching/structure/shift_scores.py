@@ -114,8 +114,7 @@ def score_frame(  # noqa: PLR0913 - what is scored, and how
         gray, cloud, camera, level, max_windows=max_windows, twist_per_s=twist_per_s
     )
     scale, weight = seen.steps_per_px, seen.windows.weight
-    reach = int(np.ceil(level.reach_rad * camera.lens.pixels_per_rad * scale.max()))
-    reach, groups = max(reach, MIN_REACH_STEPS), len(seen.points_lidar_m)
+    reach, groups = _reach_steps(camera, level, scale), len(seen.points_lidar_m)
     grids: Grids = mmap_zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
     _add_scores(grids, seen, likelihood=level.fine)
     pixels_px, jacobian_px = project_with_jacobian(seen.camera, seen.seen_lidar_m)
@@ -194,6 +193,18 @@ def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
     grids: Grids = mmap_zeros((len(stacked["weights"]), *scores[0].grids.shape[1:]), np.float32)
     np.concatenate([s.grids for s in scores], out=grids)
     return ShiftScores(**stacked, grids=grids, steps_per_px=scores[0].steps_per_px)
+
+
+def crop_grids(scores: ShiftScores, camera: Camera, level: Level) -> ShiftScores:
+    """The same scores with grids that reach as far as those of a level of the same step."""
+    cut = (scores.grids.shape[1] - 1) // 2 - _reach_steps(camera, level, scores.steps_per_px)
+    grids = scores.grids[:, cut:-cut, cut:-cut] if cut > 0 else scores.grids
+    return replace(scores, grids=grids - grids.mean(axis=(1, 2), keepdims=True))
+
+
+def _reach_steps(camera: Camera, level: Level, steps_per_px: Array) -> int:
+    reach = level.reach_rad * camera.lens.pixels_per_rad * steps_per_px.max()
+    return max(int(np.ceil(reach)), MIN_REACH_STEPS)
 
 
 def pad_grids(scores: Sequence[ShiftScores]) -> list[ShiftScores]:

@@ -8,19 +8,15 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array, Mask
 from calibgraph.matching.structure.directions import thin
-from calibgraph.matching.structure.windows import (
-    Neighbours,
-    Windows,
-    cut_windows,
-)
+from calibgraph.matching.structure.nearest_rays import NearestRays
+from calibgraph.matching.structure.windows import Windows, cut_windows
 from calibgraph.memory import mmap_copy, mmap_zeros
 from calibgraph.parallel import KeyedCache
 
 Rows = NDArray[np.intp]
 
 MIN_RELIABILITY = 0.3  # of a window's variation (0 flat, 1 strong)
-MAX_BYTES = 500_000_000  # of all tables of a cache, without the trees of neighbours
-MAX_TREE_BYTES = 100_000_000  # of their trees: most of a table, and of use only while it is cut
+MAX_BYTES = 500_000_000  # of all tables of a cache
 _UNCUT, _USELESS = -1, -2
 
 
@@ -34,6 +30,7 @@ class WindowTable:
         rays_m: (n, 3) from the viewpoint to the cloud's points, along the axes of the LiDAR frame.
         intensity_rank: (n,) of the points.
         rows: (m,) the points that may be used.
+        angles: (m, 2) azimuth and elevation of their rays.
         spacing_rad: of the points in a window.
         stride_spacings: of the windows, in spacings of the points.
         keep_linear: keep the linear parts of the variation.
@@ -44,21 +41,22 @@ class WindowTable:
         rays_m: Array,
         intensity_rank: Array,
         rows: Rows,
+        angles: Array,
         *,
         spacing_rad: float,
         stride_spacings: float,
         keep_linear: bool,
     ) -> None:
-        usable = rays_m[rows]
-        kept = thin(usable, spacing_rad)
-        centres = thin(usable[kept], stride_spacings * spacing_rad)
+        kept = thin(angles, spacing_rad)
+        centres = thin(angles[kept], stride_spacings * spacing_rad)
         self._cloud = rays_m, intensity_rank
         self._rows = mmap_copy(rows[kept].astype(np.int32))
         self._centres = mmap_copy(np.random.default_rng(0).permutation(centres).astype(np.int32))
+        self._centre_rows = mmap_copy(self._rows[self._centres])
         self._slots = mmap_copy(np.full(len(centres), _UNCUT, np.int32))
         self._windows, self._count = Windows.empty(len(centres), mmap_zeros), 0
         self._windows_nbytes = self._windows.nbytes
-        self._neighbours: Neighbours | None = None
+        self._neighbours = NearestRays(rays_m, self._rows, angles[kept], spacing_rad)
         self._spacing_rad, self._keep_linear = spacing_rad, keep_linear
         self._lock = Lock()
 
@@ -74,7 +72,7 @@ class WindowTable:
             max_windows: largest number of centres in view.
             seed: of the choice.
         """
-        chosen = np.flatnonzero(in_view[self._rows[self._centres]])
+        chosen = np.flatnonzero(in_view[self._centre_rows])
         if seed:
             chosen = np.random.default_rng(seed).permutation(chosen)
         windows, slots = self._take(chosen[:max_windows])
@@ -92,11 +90,10 @@ class WindowTable:
             return self._windows, slots[slots >= 0]
 
     def _cut_missing(self, missing: Rows) -> None:
-        neighbours = self._neighbours or Neighbours(self._cloud[0], self._rows, self._spacing_rad)
-        self._neighbours = neighbours
         windows, reliability = cut_windows(
-            self._cloud, self._centres[missing], neighbours, keep_linear=self._keep_linear
-        )
+            self._cloud, self._centres[missing], self._neighbours,
+            spacing_rad=self._spacing_rad, keep_linear=self._keep_linear,
+        )  # fmt: skip
         useful = reliability > MIN_RELIABILITY
         first, self._count = self._count, self._count + int(np.count_nonzero(useful))
         self._windows.put(first, windows.select(useful))
@@ -105,23 +102,14 @@ class WindowTable:
 
     @property
     def nbytes(self) -> int:
-        """Size in memory, without the tree of neighbours and the cloud."""
+        """Size in memory, without the cloud."""
         cut = self._count * self._windows_nbytes // max(1, len(self._centres))
-        return cut + self._rows.nbytes + self._centres.nbytes + self._slots.nbytes
-
-    @property
-    def tree_nbytes(self) -> int:
-        """Size in memory of the tree of neighbours; 0 if there is none now."""
-        neighbours = self._neighbours
-        return neighbours.nbytes if neighbours else 0
-
-    def drop_tree(self) -> None:
-        """Drop the tree of neighbours; it is built again when it is needed."""
-        self._neighbours = None
+        kept = self._rows.nbytes + 3 * self._centres.nbytes
+        return cut + kept + self._neighbours.nbytes
 
 
 class WindowTables:
-    """The tables of several clouds: those used last, up to ``MAX_BYTES`` and ``MAX_TREE_BYTES``."""
+    """The tables of several clouds: those used last, up to ``MAX_BYTES``."""
 
     def __init__(self) -> None:
         self._tables: KeyedCache[tuple[Hashable, ...], WindowTable] = KeyedCache()
@@ -130,15 +118,7 @@ class WindowTables:
         """The table of a key whose first entry is the cloud; made if it is missing."""
         table = self._tables.get(key, make)
         self._tables.keep_last(MAX_BYTES, lambda table: table.nbytes)
-        self._keep_last_trees()
         return table
-
-    def _keep_last_trees(self) -> None:
-        total = 0
-        for table in reversed(self._tables.values()):
-            total += table.tree_nbytes
-            if total > MAX_TREE_BYTES:
-                table.drop_tree()
 
     def keep_only(self, clouds: Iterable[Hashable]) -> None:
         """Drop the tables of all other clouds."""

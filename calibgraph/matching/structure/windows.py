@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array, Mask
+from calibgraph.matching.structure.nearest_rays import NearestRays
 from calibgraph.matching.structure.window_kernels import FEATURES, describe_windows, fill_features
 from calibgraph.matching.structure.window_weights import WindowNetwork
 
@@ -28,7 +28,6 @@ MIN_WINDOW_POINTS = 9
 WINDOW_STRETCH = 4.0  # longest window by the radius of an even one: room for single scan lines
 MIN_WEIGHT = 0.1  # of a window that counts where windows are weighed
 MIN_SPACING_RAD = np.radians(0.15)  # few sensors sample more finely along their scan lines
-_TREE_NODE_BYTES = 72
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +99,9 @@ class Windows:
 def cut_windows(
     cloud: tuple[Array, Array],
     centres: NDArray[np.int32],
-    neighbours: Neighbours,
+    neighbours: NearestRays,
     *,
+    spacing_rad: float,
     keep_linear: bool,
 ) -> tuple[Windows, Array]:
     """Cut windows of the nearest rays.
@@ -111,6 +111,7 @@ def cut_windows(
             [m]; (n,) their intensity ranks.
         centres: (w,) of the neighbours' rays, those that are the windows' centres.
         neighbours: of the thinned rays.
+        spacing_rad: of these.
         keep_linear: keep the linear parts of the variation, and describe it.
 
     Returns:
@@ -118,7 +119,9 @@ def cut_windows(
         flat, 1 where much varies.
     """
     windows, reliability = Windows.empty(len(centres)), np.zeros(len(centres))
-    windows.members[:], windows.counts[:] = neighbours.of(centres)
+    even = math.sqrt(WINDOW_POINTS / math.pi) * max(spacing_rad, MIN_SPACING_RAD)
+    reach = 2 * math.sin(WINDOW_STRETCH * even / 2)  # as a chord
+    windows.members[:], windows.counts[:] = neighbours.of(centres, WINDOW_POINTS, reach)
     describe_windows(
         cloud, windows.members, windows.counts, keep_linear,
         windows.rays_m, windows.front, windows.basis, reliability,
@@ -130,42 +133,3 @@ def cut_windows(
             cloud, windows.members, windows.counts, windows.front, windows.basis, windows.features
         )
     return windows, reliability
-
-
-class Neighbours:
-    """The nearest rays of any ray.
-
-    Args:
-        rays_m: (n, 3) of a cloud.
-        rows: (m,) those that have neighbours and are some.
-        spacing_rad: between them.
-
-    Attributes:
-        nbytes: size in memory.
-    """
-
-    def __init__(self, rays_m: Array, rows: NDArray[np.int32], spacing_rad: float) -> None:
-        self._rows = rows
-        self._tree = cKDTree(to_directions(rays_m[rows]), balanced_tree=False)
-        even = math.sqrt(WINDOW_POINTS / math.pi) * max(spacing_rad, MIN_SPACING_RAD)
-        self._reach = 2 * math.sin(WINDOW_STRETCH * even / 2)  # as a chord
-        tree = self._tree
-        self.nbytes = int(tree.data.nbytes + tree.indices.nbytes + tree.size * _TREE_NODE_BYTES)
-
-    def of(self, centres: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """The nearest rays of some of the m.
-
-        Returns:
-            (w, WINDOW_POINTS) rows of the cloud, the centre first and in place of missing ones;
-            (w,) how many there are.
-        """
-        _, nearest = self._tree.query(
-            self._tree.data[centres], WINDOW_POINTS, distance_upper_bound=self._reach
-        )
-        found = nearest < self._tree.n
-        return self._rows[np.where(found, nearest, centres[:, None])], found.sum(axis=1)
-
-
-def to_directions(rays: Array) -> Array:
-    """Rays (n, 3) as unit vectors."""
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))

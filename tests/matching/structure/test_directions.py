@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibgraph.matching.structure.directions import thin, view_angles
+from calibgraph.matching.structure.directions import sphere_angles, thin, view_angles
 from calibgraph.matching.structure.visibility import find_visible
 
 
@@ -25,7 +25,7 @@ def test_thinning_is_independent_of_the_order_of_points() -> None:
     rays = rng.standard_normal((20_000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     order = rng.permutation(len(rays))
-    one, two = thin(rays, 0.05), thin(rays[order], 0.05)
+    one, two = (thin(sphere_angles(each), 0.05) for each in (rays, rays[order]))
     np.testing.assert_array_equal(rays[one], rays[order][two])
     assert len(one) == pytest.approx(4 * np.pi / 0.05**2, rel=0.05)  # cells of the sphere
 
@@ -34,7 +34,7 @@ def test_thinned_directions_are_as_dense_everywhere() -> None:
     rng = np.random.default_rng(0)
     rays = rng.standard_normal((400_000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    kept = rays[thin(rays, 0.02)]
+    kept = rays[thin(sphere_angles(rays), 0.02)]
     cells = 2 * np.pi * (1 - np.cos(0.5)) / 0.02**2  # of a cone of 0.5 rad
     for axis in np.vstack([np.eye(3), -np.eye(3)]):
         assert np.count_nonzero(kept @ axis > np.cos(0.5)) == pytest.approx(cells, rel=0.1)

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import gc
 import weakref
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from calibgraph.matching.structure import window_table
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.shift_scores import score_frame, select_windows
-from calibgraph.matching.structure.window_table import WindowTable, WindowTables
+from calibgraph.matching.structure.window_table import WindowTable
 from tests.conftest import SAMPLE
 
 
@@ -79,30 +78,6 @@ def test_a_table_that_was_dropped_is_made_again_alike(
     )  # fmt: skip
     assert len(made) == 2
     np.testing.assert_array_equal(first.grids, again.grids)
-
-
-def test_a_tree_of_neighbours_that_was_dropped_is_built_again_alike(
-    cloud: PreparedCloud, truth: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    left, right = truth.cameras["front_left"], truth.cameras["left"]
-    level = LEVELS[3]
-
-    def table() -> WindowTable:
-        return cloud.windows(
-            left, np.empty(0, np.bool_), level.spacing_rad, level.stride_spacings, fine=level.fine
-        )
-
-    select_windows(cloud, left, level, max_windows=500)
-    assert table().tree_nbytes > 0
-    monkeypatch.setattr(window_table, "MAX_TREE_BYTES", 0)
-    size = table().nbytes
-    assert table().tree_nbytes == 0
-    again = select_windows(cloud, right, level, max_windows=500)
-    assert table().nbytes > size  # the same table has grown
-    alone = replace(cloud, tables=WindowTables())
-    fresh = select_windows(alone, right, level, max_windows=500)
-    for name in vars(fresh):
-        np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
 
 
 def test_a_cloud_and_its_windows_go_without_the_garbage_collector(truth: Rig) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 
 import calibgraph
 from calibgraph import Camera, Intrinsics, Rig
+from calibgraph.matching.structure.directions import sphere_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.shift_scores import select_windows
@@ -61,6 +62,7 @@ def test_members_behind_a_silhouette_are_moved_to_it() -> None:
         rays,
         np.ones(len(rays)),
         np.arange(len(rays)),
+        sphere_angles(rays),
         spacing_rad=np.radians(0.2),
         stride_spacings=2.0,
         keep_linear=False,

@@ -1,0 +1,128 @@
+"""The nearest rays of a ray, among rays that are thinned to one per cell of the sphere.
+
+Thinned rays come by rows of equal elevation, and by azimuth within a row. From a ray outwards, rows
+and the rays of a row are visited until none can be nearer than the farthest of those found: no tree
+has to be built and kept.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.arrays import Array
+from factors.compiled import compiled
+
+_ROUNDING_RAD = 1e-6  # of azimuths in single precision
+_MONOTONE_RAD = math.sqrt(2.0)  # up to there x - x^3 / 6 rises; it is at most sin x
+
+
+class NearestRays:
+    """The nearest rays of any ray of a thinned cloud.
+
+    Args:
+        rays_m: (n, 3) of a cloud.
+        rows: (m,) those that were kept, in the order of :func:`.directions.thin`.
+        angles: (m, 2) their azimuth and elevation.
+        cell_rad: by which they are thinned.
+    """
+
+    def __init__(
+        self, rays_m: Array, rows: NDArray[np.int32], angles: Array, cell_rad: float
+    ) -> None:
+        self._rays_m, self._rows, self._cell_rad = np.ascontiguousarray(rays_m), rows, cell_rad
+        self._azimuth = angles[:, 0].astype(np.float32)
+        row = np.floor(angles[:, 1] / cell_rad).astype(np.int64)
+        self._lowest = int(row[0]) if len(row) else 0
+        count = int(row[-1]) - self._lowest + 1 if len(row) else 0
+        self._starts = np.searchsorted(row - self._lowest, np.arange(count + 1))
+
+    @property
+    def nbytes(self) -> int:
+        """Size in memory, without the rays and their rows."""
+        return self._azimuth.nbytes + self._starts.nbytes
+
+    def of(
+        self, centres: NDArray[np.int32], most: int, reach: float
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """The nearest rays of some of the m, as far as a chord of the unit sphere reaches.
+
+        Returns:
+            (w, most) rows of the cloud, the centre first and in place of missing ones; (w,) how
+            many there are.
+        """
+        members = np.empty((len(centres), most), np.int32)
+        counts = np.empty(len(centres), np.int32)
+        cloud = self._rays_m, self._rows, self._azimuth, self._starts
+        grid = self._lowest, self._cell_rad, reach
+        _find_nearest(cloud, grid, centres, members, counts)
+        return members, counts
+
+
+@compiled()
+def _find_nearest(cloud, grid, centres, members, counts):  # type: ignore[no-untyped-def]
+    """See :meth:`NearestRays.of`."""
+    (rays, rows, _, starts), (lowest, cell, reach) = cloud, grid
+    squares, direction = np.empty(members.shape[1]), np.empty(3)
+    for w in range(len(centres)):
+        centre, count = centres[w], 0
+        x, y, z = rays[rows[centre], 0], rays[rows[centre], 1], rays[rows[centre], 2]
+        over, up = 1.0 / math.sqrt(x * x + y * y + z * z), math.atan2(z, math.sqrt(x * x + y * y))
+        direction[0], direction[1], direction[2] = x * over, y * over, z * over
+        squares[:] = reach * reach
+        above = math.floor(up / cell) - lowest
+        below, both, upwards = above - 1, True, True
+        while True:
+            row = above if upwards else below
+            gap = (row + lowest) * cell - up if upwards else up - (row + 1 + lowest) * cell
+            gap -= _ROUNDING_RAD
+            if 0 <= row < len(starts) - 1 and _is_within(gap - gap**3 / 24, squares[-1]):
+                count = _visit_row(cloud, row, centre, direction, squares, members[w], count)
+                above, below = above + upwards, below - (not upwards)
+                upwards = upwards != both
+            elif both:
+                both, upwards = False, not upwards
+            else:
+                break
+        counts[w] = count
+        members[w, count:] = rows[centre]
+
+
+@compiled(part=True)
+def _visit_row(cloud, row, centre, direction, squares, found, count):  # type: ignore[no-untyped-def]
+    """Insert the rays of a row that are nearer than the farthest; how many are found by then."""
+    rays, rows, azimuth, starts = cloud
+    first, size, own = starts[row], starts[row + 1] - starts[row], azimuth[centre]
+    low, high = 0, size
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (middle + 1, high) if azimuth[first + middle] < own else (low, middle)
+    cosine = math.sqrt(direction[0] ** 2 + direction[1] ** 2)
+    left = size
+    for side in range(2):
+        for k in range(left):
+            at = low + k if side == 0 else low - 1 - k
+            at = first + (at - size if at >= size else at + size if at < 0 else at)
+            away = abs(azimuth[at] - own)
+            away = min(min(away, 2 * math.pi - away) - _ROUNDING_RAD, _MONOTONE_RAD)
+            if not _is_within(cosine * (away - away**3 / 6), squares[-1]):
+                break
+            left -= 1 - side
+            x, y, z = rays[rows[at], 0], rays[rows[at], 1], rays[rows[at], 2]
+            over = 1.0 / math.sqrt(x * x + y * y + z * z)
+            x, y, z = x * over - direction[0], y * over - direction[1], z * over - direction[2]
+            square = x * x + y * y + z * z
+            if square < squares[-1]:
+                count = min(count + 1, len(found))
+                place = count - 1
+                while place > 0 and squares[place - 1] > square:
+                    squares[place], found[place] = squares[place - 1], found[place - 1]
+                    place -= 1
+                squares[place], found[place] = square, rows[at]
+    return count
+
+
+@compiled(part=True)
+def _is_within(distance, square):  # type: ignore[no-untyped-def]
+    """Whether a lower bound of a chord is below the root of a square; a negative one is."""
+    return distance < 0 or distance * distance < square
