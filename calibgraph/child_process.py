@@ -24,8 +24,9 @@ Note = Callable[[Any], None]
 """Called in the child with what the parent is to get before the answer."""
 
 _ONE_THREAD = dict.fromkeys(
-    (THREADS_VARIABLE, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
+    (THREADS_VARIABLE, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM",
+     "NUMBA_NUM_THREADS"), "1",
+)  # fmt: skip
 """The requests share the cores, so that each needs one thread only."""
 
 

@@ -35,6 +35,9 @@ _INTERRUPTED = 130
 _COLLECT_AFTER = 100_000, 20, 20
 """Objects and passes between collections. With Python's own numbers, a fifth of the time in which
 kernels are compiled goes into searches of objects that all live."""
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
+"""Calibgraph's threads take all cores; those of BLAS and OpenCV would spin beside them, BLAS's for
+0.3 s while they start."""
 _WEIGHTS_SUFFIXES = (".tar", ".pt", ".pth", ".safetensors")
 _UsageError: type[Exception] = typer.BadParameter.__base__ or Exception
 _PLAIN: Any = {"add_completion": False, "pretty_exceptions_enable": False}
@@ -86,7 +89,7 @@ def main() -> None:
     """Run the command line; errors in the data become one line on stderr and exit code 2."""
     from calibgraph.errors import CalibrationError
 
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # more spin for 0.3 s while they load
+    os.environ.update(_ONE_THREAD | os.environ)
     gc.set_threshold(*_COLLECT_AFTER)
     atexit.register(gc.freeze)  # at its end Python would look for garbage in all objects: 0.3 s
     sys.argv[1:] = _repeat_weights_option(sys.argv[1:])

@@ -44,6 +44,9 @@ def _calibrate(
     dataset: list[Path], matching: MatchingOptions, out: Path, solving: SolveOptions, draw: Draw
 ) -> tuple[Calibration, Dataset, list[Path]]:
     """The result, the data, and the files that were written."""
+    from calibgraph.memory import keep_freed_memory
+
+    keep_freed_memory()
     from calibgraph.pipeline import calibrate
     from calibgraph.report.html import write_result
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 
 from calibgraph import load_calibration, load_rig
 from calibgraph.cli import app
+from calibgraph.parallel import count_cores
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
 
@@ -169,3 +171,25 @@ def test_help_imports_nothing_heavy() -> None:
         "simulate", "weights", "train", "train-windows", "track",
     ):  # fmt: skip
         assert command in done.stdout
+
+
+@pytest.mark.parametrize("given", ["", "3"])
+def test_libraries_get_one_thread_unless_the_user_gave_more(given: str) -> None:
+    code = (
+        "import sys; sys.argv = ['calibgraph', '--version']\n"
+        "from calibgraph.cli.app import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "import cv2, numpy, threadpoolctl\n"
+        "blas = threadpoolctl.threadpool_info()\n"
+        "sys.exit(f'{cv2.getNumThreads()} {blas[0][\"num_threads\"]}')\n"
+    )
+    names = "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"
+    environment = {name: value for name, value in os.environ.items() if name not in names}
+    if given:
+        environment |= dict.fromkeys(names, given)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    threads = int(given or 1)
+    found = [int(number) for number in done.stderr.split()[-2:]]
+    assert found == [threads, min(threads, count_cores())]  # BLAS takes no more than there are
