@@ -31,17 +31,17 @@ from factors.block_arrays import (
     to_runs,
 )
 from factors.block_sums import BlockSums, square_root, unpack_sums
-from factors.compiled import one_at_a_time
 from factors.conditioning import root_of_sums
 from factors.kernel import COST, GRADIENT, HESSIAN, accumulate, evaluate
+from factors.kernel_projection import MATRICES, RAYS
 from factors.lens import Lens
 from factors.loss import loss_id
 
 Array = NDArray[np.float64]
 
+_WORTH_RAYS = 2048  # correspondences (4 us a pass): the kernel compiles for a second
 _WORTH_SHARING = 2_000_000  # correspondences (7 ms): below, waiting for busy cores costs more
 _WIDTHS = {"points_lidar_m": 3, "pixels_px": 2, "sqrt_information": 3, "motion": 7}
-_NO_RESIDUALS, _NO_NORMS = np.empty((0, 2)), np.empty((0, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,15 +199,22 @@ class ProjectionBlock(RobustBlock):
     ) -> Array:
         shared = wanted == HESSIAN and len(runs) * len(self) >= _WORTH_SHARING
         shared = shared and int((runs[:, 1] - runs[:, 0]).sum()) >= _WORTH_SHARING
-        kernel = accumulate(self.lens.kind, shared=shared)
-        run = one_at_a_time(kernel) if shared else kernel
         scales = np.array([self.scale]) if scales is None else scales
-        # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
-        sums: Array = run(
-            self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
-            loss_id(self.loss), scales * self.sigma, contiguous(runs), wanted,
-        )  # fmt: skip
+        sums = np.empty((len(runs), 28))
+        for kind in (RAYS, self.lens.kind) if self._has_rays() else (self.lens.kind,):
+            # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
+            accumulate(kind, shared=shared)(
+                self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
+                loss_id(self.loss), scales * self.sigma, contiguous(runs), wanted, sums,
+            )  # fmt: skip
+            if kind != RAYS or not np.isnan(sums[:, 27]).any():
+                break
         return sums if self.sigma == 1.0 else sums / self.sigma**2
+
+    def _has_rays(self) -> bool:
+        """Whether the kernel RAYS serves, unless a point is too near."""
+        numbers = len(self) >= _WORTH_RAYS and len(self._whitening) < MATRICES
+        return numbers and self.lens.is_undistorted_pinhole
 
     def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable."""
@@ -223,7 +230,7 @@ class ProjectionBlock(RobustBlock):
             runs: (r, 2) as in :meth:`run_sums`.
         """
         residuals = np.empty((len(self), 2))
-        return residuals, self._evaluate(T_camera_lidar, runs, residuals=residuals)
+        return residuals, self._evaluate(T_camera_lidar, runs, residuals, None)
 
     def run_norms(
         self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None, *, factor: float = 1.0
@@ -239,33 +246,26 @@ class ProjectionBlock(RobustBlock):
         """
         norms = np.empty((1 if len(self._whitening) == 0 else 2, len(self)))
         runs = self._chunks if runs is None else runs
-        self._evaluate(T_camera_lidar, runs, norms=norms, factor=factor)
+        self._evaluate(T_camera_lidar, runs, norms, factor)
         return norms
 
     def _evaluate(
-        self,
-        T_camera_lidar: Array,
-        runs: NDArray[np.int64],
-        *,
-        residuals: Array = _NO_RESIDUALS,
-        norms: Array = _NO_NORMS,
-        factor: float = 1.0,
+        self, T_camera_lidar: Array, runs: NDArray[np.int64], out: Array, factor: float | None
     ) -> NDArray[np.bool_]:
-        """Fill in residuals or norms; (n,) whether each point is projectable."""
-        shared = len(self) >= _WORTH_SHARING
-        kernel = evaluate(self.lens.kind, shared=shared)
-        run = one_at_a_time(kernel) if shared else kernel
-        projectable: NDArray[np.bool_] = run(
-            self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening, factor,
-            contiguous(runs), residuals, norms,
+        """Fill in residuals, or norms times a factor; (n,) whether each point is projectable."""
+        valid = np.empty(len(self), np.bool_)
+        evaluate(self.lens.kind, norms=factor is not None, shared=len(self) >= _WORTH_SHARING)(
+            self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
+            factor or 1.0, contiguous(runs), out, valid,
         )  # fmt: skip
-        return projectable
+        return valid
 
     def error_and_jacobian(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, Array]:
         """The (7,) error and (7, 6) Jacobian of the block factor."""
-        sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
-        error, jacobian, regular = root_of_sums(sums)
-        return (error, jacobian.T) if regular else square_root(unpack_sums(sums.sum(axis=0)))
+        runs = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
+        sums, error, jacobian = runs.sum(axis=0), np.empty(7), np.zeros((6, 7))
+        regular = root_of_sums(sums, error, jacobian)
+        return (error, jacobian.T) if regular else square_root(unpack_sums(sums))
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:

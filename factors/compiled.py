@@ -5,8 +5,8 @@ else beside the source. Where nothing can be written, kernels are compiled in me
 on standard error (by ``logging``) reports it once.
 
 numba compares the source file of a kernel alone, and not what the file imports. So the cache is one
-of all files with kernels in the folder of a kernel and in this one, of the options below, and of
-the versions of Python, numpy and numba: a change of any of them begins another, a change elsewhere
+of this file and of the files with kernels that it imports, of the options below, and of the
+versions of Python, numpy and numba: a change of any of them begins another, a change elsewhere
 keeps it, and environments with other versions do not overwrite each other's code while it is in
 use. A kernel uses kernels and constants of these files alone. It may enclose numbers, but no other
 kernel: numba would not find its code again.
@@ -15,12 +15,14 @@ kernel: numba would not find its code again.
 import hashlib
 import logging
 import os
+import re
 import shutil
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -96,19 +98,28 @@ def _name(function: Callable[..., Any], options: Mapping[str, Any]) -> str:
     return "_".join(filter(None, (function.__qualname__, digest)))
 
 
+def has_kernels(source: str) -> bool:
+    """Whether a file defines kernels, by its text."""
+    return re.search(r"^\s*@compiled\b", source, re.MULTILINE) is not None
+
+
 @cache
-def with_kernels(folder: Path) -> tuple[Path, ...]:
-    """The files of a folder that define kernels."""
-    files = sorted(folder.glob("*.py"))
-    return tuple(file for file in files if b"@compiled" in file.read_bytes())
+def _files(module: str) -> tuple[Path, ...]:
+    """The file of a module, and the files with kernels that it imports, and that these do."""
+    name = getattr(sys.modules.get(module), "__file__", None)
+    source = Path(name).read_text("utf-8") if name else ""
+    if not has_kernels(source):
+        return ()
+    others = re.findall(r"^from (\S+) import", source, re.MULTILINE)
+    return tuple(sorted({Path(str(name)), *chain.from_iterable(map(_files, others))}))
 
 
 @cache
 def _folder(module: str) -> Path | None:
     """Where the code of the kernels of a module is kept; None if nothing can be written."""
     versions = f"{numba.__version__} {np.__version__} {sys.version} {sorted(_COMMON.items())}"
-    digest, own = hashlib.sha256(versions.encode()), Path(str(sys.modules[module].__file__))
-    for file in sorted({own, *with_kernels(own.parent), *with_kernels(Path(__file__).parent)}):
+    digest = hashlib.sha256(versions.encode())
+    for file in _files(module):
         digest.update(file.read_bytes())
     name, chosen = f"{module}-{digest.hexdigest()[:16]}", _config.CACHE_DIR
     user, beside = platformdirs.user_cache_path("calibgraph"), Path(__file__).parent / "__pycache__"

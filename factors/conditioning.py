@@ -88,45 +88,40 @@ def sigmas_of_hessian(hessian: Array) -> Array:
 
 
 @compiled()
-def root_of_sums(sums):  # type: ignore[no-untyped-def]
-    """The (7,) error and transposed (6, 7) Jacobian of ``block_sums.square_root``, by Cholesky.
+def root_of_sums(sums, error, jacobian):  # type: ignore[no-untyped-def]
+    """Fill the (7,) error and transposed Jacobian of ``block_sums.square_root``, by Cholesky.
 
     Args:
-        sums: (r, 28) of runs, which are added: 21 of the upper triangle of H, 6 of b, 1 of c.
+        sums: (28,) 21 of the upper triangle of H, 6 of b, 1 of c.
+        error: (7,).
+        jacobian: (6, 7), of zeros.
 
     Returns:
-        Both, and whether H is regular; if it is not, they mean nothing.
+        Whether H is regular; if it is not, both mean nothing.
     """
-    total, units, hessian = np.empty(28), np.empty(6), np.empty((6, 6))
-    jacobian, error = np.empty((6, 7)), np.empty(7)
-    for k in range(28):  # np.zeros, np.sum and slices compile slowly
-        total[k] = 0.0
-        for r in range(len(sums)):
-            total[k] += sums[r, k]
-    jacobian[:] = 0.0
-    place, rest_of_cost = 0, total[27]
+    rest_of_cost = sums[27]
     for i in range(6):
-        for j in range(i, 6):
-            hessian[j, i] = total[place]
-            place += 1
-    for i in range(6):
-        units[i] = math.sqrt(hessian[i, i]) if hessian[i, i] > 0.0 else 1.0
-        error[i] = total[21 + i] / units[i]
+        square = sums[i * (13 - i) // 2]
+        unit = math.sqrt(square) if square > 0.0 else 1.0
+        along, jacobian[i, 6] = sums[21 + i] / unit, unit  # for a while
         for j in range(i + 1):
-            rest = hessian[i, j] / (units[i] * units[j])
+            rest = sums[j * (11 - j) // 2 + i] / (unit * jacobian[j, 6])
             for m in range(j):
                 rest -= jacobian[i, m] * jacobian[j, m]
             if j < i:
-                jacobian[i, j] = rest / jacobian[j, j]
-                error[i] -= jacobian[i, j] * error[j]
+                rest /= jacobian[j, j]
+                along -= rest * error[j]
             elif rest > REGULAR:
-                jacobian[i, i] = math.sqrt(rest)
-                error[i] /= jacobian[i, i]
+                rest = math.sqrt(rest)
+                along /= rest
             else:
-                return error, jacobian, False
-        rest_of_cost -= error[i] * error[i]
+                return False
+            jacobian[i, j] = rest
+        error[i] = along
+        rest_of_cost -= along * along
     for i in range(6):
         for j in range(i + 1):
-            jacobian[i, j] *= units[i]
-    error[6] = math.sqrt(max(rest_of_cost, 0.0))
-    return error, jacobian, True
+            jacobian[i, j] *= jacobian[i, 6]
+        jacobian[i, 6] = 0.0
+    error[6] = math.sqrt(rest_of_cost) if rest_of_cost > 0.0 else 0.0
+    return True

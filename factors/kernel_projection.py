@@ -3,9 +3,9 @@
 A tile is a (ROWS, TILE) array: a few hundred correspondences whose intermediate values stay in the
 cache. Each row holds one quantity, so that the loops over it vectorize.
 
-Two things would keep the compiler from vectorizing the loops: an index that may be negative, hence
-the rows that are taken out before a loop, and Python's exception on a division by zero, hence
-``error_model="numpy"``.
+Three things would keep the compiler from vectorizing the loops: an index that may be negative, and
+an entry that a row may overlap, hence what is taken out before a loop, and Python's exception on a
+division by zero, hence ``error_model="numpy"``.
 """
 
 from factors.compiled import compiled
@@ -27,6 +27,9 @@ ROWS = 13
 
 MATRICES = 3
 """Rows of the whitening if it is matrices; 1 if it is numbers, 0 if there is none."""
+
+RAYS = -1
+"""In place of a kind of lens: an undistorted pinhole, and no matrices."""
 
 
 @compiled(part=True, fastmath=FAST)
@@ -88,12 +91,15 @@ def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untype
         lens[0], lens[1], lens[2], lens[3], lens[4], lens[5], lens[6], lens[7], lens[8], lens[9],
         lens[10], lens[11], lens[12],
     )  # fmt: skip
+    t00, t01, t02, t03 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    t10, t11, t12, t13 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    t20, t21, t22, t23 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
     outside = 0.0
     for i in range(n):
         px, py, pz = xs[i], ys[i], zs[i]
-        x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        x = t00 * px + t01 * py + t02 * pz + t03
+        y = t10 * px + t11 * py + t12 * pz + t13
+        z = t20 * px + t21 * py + t22 * pz + t23
         w = 1.0 / z
         a, b = x * w, y * w
         r2 = a * a + b * b

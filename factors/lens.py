@@ -24,6 +24,7 @@ from factors.compiled import compiled
 from factors.lens_kernels import (
     EQUIRECTANGULAR,
     FISHEYE,
+    LIMIT,
     OMNIDIRECTIONAL,
     PINHOLE,
     is_projectable,
@@ -48,7 +49,7 @@ ORDERS: dict[LensModel, str] = {
     "equirectangular": "[]",
 }
 """The distortion coefficients of each model in their order, which is OpenCV's."""
-_NO_JACOBIANS, _NO_VALIDITY = np.empty((0, 6)), np.empty(0, np.bool_)
+_NO_PIXELS, _NO_JACOBIANS, _NO_VALIDITY = np.empty((0, 2)), np.empty((0, 6)), np.empty(0, np.bool_)
 _MAX_RADTAN_ANGLE_RAD = math.radians(85.0)
 
 
@@ -119,6 +120,11 @@ class Lens:
         return Lens(EQUIRECTANGULAR, np.array([fx, fy, cx, cy, *coefficients, math.pi]))
 
     @property
+    def is_undistorted_pinhole(self) -> bool:
+        """Whether its pixels are linear in x/z and y/z; it has no limit then."""
+        return self.kind == PINHOLE and math.isinf(self.packed[LIMIT])
+
+    @property
     def pixels_per_rad(self) -> float:
         """Resolution along u on the camera's axis [px/rad]."""
         fx = float(self.packed[0])
@@ -149,9 +155,10 @@ class Lens:
 
     def are_projectable(self, points_lidar_m: Array, T_camera_lidar: Array) -> NDArray[np.bool_]:
         """(n,) whether (n, 3) points in the LiDAR frame have a real projection, as `project`."""
-        points = contiguous(np.asarray(points_lidar_m, dtype=np.float64))
-        T = contiguous(T_camera_lidar)
-        return np.asarray(_are_projectable(self.kind)(self.packed, T, points))
+        points = contiguous(points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3])
+        valid = np.empty(len(points), np.bool_)
+        _project_many(self.kind)(self.packed, points, _NO_PIXELS, valid, _NO_JACOBIANS)
+        return valid
 
     def project_with_jacobian(self, points_camera_m: ArrayLike) -> tuple[Array, Array]:
         """Project points: (n, 2) pixels, and their (n, 2, 3) derivatives by the points."""
@@ -228,33 +235,18 @@ def _fisheye_limit(coefficients: Array) -> float:
 
 
 @cache
-def _are_projectable(kind: int) -> Any:
-    @compiled()
-    def run(lens, T, points):  # type: ignore[no-untyped-def]
-        valid = np.empty(len(points), dtype=np.bool_)
-        for i in range(len(points)):
-            px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
-            valid[i] = is_projectable(kind, lens, x, y, z)
-        return valid
-
-    return run
-
-
-@cache
 def _project_many(kind: int) -> Any:
     @compiled()
     def run(lens, points, pixels, valid, jacobians):  # type: ignore[no-untyped-def]
-        """Fill in (n, 2) pixels, and (n,) validity and (n, 6) derivatives where there is room."""
+        """Fill in (n, 2) pixels, (n,) validity and (n, 6) derivatives, where there is room."""
         for k in range(len(points)):
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
-            projection = project_one(kind, lens, x, y, z)
-            pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
-            for place in range(6 if len(jacobians) else 0):
-                jacobians[k, place] = projection[2 + place]
             if len(valid):
                 valid[k] = is_projectable(kind, lens, x, y, z)
+            if len(pixels):
+                projection = project_one(kind, lens, x, y, z)
+                pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
+                for place in range(6 if len(jacobians) else 0):
+                    jacobians[k, place] = projection[2 + place]
 
     return run

@@ -30,7 +30,7 @@ class Tracking(StrictNumbers):
 
     Attributes:
         start_frames: frames with matches before a camera's first estimate.
-        epoch_frames: frames that share one extrinsic.
+        epoch_frames: frames that share one extrinsic; up to twice as many where they come at once.
         live_epochs: closed epochs that are kept with all their matches, for a new gate and a new
             linearization; older ones are merged into a summary of constant size.
         walk_rotation_deg: standard deviation, per axis, of the random walk that a drifting camera

@@ -112,7 +112,7 @@ def _solve_damped(sums, k, damping, work, steps, i):  # type: ignore[no-untyped-
             place += 1
     for row in range(6):
         size = work[row, row]
-        work[6, row] = 1.0 / math.sqrt(max(size, _LEAST)) if size > 0.0 else 0.0
+        work[6, row] = 1.0 / math.sqrt(size if size > _LEAST else _LEAST) if size > 0.0 else 0.0
     for row in range(6):
         steps[i, row] = work[6, row] * sums[k, 21 + row]
         for column in range(row + 1):
@@ -121,7 +121,7 @@ def _solve_damped(sums, k, damping, work, steps, i):  # type: ignore[no-untyped-
             for m in range(column):
                 rest -= work[row, m] * work[column, m]
             if row == column:
-                work[row, row] = math.sqrt(max(rest, _LEAST))
+                work[row, row] = math.sqrt(rest if rest > _LEAST else _LEAST)
             else:
                 work[row, column] = rest / work[column, column]
                 steps[i, row] -= work[row, column] * steps[i, column]
@@ -162,19 +162,22 @@ def descend(sums, T, dampings, active, steps, tried, new, limits):  # type: igno
             gain, size = sums[k, 27] - new[i, 27], 0.0
             is_done = gain >= 0.0 and gain <= limits[0] * sums[k, 27]
             for m in range(6):
-                size = max(size, abs(steps[i, m]))
+                size = abs(steps[i, m]) if abs(steps[i, m]) > size else size
             if gain >= 0.0:
                 for m in range(28):
                     sums[k, m] = new[i, m]
                 for m in range(4):
                     for n in range(4):
                         T[k, m, n] = tried[i, m, n]
-            dampings[k] = max(dampings[k] * (0.1 if gain >= 0.0 else 10.0), _MIN_DAMPING)
+            damping = dampings[k] * (0.1 if gain >= 0.0 else 10.0)
+            dampings[k] = damping if damping > _MIN_DAMPING else _MIN_DAMPING
             if is_done or size < _SMALL_STEP or not dampings[k] < MAX_DAMPING:
                 continue
         active[left] = k
         _solve_damped(sums, k, dampings[k], work, steps, left)
-        turn = max(abs(steps[left, 0]), abs(steps[left, 1]), abs(steps[left, 2]))
+        turn = 0.0
+        for m in range(3):
+            turn = abs(steps[left, m]) if abs(steps[left, m]) > turn else turn
         if turn > limits[1]:
             for m in range(6):
                 steps[left, m] *= limits[1] / turn

@@ -88,8 +88,8 @@ def move_damped(
     """
     count = len(sums)
     steps, moved = np.empty((count, 6)), np.empty((count, 4, 4))
-    dampings, numbers = np.full(count, damping), np.arange(count)
-    descend(sums, T_camera_lidar, dampings, numbers, steps, moved, sums[:0], (0.0, most_rad))
+    T, dampings = np.array(T_camera_lidar), np.full(count, damping)  # which can be written
+    descend(sums, T, dampings, np.arange(count), steps, moved, sums[:0], (0.0, most_rad))
     return moved, steps
 
 

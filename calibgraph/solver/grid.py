@@ -39,10 +39,8 @@ def best_in_cell(
     sizes = np.array([[c.width_px, c.height_px] for c in rig.cameras.values()], dtype=np.float64)
     shape = np.array([config.grid_columns, config.grid_rows], dtype=np.float64)
     among = np.ones(len(table), dtype=np.bool_) if among is None else among
-    cell, cells = (
-        _cells(camera, table.pixels_px, sizes, shape),
-        config.grid_columns * config.grid_rows,
-    )
+    cell, cells = np.empty(len(table), np.int64), config.grid_columns * config.grid_rows
+    _number_cells(camera, table.pixels_px, sizes, shape, cell)
     if cells > _MOST_CELLS:
         taken, cell = np.unique(cell, return_inverse=True)
         cells = len(taken)
@@ -69,33 +67,47 @@ def frame_edges(camera: NDArray[np.integer[Any]], frame: NDArray[np.int64]) -> N
     return np.concatenate([[0], np.flatnonzero(new) + 1, [len(frame)]])
 
 
+def _best_of_runs(
+    edges: NDArray[np.int64],
+    cells: int,
+    cell: NDArray[np.int64],
+    confidence: NDArray[np.floating[Any]],
+    among: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """(n,) which rows have the largest confidence, the first of them, of their run and cell."""
+    keep = np.zeros(len(cell), dtype=np.bool_)
+    _keep_best(edges, np.full(cells, -1), cell, confidence, among, keep)
+    return keep
+
+
 @compiled()
-def _cells(camera, pixels, sizes, shape):  # type: ignore[no-untyped-def]
-    """(n,) number of the cell that each pixel lies in; pixels outside belong to the edge cells."""
-    cells, columns = np.empty(len(camera), dtype=np.int64), np.int64(shape[0])
+def _number_cells(camera, pixels, sizes, shape, cells):  # type: ignore[no-untyped-def]
+    """Fill (n,) the cell that each pixel lies in; pixels outside belong to the edge cells."""
     for i in range(len(camera)):
-        width, height = sizes[camera[i], 0], sizes[camera[i], 1]
-        column = min(max((pixels[i, 0] + 0.5) / width * shape[0], 0.0), shape[0] - 1.0)
-        row = min(max((pixels[i, 1] + 0.5) / height * shape[1], 0.0), shape[1] - 1.0)
-        cells[i] = np.int64(row) * columns + np.int64(column)
-    return cells
+        which, number = camera[i], np.int64(0)
+        for axis in (1, 0):
+            place = (pixels[i, axis] + 0.5) / sizes[which, axis] * shape[axis]
+            last = shape[axis] - 1.0
+            place = place if place > 0.0 else 0.0
+            number = number * np.int64(shape[axis]) + np.int64(place if place < last else last)
+        cells[i] = number
 
 
 @compiled()
-def _best_of_runs(edges, cells, cell, confidence, among):  # type: ignore[no-untyped-def]
-    """(n,) which rows have the largest confidence, the first of them, of their run and cell.
+def _keep_best(edges, best, cell, confidence, among, keep):  # type: ignore[no-untyped-def]
+    """Set which rows are kept; ``best``: a place per cell, of the best row so far, -1 at first.
 
-    A place per cell holds the best row so far; one of an earlier run counts as none.
+    One of an earlier run counts as none.
     """
-    keep, best = np.zeros(len(cell), dtype=np.bool_), np.full(cells, -1)
     for run in range(len(edges) - 1):
         first = edges[run]
         for row in range(first, edges[run + 1]):
             if not among[row]:
                 continue
             other = best[cell[row]]
-            if other < first:
-                best[cell[row]], keep[row] = row, True
-            elif confidence[row] > confidence[other]:
-                best[cell[row]], keep[row], keep[other] = row, True, False
-    return keep
+            taken = other >= first
+            if taken and not confidence[row] > confidence[other]:
+                continue
+            if taken:
+                keep[other] = False
+            best[cell[row]], keep[row] = row, True

@@ -84,7 +84,7 @@ def robust_spreads(values: Array, runs: NDArray[np.int64]) -> Array:
 
     Infinite where a run has no finite value.
     """
-    found: Array = _spreads(*_sort_runs(values, runs), (_START_QUANTILE, _START_FACTOR), _ROUNDS)
+    found = _spreads(values, runs, (_START_QUANTILE, _START_FACTOR), _ROUNDS)
     return np.where(np.isnan(found), math.inf, found)
 
 
@@ -96,7 +96,7 @@ def quantiles(values: Array, runs: NDArray[np.int64], share: float) -> Array:
         runs: (r, 2).
         share: of the values below.
     """
-    return np.asarray(_spreads(*_sort_runs(values, runs), (share, 1.0), 0))
+    return _spreads(values, runs, (share, 1.0), 0)
 
 
 def quantile(values: Array, share: float) -> float:
@@ -120,20 +120,22 @@ def iterate_spread(quantile_below: Callable[[float, float], float]) -> float:
     return spread
 
 
-def _sort_runs(values: Array, runs: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """The sorted values of each run one behind the other, and (r + 1,) where they begin and end."""
-    parts = [values[first:end] for first, end in runs.tolist()]
+def _spreads(
+    values: Array, runs: NDArray[np.int64], start: tuple[float, float], rounds: int
+) -> Array:
+    """(r,) see :func:`_fill_spreads`."""
+    parts, found = [values[first:end] for first, end in runs.tolist()], np.empty(len(runs))
     edges = list(accumulate(map(len, parts), initial=0))
     ordered = np.concatenate([*parts, values[:0]])
     for first, end in pairwise(edges):
         ordered[first:end].sort()
-    return contiguous(ordered), contiguous(np.array(edges))
+    _fill_spreads(contiguous(ordered), contiguous(np.array(edges)), start, rounds, found)
+    return found
 
 
 @compiled()
-def _spreads(ordered, edges, start, rounds):  # type: ignore[no-untyped-def]
+def _fill_spreads(ordered, edges, start, rounds, found):  # type: ignore[no-untyped-def]
     """Per run the start's quantile times its factor, then :func:`iterate_spread`."""
-    found = np.empty(len(edges) - 1)
     for i in range(len(found)):
         values = ordered[edges[i] : edges[i + 1]]
         spread = start[1] * _quantile_below(values, math.inf, start[0])
@@ -145,7 +147,6 @@ def _spreads(ordered, edges, start, rounds):  # type: ignore[no-untyped-def]
             if abs(spread - before) <= 1e-6 * before:
                 break
         found[i] = spread
-    return found
 
 
 @compiled(part=True)
@@ -159,5 +160,5 @@ def _quantile_below(ordered, limit, share):  # type: ignore[no-untyped-def]
     if count == 0:
         return math.nan
     place = share * (count - 1)
-    k = int(place)
-    return ordered[k] + (place - k) * (ordered[min(k + 1, count - 1)] - ordered[k])
+    k = np.int64(place)
+    return ordered[k] + (place - k) * (ordered[k + 1 if k + 1 < count else k] - ordered[k])

@@ -117,13 +117,15 @@ def usual_frames(state: State, frames: Sequence[StreamFrame]) -> tuple[list[Inco
     return group[:end], {camera: block for camera, block in blocks.items() if len(block)}
 
 
-def _alike(state: State, frames: Iterable[StreamFrame]) -> list[Incoming]:
+def _alike(state: State, frames: Sequence[StreamFrame]) -> list[Incoming]:
     """The first frames, up to the end of the epoch, that state the same of their errors.
 
-    None repeats a frame of before: a camera may have its first matches in any of them.
+    No more than an epoch's frames are not divided: the epoch is longer then, and the next ones that
+    come so fill one each. None repeats a frame of before: a camera may have its first matches in
+    any of them.
     """
-    group = list[Incoming]()
-    room = state.config.tracking.epoch_frames - len(state.epochs[-1].frames)
+    group, room = list[Incoming](), state.config.tracking.epoch_frames
+    room -= len(state.epochs[-1].frames) if len(frames) > room else 0
     last = state.frame, state.stamp_ns
     for frame, _ in zip(frames, range(room), strict=False):
         try:

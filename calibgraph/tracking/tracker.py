@@ -107,7 +107,8 @@ class IncrementalCalibrator:
         """The graph whose optimum and marginal are reported, as :meth:`Solution.graph`.
 
         Its variables are those of ``calibgraph.graph.variables``; places that no frame of the open
-        epoch is of are one factor. With a preset of the paper it is Eq. 5, without its marginal.
+        epoch is of are one factor, once it has a frame. With a preset of the paper it is Eq. 5,
+        without its marginal.
         """
         if self.config.preset != "auto":
             return self._closed.equation_5(self._state)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import angle_deg, pose_difference, relative_transform
+from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.verdict import Check
 from calibgraph.trust.conventions import convention_error_between
 from calibgraph.trust.evidence import Checks, Evidence
@@ -79,26 +80,32 @@ def compare_with_other_guesses(
     Returns:
         One check; none for a single camera.
     """
+    others = [name for name in guesses if name != camera]
+    if not others:
+        return []
+    pairs_of = product(guesses, results)
+    squared = dict(zip(pairs_of, _squared_distances(guesses, results).flat, strict=True))
 
     def ratio(other: str) -> float:
         swapped = {camera: other, other: camera}
         pairs = [(swapped[name], name) for name in swapped if name in results]
-        own = sum(_squared_distance(guesses[name], results[name]) for _, name in pairs)
-        crossed = sum(_squared_distance(guesses[one], results[two]) for one, two in pairs)
-        return float((crossed / own) ** (len(pairs) / 4))
+        own = sum(squared[name, name] for _, name in pairs)
+        return float((sum(squared[pair] for pair in pairs) / own) ** (len(pairs) / 4))
 
-    others = [name for name in guesses if name != camera]
-    if not others:
-        return []
     other = min(others, key=ratio)
     name = f"distance of this camera and {other} to each other's guess over that to their own"
     return [threshold("swapped_cameras").check(ratio(other), name=name)]
 
 
-def _squared_distance(one: Array, two: Array) -> float:
-    """Between two T_camera_lidar: centres [m] and angle [rad], with the usual error of a result."""
-    degrees, centimetres = pose_difference(one, two)
-    return float(np.radians(degrees) ** 2 + (centimetres / 100) ** 2 + limit("swap_slack") ** 2)
+def _squared_distances(guesses: Mapping[str, Array], results: Mapping[str, Array]) -> Array:
+    """(g, r) between T_camera_lidar: centres [m] and angle [rad], and a result's usual error."""
+    one, two = (np.array([*each.values()])[:, None] for each in (guesses, results))
+    R = one[..., :3, :3] @ two[:, 0, :3, :3].swapaxes(1, 2)
+    axes = R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]]
+    angles = np.arctan2(np.linalg.norm(axes, axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1.0)
+    centers = [T[..., :3, :3].swapaxes(-1, -2) @ T[..., :3, 3:] for T in (one, two)]
+    apart = centers[0] - centers[1][:, 0]
+    return np.asarray(angles**2 + (apart**2).sum(axis=(-1, -2)) + limit("swap_slack") ** 2)
 
 
 def point_distance_checks(evidence: Evidence) -> Checks:

@@ -76,11 +76,14 @@ def test_error_and_linearization_equal_the_separate_factors(name: str, loss: str
         ("radtan", "numbers", "huber"),
     ],
 )
-def test_numbers_as_weights_equal_the_separate_factors(name: str, weights: str, loss: str) -> None:
-    """The kernel has a way of its own for a pinhole whose weights are no matrices.
+def test_numbers_as_weights_equal_the_separate_factors(
+    name: str, weights: str, loss: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is a kernel of its own for a pinhole whose weights are no matrices.
 
     600 correspondences are more than two of its tiles; at the last pose some lie behind.
     """
+    monkeypatch.setattr("factors.block._WORTH_RAYS", 0)
     numbers = np.random.default_rng(3).uniform(0.2, 2, 600)
     numbers = np.ones(600) if weights == "none" else numbers
     roots = np.column_stack([numbers, np.zeros(600), numbers])
@@ -347,6 +350,6 @@ def test_kernels_are_compiled_once_whether_or_not_their_arrays_can_be_written() 
         block.lens.are_projectable(block.points_lidar_m, pose)
     for one in (
         kernel.accumulate(block.lens.kind, shared=False),
-        kernel.evaluate(block.lens.kind, shared=False),
+        *(kernel.evaluate(block.lens.kind, norms=norms, shared=False) for norms in (False, True)),
     ):
         assert len(one.signatures) == 1, one.signatures

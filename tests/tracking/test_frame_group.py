@@ -91,6 +91,17 @@ def test_along_places_estimates_are_those_of_a_batch() -> None:
         assert sigmas_apart(found[-1], batch, camera) < 0.2 * np.sqrt(6)
 
 
+def test_frames_of_an_epochs_number_are_not_divided() -> None:
+    """The epoch is longer, and the frames that come next so fill one each."""
+    rig, tracker = pair_of(), IncrementalCalibrator(guess_of(pair_of()))
+    frames = frames_of(drive(rig, 57))
+    together(tracker, frames[:7])
+    groups = [together(tracker, frames[first : first + EPOCH])[1] for first in range(7, 57, EPOCH)]
+    assert groups == [[EPOCH]] * 5
+    lengths = [len(epoch.frames) for epoch in tracker._state.epochs]
+    assert lengths == [7 + EPOCH, *[EPOCH] * 4, 0]
+
+
 def test_all_updates_of_a_group_have_the_estimate_after_it() -> None:
     rig = pair_of()
     tracker = IncrementalCalibrator(guess_of(rig))

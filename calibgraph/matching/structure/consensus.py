@@ -110,7 +110,8 @@ def sum_scores(scores: ShiftScores, unknowns: Array) -> Array:
     columns = np.ascontiguousarray(unknowns.T, dtype=np.float32)
     count, size, _ = scores.grids.shape
     grids = scores.grids.reshape(count, size * size), size
-    _sum_interpolated(grids, scores.jacobian.astype(np.float32), columns, out)
+    room = *np.empty((2, len(out)), np.float32), np.empty(len(out), np.uint32)
+    _sum_interpolated(grids, scores.jacobian.astype(np.float32), columns, room, out)
     return out
 
 
@@ -136,16 +137,15 @@ def _maximize_once(
 
 
 @compiled(fastmath=True)
-def _sum_interpolated(grids, jacobian, unknowns, out):  # type: ignore[no-untyped-def]
+def _sum_interpolated(grids, jacobian, unknowns, room, out):  # type: ignore[no-untyped-def]
     """Add bilinearly interpolated scores; shifts outside the grid count 0. unknowns: (k, n).
 
     A grid, a row of (g, size * size), is in the first-level cache for all of the unknowns.
     """
-    (flat, size), (k, n) = grids, unknowns.shape
+    (flat, size), (k, n), (us, vs, corner) = grids, unknowns.shape, room
     reach = (size - 1) // 2
     limit = np.float32(2 * reach)
     right, below = np.uint64(1), np.uint64(size)  # unsigned: numba tests others for negative ones
-    us, vs, corner = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.uint32)
     for g in range(len(flat)):
         by, grid = jacobian[g], flat[g]
         for i in range(n):

@@ -65,11 +65,12 @@ def _find_nearest(cloud, grid, centres, members, counts):  # type: ignore[no-unt
     (rays, rows, _, starts), (lowest, cell, reach) = cloud, grid
     squares, direction = np.empty(members.shape[1]), np.empty(3)
     for w in range(len(centres)):
-        centre, count = centres[w], 0
+        centre, count = centres[w], np.int64(0)  # not 0, of which it would be compiled again
         x, y, z = rays[rows[centre], 0], rays[rows[centre], 1], rays[rows[centre], 2]
         over, up = 1.0 / math.sqrt(x * x + y * y + z * z), math.atan2(z, math.sqrt(x * x + y * y))
         direction[0], direction[1], direction[2] = x * over, y * over, z * over
-        squares[:] = reach * reach
+        for k in range(len(squares)):  # a slice compiles slowly
+            squares[k] = reach * reach
         above = math.floor(up / cell) - lowest
         below, both, upwards = above - 1, True, True
         while True:

@@ -115,18 +115,22 @@ def _score_windows(pixels, shape, windows, origin, likelihood, room, grids, by_c
         right, bottom, share = left, top, np.float32(0)
         for p in range(n):
             u, v = places[w, p, 0], places[w, p, 1]
-            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+            left, right = u if u < left else left, u if u > right else right
+            top, bottom = v if v < top else top, v if v > bottom else bottom
             share += by_chance[0] * basis[w, p, 0] ** 2 + by_chance[1] * basis[w, p, 1] ** 2
-        first, above = max(origin[0], -left), max(origin[1], -top)
-        size = min(origin[0] + columns, width - right) - first
-        end = min(origin[1] + rows, height - bottom)
+        first = -left if -left > origin[0] else origin[0]
+        above = -top if -top > origin[1] else origin[1]
+        size, end = origin[0] + columns, origin[1] + rows
+        size = (width - right if width - right < size else size) - first
+        end = height - bottom if height - bottom < end else end
         numbers = np.float32(1 / n), np.float32(n * GRAY_NOISE**2), share
         for p in range(n - 1, n + POINTS):
             starts[p] = height * stride  # zeros, which add nothing
         for column in range(0, size, LANES):
-            inside = ones[LANES - min(size - column, LANES) :]
+            inside = ones[LANES - (size - column if size - column < LANES else LANES) :]
             for row in range(above, end, LINES):
-                corner, lines = row * stride + first + column, min(LINES, end - row)
+                corner = row * stride + first + column
+                lines = end - row if end - row < LINES else LINES
                 for p in range(n - 1):
                     starts[p] = places[w, p, 1] * stride + places[w, p, 0] + corner
                 last = pixels[places[w, n - 1, 1] * stride + places[w, n - 1, 0] + corner :]
@@ -197,7 +201,9 @@ def _multiply_factors(pixels, basis, strip, sums, numbers, inside, out):  # type
             sums[_index(m)] = sums[_index(m + LANES)] = 0
             sums[_index(m + 2 * LANES)] = sums[_index(m + 3 * LANES)] = 0
             variation = square - total * total * over + noise
-            explained = depth * depth + intensity * max(intensity, OPPOSITE * intensity)
+            explained = depth * depth + intensity * (
+                intensity if intensity > 0 else OPPOSITE * intensity
+            )
             share = (explained + chance * noise) / variation - chance
             out[_index(line * padded + k)] *= np.float32(1) - inside[_index(k)] * share * _TO_FACTOR
 
@@ -217,7 +223,9 @@ def _add_scores(pixels, basis, strip, sums, numbers, inside, out):  # type: igno
             sums[_index(m + 2 * LANES)] = sums[_index(m + 3 * LANES)] = 0
             sums[_index(m + 4 * LANES)] = sums[_index(m + 5 * LANES)] = 0
             variation = square - total * total * over + noise - u * u - v * v
-            explained = depth * depth + intensity * max(intensity, OPPOSITE * intensity)
+            explained = depth * depth + intensity * (
+                intensity if intensity > 0 else OPPOSITE * intensity
+            )
             share = (explained + chance * noise) / variation - chance
             out[_index(line * padded + k)] += inside[_index(k)] * share
 

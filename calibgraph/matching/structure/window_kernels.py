@@ -5,13 +5,12 @@ The features, how range and intensity vary over a window, are what its weight de
 
 import math
 
-import numpy as np
-
 from factors.compiled import compiled
 
 INTENSITY_NOISE = 0.05  # of intensity ranks: below, a window counts as flat
 DEPTH_NOISE = 0.03  # of relative inverse range: below, a window counts as flat
 SILHOUETTE_SHARE, SILHOUETTE_RATIO = 0.5, 1.25
+ROOM = 8  # columns that the kernels work in
 SCAN_LINE = 1e-3  # ratio of variances below which a window's rays lie on one line
 FEATURES = (
     "depth varies", "intensity varies", "share of rays", "log range", "log spread of log range",
@@ -22,17 +21,19 @@ FEATURES = (
 
 
 @compiled()
-def describe_windows(cloud, members, counts, keep_linear, moved_m, front, basis, reliability):  # type: ignore[no-untyped-def]
+def describe_windows(  # type: ignore[no-untyped-def]
+    cloud, members, counts, keep_linear, room, moved_m, front, basis, reliability
+):
     """Fill the rays, the silhouettes and the bases of windows, see :class:`windows.Windows`.
 
-    cloud: rays (n, 3) [m] and intensity ranks (n,); members: (w, l); counts: (w,). Filled are
-    moved_m (w, l, 3), front (w, l), basis (w, l, 4), and reliability (w,): the larger of those of
-    inverse range and intensity. Loops in place of array expressions: these compile slowly.
+    cloud: rays (n, 3) [m] and intensity ranks (n,); members: (w, l); counts: (w,); room: ROOM
+    times (l,). Filled are moved_m (w, l, 3), front (w, l), basis (w, l, 4), and reliability (w,):
+    the larger of those of inverse range and intensity. Loops in place of array expressions, and of
+    np.empty, max and min: these compile slowly.
     """
     rays_m, intensity_rank = cloud
     size = members.shape[1]
-    inverse, intensity, ordered = np.empty(size), np.empty(size), np.empty(size)
-    trend_u, trend_v, directions = np.empty(size), np.empty(size), np.empty((size, 3))
+    inverse, intensity, ordered, trend_u, trend_v, xs, ys, zs = room
     for i in range(size):
         trend_u[i] = trend_v[i] = 0.0
     for w in range(len(members)):
@@ -42,16 +43,15 @@ def describe_windows(cloud, members, counts, keep_linear, moved_m, front, basis,
             x, y, z = rays_m[row, 0], rays_m[row, 1], rays_m[row, 2]
             inverse[i] = 1.0 / math.sqrt(x * x + y * y + z * z)
             intensity[i] = intensity_rank[row]
-            directions[i, 0], directions[i, 1] = x * inverse[i], y * inverse[i]
-            directions[i, 2] = z * inverse[i]
+            xs[i], ys[i], zs[i] = x * inverse[i], y * inverse[i], z * inverse[i]
         near = _find_silhouette(inverse, n, ordered)
         for i in range(size):
             front[w, i] = inverse[i] >= near
-            moved = 1.0 / max(inverse[i], near)
-            for axis in range(3):
-                moved_m[w, i, axis] = directions[i, axis] * moved
+            moved = 1.0 / (near if near > inverse[i] else inverse[i])
+            moved_m[w, i, 0], moved_m[w, i, 1] = xs[i] * moved, ys[i] * moved
+            moved_m[w, i, 2] = zs[i] * moved
         if not keep_linear:
-            _fill_trend(directions, n, trend_u, trend_v)
+            _fill_trend(xs, ys, zs, n, trend_u, trend_v)
         mean = 0.0
         for i in range(n):
             mean += inverse[i] / n
@@ -64,7 +64,7 @@ def describe_windows(cloud, members, counts, keep_linear, moved_m, front, basis,
             basis[w, i, 0] = used * depth * inverse[i]
             basis[w, i, 1] = used * shade * intensity[i]
             basis[w, i, 2], basis[w, i, 3] = used * trend_u[i], used * trend_v[i]
-        reliability[w] = max(depth, shade)
+        reliability[w] = shade if shade > depth else depth
 
 
 @compiled(part=True)
@@ -95,19 +95,19 @@ def _find_silhouette(inverse, n, ordered):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True)
-def _fill_trend(directions, n, trend_u, trend_v):  # type: ignore[no-untyped-def]
+def _fill_trend(xs, ys, zs, n, trend_u, trend_v):  # type: ignore[no-untyped-def]
     """Fill an orthonormal basis of the linear functions of direction in a window.
 
     Inverse range is linear in direction on any plane, and shading mostly so: without these parts
     only edges and markings are left to match. A single scan line has one such function only.
     """
-    x, y, z = directions[0, 0], directions[0, 1], directions[0, 2]
+    x, y, z = xs[0], ys[0], zs[0]
     flat = math.sqrt(x * x + y * y)
     along_x, along_y = (-y / flat, x / flat) if flat > 1e-9 else (1.0, 0.0)  # noqa: PLR2004
     up_x, up_y, up_z = -z * along_y, z * along_x, x * along_y - y * along_x
     mean_u, mean_v = 0.0, 0.0
     for i in range(n):
-        a, b, c = directions[i, 0], directions[i, 1], directions[i, 2]
+        a, b, c = xs[i], ys[i], zs[i]
         trend_u[i] = a * along_x + b * along_y
         trend_v[i] = a * up_x + b * up_y + c * up_z
         mean_u += trend_u[i] / n
@@ -157,16 +157,14 @@ def _normalize(values, n, trend_u, trend_v, other, by_other, noise):  # type: ig
 
 
 @compiled()
-def fill_features(cloud, members, counts, front, basis, out):  # type: ignore[no-untyped-def]
+def fill_features(cloud, members, counts, room, front, basis, out):  # type: ignore[no-untyped-def]
     """Fill the features (w, f) of windows, see ``FEATURES``.
 
-    cloud: rays (n, 3) [m] and intensity ranks (n,); members: (w, l); counts: (w,); front: (w, l);
-    basis: (w, l, 4).
+    ``cloud`` to ``basis`` as of :func:`describe_windows`.
     """
     rays_m, intensity_rank = cloud
     size = members.shape[1]
-    inverse, shade, logs = np.empty(size), np.empty(size), np.empty(size)
-    u, v, ordered = np.empty(size), np.empty(size), np.empty(size)
+    inverse, shade, logs, u, v, ordered, _, _ = room
     for w in range(len(members)):
         n = counts[w]
         x0, y0, z0 = rays_m[members[w, 0], 0], rays_m[members[w, 0], 1], rays_m[members[w, 0], 2]
@@ -220,7 +218,8 @@ def _beside_trend(values, u, v, n):  # type: ignore[no-untyped-def]
         power += values[i] * values[i]
     det = uu * vv - uv * uv
     followed = (vv * along_u**2 - 2 * uv * along_u * along_v + uu * along_v**2) / det
-    return 1.0 - min(followed / max(power, 1e-12), 1.0)
+    share = followed / (power if power > 1e-12 else 1e-12)  # noqa: PLR2004
+    return 1.0 - (share if share < 1.0 else 1.0)
 
 
 @compiled(part=True)
@@ -235,5 +234,6 @@ def _in_two_classes(values, n, ordered):  # type: ignore[no-untyped-def]
     for i in range(n - 1):
         below += ordered[i]
         apart = below - total * (i + 1) / n
-        between = max(between, apart * apart * n / ((i + 1) * (n - i - 1)))
+        squared = apart * apart * n / ((i + 1) * (n - i - 1))
+        between = squared if squared > between else between
     return between / variation if variation > 1e-12 else 0.0  # noqa: PLR2004

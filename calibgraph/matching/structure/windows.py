@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array, Mask
 from calibgraph.matching.structure.nearest_rays import NearestRays
-from calibgraph.matching.structure.window_kernels import FEATURES, describe_windows, fill_features
+from calibgraph.matching.structure.window_kernels import (
+    FEATURES,
+    ROOM,
+    describe_windows,
+    fill_features,
+)
 from calibgraph.matching.structure.window_weights import WindowNetwork
 
 Rows = NDArray[np.intp]
@@ -122,14 +127,16 @@ def cut_windows(
     even = math.sqrt(WINDOW_POINTS / math.pi) * max(spacing_rad, MIN_SPACING_RAD)
     reach = 2 * math.sin(WINDOW_STRETCH * even / 2)  # as a chord
     windows.members[:], windows.counts[:] = neighbours.of(centres, WINDOW_POINTS, reach)
+    room = tuple(np.empty((ROOM, WINDOW_POINTS)))
     describe_windows(
-        cloud, windows.members, windows.counts, keep_linear,
+        cloud, windows.members, windows.counts, keep_linear, room,
         windows.rays_m, windows.front, windows.basis, reliability,
     )  # fmt: skip
     reliability[windows.counts < MIN_WINDOW_POINTS] = 0.0
     windows.weight[:], windows.features[:] = 1.0, 0.0
     if keep_linear:
         fill_features(
-            cloud, windows.members, windows.counts, windows.front, windows.basis, windows.features
-        )
+            cloud, windows.members, windows.counts, room,
+            windows.front, windows.basis, windows.features,
+        )  # fmt: skip
     return windows, reliability

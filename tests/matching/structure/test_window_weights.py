@@ -22,7 +22,7 @@ from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.shift_scores import score_frame
-from calibgraph.matching.structure.window_kernels import FEATURES, fill_features
+from calibgraph.matching.structure.window_kernels import FEATURES, ROOM, fill_features
 from calibgraph.matching.structure.window_weights import (
     PACKAGE_FILE,
     WindowNetwork,
@@ -52,7 +52,8 @@ def grid_of_rays() -> Array:
 def features_of(ranges_m: Array, rank: Array, rays: Array | None = None) -> dict[str, float]:
     rays = (grid_of_rays() if rays is None else rays) * ranges_m[:, None]
     basis, out = np.full((1, WINDOW_POINTS, 4), 0.2, np.float32), np.zeros((1, len(FEATURES)))
-    fill_features((rays, rank), MEMBERS, COUNTS, ALL, basis, out)
+    room = tuple(np.empty((ROOM, WINDOW_POINTS)))
+    fill_features((rays, rank), MEMBERS, COUNTS, room, ALL, basis, out)
     return dict(zip(FEATURES, out[0].tolist(), strict=True))
 
 
