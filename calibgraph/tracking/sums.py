@@ -174,13 +174,19 @@ class Sums:
     def after_walk(self, variance: Array, overconfidence: Array | float) -> tuple[Sums, Array]:
         """The sums after a random walk, and (...) which share of them is left.
 
+        A Hessian that is no covariance's inverse, as of frames far from the estimate, is replaced
+        by the one by weights: the gain of a negative eigenvalue has a pole.
+
         Args:
             variance: (..., d) of the walk.
             overconfidence: (...) k of the module's description.
         """
-        by = variance / np.asarray(overconfidence)[..., None]
-        gain = np.linalg.inv(np.eye(self.width) + self.hessian * by[..., None, :])
-        hessian, back = gain @ self.hessian, gain.swapaxes(-1, -2)
+        by, hessian = variance / np.asarray(overconfidence)[..., None], self.hessian
+        values = np.linalg.eigvalsh(hessian)
+        bad = (values[..., 0] < -_LEAST_EIGENVALUE * values[..., -1]) & variance.any(axis=-1)
+        hessian = np.where(bad[..., None, None], self.reweighted, hessian)
+        gain = np.linalg.inv(np.eye(self.width) + hessian * by[..., None, :])
+        hessian, back = gain @ hessian, gain.swapaxes(-1, -2)
         hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
         kept = np.trace(gain[..., :_POSE, :_POSE], axis1=-2, axis2=-1) / _POSE
         walked = (self * kept).change(

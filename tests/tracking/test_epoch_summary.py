@@ -35,3 +35,17 @@ def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
 def inverse_sandwich(memory: EpochSummary, walk: int) -> Array:
     inverse = np.linalg.inv(memory.walks.hessian[walk])
     return np.asarray(inverse @ memory.walks.scatter[walk] @ inverse)
+
+
+def test_a_walk_does_not_magnify_sums_of_a_hessian_that_is_not_definite() -> None:
+    """Frames far from the estimate give one: the gain has a pole at -k / Q."""
+    variance, weights = np.full(6, 0.5), np.diag([3.0, 2, 2, 2, 2, 2])
+    for least in (-1.0, -5.99, -6.01, -40.0):  # k / Q is 6
+        sums = Sums.zeros().change(
+            hessian=np.diag([5.0, 2, 2, 2, 2, least]), reweighted=weights, gradient=np.ones(6)
+        )
+        after, kept = sums.after_walk(variance, 3.0)
+        assert 0.5 < kept < 1 and np.linalg.eigvalsh(after.hessian)[0] > 0
+        assert np.abs(after.gradient).max() < 1
+        standing, _ = sums.after_walk(np.zeros(6), 3.0)
+        np.testing.assert_array_equal(standing.packed, sums.packed)
