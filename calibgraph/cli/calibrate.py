@@ -44,6 +44,7 @@ def _calibrate(
     dataset: list[Path], matching: MatchingOptions, out: Path, solving: SolveOptions, draw: Draw
 ) -> tuple[Calibration, Dataset, list[Path]]:
     """The result, the data, and the files that were written."""
+    from calibgraph.cli.compile_ahead import compile_ahead
     from calibgraph.memory import keep_freed_memory
 
     keep_freed_memory()
@@ -54,7 +55,7 @@ def _calibrate(
         settings, terms = solving.checked()
         chosen = matching.find_matcher(seed=settings.seed)
     data = matching.load_dataset(dataset)
-    with progress_bar() as progress:
+    with compile_ahead(data.rig), progress_bar() as progress:
         result = calibrate(
             data,
             matcher=chosen,

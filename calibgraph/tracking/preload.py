@@ -6,7 +6,7 @@ from calibgraph.simulation.correspondences import simulate_correspondences
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.tracking.tracker import IncrementalCalibrator
 
-_FRAMES, _MATCHES = 24, 100  # as few as start a camera and close two epochs
+_FRAMES, _MATCHES = 24, 250  # enough to start a camera, close two epochs and fill a large block
 
 
 def warm_up_tracker() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from calibgraph import Calibration, FileError, load_calibration, load_correspondences, load_rig
+from calibgraph import FileError, load_calibration, load_correspondences, load_rig
 from calibgraph.io.calibrations import error_bars
 from calibgraph.report.html import write_result
 from tests.conftest import CommandRun
@@ -97,10 +97,10 @@ def test_a_result_that_a_full_disk_cuts_short_leaves_the_older_one(
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert {"calibration.yaml", "correspondences.parquet", "report.html"} <= before.keys()
 
-    def fill_up(_: Calibration, path: Path) -> None:
+    def fill_up(path: Path, _: str) -> None:
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    monkeypatch.setattr("calibgraph.report.html.write_report", fill_up)
+    monkeypatch.setattr("calibgraph.report.html.write_text", fill_up)
     with pytest.raises(OSError, match="No space") as caught:
         write_result(replace(result, camera_matches=None, warnings=("changed",)), tmp_path)
     assert caught.value.filename == str(tmp_path / "report.html")
