@@ -25,13 +25,15 @@ from calibgraph.model.later import Later
 from calibgraph.model.lens_estimate import with_sigmas
 from calibgraph.model.rig import Rig
 from calibgraph.overlaps import refine_with_camera_pairs
-from calibgraph.parallel import with_own_threads
+from calibgraph.parallel import Threads, with_own_threads
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess, assess_run, in_order
+from calibgraph.trust.clock_checks import asks_offset
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.image_record import ImageRecord, RunChecks, to_metadata
+from calibgraph.trust.motion_checks import registered_twists
 from calibgraph.trust.observability import weaknesses
 from calibgraph.trust.probability import TABLES, judge, model_of
 from calibgraph.trust.run_evidence import RunEvidence
@@ -70,17 +72,20 @@ def calibrate(
         ValueError: if the matcher is unknown.
     """
     report = progress or no_progress
-    run = match_in_rounds(                                   # match -> solve_joint, in rounds
-        dataset, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=report
-    )  # fmt: skip
-    run = refine_with_camera_pairs(run, report)  # what cameras see in common
-    with run.watch("hash_inputs"):
-        inputs = hash_inputs(run.dataset)
-    evidence = go_on_elsewhere(RunEvidence(run, inputs, report))  # where the rounds ended wrong
-    run = evidence.run
-    with run.watch("checks"):
-        checks = assess_run(evidence)
-        record = to_metadata(evidence.solution, checks)
+    with Threads(1) as beside:
+        run = match_in_rounds(                                   # match -> solve_joint, in rounds
+            dataset, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=report
+        )  # fmt: skip
+        if asks_offset(run):
+            beside.submit(registered_twists, run.dataset)  # which its checks wait for
+        run = refine_with_camera_pairs(run, report)  # what cameras see in common
+        with run.watch("hash_inputs"):
+            inputs = hash_inputs(run.dataset)
+        evidence = go_on_elsewhere(RunEvidence(run, inputs, report))  # where the rounds ended wrong
+        run = evidence.run
+        with run.watch("checks"):
+            checks = assess_run(evidence)
+            record = to_metadata(evidence.solution, checks)
     report("done", 1, 1)
     table = run.correspondences
     return replace(

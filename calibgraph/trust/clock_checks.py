@@ -16,9 +16,8 @@ import numpy as np
 
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.io.frame import ScanSteps, seconds_between
-from calibgraph.io.kept_frames import KeptFrame
-from calibgraph.matching.run import with_motion
+from calibgraph.io.frame import seconds_between
+from calibgraph.matching.run import MatchingRun, with_motion
 from calibgraph.model.clock import at_pixels, clock_of
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
@@ -34,7 +33,7 @@ from calibgraph.trust.lens_parameter import (
     LensParameter,
     check_parameter,
 )
-from calibgraph.trust.motion_checks import INTERVAL_S, MAX_FRAMES, register_neighbours
+from calibgraph.trust.motion_checks import INTERVAL_S, MAX_FRAMES, registered_twists
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import limit
 from factors import FreeLens
@@ -55,19 +54,25 @@ def offset_checks(evidence: Evidence) -> Checks:
     return {n: [check_offset(fit, RESIDUALS, solution.config.tolerance)] for n, fit in fits}
 
 
+def asks_offset(run: MatchingRun) -> bool:
+    """Whether the checks ask for the offset, and so for the motion: if it is not estimated."""
+    is_free = not {*CLOCK}.isdisjoint(run.solution.config.estimate)
+    return bool(run.matcher.tracking_rounds) and not (run.out_of_time or is_free)
+
+
 def image_offset_checks(evidence: RunEvidence) -> Checks:
     """The offset of each camera by matches that are made for it, unless it is estimated.
 
     By a matcher made for them, since that of the run has been released.
     """
     run, config = evidence.run, evidence.run.solution.config
-    if run.out_of_time or not {*CLOCK}.isdisjoint(config.estimate):
+    if not asks_offset(run):
         return {}
     rig, moved, registered = run.solution.without_pairs().solved_rig, None, False
     with suppress(CalibrationError, OSError):  # the checks on images report it
         moved, registered = _with_known_motion(run.dataset)
     matcher = run.matcher.with_estimate(("offset",))
-    if moved is None or not matcher.tracking_rounds or matcher is run.matcher:
+    if moved is None or matcher is run.matcher:
         return {}
     if registered:
         rig = _without_times(rig)
@@ -140,15 +145,11 @@ def _without_times(rig: Rig) -> Rig:
 
 def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
     """Some frames with their motion, None of too few; whether scans show that of any of them."""
-    frames, registered, steps = [], False, ScanSteps()
-    for frame in spread_out(dataset.frames, MAX_FRAMES):
-        twist = frame.twist_per_s
-        if twist is not None:
-            frames.append(frame)
-        elif (
-            isinstance(frame, KeptFrame)
-            and (found := register_neighbours(dataset, frame, steps)) is not None
-        ):
-            frames.append(replace(frame, twist=found))
-            registered = True
-    return dataset.only(frames) if len(frames) >= MIN_FRAMES else None, registered
+    found = registered_twists(dataset)
+    chosen = spread_out(dataset.frames, MAX_FRAMES)
+    frames = [
+        replace(frame, twist=found[frame.index]) if frame.index in found else frame
+        for frame in chosen
+        if frame.index in found or frame.twist_per_s is not None
+    ]
+    return dataset.only(frames) if len(frames) >= MIN_FRAMES else None, bool(found)

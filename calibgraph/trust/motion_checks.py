@@ -10,6 +10,7 @@ from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame, ScanSteps, seconds_between, twist_by_scans
+from calibgraph.io.kept_frames import KeptFrame
 
 INTERVAL_S = 0.1  # between clouds, where they have no stamps
 MAX_STEPS = 10  # between the numbers of neighbouring clouds, if it is clouds that they count
@@ -76,6 +77,26 @@ def _speed_doubt(told: Array, shown: Array, *, timed: bool) -> list[str]:
         f"by neighbouring clouds, the LiDAR moves at {by_clouds:.1f} m/s, by its motion at "
         f"{ratio * by_clouds:.1f} m/s{unit}"
     ]
+
+
+def registered_twists(dataset: Dataset) -> dict[int, Array]:
+    """By number of a kept frame whose motion is not known, its twist (6,) by both neighbours.
+
+    Found once: another thread that asks meanwhile waits.
+
+    Raises:
+        CalibrationError, OSError: if a cloud cannot be read.
+    """
+    chosen = spread_out(dataset.frames, MAX_FRAMES)
+    frames = [f for f in chosen if isinstance(f, KeptFrame) and f.twist_per_s is None]
+
+    def register() -> dict[int, Array]:
+        steps = ScanSteps()
+        found = ((frame.index, register_neighbours(dataset, frame, steps)) for frame in frames)
+        return {number: twist for number, twist in found if twist is not None}
+
+    key = "twists", *(frame.index for frame in frames)
+    return frames[0].derive_for_all(key, register) if frames else {}
 
 
 def register_neighbours(dataset: Dataset, frame: Frame, steps: ScanSteps) -> Array | None:
