@@ -36,7 +36,7 @@ def loss_id(name: str) -> int:
         raise ValueError(f"unknown robust loss {name!r}; known are {', '.join(LOSSES)}") from None
 
 
-@compiled()
+@compiled(forceinline=True)  # so that all kernels hold the same code of it
 def loss_and_weight(loss, scale, s):  # type: ignore[no-untyped-def]
     """Return rho(s) and psi = rho'(s); ``scale`` is the residual norm at which the loss bends."""
     if loss == L2:

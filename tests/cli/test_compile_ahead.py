@@ -13,6 +13,7 @@ from calibgraph.child_process import ChildEndedError, ChildProcess
 from calibgraph.cli import compile_ahead
 from calibgraph.cli.compile_ahead import ask_to_compile
 from calibgraph.simulation.rigs import rig_of
+from tests.conftest import SAMPLE
 
 RIG = rig_of("kitti")
 IN_AN_EMPTY_CACHE = """
@@ -35,6 +36,13 @@ print(before, is_kept("factors.kernel"), len(kept) > 20)
 print(*(path.name for path in set(cache.rglob("*.nbc")) - kept))
 """
 
+TWO_FRAMES = """
+import sys
+from calibgraph import calibrate, load_dataset
+result = calibrate(load_dataset(sys.argv[1]).select("0:2"))
+print(*(T.tobytes().hex() for T in result.T_camera_lidar.values()))
+"""
+
 
 @pytest.mark.slow
 def test_a_solve_finds_its_kernels_compiled(tmp_path: Path) -> None:
@@ -44,6 +52,16 @@ def test_a_solve_finds_its_kernels_compiled(tmp_path: Path) -> None:
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert done.stdout.split() == ["False", "True", "True"]  # and no other
+
+
+@pytest.mark.slow
+def test_the_first_run_of_a_machine_gives_the_numbers_of_later_ones(tmp_path: Path) -> None:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    first, later = (
+        subprocess.check_output([sys.executable, "-c", TWO_FRAMES, SAMPLE], env=environment)
+        for _ in range(2)
+    )
+    assert first == later
 
 
 @pytest.mark.parametrize(("cores", "kept"), [(1, False), (2, True), (2, None)])

@@ -146,7 +146,9 @@ def _score_windows(pixels, shape, windows, origin, likelihood, room, grids, by_c
         _take_totals(totals, padded, likelihood, grids[group[-1]])
 
 
-@compiled(part=True, fastmath=True)
+# Parts are inlined: of one that is not, a process that compiles it runs other code than a later
+# process, and with fastmath other sums.
+@compiled(part=True, fastmath=True, forceinline=True)
 def _add_points(pixels, starts, basis, count, strip, sums):  # type: ignore[no-untyped-def]
     """Add points to the sums of a strip: along depth and intensity, plain, and squared."""
     lines, stride, _ = strip
@@ -165,7 +167,7 @@ def _add_points(pixels, starts, basis, count, strip, sums):  # type: ignore[no-u
                 sums[_index(m + 3 * LANES)] += x0 * x0 + x1 * x1 + x2 * x2 + x3 * x3
 
 
-@compiled(part=True, fastmath=True)
+@compiled(part=True, fastmath=True, forceinline=True)
 def _add_points_with_trend(pixels, starts, basis, count, strip, sums):  # type: ignore[no-untyped-def]
     """As :func:`_add_points`, and along both columns of the trend."""
     lines, stride, _ = strip
@@ -188,7 +190,7 @@ def _add_points_with_trend(pixels, starts, basis, count, strip, sums):  # type: 
                 sums[_index(m + 5 * LANES)] += d0 * x0 + d1 * x1 + d2 * x2 + d3 * x3
 
 
-@compiled(part=True, fastmath=True)
+@compiled(part=True, fastmath=True, forceinline=True)
 def _multiply_factors(pixels, basis, strip, sums, numbers, inside, out):  # type: ignore[no-untyped-def]
     """Add the last point of a window, multiply the factors of the strip, and clear its sums."""
     (lines, stride, padded), (over, noise, chance) = strip, numbers
@@ -208,7 +210,7 @@ def _multiply_factors(pixels, basis, strip, sums, numbers, inside, out):  # type
             out[_index(line * padded + k)] *= np.float32(1) - inside[_index(k)] * share * _TO_FACTOR
 
 
-@compiled(part=True, fastmath=True)
+@compiled(part=True, fastmath=True, forceinline=True)
 def _add_scores(pixels, basis, strip, sums, numbers, inside, out):  # type: ignore[no-untyped-def]
     """As :func:`_multiply_factors`, with the trend, and the scores are added."""
     (lines, stride, padded), (over, noise, chance) = strip, numbers
@@ -230,7 +232,7 @@ def _add_scores(pixels, basis, strip, sums, numbers, inside, out):  # type: igno
             out[_index(line * padded + k)] += inside[_index(k)] * share
 
 
-@compiled(part=True, fastmath=True)
+@compiled(part=True, fastmath=True, forceinline=True)
 def _take_totals(totals, padded, likelihood, grid):  # type: ignore[no-untyped-def]
     """Add the totals to a grid, of factors the negative logarithms, and clear them."""
     for row in range(grid.shape[0]):
