@@ -51,9 +51,11 @@ import resource, sys, numpy
 from calibgraph.memory import keep_freed_memory
 if sys.argv[1] == "keep":
     keep_freed_memory()
-for _ in range(100):
+faults = []
+for _ in range(101):
     numpy.ones(5 * 2**20)  # 40 MB
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+print(faults[-1] - faults[0])
 """
 
 
@@ -63,5 +65,4 @@ def test_freed_arrays_are_used_again_without_page_faults() -> None:
         command = [sys.executable, "-c", _COUNT_FAULTS, how]
         return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
-    # All arrays but one save 20 faults: the system may give pages of 2 MB.
-    assert faults("return") - faults("keep") > 90 * 20
+    assert faults("keep") < 100 <= faults("return")  # of 100 arrays, each of many pages
