@@ -36,8 +36,8 @@ _COLLECT_AFTER = 100_000, 20, 20
 """Objects and passes between collections. With Python's own numbers, a fifth of the time in which
 kernels are compiled goes into searches of objects that all live."""
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
-"""Calibgraph's threads take all cores; those of BLAS and OpenCV would spin beside them, BLAS's for
-0.3 s while they start."""
+"""BLAS and OpenCV get one thread each: calibgraph's own threads use all cores, and idle threads of
+these libraries spin (0.3 s of processor time while BLAS starts)."""
 _WEIGHTS_SUFFIXES = (".tar", ".pt", ".pth", ".safetensors")
 _UsageError: type[Exception] = typer.BadParameter.__base__ or Exception
 _PLAIN: Any = {"add_completion": False, "pretty_exceptions_enable": False}

@@ -152,8 +152,8 @@ def marginal_information(
 
     Args:
         graph: linear factors.
-        keys: of all its variables, in the order of elimination.
-        kept: keys of these variables.
+        keys: all its variables, in the order in which they are eliminated.
+        kept: those whose information is wanted.
 
     Raises:
         RuntimeError: if one of the others is not determined.

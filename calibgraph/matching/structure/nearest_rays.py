@@ -1,8 +1,8 @@
 """The nearest rays of a ray, among rays that are thinned to one per cell of the sphere.
 
 Thinned rays come by rows of equal elevation, and by azimuth within a row. From a ray outwards, rows
-and the rays of a row are visited until none can be nearer than the farthest of those found: no tree
-has to be built and kept.
+and the rays of a row are visited while they can be nearer than the farthest ray found so far. No
+tree has to be built or kept.
 """
 
 import math
@@ -65,7 +65,7 @@ def _find_nearest(cloud, grid, centres, members, counts):  # type: ignore[no-unt
     (rays, rows, _, starts), (lowest, cell, reach) = cloud, grid
     squares, direction = np.empty(members.shape[1]), np.empty(3)
     for w in range(len(centres)):
-        centre, count = centres[w], np.int64(0)  # not 0, of which it would be compiled again
+        centre, count = centres[w], np.int64(0)  # a literal 0 has another type
         x, y, z = rays[rows[centre], 0], rays[rows[centre], 1], rays[rows[centre], 2]
         over, up = 1.0 / math.sqrt(x * x + y * y + z * z), math.atan2(z, math.sqrt(x * x + y * y))
         direction[0], direction[1], direction[2] = x * over, y * over, z * over

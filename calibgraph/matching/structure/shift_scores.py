@@ -196,7 +196,7 @@ def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
 
 
 def crop_grids(scores: ShiftScores, camera: Camera, level: Level) -> ShiftScores:
-    """The same scores with grids that reach as far as those of a level of the same step."""
+    """The same scores, with grids cropped to the reach of a level that has the same step."""
     cut = (scores.grids.shape[1] - 1) // 2 - _reach_steps(camera, level, scores.steps_per_px)
     grids = scores.grids[:, cut:-cut, cut:-cut] if cut > 0 else scores.grids
     return replace(scores, grids=grids - grids.mean(axis=(1, 2), keepdims=True))
