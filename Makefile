@@ -78,7 +78,6 @@ bench: $(VENV)/test ## Compare ratios of processor times with the last release's
 	$(BIN)/python -m benchmarks.speed.solve --frames 20 --cameras 12 --matches 500
 	$(BIN)/python -m benchmarks.speed.scaling --rows 1e3 1e5 1e7
 	$(BIN)/python -m benchmarks.speed.incremental
-	$(BIN)/python -m benchmarks.speed.cmrnext
 
 clean: ## Remove everything that was made
 	rm -rf $(VENV) out build web/pick/node_modules *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -38,20 +38,6 @@ def tracking_settings() -> str:
     return settings_table(Tracking)
 
 
-def training_settings() -> str:
-    """The settings of `calibgraph train`."""
-    from calibgraph.matching.cmrnext.training.settings import TrainSettings
-
-    return settings_table(TrainSettings)
-
-
-def window_settings() -> str:
-    """The settings of `calibgraph train-windows`."""
-    from calibgraph.matching.structure.training.settings import WindowSettings
-
-    return settings_table(WindowSettings)
-
-
 def presets() -> str:
     """The settings in which the presets differ."""
     from calibgraph.model.config import PRESETS, preset
@@ -86,8 +72,6 @@ GENERATED: Mapping[str, Callable[..., str]] = {
     "thresholds": thresholds,
     "settings": settings,
     "tracking settings": tracking_settings,
-    "training settings": training_settings,
-    "window settings": window_settings,
     "presets": presets,
     "commands": commands,
     "api": api,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.box import SIMPLE
 from rich.console import Console
@@ -19,9 +19,6 @@ from calibgraph.model.geometry import degrees_and_centimetres
 from calibgraph.model.metrics import Evaluation, PoseError, pose_error
 from calibgraph.model.places import describe_places
 from calibgraph.model.summary import Summary
-
-if TYPE_CHECKING:
-    from calibgraph.matching.cmrnext.training.validation import Validation
 
 _DETAILS = "report.html or calibration.yaml"
 CAMERA_AXES_COLUMNS = (
@@ -87,18 +84,6 @@ def print_weights(console: Console, summary: Mapping[str, Any], converted: Path 
         print_plain(console, f"  {line}")
     if converted is not None:
         print_plain(console, f"{converted}: written")
-
-
-def print_validation(console: Console, validation: Validation) -> None:
-    """Print the errors of a network in training, on held-out frames."""
-    v = validation
-    print_plain(
-        console,
-        f"step {v.step}: loss {v.train_loss:.4g}; held out: flow error {v.epe_px:.2f} px (median "
-        f"{v.median_px:.2f}) of {v.zero_px:.2f}; pose of a frame {v.pose_deg:.3f} deg "
-        f"{v.pose_cm:.1f} cm of {v.start_deg:.3f} deg {v.start_cm:.1f} cm (medians; "
-        f"{v.failed_share:.0%} failed)",
-    )
 
 
 def result_table(result: Calibration) -> Table:

@@ -12,7 +12,6 @@ from calibgraph.files import write_text
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
-from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
@@ -89,19 +88,9 @@ def _page(
         overlays_left_out=overlays_left_out,
         residuals_left_out=not errors,
         config=yaml.safe_dump(result.config.model_dump(), sort_keys=False, allow_unicode=True),
-        window_weights=_describe_weights(result.correspondences),
         frames_sentence=FRAMES_SENTENCE,
         tangent_sentence=TANGENT_SENTENCE,
     )
-
-
-def _describe_weights(table: Correspondences | None) -> str:
-    """The weights of the matcher's windows; empty if the table does not state them."""
-    found = None if table is None else table.metadata.get("window_weights")
-    if not isinstance(found, dict):
-        return ""
-    digest = f", SHA-256 {found['sha256']}" if "sha256" in found else ""
-    return f"{found.get('how', 'unknown')}{digest}"
 
 
 def _export_command(result: Calibration) -> str:

@@ -4,7 +4,7 @@ Three ways to be off. Grossly, in a way that checks notice: a logistic model of 
 sign of an error is, and single checks besides, which can only grow as a check gets worse. By a
 wrong lens, or by a pose that a search found by chance: checks whose value is a probability. And by
 the error bar itself, if it is wide beside the tolerance. The last two hold as far as they did in
-the cases fitted to. The weights are fitted by ``benchmarks.accuracy.probability``, on results that
+the cases fitted to. The weights are fitted by ``tools.probability``, on results that
 were made wrong on purpose and right ones, and kept in ``probability.json``, with how they were got.
 """
 

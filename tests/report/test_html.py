@@ -174,20 +174,6 @@ def test_a_result_without_correspondences_is_reported(
     assert "a point 10 m ahead on the optical axis" in text
 
 
-def test_the_weights_of_the_windows_are_stated(solved_pair: Calibration, tmp_path: Path) -> None:
-    table = solved_pair.correspondences
-    assert table is not None
-
-    def page(metadata: object) -> str:
-        marked = table.with_metadata({**table.metadata, "window_weights": metadata})
-        return write_page(replace(solved_pair, correspondences=marked), tmp_path)
-
-    own = page({"sha256": "ab12", "how": "<mine>"})
-    assert "Weights of the matcher's windows: &lt;mine&gt;, SHA-256 ab12." in own
-    assert "windows: all alike." in page({"how": "all alike"})
-    assert "Weights of the matcher" not in page("text of a foreign table")
-
-
 def test_a_result_from_driving_is_reported(pair: Rig, tmp_path: Path) -> None:
     tracker = calibgraph.IncrementalCalibrator(pair)
     table = simulate_correspondences(pair, frames=12, matches=100)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.accuracy.verdicts --set tune --tables 24 --data 3 --out out/tune.jsonl
     python -m benchmarks.accuracy.verdicts --set count --tables 24 --data 3 --out out/count.jsonl
-    python -m benchmarks.accuracy.probability --tune out/tune.jsonl --count out/count.jsonl
+    python -m tools.probability --tune out/tune.jsonl --count out/count.jsonl
 
 The weights come from the first files, the tables from the others, which share no recordings (but
 for the motorway), scenes or seeds with them. ``--write`` writes the weights into the package; a
@@ -28,8 +28,11 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.special import expit, logit
 
 from benchmarks.accuracy import ledger
-from benchmarks.accuracy.probability_tables import judged
-from benchmarks.accuracy.verdict_samples import (
+from benchmarks.tables import ROOT, add_record_option
+from calibgraph.model.verdict import FAIL_ABOVE
+from calibgraph.trust.probability import STRUCTURE, TABLES, WORST, steps
+from tools.probability_tables import judged
+from tools.verdict_samples import (
     AMBIGUOUS,
     SHARE_OFF,
     Sample,
@@ -37,9 +40,6 @@ from benchmarks.accuracy.verdict_samples import (
     probabilities,
     samples_of,
 )
-from benchmarks.tables import ROOT, add_record_option
-from calibgraph.model.verdict import FAIL_ABOVE
-from calibgraph.trust.probability import STRUCTURE, TABLES, WORST, steps
 
 Array = np.ndarray
 

@@ -1,7 +1,7 @@
 """Train the network that weighs windows on rendered scenes; judge it on recordings.
 
-    python -m benchmarks.accuracy.window_weights --scenes out/weights --write
-    python -m benchmarks.accuracy.window_weights --judge
+    python -m tools.window_weights --scenes out/weights --write
+    python -m tools.window_weights --judge
 
 Every window is scored at all shifts about the true alignment, as the matcher's fine levels do. Its
 weight w turns its score s into -log(1 - w (1 - exp(-s))); the loss is the negative logarithm of
@@ -14,6 +14,7 @@ all windows of one weight and with the network's.
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -29,19 +30,20 @@ from benchmarks.accuracy.error_bars import pair, wide
 from benchmarks.accuracy.scenes import Folders
 from benchmarks.tables import ROOT, Table, add_record_option, publish
 from calibgraph import Dataset, Rig, load_dataset, simulate_street
+from calibgraph.files import write_text
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
 from calibgraph.matching.structure.schedule import LEVELS
+from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.shift_scores import downscale_log_gray, select_windows
-from calibgraph.matching.structure.training.loss import damped
-from calibgraph.matching.structure.training.samples import score_each
-from calibgraph.matching.structure.training.trainee import Trainee
 from calibgraph.matching.structure.visibility import find_places
 from calibgraph.matching.structure.window_kernels import FEATURES
 from calibgraph.matching.structure.window_weights import (
+    LARGEST,
     PACKAGE_FILE,
     WindowNetwork,
     window_network,
 )
+from calibgraph.matching.structure.windows import Windows
 from calibgraph.simulation.scan_errors import draw_scan_errors
 from calibgraph.simulation.surroundings import SURROUNDINGS
 
@@ -84,7 +86,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.write:
         samples = [sample_of(*scene, "rendered") for scene in rendered(options.scenes)]
-        train(samples, options.seed).save(PACKAGE_FILE)
+        save(train(samples, options.seed))
         window_network.cache_clear()
     if options.judge:
         publish("accuracy.window_weights", [judge(options.realdata)], record=options.record)
@@ -154,9 +156,68 @@ def train(samples: Sequence[Sample], seed: int) -> WindowNetwork:
         print(f"sharpness {float(sharpness.detach().exp()):.1f}", flush=True)
     count = sum(len(sample.features) for sample in samples)
     return trainee.to_network(
-        f"python -m benchmarks.accuracy.window_weights --write: {count} windows of "
+        f"python -m tools.window_weights --write: {count} windows of "
         f"{len(samples)} rendered scenes, seeds from {FIRST_SEED} on"
     )
+
+
+class Trainee:
+    """The network that is trained, in torch; the features' units stay as they are."""
+
+    def __init__(self, start: WindowNetwork) -> None:
+        self._mean, self._spread = torch.as_tensor(start.mean), torch.as_tensor(start.spread)
+        self._linear = []
+        for matrix, bias in start.layers:
+            layer = torch.nn.Linear(*matrix.shape)
+            layer.weight.data = torch.tensor(matrix.T, dtype=torch.float32)
+            layer.bias.data = torch.tensor(bias, dtype=torch.float32)
+            self._linear.append(layer)
+        *hidden, last = self._linear
+        gelus = [(layer, torch.nn.GELU(approximate="tanh")) for layer in hidden]
+        self.layers = torch.nn.Sequential(*(module for pair in gelus for module in pair), last)
+
+    def weights(self, features: np.ndarray, noise: float = 0.0) -> torch.Tensor:
+        """(w,) of windows with features (w, f), differentiable, with noise on the features."""
+        values = (torch.as_tensor(features).double() - self._mean) / self._spread
+        values = (values + noise * torch.randn_like(values)).float()
+        logits: torch.Tensor = self.layers(values).clamp(-LARGEST, LARGEST)[:, 0]
+        return torch.sigmoid(logits)
+
+    def to_network(self, how: str) -> WindowNetwork:
+        """As the matcher uses it, with a description of its training."""
+        layers = [(layer.weight.detach().T, layer.bias.detach()) for layer in self._linear]
+        arrays = tuple((matrix.double().numpy(), bias.double().numpy()) for matrix, bias in layers)
+        return WindowNetwork(self._mean.numpy(), self._spread.numpy(), arrays, how)
+
+
+def save(network: WindowNetwork) -> None:
+    """Write the package's file, numbers to five digits."""
+
+    def rounded(values: np.ndarray) -> list[float]:
+        return [float(f"{value:.5g}") for value in values.tolist()]
+
+    content = {
+        "format": "calibgraph-window-weights/1", "how": network.how, "features": list(FEATURES),
+        "mean": rounded(network.mean), "spread": rounded(network.spread),
+        "layers": [{"matrix": [rounded(row) for row in matrix], "bias": rounded(bias)}
+                   for matrix, bias in network.layers],
+    }  # fmt: skip
+    write_text(PACKAGE_FILE, json.dumps(content) + "\n")
+
+
+def damped(scores: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    """-log(1 - w (1 - exp(-s))) of scores (w, ...) by weights (w,)."""
+    shaped = weights.reshape(-1, *[1] * (scores.ndim - 1))
+    return -torch.log1p(-shaped * -torch.expm1(-scores))
+
+
+def score_each(image: np.ndarray, places: np.ndarray, windows: Windows, reach: int) -> np.ndarray:
+    """(w, s, s) scores of every window by itself, by shift [v, u] up to a reach in steps."""
+    count, side = len(windows.counts), 2 * reach + 1
+    grids = np.zeros((count, side, side), np.float32)
+    group, first = np.arange(count, dtype=np.int32), np.array([-reach, -reach])
+    score_windows(image, places, windows.counts, windows.basis, group, first, True, grids)
+    return grids
 
 
 def untrained(features: np.ndarray) -> WindowNetwork:

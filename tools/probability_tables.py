@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.accuracy.verdict_samples import AMBIGUOUS, Sample, doubts, probabilities, shares
 from benchmarks.tables import Table
 from calibgraph.model.verdict import Check, ErrorProbability, Verdict
+from tools.verdict_samples import AMBIGUOUS, Sample, doubts, probabilities, shares
 
 Array = np.ndarray
 
