@@ -63,7 +63,7 @@ def compare(before: Path, after: Path, *, sigmas: float) -> int:
             twist = np.asarray(twist_between(pose, new.T_camera_lidar[camera]))
             sigma = np.sqrt(np.diag(old.covariance[camera]))
             ratio = np.sqrt(np.diag(new.covariance[camera])) / sigma
-            was, now = old.verdict[camera], new.verdict[camera]
+            was, now = old.camera_verdicts[camera], new.camera_verdicts[camera]
             moved = float(np.abs(twist / sigma).max())
             other = moved > sigmas or was.status != now.status
             differ += other
@@ -71,7 +71,7 @@ def compare(before: Path, after: Path, *, sigmas: float) -> int:
                 f"{name:12} {camera:20} {'DIFFERS' if other else 'same':8}"
                 f" {np.degrees(np.linalg.norm(twist[:3])):8.4f} deg"
                 f" {100 * np.linalg.norm(twist[3:]):7.3f} cm {moved:8.4f} sigma,"
-                f" bars x {ratio.min():.3f} to {ratio.max():.3f}, {was.status} -> {now.status}"
+                f" bars x {ratio.min():.3f} to {ratio.max():.3f}, {was.status} {was.percent} -> {now.status} {now.percent}"
             )
     return differ
 

@@ -45,7 +45,7 @@ from calibgraph.matching.structure.window_weights import (
 )
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.simulation.scan_errors import draw_scan_errors
-from calibgraph.simulation.surroundings import SURROUNDINGS
+from tools.scenes.surroundings import SURROUNDINGS
 
 LEVEL = replace(LEVELS[3], weighed=False)
 REACH = 12  # steps to each side that are kept
@@ -102,7 +102,7 @@ def rendered(scenes: Path) -> Iterator[tuple[Dataset, Rig]]:
         if not (folder / "rig.yaml").exists():
             simulate_street(
                 folder, truth, beams=beams, frames=FRAMES, seed=seed, sensor_errors=errors,
-                vary_layout=True, surroundings=where,
+                vary_layout=True, build_scene=SURROUNDINGS[where],
             )  # fmt: skip
         yield load_dataset(folder, truth), aligned_rig(truth, truth, folder, beams, errors)
 

@@ -21,6 +21,7 @@ from calibgraph.matching.structure.window_kernels import FEATURES, ROOM, fill_fe
 from calibgraph.matching.structure.window_weights import WindowNetwork, window_network
 from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows
 from tests.conftest import SAMPLE, make_camera
+from tools.scenes.surroundings import build_meadow
 
 Array = NDArray[np.float64]
 
@@ -123,7 +124,7 @@ def test_weights_make_the_truth_stand_out_more_among_leaves(tmp_path: Path) -> N
     pytest.importorskip("open3d", exc_type=ImportError)
     rig = Rig(cameras={"left": make_camera()})
     calibgraph.simulate_street(
-        tmp_path / "meadow", rig, frames=1, seed=5, vary_layout=True, surroundings="meadow"
+        tmp_path / "meadow", rig, frames=1, seed=5, vary_layout=True, build_scene=build_meadow
     )
     frame, camera = calibgraph.load_dataset(tmp_path / "meadow", rig).frames[0], rig.cameras["left"]
     gray = frame.load_gray("left", camera)

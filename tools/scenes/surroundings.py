@@ -6,7 +6,7 @@ Few of them have the walls, corners and poles that a calibration lives on. Frame
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from calibgraph.simulation.paints import (
     Albedo,
     Paint,
 )
+from calibgraph.simulation.recording import SceneBuilder
 from calibgraph.simulation.solids import Solid, box, cylinder
 from calibgraph.simulation.street import (
     KINDS,
@@ -135,7 +136,7 @@ def build_quay(line: Centreline, length_m: float, rng: Rng) -> Mesh:
     return join_meshes([*parts, *map(mesh_of_solid, rail)])
 
 
-SURROUNDINGS: Mapping[str, Callable[[Centreline, float, Rng], Mesh]] = {
+SURROUNDINGS: Mapping[str, SceneBuilder] = {
     "street": build_street,
     "meadow": build_meadow,
     "motorway": build_motorway,

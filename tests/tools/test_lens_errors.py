@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from calibgraph import Camera, Rig, load_rig, simulate_street
+from calibgraph import Camera
 from calibgraph.simulation.cameras import pixel_directions
-from calibgraph.simulation.lens_errors import draw_lens_errors
 from calibgraph.simulation.rigs import RIG_NAMES, rig_of
-from tests.simulation.conftest import small_camera
+from tools.scenes.lens_errors import draw_lens_errors
 
 
 def missed_px(stated: Camera, camera: Camera, T_camera_lidar: np.ndarray) -> float:
@@ -54,21 +51,3 @@ def test_the_size_scales_them_and_none_changes_nothing() -> None:
         assert centre == pytest.approx(5e-4 * 1920 * size, rel=0.4)
     panorama = rig_of("panorama")
     assert draw_lens_errors(panorama, 1.0, np.random.default_rng(0)) == panorama
-
-
-def test_both_rig_files_state_them_and_the_sensors_see_as_before(tmp_path: Path) -> None:
-    pytest.importorskip("open3d", exc_type=ImportError)
-    rig = Rig(cameras={"front": small_camera("pinhole")})
-    for name, size in (("exact", 0.0), ("stated", 1.0)):
-        simulate_street(tmp_path / name, rig, beams=16, frames=1, seed=5, lens_errors=size)
-    files = {path.relative_to(tmp_path / "exact") for path in (tmp_path / "exact").rglob("*.*")}
-    for file in files:
-        exact, stated = (tmp_path / name / file for name in ("exact", "stated"))
-        assert (exact.read_bytes() == stated.read_bytes()) == (file.suffix != ".yaml"), file
-    guess, truth = (load_rig(tmp_path / "stated" / f"{n}.yaml") for n in ("rig", "reference"))
-    assert (
-        guess.cameras["front"].lens.packed.tolist() == truth.cameras["front"].lens.packed.tolist()
-    )
-    with pytest.raises(ValueError, match="lens errors of -1"):
-        simulate_street(tmp_path / "wrong", rig, beams=16, frames=1, lens_errors=-1)
-    assert not (tmp_path / "wrong").exists()
