@@ -71,7 +71,8 @@ def compare(before: Path, after: Path, *, sigmas: float) -> int:
                 f"{name:12} {camera:20} {'DIFFERS' if other else 'same':8}"
                 f" {np.degrees(np.linalg.norm(twist[:3])):8.4f} deg"
                 f" {100 * np.linalg.norm(twist[3:]):7.3f} cm {moved:8.4f} sigma,"
-                f" bars x {ratio.min():.3f} to {ratio.max():.3f}, {was.status} {was.percent} -> {now.status} {now.percent}"
+                f" bars x {ratio.min():.3f} to {ratio.max():.3f}, {was.status} {was.percent} "
+                f"-> {now.status} {now.percent}"
             )
     return differ
 

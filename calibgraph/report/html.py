@@ -1,8 +1,6 @@
 """The page: the template, filled with all of a result; and the files of a result in its folder."""
 
 import shlex
-from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 
 import yaml
@@ -22,17 +20,15 @@ from calibgraph.model.result_files import (
 )
 from calibgraph.outputs import require_writable
 from calibgraph.report.camera_section import camera_diagrams, camera_section
-from calibgraph.report.drawing import Draw, Drawn, draw_here
 from calibgraph.report.frames import recording_name
 from calibgraph.report.kit import load_template
-from calibgraph.report.match_errors import BeforeAfter
 from calibgraph.report.page_overlays import draw_overlays
 from calibgraph.report.page_pairs import match_scale, pair_sections
 from calibgraph.report.point_overlay import write_overlays
 from calibgraph.report.reprojection_errors import errors_before_after
 
 
-def write_report(result: Calibration, path: Path | str, *, draw: Draw = draw_here) -> Path:
+def write_report(result: Calibration, path: Path | str) -> Path:
     """Write a result as one HTML page that needs nothing else: no network, no files beside it.
 
     Images and clouds are read from the files that the result names; if they cannot be read, the
@@ -41,7 +37,6 @@ def write_report(result: Calibration, path: Path | str, *, draw: Draw = draw_her
     Args:
         result: any result; without correspondences the residuals' pictures are left out.
         path: of the page.
-        draw: how the diagrams are drawn, see :func:`calibgraph.report.drawing.drawing_processes`.
 
     Returns:
         The path.
@@ -51,26 +46,18 @@ def write_report(result: Calibration, path: Path | str, *, draw: Draw = draw_her
         FileError: if the page cannot be written.
     """
     path = Path(path)
-    write_text(path, begin_page(result, draw)())
+    write_text(path, render_page(result))
     return path
 
 
-def begin_page(result: Calibration, draw: Draw) -> Callable[[], str]:
-    """Begin to draw the diagrams; the result waits for them, and gives the page as text."""
+def render_page(result: Calibration) -> str:
+    """The page as text, its diagrams drawn into it."""
     errors = errors_before_after(result)
-    drawn = {name: draw(camera_diagrams(result, name, errors.get(name)))
-             for name in result.rig.cameras}  # fmt: skip
-    return partial(_page, result, errors, drawn)
-
-
-def _page(
-    result: Calibration, errors: Mapping[str, BeforeAfter], drawn: Mapping[str, Callable[[], Drawn]]
-) -> str:
     overlays, overlays_left_out = draw_overlays(result, errors)
     cameras = [
         camera_section(result, name, index, overlays.get(name), errors=errors.get(name),
-                       diagrams=diagrams())
-        for index, (name, diagrams) in enumerate(drawn.items())
+                       diagrams=camera_diagrams(result, name, errors.get(name)))
+        for index, name in enumerate(result.rig.cameras)
     ]  # fmt: skip
     summary = result.summary
     return load_template("page.html.j2").render(
@@ -110,7 +97,6 @@ def write_result(
     data: Dataset | None = None,
     *,
     with_report: bool = True,
-    draw: Draw = draw_here,
 ) -> list[Path]:
     """Write a result in place of an older one: of images with an overlay picture per camera.
 
@@ -122,7 +108,6 @@ def write_result(
     outputs = outputs_of_result(folder)
     require_writable(outputs)
     stale = [output.path for output in outputs if output.is_ours]
-    page = begin_page(result, draw) if with_report else None  # drawn while the rest is written
     with written_together(folder, last=CALIBRATION_FILE) as new:
         written = [result.save(new)]
         tables = (new / CORRESPONDENCES_FILE, new / CAMERA_MATCHES_FILE)
@@ -131,8 +116,8 @@ def write_result(
             middle = data.frames[len(data.frames) // 2]
             mark = "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
             written += write_overlays(middle, result.initial_rig, result.rig, new, mark=mark)
-        if page is not None:
-            write_text(new / REPORT_FILE, page())
+        if with_report:
+            write_text(new / REPORT_FILE, render_page(result))
             written.append(new / REPORT_FILE)
         names = {path.name for path in new.iterdir()}
     for path in (path for path in stale if path.name not in names):
