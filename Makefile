@@ -10,7 +10,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help install run test coverage test-ci test-slow lint type docs web bench clean
+.PHONY: help install run test coverage test-ci test-slow lint type docs bench clean
 
 help: ## Show this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -67,9 +67,6 @@ $(VENV)/docs: pyproject.toml constraints.txt
 docs: $(VENV)/docs ## Build the documentation into build/docs, without a network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-web: ## Build the page of `calibgraph pick` (needs node and a network; its bundle is committed)
-	cd web/pick && npm ci && npm run check && npm run build
-
 bench: $(VENV)/test ## Compare ratios of processor times with the last release's; measure parts by themselves
 	$(BIN)/python -m benchmarks.speed.gate --against benchmarks/ratios.json
 	$(BIN)/python -m benchmarks.speed.stages data/sample
@@ -80,5 +77,5 @@ bench: $(VENV)/test ## Compare ratios of processor times with the last release's
 	$(BIN)/python -m benchmarks.speed.incremental
 
 clean: ## Remove everything that was made
-	rm -rf $(VENV) out build web/pick/node_modules *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) out build *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

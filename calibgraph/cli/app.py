@@ -27,7 +27,8 @@ from calibgraph.cli.guess import bag, guess, init
 from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
 from calibgraph.cli.learned import weights
 from calibgraph.cli.outputs import keep_files
-from calibgraph.cli.serve import pick, serve, token
+from calibgraph.cli.pick import pick
+from calibgraph.cli.serve import serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
 

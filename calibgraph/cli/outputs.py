@@ -78,7 +78,7 @@ def _pictures(folder: Path | None, _: Given) -> list[Output]:
 
 
 def _picked(folder: Path, _: Given) -> list[Output]:
-    from calibgraph.service.pick.reference import outputs_of_pick
+    from calibgraph.pick.workspace import outputs_of_pick
 
     return outputs_of_pick(folder)
 
