@@ -127,15 +127,15 @@ def test_axes_of_the_lidar_turned_about_z_are_the_only_hint(folder: Path) -> Non
 @pytest.mark.parametrize(
     ("scale", "expected"),
     [
-        (1000, "9332 m is above 1000 m: are the clouds in millimetres?"),
-        (100, "933 m is above 200 m: are the clouds in centimetres?"),
+        (1000, "9332 m, above the limit 1000 m: are the clouds in millimetres?"),
+        (100, "933 m, above the limit 200 m: are the clouds in centimetres?"),
     ],
 )
 def test_clouds_in_other_units_are_named_with_their_distance(
     folder: Path, scale: float, expected: str
 ) -> None:
     change_clouds(folder, lambda cloud: cloud * np.float32([scale] * 3 + [1])[: cloud.shape[1]])
-    assert texts(diagnose([folder]), "warning") == [f"median distance of the points {expected}"]
+    assert texts(diagnose([folder]), "warning") == [f"median distance of the points: {expected}"]
 
 
 @pytest.mark.usefixtures("no_image_checks")

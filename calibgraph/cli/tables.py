@@ -45,9 +45,11 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     if result.places:
         print_plain(console, describe_places(result.places))
     console.print(error_bar_table(result))
+    unknown = any(not result.error_bar_holds(name) for name in result.covariance)
     console.print(
         f"1 sigma per axis of the {config.of}. Not included: {result.not_included}."
         f"{result.verdict.images_note} A->B is the relative pose, in B's axes."
+        + " A FAIL has no error bar." * unknown
     )
     if result.lens:
         console.print(lens_table(result))

@@ -72,9 +72,9 @@ def check_sigmas(what: str, sigmas: Array | None, tolerance: tuple[float, float]
         100 * float(sigmas[3:].max()),
     )
     return [
-        threshold("sigma_rotation", tolerance).check(rotation_deg, name=f"{what}: rotation"),
+        threshold("sigma_rotation", tolerance).check(rotation_deg, name=f"{what}, rotation"),
         threshold("sigma_translation", tolerance).check(
-            translation_cm, name=f"{what}: translation"
+            translation_cm, name=f"{what}, translation"
         ),
     ]
 

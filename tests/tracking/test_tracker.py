@@ -195,15 +195,15 @@ def test_a_camera_without_matches_is_held_by_a_relative_pose(pair: Rig) -> None:
     _, updates = tracked(guess, tables)
     xi = difference(updates[-1].T_camera_lidar["right"], pair.T_camera_lidar["right"])
     assert np.degrees(np.linalg.norm(xi[:3])) < 0.2
-    assert updates[-1].verdicts["right"].status == "FAIL"  # it has no estimate of its own
+    assert updates[-1].verdicts["right"].cannot_tell  # it has no estimate of its own
 
 
-def test_the_guess_is_given_and_failed_until_there_is_an_estimate(pair: Rig) -> None:
+def test_until_there_is_an_estimate_the_guess_is_given_and_nothing_can_be_told(pair: Rig) -> None:
     guess = perturb(pair, rotation_deg=2, translation_m=0.2, seed=4)
     _, updates = tracked(guess, drive(lambda frame: pair, 6))
     first = updates[0]
     np.testing.assert_allclose(first.T_camera_lidar["left"], guess.T_camera_lidar["left"])
-    assert first.verdicts["left"].status == "FAIL" and first.covariance["left"] is None
+    assert first.verdicts["left"].cannot_tell and first.covariance["left"] is None
     assert "1 of 5 frames" in first.verdicts["left"].reasons[0]
     assert [event.kind for event in updates[4].events] == ["started", "started"]
 
@@ -277,7 +277,7 @@ def test_a_tracker_of_degenerate_frames_alone_never_throws() -> None:
                 camera="only", frame=frame, pixels_px=pixels, points_lidar_m=line
             )
         )
-    assert update.verdicts["only"].status == "FAIL"
+    assert update.verdicts["only"].cannot_tell
 
 
 def test_an_update_that_fails_leaves_nothing_behind(
@@ -346,7 +346,7 @@ def test_a_stream_that_is_stuck_from_the_beginning_is_named(pair: Rig) -> None:
     (table,) = drive(lambda _: pair, 1)
     tables = [replace(table, frame=np.full(len(table), number)) for number in range(21)]
     tracker, _ = tracked(pair, tables[:20])
-    assert tracker.calibration().summary.reasons[0].text.startswith("no estimate yet")
+    assert "no estimate yet" in tracker.calibration().summary.reasons[0].text
     tracker.update(tables[20])
     result = tracker.calibration()
     assert result.verdict.status == "FAIL"
