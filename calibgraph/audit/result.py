@@ -98,7 +98,7 @@ class Audit:
         deployed: the rig that was compared.
         shown: the frame that a page shows, in the middle of the recording.
         recording: the sources of the frames.
-        tolerance_deg, tolerance_cm: largest deviation per axis that is OK.
+        tolerance_deg, tolerance_cm: largest turn and shift that are OK.
         frames: number of frames that were matched.
         timings_s: wall time per stage.
         versions: of this package and the libraries that matter.

@@ -59,7 +59,7 @@ def _print_status(console: Console, status: str, question: str) -> None:
 
 
 def _tolerance(of: Audit | Drift) -> str:
-    return f"tolerance {of.tolerance_deg:g} deg, {of.tolerance_cm:g} cm per axis"
+    return f"tolerance {of.tolerance_deg:g} deg, {of.tolerance_cm:g} cm"
 
 
 def _axes_table(title: str, *names: str, words: tuple[str, ...] = ()) -> Table:

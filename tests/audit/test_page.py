@@ -48,7 +48,7 @@ def test_a_wrong_camera_is_shown_beside_what_was_measured(tmp_path: Path) -> Non
     assert "No. front_left is not where the calibration has it." in text
     assert "Fasten what is loose, and calibrate again" in text
     assert text.count("<svg") == 4
-    assert text.count('class="beyond" x=') == 1
+    assert text.count('class="beyond" x=') == 3  # the axes of one turn
     for name in ("front_left", "front_right"):
         assert f'alt="{name} deployed, coloured by distance"' in text
         assert f'alt="{name} measured, coloured by distance"' in text
