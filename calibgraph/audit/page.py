@@ -161,15 +161,20 @@ def charts_of(camera: CameraAudit, tolerance_deg: float, tolerance_cm: float) ->
         return ()
     twists = (camera.deviation, camera.sigma, camera.detectable)
     rows = np.stack([np.full(6, np.nan) if t is None else t * DISPLAY for t in twists], axis=1)
-    parts = ((slice(0, 3), "rotation", "deg", tolerance_deg), (slice(3, 6), "translation", "cm", tolerance_cm))
+    parts = (
+        (slice(0, 3), "rotation", "deg", tolerance_deg),
+        (slice(3, 6), "translation", "cm", tolerance_cm),
+    )
     charts = []
     for part, word, unit, tolerance in parts:
         total = float(np.linalg.norm(rows[part, 0]))
         style = "beyond" if total > tolerance else "within"
         style = "unsure" if camera.status == "CANNOT TELL" else style
         bars = (
-            Bar(name, *numbers, style)
-            for name, numbers in zip(CAMERA_AXES[part], rows[part].tolist(), strict=True)
+            Bar(name, deviation, sigma, detectable, style)
+            for name, (deviation, sigma, detectable) in zip(
+                CAMERA_AXES[part], rows[part].tolist(), strict=True
+            )
         )
         charts.append(Chart(f"{word} [{unit}], {total:.2f} in all", tuple(bars), tolerance))
     return tuple(charts)

@@ -55,9 +55,7 @@ def axes_beyond(deviation: Array, significant: Mask, tolerance: Array) -> Mask:
         tolerance: (2,) largest turn and shift.
     """
     parts = np.where(significant, deviation, 0.0).reshape(*deviation.shape[:-1], 2, 3)
-    beyond: Mask = significant & np.repeat(
-        np.linalg.norm(parts, axis=-1) > tolerance, 3, axis=-1
-    )
+    beyond: Mask = significant & np.repeat(np.linalg.norm(parts, axis=-1) > tolerance, 3, axis=-1)
     return beyond
 
 

@@ -31,7 +31,9 @@ def print_audit(console: Console, audit: Audit, page: Path | None = None) -> Non
         "that are all too long or too short, look like a motion"
     )
     written = "nothing was written" if page is None else f"{page}: written"
-    print_plain(console, f"{_tolerance(audit)}; {audit.frames} frames; {elapsed_s():.1f} s; {written}")
+    print_plain(
+        console, f"{_tolerance(audit)}; {audit.frames} frames; {elapsed_s():.1f} s; {written}"
+    )
 
 
 def print_drift(console: Console, drift: Drift) -> None:
@@ -119,4 +121,3 @@ def _detectable_table(drift: Drift) -> Table:
             cells = twist_cells(each.detectable, 2)
             table.add_row("" if row else escape(name), escape(result), *cells)
     return table
-

@@ -49,7 +49,8 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
     console.print(
         f"1 sigma per axis of the {config.of}. Not included: {result.not_included}."
         f"{result.verdict.images_note} A->B is the relative pose, in B's axes."
-        + " A FAIL has no error bar." * unknown
+        + " A FAIL has no error bar."
+        * unknown
     )
     if result.lens:
         console.print(lens_table(result))

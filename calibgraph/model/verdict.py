@@ -151,7 +151,7 @@ class ErrorProbability:
 
     @property
     def status(self) -> Status:
-        """PASS, WARN or FAIL; a wide error bar alone is a FAIL only if it is sure to be too wide."""
+        """PASS, WARN or FAIL; a wide error bar alone is a FAIL only if an error is sure."""
         sure = self.probability > _SURE
         return grade(not self.probability < PASS_BELOW, sure or not self.by_checks <= FAIL_ABOVE)
 

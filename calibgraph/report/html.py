@@ -141,7 +141,9 @@ def write_result(
         if data is not None:
             middle = data.frames[len(data.frames) // 2]
             verdicts = {name: one.status for name, one in result.camera_verdicts.items()}
-            written += write_overlays(middle, result.initial_rig, result.rig, new, verdicts)
+            written += write_overlays(
+                middle, result.initial_rig, result.rig, new, verdicts=verdicts
+            )
         if page is not None:
             write_text(new / REPORT_FILE, page())
             written.append(new / REPORT_FILE)

@@ -27,7 +27,7 @@ _MARKS: dict[Status, str] = {"PASS": "PASS", "WARN": "WARN", "FAIL": "FAIL, do n
 
 
 def write_overlays(
-    frame: Frame, initial: Rig, final: Rig, folder: Path, verdicts: Mapping[str, Status]
+    frame: Frame, initial: Rig, final: Rig, folder: Path, *, verdicts: Mapping[str, Status]
 ) -> list[Path]:
     """Write ``overlay_CAMERA.png`` for every camera: before above, after below, its verdict.
 

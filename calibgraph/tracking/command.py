@@ -97,9 +97,7 @@ def track(
     named = as_groups([*run.places.values()]) if any(run.places) else ()
     # The guess, not where the first batch has located it.
     verdicts = {name: _at_the_end(one) for name, one in result.camera_verdicts.items()}
-    result = replace(
-        result, initial_rig=settings.rig, places=named, camera_verdicts=verdicts
-    )
+    result = replace(result, initial_rig=settings.rig, places=named, camera_verdicts=verdicts)
     return result, _write_results(settings.out, result, history if run.updates else None)
 
 

@@ -51,7 +51,8 @@ def test_a_number_next_to_its_limit_is_told_from_it_in_three_digits() -> None:
         == "x: 0.151 deg, above the limit 0.15 deg"
     )
     assert (
-        check_of("x", 0.2, "at most", 0.15, 0.5, unit="deg").text == "x: 0.2 deg, above the limit 0.15 deg"
+        check_of("x", 0.2, "at most", 0.15, 0.5, unit="deg").text
+        == "x: 0.2 deg, above the limit 0.15 deg"
     )
     assert beside(0.14999, 0.15, "deg") == "0.149 deg"
     assert beside(-0.2001, -0.2, "share") == "-20.1%"
