@@ -100,8 +100,8 @@ def test_a_guess_in_millimetres_is_named_by_what_the_images_show_first() -> None
     found = diagnose([SAMPLE], rig.moved_to({"left": T}))
     assert found.points_in_image["left"] == 0
     assert texts(found, "error") == [
-        "the images of left fit clearly better if the guess has a translation in millimetres: correct "
-        "it",
+        "the images of left fit clearly better if the guess has a translation in millimetres: "
+        "correct it",
         "left: by the guess, no point of the cloud lies in the image",
     ]
     assert texts(found, "warning") == [
