@@ -78,10 +78,12 @@ def test_one_result_type_serves_both_solvers(pair: Rig, tmp_path: Path) -> None:
 def test_a_step_of_one_camera_is_found_within_3_frames_and_named(pair: Rig, who: str) -> None:
     after = moved(pair, who, step_of(0.5, 3))
     tables = drive(lambda frame: after if frame >= 25 else pair, 50)
-    _, updates = tracked(pair, tables)
+    tracker, updates = tracked(pair, tables)
     (event,) = events_of(updates)
     assert (event.kind, event.camera, event.frame) == ("moved", who, 25)
     assert event.detected_frame <= 27
+    for one in (tracker, IncrementalCalibrator.from_bytes(tracker.to_bytes())):
+        assert one.calibration().summary.moves == (str(event),)
     assert event.size is not None
     assert abs(event.size.rotation_deg - 0.5) < 4 * event.size.rotation_sigma_deg
     for name, T in updates[-1].T_camera_lidar.items():
