@@ -69,14 +69,15 @@ def audit_html(audit: Audit) -> str:
 
 
 def _reasons(audit: Audit) -> list[Reason]:
-    """The findings of the LiDAR and of each camera; the same of several is one line."""
+    """The findings of the LiDAR and of each camera, the worst first; the same of several is one."""
     alike: dict[tuple[str, str], tuple[str, ...]] = {}
     if audit.lidar is not None:
         alike["WRONG", f"{audit.lidar.reason}; all cameras agree on it"] = ("LiDAR",)
     for name, camera in audit.cameras.items():
         key = camera.status, camera.reason
         alike[key] = (*alike.get(key, ()), name)
-    return [Reason(status, names, text) for (status, text), names in alike.items()]
+    reasons = [Reason(status, names, text) for (status, text), names in alike.items()]
+    return sorted(reasons, key=lambda reason: ("WRONG", "CANNOT TELL", "OK").index(reason.status))
 
 
 def _detectable(audit: Audit) -> str:
