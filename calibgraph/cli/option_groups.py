@@ -120,8 +120,8 @@ class SolveOptions:
         bootstrap: Check the covariance: solve N times with frames drawn with replacement.
         tolerance_deg (DEG): Rotation by which a PASS may be off; by default 0.5.
         tolerance_cm (CM): Distance by which a PASS may be off; by default 10.
-        of (alignment|mount): Poses to report: where the LiDAR's points meet the images, or where
-            the sensors are mounted, less certain. (default: alignment)
+        of (alignment|mount): Poses to report. alignment: for projecting points. mount: the physical
+            pose, with a wider error bar. (default: alignment)
         estimate (PART,...): Estimate each camera's lens and clock too: focal, aspect, centre,
             distortion, or lens for all but aspect; offset, readout, or clock for both. The rig may
             state how well they are known.

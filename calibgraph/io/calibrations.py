@@ -156,6 +156,7 @@ class _Parts(BaseModel):
     residuals: dict[str, Residuals]
     weaknesses: dict[str, tuple[str, ...]]
     frames_used: tuple[_FrameEntry, ...]
+    moves: tuple[str, ...] = ()
     places: tuple[tuple[int, ...], ...] = ()
     rounds: tuple[dict[str, Any], ...]
     warnings: tuple[str, ...] = ()
@@ -215,7 +216,7 @@ _OF_SOME_CAMERAS = (
 _PLAIN = (
     "covariance", "joint_covariance", "pair_covariance", "stage1_T_camera_lidar", "residuals",
     "weaknesses", "rounds", "counts", "timings_s", "terms", "prior_share", "error_sources",
-    "inputs", "versions", "date", "warnings", "lens", "places",
+    "inputs", "versions", "date", "warnings", "lens", "moves", "places",
 )  # fmt: skip
 assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}
 

@@ -114,8 +114,10 @@ def write_result(
         written += [table for table in tables if table.exists()]
         if data is not None:
             middle = data.frames[len(data.frames) // 2]
-            mark = "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
-            written += write_overlays(middle, result.initial_rig, result.rig, new, mark=mark)
+            verdicts = {name: one.status for name, one in result.camera_verdicts.items()}
+            written += write_overlays(
+                middle, result.initial_rig, result.rig, new, verdicts=verdicts
+            )
         if with_report:
             write_text(new / REPORT_FILE, render_page(result))
             written.append(new / REPORT_FILE)
