@@ -105,10 +105,16 @@ class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[Any] = set()
-        for key_node, _ in node.value:
+        for key_node, value_node in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":
                 continue
             key = self.construct_object(key_node, deep=True)
+            if isinstance(key, (int, float)) and value_node.value == "" and node.flow_style:
+                raise yaml.MarkedYAMLError(
+                    problem=f"{key_node.value} after a comma has no value: is it a decimal comma? "
+                    "write 1.5 for 1,5; found at",
+                    problem_mark=key_node.start_mark,
+                )
             if isinstance(key, (str, int)) and key in seen:
                 raise yaml.MarkedYAMLError(
                     problem=f"key {key!r} is given twice", problem_mark=key_node.start_mark

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.files import require_file
+from calibgraph.files import require_file, wide_encoding
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import Places
 from calibgraph.model.table_columns import (
@@ -127,11 +127,26 @@ def read_arrow(
 
     with arrow_reads(path):
         if path.suffix == ".csv":
+            _require_commas(path)
             column_types = {**dict.fromkeys(names, pa.string()), **(types or {})}
             options = csv.ConvertOptions(column_types=column_types)
             return csv.read_csv(path, convert_options=options)
         with open_parquet(path, names) as file:
             return file.read()
+
+
+def _require_commas(path: Path) -> None:
+    """Check the encoding of a CSV file, and what separates the columns of its first line."""
+    with path.open("rb") as file:
+        head = file.readline(2**16)
+    if encoding := wide_encoding(head):
+        raise FileError(path, f"is {encoding}; save it as UTF-8 (in Excel: CSV UTF-8)")
+    for separator, name in ((b";", "semicolons"), (b"\t", "tabs")):
+        if separator in head and b"," not in head:
+            raise FileError(
+                path, f"its columns are separated by {name}; save it with commas between columns, "
+                "and points in numbers"
+            )  # fmt: skip
 
 
 def open_parquet(path: Path, names: Sequence[str] = ("camera",)) -> Any:
