@@ -26,6 +26,7 @@ from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.trust.inputs import (
     Finding,
     count_points_in_view,
+    describe_brightness,
     describe_out_of_view,
     describe_repeats,
     explain_guess,
@@ -160,11 +161,14 @@ def _examine_frames(
     """The clouds that can be read, by frame; with findings about clouds and images."""
     read = map_on_cores(_examine_frame, frames, [rig] * len(frames))
     for source in ("", *rig.cameras):
-        problems = [each[source] for _, each in read if source in each]
+        problems = [each.problems[source] for each in read if source in each.problems]
         if problems:
             others = f"; {len(problems) - 1} more of its frames have errors" if problems[1:] else ""
             findings.append(Finding("error", problems[0] + others))
-    clouds = [(f, cloud) for f, (cloud, _) in zip(frames, read, strict=True) if cloud is not None]
+    for name in rig.cameras:
+        text = describe_brightness(name, [e.brightness[name] for e in read if name in e.brightness])
+        findings += [Finding("warning", text)] if text else []
+    clouds = [(f, e.cloud) for f, e in zip(frames, read, strict=True) if e.cloud is not None]
     findings += _repeats("cloud", [(f.name, f.cloud_path) for f, _ in clouds])
     for name in rig.cameras:
         images = [(f.name, f.image_paths[name]) for f, _ in clouds]
@@ -172,23 +176,31 @@ def _examine_frames(
     return clouds
 
 
-def _examine_frame(frame: Frame, rig: Rig) -> tuple[NDArray[np.float32] | None, dict[str, str]]:
-    """The cloud if readable, and the problems of the cloud ("") and of each camera's image."""
-    problems: dict[str, str] = {}
-    cloud = None
+@dataclass
+class _Examined:
+    """A frame: its cloud if readable, problems of it ("") and of images, and their mean levels."""
+
+    cloud: NDArray[np.float32] | None = None
+    problems: dict[str, str] = field(default_factory=dict)
+    brightness: dict[str, float] = field(default_factory=dict)
+
+
+def _examine_frame(frame: Frame, rig: Rig) -> _Examined:
+    found = _Examined()
     try:
-        cloud = frame.load_cloud()
+        found.cloud = frame.load_cloud()
     except (CalibrationError, OSError) as error:
-        problems[""] = str(error)
+        found.problems[""] = str(error)
     for name, camera in rig.cameras.items():
         try:
             gray = frame.load_gray(name, camera)
         except (CalibrationError, OSError) as error:
-            problems[name] = str(error)
+            found.problems[name] = str(error)
             continue
         if np.ptp(gray) == 0:
-            problems[name] = f"{frame.image_paths[name]}: all pixels are {gray[0, 0]}"
-    return cloud, problems
+            found.problems[name] = f"{frame.image_paths[name]}: all pixels are {gray[0, 0]}"
+        found.brightness[name] = float(gray.mean())
+    return found
 
 
 def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> list[Finding]:

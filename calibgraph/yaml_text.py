@@ -33,6 +33,11 @@ def parse_yaml_documents(text: str, path: Path | str) -> list[dict[str, Any]]:
         raise FileError(path, why)
     if _bracket_depth(text) > MAX_YAML_DEPTH:
         raise FileError(path, _TOO_DEEP)
+    if pairs := _DECIMAL_COMMAS.search(text):
+        raise FileError(
+            path, f"{pairs[0]} looks like decimal commas; write points, 1.5 for 1,5, or a space "
+            "after each comma if these are whole numbers"
+        )  # fmt: skip
     try:
         documents = list(yaml.load_all(text, Loader=_Loader))
         documents = [each for each in documents if each is not None] or documents[:1]
@@ -59,6 +64,9 @@ def parse_yaml_documents(text: str, path: Path | str) -> list[dict[str, Any]]:
 
 _SEPARATORS = (",", "\n", ": ", "- ", "? ", "[", "{")
 """One of these is before every value but the first."""
+
+_DECIMAL_COMMAS = re.compile(r"\[ *[-+]?[0-9]+,[0-9]+(?:, +[-+]?[0-9]+,[0-9]+)+ *\]")
+"""A list of pairs, each without a space: PyYAML would read twice as many whole numbers."""
 
 _CUT_OFF = "it ends within a line: if it was cut off, write or copy it again"
 _TOO_DEEP = "is nested too deeply; expected a mapping of keys to values"

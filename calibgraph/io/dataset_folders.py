@@ -86,8 +86,8 @@ def frames_of_folder(
     }
     stamped = _stamps(clouds)
     if stamped and any(found.keys() != clouds.keys() for found in images.values()):
-        of_images = {name: _stamps(found) for name, found in images.items()}
-        if all(of_images.values()):
+        of_images = {name: s for name, found in images.items() if (s := _stamps(found))}
+        if of_images.keys() == images.keys():
             return _paired_by_stamps(folder, stamped, of_images, tolerance_s=tolerance_s)
     for name in cameras if complete else ():
         _require_pairs(folder, name, set(clouds), set(images[name]))

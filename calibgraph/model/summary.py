@@ -11,7 +11,7 @@ from typing import Any
 from calibgraph.model.causes import CAUSES, action_of, cause_of
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.threshold import beside, in_unit
-from calibgraph.model.verdict import TOLERANCE, Check, Status, Verdict, rig_verdict
+from calibgraph.model.verdict import BRIGHTNESS, TOLERANCE, Check, Status, Verdict, rig_verdict
 
 MOST = 3
 """Reasons and actions that are shown; the others are folded."""
@@ -185,12 +185,18 @@ def _findings(verdicts: Mapping[str, Verdict]) -> list[Reason]:
     """The checks that are not PASS, equal ones of several cameras once, the most severe first."""
     alike: dict[tuple[str, ...], dict[str, Check]] = {}
     for camera, verdict in verdicts.items():
-        for check in verdict.checks:
+        for check in _unexplained(verdict.checks):
             key = (check.name, check.unit, "" if check.is_graded else _NUMBER.sub("", check.text))
             if check.status != "PASS":
                 alike.setdefault(key, {})[camera] = check
     severest = sorted(alike.values(), key=lambda of: -max(check.severity for check in of.values()))
     return [_reason(each) for each in severest]
+
+
+def _unexplained(checks: Sequence[Check]) -> Sequence[Check]:
+    """The checks without those that dark images explain: their advice would be untrue."""
+    dark = [check for check in checks if check.name == BRIGHTNESS]
+    return dark or checks
 
 
 def _nearest(verdicts: Mapping[str, Verdict]) -> list[Reason]:

@@ -151,7 +151,7 @@ def read_rig_parts(
     notes = [note for part in parts for note in part.notes]
     notes += [NO_LIDAR_IN_IMU] if missing and len(tied) < len(links) else []
     try:
-        T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen, notes)
+        T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen, notes=notes)
     except CalibrationError as error:
         raise CalibrationError("; ".join([str(error), *notes])) from error
     pairs = [pair for part in parts for pair in part.relative_poses]
@@ -224,6 +224,7 @@ def _by_frames(
     cameras: Iterable[str],
     lidar_frame: str | None,
     chosen: Mapping[str, str],
+    *,
     notes: list[str],
 ) -> dict[str, Array]:
     """T_camera_lidar of the cameras that have a frame in the tree; with notes on their links."""
