@@ -36,7 +36,9 @@ def _read_table(path: Path) -> Any:
     from pyarrow import feather
 
     _require_plausible_size(require_file(path))
-    return feather.read_table(path, memory_map=False)
+    table = feather.read_table(path, memory_map=False)
+    table.validate(full=True)  # Arrow believes offsets and lengths, and would read elsewhere
+    return table
 
 
 def _require_plausible_size(path: Path) -> None:
