@@ -205,9 +205,9 @@ def wide_encoding(data: bytes) -> str:
     head = data[:64]
     if head.startswith((b"\xff\xfe\0\0", b"\0\0\xfe\xff")):
         return "UTF-32"
-    body = head.removeprefix(b"\xff\xfe").removeprefix(b"\xfe\xff")
-    zeros = [body[start::2].count(0) * 2 >= len(body) - 1 for start in (0, 1)]
-    return "UTF-16" if len(body) > 1 and zeros[0] != zeros[1] else ""
+    zeros = [head[start::2].count(0) * 2 >= len(head) - 1 for start in (0, 1)]
+    is_wide = len(head) > 1 and zeros[0] != zeros[1]
+    return "UTF-16" if is_wide or head.startswith((b"\xff\xfe", b"\xfe\xff")) else ""
 
 
 def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> None:

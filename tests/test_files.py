@@ -110,7 +110,7 @@ def test_merge_keys_of_a_rig_are_read(tmp_path: Path) -> None:
 
 
 def test_binary_files_and_folders_and_nothing_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "rig.bin").write_bytes(b"\xff\xfe\x00\x81")
+    (tmp_path / "rig.bin").write_bytes(b"\xff\x00\x81\xfe")
     with pytest.raises(FileError, match="not a text file"):
         load_rig(tmp_path / "rig.bin")
     with pytest.raises(FileError, match="holds none of"):
