@@ -97,12 +97,13 @@ def diagnose(
     choice = choose_frames(data, data.rig, MOST_FRAMES)
     examined = choice.dataset
     findings += [Finding("note", choice.text)] if choice.text else []
-    clouds = _examine_frames(examined.frames, data.rig, findings)
+    readable = _examine_frames(examined.frames, data.rig, findings)
     findings += _examine_places(examined)
     seen: dict[str, int] = {}
     written: list[Path] = []
-    if clouds:
-        frame, cloud = clouds[len(clouds) // 2]
+    if readable:
+        frame = readable[len(readable) // 2]
+        cloud = frame.load_cloud()
         seen = count_points_in_view(data.rig, cloud)
         findings += _examine_guess(examined, (frame, cloud), seen)
         if pictures is not None and not any(finding.level == "error" for finding in findings):
@@ -155,10 +156,8 @@ def _describe(data: Dataset) -> Iterator[Finding]:
         )
 
 
-def _examine_frames(
-    frames: Sequence[Frame], rig: Rig, findings: list[Finding]
-) -> list[tuple[Frame, NDArray[np.float32]]]:
-    """The clouds that can be read, by frame; with findings about clouds and images."""
+def _examine_frames(frames: Sequence[Frame], rig: Rig, findings: list[Finding]) -> list[Frame]:
+    """The frames whose clouds can be read, with findings about clouds and images."""
     read = map_on_cores(_examine_frame, frames, [rig] * len(frames))
     for source in ("", *rig.cameras):
         problems = [each.problems[source] for each in read if source in each.problems]
@@ -168,19 +167,18 @@ def _examine_frames(
     for name in rig.cameras:
         text = describe_brightness(name, [e.brightness[name] for e in read if name in e.brightness])
         findings += [Finding("warning", text)] if text else []
-    clouds = [(f, e.cloud) for f, e in zip(frames, read, strict=True) if e.cloud is not None]
-    findings += _repeats("cloud", [(f.name, f.cloud_path) for f, _ in clouds])
+    readable = [f for f, each in zip(frames, read, strict=True) if "" not in each.problems]
+    findings += _repeats("cloud", [(f.name, f.cloud_path) for f in readable])
     for name in rig.cameras:
-        images = [(f.name, f.image_paths[name]) for f, _ in clouds]
+        images = [(f.name, f.image_paths[name]) for f in readable]
         findings += _repeats(f"image of {name}", images)
-    return clouds
+    return readable
 
 
 @dataclass
 class _Examined:
-    """A frame: its cloud if readable, problems of it ("") and of images, and their mean levels."""
+    """A frame: problems of its cloud ("") and of images, and the mean levels of these."""
 
-    cloud: NDArray[np.float32] | None = None
     problems: dict[str, str] = field(default_factory=dict)
     brightness: dict[str, float] = field(default_factory=dict)
 
@@ -188,7 +186,7 @@ class _Examined:
 def _examine_frame(frame: Frame, rig: Rig) -> _Examined:
     found = _Examined()
     try:
-        found.cloud = frame.load_cloud()
+        frame.load_cloud()
     except (CalibrationError, OSError) as error:
         found.problems[""] = str(error)
     for name, camera in rig.cameras.items():

@@ -57,7 +57,7 @@ def read_part(path: Path, name: str | None) -> Part:
         return _read_content(read_documents(path), path, name)
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES).decode("utf-8", "replace")
-    raise FileError(path, _unknown(f"a file {suffix or 'without a suffix'}", head))
+    raise FileError(path, _unknown(f"a file {suffix or 'without a suffix'} is", head))
 
 
 def _read_lines(path: Path, name: str | None) -> Part:
@@ -70,7 +70,7 @@ def _read_lines(path: Path, name: str | None) -> Part:
     if is_kitti_lines(text):
         return read_kitti_lines(path, name)
     first = next((line for line in text.splitlines() if line.strip()), "")
-    raise FileError(path, _unknown(f"its line {first[:40]!r}", text))
+    raise FileError(path, _unknown(f"its line {first[:40]!r} is", text))
 
 
 def _unknown(what: str, text: str = "") -> str:
@@ -83,7 +83,7 @@ def _unknown(what: str, text: str = "") -> str:
     if "camera matrix" in text:
         return "is the .ini of camera_calibration; give the .yaml that it writes beside it"
     return (
-        f"{what} is of no known format; known are those of Kalibr, ROS (camera_info, /tf_static, "
+        f"{what} of no known format; known are those of Kalibr, ROS (camera_info, /tf_static, "
         "URDF), OpenCV, Autoware, KITTI, COLMAP and others in docs/formats.md; or write "
         "T_camera_lidar into rig.yaml"
     )
@@ -104,7 +104,7 @@ def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None)
     found = read_camera_maps(content, path, name)
     if found is None:
         keys = ", ".join(str(key) for key in list(content)[:5])
-        raise FileError(path, _unknown(f"the content with the keys {keys}"))
+        raise FileError(path, _unknown(f"its keys ({keys}) are"))
     return found
 
 

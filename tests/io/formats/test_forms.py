@@ -345,7 +345,7 @@ def test_a_matrix_whose_file_states_no_direction_is_a_question(tmp_path: Path) -
 @pytest.mark.parametrize("text", ["At time 0.0\n- Translation: [1, 2, 3]\n", "hello\n", ""])
 def test_other_text_is_of_no_known_format(text: str, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text(text)
-    with pytest.raises(CalibrationError, match="is of no known format; known are Kalibr"):
+    with pytest.raises(CalibrationError, match="is of no known format; known are those of Kalibr"):
         import_rig([tmp_path / "notes.txt"])
 
 
