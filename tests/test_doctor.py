@@ -177,3 +177,16 @@ def test_doctor_replaces_its_own_pictures_and_no_others(tmp_path: Path, call: Ca
     cv2.imwrite(str(picture), np.zeros((4, 4, 3), np.uint8))
     code, _, err = call(*given)
     assert code == 2 and "was not written by calibgraph doctor" in err
+
+
+@pytest.mark.parametrize(("scale", "lift", "word"), [(0.12, 0, "dark"), (0.2, 215, "bright")])
+@pytest.mark.usefixtures("no_image_checks")
+def test_the_brightness_of_images_that_show_too_little_is_named(
+    scale: float, lift: float, word: str, folder: Path
+) -> None:
+    for path in folder.glob("cameras/left/*"):
+        image = cv2.imread(str(path))
+        assert image is not None
+        cv2.imwrite(str(path), np.clip(image * scale + lift, 0, 255).astype(np.uint8))
+    (found,) = texts(diagnose([folder]), "warning")
+    assert found.startswith(f"the images of left are too {word} to show structure: their mean")

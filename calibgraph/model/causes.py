@@ -33,6 +33,11 @@ _ESTIMATED_AS = {
 
 # fmt: off
 CAUSES: dict[str, Cause] = {
+    "brightness": Cause(
+        "images that are too dark or too bright",
+        "Record by daylight, or with another exposure.",
+        {"brightness of the images": ""},
+    ),
     "repeats": Cause(
         "frames that repeat others",
         "See why the named images or clouds repeat, and leave the repeats out.",

@@ -11,7 +11,7 @@ from typing import Any
 from calibgraph.model.causes import CAUSES, action_of, cause_of
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.threshold import beside, in_unit
-from calibgraph.model.verdict import TOLERANCE, Check, Status, Verdict, rig_verdict
+from calibgraph.model.verdict import BRIGHTNESS, TOLERANCE, Check, Status, Verdict, rig_verdict
 
 LEAST = 3
 """Reasons that are shown if there are so many: more only where each is the worst of a camera."""
@@ -124,7 +124,7 @@ def _by_cause(verdicts: Mapping[str, Verdict]) -> tuple[_Checks, _Checks]:
     others: _Checks = {}
     for camera, verdict in verdicts.items():
         causes: set[str] = set()
-        for check in sorted(verdict.checks, key=lambda check: -check.severity):
+        for check in sorted(_unexplained(verdict.checks), key=lambda check: -check.severity):
             cause = cause_of(check.kind or check.name)
             if check.status != "PASS":
                 (others if cause in causes else worst).setdefault(camera, []).append(check)
@@ -220,6 +220,12 @@ def _findings(checks: Mapping[str, Sequence[Check]]) -> list[Reason]:
             alike.setdefault(key, {})[camera] = check
     severest = sorted(alike.values(), key=lambda of: -max(check.severity for check in of.values()))
     return [_reason(each) for each in severest]
+
+
+def _unexplained(checks: Sequence[Check]) -> Sequence[Check]:
+    """The checks without those that dark images explain: their advice would be untrue."""
+    dark = [check for check in checks if check.name == BRIGHTNESS]
+    return dark or checks
 
 
 def _nearest(verdicts: Mapping[str, Verdict]) -> list[Reason]:

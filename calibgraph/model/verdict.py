@@ -48,6 +48,8 @@ and keeps from a PASS, since the same posterior cannot vouch for it."""
 FLAT_EVIDENCE = "flat_evidence"
 """Kind of the check that compares the error bars by images and by matches. The wider one is in the
 result, so that the check itself changes no verdict."""
+BRIGHTNESS = "brightness of the images"
+"""Kind of the check that explains all others of a camera: its images show too little."""
 IMAGES_ELSEWHERE = "images"
 """Kind of the check that the images of a table were compared with another pose, lens or time."""
 _SURE, _LEAST = 0.99, 0.001  # beyond these, probabilities are not known

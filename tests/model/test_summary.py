@@ -20,7 +20,7 @@ from calibgraph.model.error_sources import (
     ErrorSources,
 )
 from calibgraph.model.summary import LEAST, summarize
-from calibgraph.model.verdict import COMMON_ERROR, Check, ErrorProbability, Verdict
+from calibgraph.model.verdict import BRIGHTNESS, COMMON_ERROR, Check, ErrorProbability, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS
 from calibgraph.trust.thresholds import THRESHOLDS, threshold
 
@@ -205,3 +205,11 @@ def test_a_doubt_without_a_check_beyond_its_limit_names_the_nearest_one() -> Non
         "matches of a competing solution over those of this one: 24%"
     )
     assert summary.actions == (CAUSES["matches"].action,)
+
+
+def test_images_that_are_too_dark_are_the_only_reason_of_their_camera() -> None:
+    dark = Check(BRIGHTNESS, "WARN", "the images of a are too dark: 13 of 255; expose longer")
+    checks = (dark, *of_kinds("guess_rotation", "lens", "z_score", "range_rotation").checks)
+    found = summarize({"a": Verdict(checks)})
+    assert [reason.text for reason in found.reasons] == [dark.text]
+    assert not found.others
