@@ -2,6 +2,7 @@
 
 import secrets
 import shutil
+from collections.abc import AsyncGenerator
 from pathlib import Path
 
 from fastapi import Request
@@ -50,8 +51,15 @@ async def receive_job(
     """
     if not request.headers.get("content-type", "").startswith("multipart/form-data"):
         raise Problem(415, "send a form: multipart/form-data")
+
+    async def chunks() -> AsyncGenerator[bytes]:
+        async for chunk in request.stream():
+            yield chunk
+        if not parser.is_whole:
+            raise MultiPartException("it breaks off; send it again")
+
     parser = _Form(
-        request.headers, request.stream(), max_files=MAX_RECORDINGS + 2,
+        request.headers, chunks(), max_files=MAX_RECORDINGS + 2,
         max_fields=MAX_RECORDINGS + 5, max_part_size=MOST_TEXT_BYTES,
     )  # fmt: skip
     try:
@@ -59,8 +67,6 @@ async def receive_job(
     except (MultiPartException, LookupError) as error:
         raise Problem(400, f"the form cannot be read ({error})") from error
     try:
-        if not parser.is_whole:
-            raise Problem(400, "the form breaks off; send it again")
         return await run_in_threadpool(_keep, form, kind, folder, roots)
     finally:
         await form.close()
