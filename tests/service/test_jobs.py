@@ -208,7 +208,6 @@ def test_a_check_has_its_page(working: TestClient, calibrated_sample: CommandRun
     assert (result["same_recording"], result["deployed_verdict"]) == (True, "PASS")
 
 
-@pytest.mark.slow
 def test_a_recording_is_calibrated_as_by_the_command(
     working: TestClient, calibrated_sample: CommandRun
 ) -> None:
@@ -217,7 +216,8 @@ def test_a_recording_is_calibrated_as_by_the_command(
         for path in sorted(SAMPLE.rglob("*")):
             if path.is_file() and path.name != "reference.yaml":
                 archive.write(path, path.relative_to(SAMPLE.parent))
-    files = {"recording": held.getvalue()}
+    table = (calibrated_sample.folder.parent / "table.parquet").read_bytes()
+    files = {"recording": held.getvalue(), "correspondences": table}
     at = working.post("/v1/jobs/calibrate", files=files).headers["location"]
     for _ in range(5):
         job = working.get(at, params={"wait_s": 60}).json()
