@@ -20,10 +20,9 @@ from calibgraph.tracking.streams import Refused
 from calibgraph.tracking.update import json_lines
 
 Held = dict[Path, DurableCalibrator]
-Answer = tuple[int, str]  # status, JSON or why it is refused
 
 
-def answer(held: Held, request: tuple[str, Path, bytes, str]) -> Answer:
+def answer(held: Held, request: tuple[str, Path, bytes, str]) -> tuple[int, str]:
     """Answer a method, folder, body and settings; after an error the state on disk counts."""
     method, folder, body, config = request
     rig, settings = folder / "rig.yaml", folder / "config.json"
