@@ -194,7 +194,7 @@ def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
 def _with_bag(data: Dataset, path: Path, prefix: str, options: BagOptions) -> Dataset:
     """The dataset with the frames of a bag."""
     start = _next_index(data)
-    found = frames_of_bag(path, list(data.rig.cameras), options)
+    found = frames_of_bag(path, data.rig.cameras, options)
     find = None if options.motion == "none" else motion_finder(path, found.recorded, options)
     recorded = tuple(_bag_frame(each, start, prefix, find) for each in found.recorded)
     data = replace(data, notes=(*data.notes, f"{path}: {found.summary}"))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
-from calibgraph.io.encoded_images import decode_image
+from calibgraph.io.encoded_images import decode_image, describe_turn
 
 Image = NDArray[np.uint8]
 
@@ -150,12 +150,26 @@ def _to_bgr(pixels: Image, layout: str) -> Image:
     return np.asarray(cv2.cvtColor(pixels, _TO_BGR[layout]), dtype=np.uint8)
 
 
+def _require_upright(data: bytes, where: str) -> None:
+    """Refuse an orientation in the data, by which cv_bridge turns the image and others do not."""
+    try:
+        turned = describe_turn(data)
+    except (SyntaxError, OSError, ValueError):
+        return  # its pixels are examined next
+    if turned:
+        raise DatasetError(f"{where}: {turned}")
+
+
 def _of_compressed(message: Any, where: str) -> Image:
     """Decode; image_transport's ``format`` is ``ENCODING; CODEC compressed STORED``, or a codec."""
     encoding, _, codec = message.format.partition(";")
     data = np.ascontiguousarray(message.data).tobytes()
     if not data.startswith((b"\xff\xd8", b"\x89PNG")):
-        raise DatasetError(f"{where}: its format {message.format!r} is neither JPEG nor PNG")
+        raise DatasetError(
+            f"{where}: its format {message.format!r} is neither JPEG nor PNG; decode it with "
+            "`ros2 run image_transport republish`, of video through ffmpeg, and give that topic"
+        )
+    _require_upright(data, where)
     mosaic = encoding.startswith("bayer_") and "bgr" not in codec and "rgb" not in codec
     kind = cv2.IMREAD_GRAYSCALE if mosaic else cv2.IMREAD_COLOR
     try:
