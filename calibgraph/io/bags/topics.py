@@ -123,6 +123,9 @@ def choose_topics(
 def _unused(bag: Bag, infos: _Infos, used: Iterable[CameraTopics]) -> Iterable[str]:
     """A line for each image topic with a CameraInfo that no camera has."""
     taken = {_words(each.image) for each in used}
+    for each in bag.of_type(*_NOT_READ):
+        if _NOT_READ[each.type].startswith("video"):
+            yield f"{bag.path}: {each.name} is {_NOT_READ[each.type]}"
     for topic in _image_topics(bag):
         if _words(topic) not in taken and infos.of(topic):
             depth = _depth(bag, topic)
@@ -185,8 +188,13 @@ def _found_cameras(bag: Bag, infos: _Infos | None) -> dict[str, str]:
             continue
         if not _depth(bag, topic):
             best[_words(topic)] = topic
-    names = _short_names(best)
-    return {names[words]: best[words] for words in sorted(best)}
+    in_space = Counter(map(_space, best.values()))
+    named = {
+        words if in_space[_space(topic)] > 1 else tuple(_space(topic).strip("/").split("/")): topic
+        for words, topic in sorted(best.items())
+    }
+    names = _short_names(named)
+    return {names[words]: topic for words, topic in named.items()}
 
 
 def _image_topics(bag: Bag) -> list[str]:

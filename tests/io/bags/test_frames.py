@@ -149,7 +149,7 @@ def test_repeated_stamps_and_empty_clouds_are_left_out_and_counted(tmp_path: Pat
     assert [frame.name for frame in data.frames] == [
         str(START_NS + number * PERIOD_NS) for number in (0, 2, 3, 5)
     ]
-    assert "/points: 1 repeat a stamp; /points: 1 have no point" in data.notes[-1]
+    assert "/points: 1 have no point; /points: 1 repeat a stamp" in data.notes[-1]
 
 
 @pytest.mark.parametrize("kind", KINDS)
