@@ -275,7 +275,7 @@ def _require_same_lenses(first: Path, rig: Rig, path: Path, other: Rig) -> None:
     """Check that two rigs differ in their extrinsics at most."""
     lenses = [
         {
-            name: camera.model_dump(exclude={"T_camera_lidar", "covariance", "frame_id"})
+            name: camera.model_dump(exclude={"T_camera_lidar", "covariance", "frame_id", "mount"})
             for name, camera in r.cameras.items()
         }
         for r in (rig, other)

@@ -17,8 +17,9 @@ from calibgraph.io.bags.messages import CAMERA_INFO, Bag, Drive
 from calibgraph.io.bags.options import BagOptions
 from calibgraph.io.bags.topics import CameraTopics, choose_topics
 from calibgraph.io.bags.transforms import Transforms
+from calibgraph.io.mounts import find_mounts
 from calibgraph.model.geometry import angle_deg, relative_transform
-from calibgraph.model.rig import Camera, RelativePose, Rig
+from calibgraph.model.rig import Camera, Mount, RelativePose, Rig
 
 _UPWARD = 0.9
 """Vertical part of a camera's axis (64 deg), beyond which it looks up: z is up in body axes."""
@@ -35,6 +36,7 @@ class BagCamera:
     Attributes:
         stated: the lens in its CameraInfo.
         T_camera_lidar: (4, 4); None if no static transforms connect it with the LiDAR.
+        mount: the link of the tree that a calibration changes; None if there is none but itself.
         frame_id: of its image, if the frame has the image's axes and origin.
         with_baseline: whether its place is its frame's, and the baseline that its P states.
         where: its CameraInfo, for errors.
@@ -45,6 +47,12 @@ class BagCamera:
     frame_id: str | None
     with_baseline: bool
     where: str
+    mount: Mount | None = None
+
+    @property
+    def T_camera_frame(self) -> Array:
+        """(4, 4) from the frame in the tree."""
+        return self.stated.T_image_frame(with_baseline=self.with_baseline)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +112,11 @@ class BagRig:
                 "give the rig (--rig)",
                 camera=name,
             )
-        extrinsic = {"frame_id": camera.frame_id, "T_camera_lidar": camera.T_camera_lidar}
+        extrinsic = {
+            "frame_id": camera.frame_id,
+            "mount": camera.mount,
+            "T_camera_lidar": camera.T_camera_lidar,
+        }
         return {**camera.stated.lens.fields(), **extrinsic}
 
 
@@ -122,6 +134,13 @@ def read_bag_rig(path: Path, options: BagOptions | None = None) -> BagRig:
         name: camera if counts[camera.frame_id] == 1 else replace(camera, frame_id=None)
         for name, camera in cameras.items()
     }
+    hanging = {
+        name: (camera.stated.frame, camera.T_camera_frame)
+        for name, camera in cameras.items()
+        if camera.T_camera_lidar is not None
+    }
+    mounts = find_mounts(hanging, lidar, reader.transforms.parents, reader.transforms.known)
+    cameras = {name: replace(camera, mount=mounts.get(name)) for name, camera in cameras.items()}
     shared = (
         f"{path}: {' and '.join(names)} name one frame, {frame!r}: at most one of them is there"
         for frame, names in _shared_frames(cameras).items()
