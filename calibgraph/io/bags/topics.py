@@ -216,7 +216,10 @@ class _Infos:
             near = [info for info in infos if _space(info) == _space(image)]
             others = {_words(each) for each in self._images} - {_words(image)}
             free = [info for info in near if _words(info) not in others]
-            shared = [info for info in free if {*_own(info)} & {*_own(image)}]
+            apart = {info: len({*_own(info)} ^ {*_own(image)}) for info in free}
+            sharing = [info for info in free if {*_own(info)} & {*_own(image)}]
+            least = min((apart[info] for info in sharing), default=0)
+            shared = [info for info in sharing if apart[info] == least]
             if same or shared or free:
                 return tuple(same or shared or free)
         return ()

@@ -26,9 +26,10 @@ from tests.io.bags.writing import (
 )
 
 pytest.importorskip("mcap")
-MAKE = Messages("mcap")
 
 from mcap.writer import CompressionType, IndexType, Writer
+
+MAKE = Messages("mcap")
 
 WHOLE: dict[str, dict[str, Any]] = {
     "whole": {},
