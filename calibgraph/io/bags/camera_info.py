@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
@@ -118,9 +118,9 @@ class LensStates:
                 self.lenses.append(lens)
         self._last = key, record_ns
 
-    def at(self, record_ns: int) -> StatedLens:
-        """The lens at a time of recording [ns]."""
-        return self.lenses[bisect_right(self.since_ns, record_ns) - 1]
+    def which(self, record_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(n,) which lens counts at times of recording [ns]."""
+        return np.searchsorted(self.since_ns, record_ns, side="right") - 1
 
 
 def lens_of(message: Any, where: str, *, rectified: bool) -> StatedLens:

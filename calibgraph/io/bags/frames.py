@@ -128,8 +128,9 @@ def _with_lens_of_rig(
     size_px = camera.width_px, camera.height_px
     own = CameraLens(camera.model, size_px, camera.intrinsics_px, camera.distortion)
     first = next((each for each in states.lenses if same_lens(each.lens, own)), None)
-    found = [states.at(int(each)) for each in record_ns] if first else []
-    fits = np.array([each.agrees(first) for each in found if first] or [True] * len(record_ns))
+    fits = np.ones(len(record_ns), bool)
+    if first is not None:
+        fits = np.array([each.agrees(first) for each in states.lenses])[states.which(record_ns)]
     notes = [f"{states.without} camera_info have no lens"] * bool(states.without)
     if states.lenses[1:]:
         one, two = states.lenses[:2]

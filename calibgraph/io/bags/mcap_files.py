@@ -15,13 +15,15 @@ from zlib import crc32
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, Footer, Schema, Statistics
+from mcap.records import Channel, ChunkIndex, Footer, Schema, Statistics
 
 from calibgraph.errors import FileError
 from calibgraph.io.bags.recording import make_topic, topics_by_name
 from calibgraph.io.bags.unpacking import require_plausible, unpack
 
 _MAGIC, _HEAD, _MESSAGE = b"\x89MCAP0\r\n", Struct("<BQ"), Struct("<HIQQ")
+_CHUNK, _LENGTH_BYTES = Struct("<QQQII"), 8
+"""Times, size, checksum, length of the compression's name; behind the name that of the data."""
 _FOOTER_BYTES = _HEAD.size + 20
 _KNOWN = frozenset(map(int, Opcode))
 
@@ -137,20 +139,25 @@ class McapFile:
             time_ns, _, topic, data = heappop(waiting)
             yield topic, time_ns, data
 
-    def _content(self, index: ChunkIndex) -> bytes:
+    def _content(self, index: ChunkIndex) -> bytes | memoryview:
         """The records of a chunk."""
         self._file.seek(index.chunk_start_offset)
-        ((opcode, body),) = _records(self._file.read(index.chunk_length))
-        chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-        content = unpack(self._path, chunk.compression, chunk.data)
-        if opcode != Opcode.CHUNK or len(content) != index.uncompressed_size:
-            raise ValueError("a chunk is not as its index states")
-        if chunk.uncompressed_crc not in (0, crc32(content)):
+        head = _HEAD.unpack(self._file.read(_HEAD.size))
+        if head != (Opcode.CHUNK, index.chunk_length - _HEAD.size):
+            raise ValueError("a chunk is not where its index states")
+        body = memoryview(self._file.read(head[1]))
+        *_, checksum, length = _CHUNK.unpack_from(body)
+        end = _CHUNK.size + length
+        kind, packed = str(body[_CHUNK.size : end], "utf-8"), body[end + _LENGTH_BYTES :]
+        content = unpack(self._path, kind, packed)
+        if len(content) != index.uncompressed_size:
+            raise ValueError("a chunk is not as long as its index states")
+        if checksum not in (0, crc32(content)):
             raise ValueError("the checksum of a chunk is not that of its content")
         return content
 
 
-def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
+def _records(data: bytes | memoryview) -> Iterator[tuple[int, memoryview]]:
     """The kind and content of each record.
 
     Raises:

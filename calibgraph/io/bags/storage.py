@@ -100,7 +100,7 @@ class BagFolder:
         parts = (part.messages(topics, start_ns, stop_ns) for part in self._parts)
         kind = "zstd" if self._mode == "message" else ""
         for topic, record_ns, data in heapq.merge(*parts, key=itemgetter(1)):
-            yield topic, record_ns, unpack(self._folder, kind, data)
+            yield topic, record_ns, bytes(unpack(self._folder, kind, data))
 
 
 def _files_of(folder: Path, stated: Iterable[str]) -> list[Path]:

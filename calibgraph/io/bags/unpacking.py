@@ -6,13 +6,15 @@ from typing import IO, Any
 
 from calibgraph.errors import FileError
 
-_ALWAYS, _RATIO, _MOST = 2**26, 100, 2**30
+Buffer = bytes | memoryview
+
+_ALWAYS, _RATIO, _MOST = 2**26, 50, 2**30
 """Of one part: a black image of 20 MP is 60 MB and packs to nothing; other data of sensors shrink
-to a hundredth at most."""
+to a fiftieth at most."""
 _ALWAYS_WHOLE, _RATIO_WHOLE = 2**28, 1000
 
 
-def unpack(path: Path, kind: str, data: bytes) -> bytes:
+def unpack(path: Path, kind: str, data: Buffer) -> Buffer:
     """The content of a compressed chunk or message.
 
     Args:
@@ -28,7 +30,13 @@ def unpack(path: Path, kind: str, data: bytes) -> bytes:
         return data
     most = max(_ALWAYS, min(_RATIO * len(data), _MOST))
     if kind == "zstd":
-        content: bytes = _zstd_stream(data).read(most + 1)
+        import zstandard
+
+        stated = zstandard.frame_content_size(data)  # -1 if it is not
+        content: bytes = (
+            zstandard.decompress(data) if 0 <= stated <= most
+            else _zstd_stream(data).read(most + 1)
+        )  # fmt: skip
     elif kind == "lz4":
         import lz4.frame
 
@@ -78,7 +86,7 @@ def unpack_file(path: Path, out: Path) -> None:
             require_plausible(path, packed, written.tell())
 
 
-def _zstd_stream(source: bytes | IO[bytes]) -> Any:
+def _zstd_stream(source: Buffer | IO[bytes]) -> Any:
     import zstandard
 
     return zstandard.ZstdDecompressor().stream_reader(source)

@@ -25,7 +25,8 @@ IMPORT_FORMATS: Final = (
     "Kalibr camchain, ROS camera_info and transforms (files, or as ros2 topic echo prints them), "
     "OpenCV FileStorage (.yaml, .xml, .json), Autoware sensor kit, Autoware.AI, parameters of "
     "VINS, LVI-SAM, FAST-LIVO and R3LIVE, multical, Basalt and SensorsCalibration (.json), URDF, "
-    "static_transform_publisher in launch files (XML) and scripts (.sh), COLMAP cameras.txt, koide3 calib.json, KITTI and KITTI-360 (calib_cam_to_velo.txt, "
-    "perspective.txt), a ROS bag, a rig file, a result or a JSON export of calibgraph"
+    "static_transform_publisher in launch files (XML) and scripts (.sh), COLMAP cameras.txt, "
+    "koide3 calib.json, KITTI and KITTI-360 (calib_cam_to_velo.txt, perspective.txt), a ROS bag, "
+    "a rig file, a result or a JSON export of calibgraph"
 )
 """What ``calibgraph import`` reads."""
