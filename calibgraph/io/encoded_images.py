@@ -47,11 +47,17 @@ def describe_turn(data: bytes) -> str:
     """What is wrong with an orientation in PNG or JPEG data; empty if the image is upright.
 
     It is unknown which pixels the intrinsics count, turned or stored.
+
+    Raises:
+        ValueError: if the header is damaged.
     """
     if is_png(data) and b"eXIf" not in data:  # Pillow decodes a PNG whole to look for it
         return ""
-    header = (PngImageFile if is_png(data) else JpegImageFile)(io.BytesIO(data))
-    found = header.getexif().get(Base.Orientation, 1)
+    try:
+        header = (PngImageFile if is_png(data) else JpegImageFile)(io.BytesIO(data))
+        found = header.getexif().get(Base.Orientation, 1)
+    except (SyntaxError, OSError) as error:
+        raise ValueError(str(error)) from error
     return "" if found in _UPRIGHT else (
         f"has the EXIF orientation {found}, by which some programs turn it and others do not; "
         "write the images without it, and the intrinsics for the pixels as they are stored"

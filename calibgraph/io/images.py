@@ -77,7 +77,7 @@ def _read(path: Path) -> tuple[bytes, ImageFile]:
 def _require_upright(path: Path, data: bytes) -> None:
     try:
         turned = describe_turn(data)
-    except (SyntaxError, OSError, ValueError) as error:
+    except ValueError as error:
         raise _damaged(path, error) from error
     if turned:
         raise FileError(path, turned)

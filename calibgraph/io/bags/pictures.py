@@ -150,16 +150,6 @@ def _to_bgr(pixels: Image, layout: str) -> Image:
     return np.asarray(cv2.cvtColor(pixels, _TO_BGR[layout]), dtype=np.uint8)
 
 
-def _require_upright(data: bytes, where: str) -> None:
-    """Refuse an orientation in the data, by which cv_bridge turns the image and others do not."""
-    try:
-        turned = describe_turn(data)
-    except (SyntaxError, OSError, ValueError):
-        return  # its pixels are examined next
-    if turned:
-        raise DatasetError(f"{where}: {turned}")
-
-
 def _of_compressed(message: Any, where: str) -> Image:
     """Decode; image_transport's ``format`` is ``ENCODING; CODEC compressed STORED``, or a codec."""
     encoding, _, codec = message.format.partition(";")
@@ -169,15 +159,17 @@ def _of_compressed(message: Any, where: str) -> Image:
             f"{where}: its format {message.format!r} is neither JPEG nor PNG; decode it with "
             "`ros2 run image_transport republish`, of video through ffmpeg, and give that topic"
         )
-    _require_upright(data, where)
     mosaic = encoding.startswith("bayer_") and "bgr" not in codec and "rgb" not in codec
     kind = cv2.IMREAD_GRAYSCALE if mosaic else cv2.IMREAD_COLOR
     try:
+        turned = describe_turn(data)
         decoded = decode_image(data, kind | cv2.IMREAD_ANYDEPTH)
     except ValueError as error:
         raise DatasetError(
             f"{where}: is truncated or no image of its kind ({error}); record it again"
         ) from error
+    if turned:
+        raise DatasetError(f"{where}: {turned}")
     image = _to_8_bits(decoded)
     if mosaic:
         return _to_bgr(image, _layout(encoding, where)[0])
