@@ -23,8 +23,8 @@ Args:
     seed: Seed of everything random.
     tolerance_cm (CM): Largest deviation along an axis that is OK.
     tolerance_deg (DEG): Largest deviation about an axis that is OK.
-    topic (NAME=/TOPIC): Topic of a camera's images, of the clouds as lidar=/TOPIC, or of
-        odometry=/TOPIC; may be repeated. (default: found by the messages' types)
+    topic (NAME=/TOPIC[,/INFO]): Topic of a camera's images, of the clouds as lidar=/TOPIC, or of
+        odometry=/TOPIC; INFO: of the camera_info. May be repeated. (default: found by types)
     weights (FILE...): Weights of the networks, .tar or .safetensors, in the order in which they
         run; a file may be repeated: --weights iter1.tar iter5.tar iter5.tar iter6.tar.
 """
