@@ -56,8 +56,8 @@ def test_the_size_scales_them_and_none_changes_nothing() -> None:
     assert draw_lens_errors(panorama, 1.0, np.random.default_rng(0)) == panorama
 
 
+@pytest.mark.usefixtures("open3d")
 def test_both_rig_files_state_them_and_the_sensors_see_as_before(tmp_path: Path) -> None:
-    pytest.importorskip("open3d", exc_type=ImportError)
     rig = Rig(cameras={"front": small_camera("pinhole")})
     for name, size in (("exact", 0.0), ("stated", 1.0)):
         simulate_street(tmp_path / name, rig, beams=16, frames=1, seed=5, lens_errors=size)

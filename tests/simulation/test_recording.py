@@ -17,9 +17,7 @@ from calibgraph.simulation.street import Layout, build_street, draw_layout, wind
 from calibgraph.simulation.surroundings import SURROUNDINGS
 from tests.simulation.conftest import SCAN
 
-pytest.importorskip(
-    "open3d", reason="open3d or a system library of it is missing", exc_type=ImportError
-)
+pytestmark = pytest.mark.usefixtures("open3d")
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,12 @@ STATIC = ROOT / "calibgraph" / "service" / "static" / "pick"
 
 needs_node = pytest.mark.skipif(
     shutil.which("node") is None or not (WEB / "node_modules").is_dir(),
-    reason="needs node and `npm ci` in web/pick",
+    reason="no node, or not its packages: install node, and run `npm ci` in web/pick",
 )
 
 
 @needs_node
+@pytest.mark.slow
 def test_the_committed_bundle_is_built_from_the_sources(tmp_path: Path) -> None:
     subprocess.run(["node", WEB / "build.mjs", tmp_path], check=True, timeout=60)
     built = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
