@@ -28,7 +28,7 @@ from calibgraph.files import (
     sync_folder,
     write_atomically,
 )
-from calibgraph.tracking.state_recovery import APPLICATION, LAYOUT, checksum, log_of, read
+from calibgraph.tracking.state_recovery import APPLICATION, LAYOUT, TABLES, checksum, log_of, read
 
 DATABASE = "state.sqlite"
 _PAGE_BYTES = 32768  # a snapshot takes half the time of SQLite's 4096
@@ -39,9 +39,7 @@ _TABLES = f"""
     PRAGMA journal_mode=WAL;
     PRAGMA application_id={APPLICATION};
     PRAGMA user_version={LAYOUT};
-    CREATE TABLE snapshot (number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL);
-    CREATE TABLE journal (number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL);
-    CREATE TABLE status (number INTEGER NOT NULL, is_open INTEGER NOT NULL);
+    {"".join(f"CREATE TABLE {name} {columns};" for name, columns in TABLES.items())}
     INSERT INTO status VALUES (0, 0);
 """
 
@@ -154,7 +152,13 @@ def _make_folder(folder: Path) -> None:
 
 def _lock(folder: Path) -> int:
     """A descriptor that holds the folder's lock until it is closed, or the process ends."""
-    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
+    path = folder / "lock"
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    except OSError as error:
+        if path.is_symlink() or path.is_dir():
+            raise FileError(path, "is a link or a folder, expected a file; remove it") from error
+        raise
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BaseException as error:
