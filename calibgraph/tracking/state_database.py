@@ -36,11 +36,13 @@ _LOG_PAGES = 128  # in the log, before they are copied to the database: 4 MB, as
 _EARLIEST = ("snapshot-*.state", "journal-*.log")
 _TABLES = f"""
     PRAGMA page_size={_PAGE_BYTES};
-    PRAGMA journal_mode=WAL;
+    BEGIN;
     PRAGMA application_id={APPLICATION};
     PRAGMA user_version={LAYOUT};
     {"".join(f"CREATE TABLE {name} {columns};" for name, columns in TABLES.items())}
     INSERT INTO status VALUES (0, 0);
+    COMMIT;
+    PRAGMA journal_mode=WAL;
 """
 
 
@@ -171,7 +173,10 @@ def _lock(folder: Path) -> int:
 
 
 def _create(path: Path) -> None:
-    """Put an empty database in place, whole or not at all; not beside another one's parts."""
+    """Put an empty database in place, whole or not at all; not beside another one's parts.
+
+    It is written before it has a log, whose copy at the end would not report a full disk.
+    """
     for pattern in _EARLIEST:
         for found in path.parent.glob(pattern):
             message = "is state of the earliest layout; choose another folder"

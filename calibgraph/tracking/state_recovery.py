@@ -27,6 +27,7 @@ TABLES = {
 _SCHEMA = [("table", name, name, f"CREATE TABLE {name} {TABLES[name]}") for name in TABLES]
 
 _LEAST_STEPS = 100_000
+_OF_THE_DISK = sqlite3.SQLITE_IOERR, sqlite3.SQLITE_FULL, sqlite3.SQLITE_CANTOPEN
 _HEADER = struct.Struct(">16s44xI4xI28x")  # text, user_version, application_id
 
 
@@ -76,6 +77,9 @@ def read(path: Path) -> tuple[Recovered, int]:
             number, is_open = database.execute("SELECT number, is_open FROM status").fetchone()
             recovered = _recover(database, path, number)
     except (sqlite3.Error, TypeError, UnicodeError) as error:  # TypeError: a row is missing
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _OF_THE_DISK:
+            message = f"cannot be read ({error}): is the disk full? Free it and start again"
+            raise FileError(path, message) from error
         raise _damaged(path, error) from error
     finally:
         _remove_index(path, had_log=had_log)
