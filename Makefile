@@ -10,12 +10,12 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help install run test coverage test-ci test-slow lint type docs web bench clean
+.PHONY: help install run test coverage test-ci test-slow lint type docs bench clean
 
 help: ## Show this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-TEST := [test,simulation,learned,ros,ray,dask,view,service,las,video,postgres]
+TEST := [test,simulation,learned,ros,ray,dask,view,service,postgres]
 DOCS := $(TEST:]=,docs])
 
 # One call of pip, and modules are compiled on all cores; those of other versions of Python cannot be.
@@ -67,9 +67,6 @@ $(VENV)/docs: pyproject.toml constraints.txt
 docs: $(VENV)/docs ## Build the documentation into build/docs, without a network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-web: ## Build the page of `calibgraph pick` (needs node and a network; its bundle is committed)
-	cd web/pick && npm ci && npm run check && npm run build
-
 bench: $(VENV)/test ## Compare ratios of processor times with the last release's; measure parts by themselves
 	$(BIN)/python -m benchmarks.speed.gate --against benchmarks/ratios.json
 	$(BIN)/python -m benchmarks.speed.stages data/sample
@@ -78,8 +75,7 @@ bench: $(VENV)/test ## Compare ratios of processor times with the last release's
 	$(BIN)/python -m benchmarks.speed.solve --frames 20 --cameras 12 --matches 500
 	$(BIN)/python -m benchmarks.speed.scaling --rows 1e3 1e5 1e7
 	$(BIN)/python -m benchmarks.speed.incremental
-	$(BIN)/python -m benchmarks.speed.cmrnext
 
 clean: ## Remove everything that was made
-	rm -rf $(VENV) out build web/pick/node_modules *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) out build *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

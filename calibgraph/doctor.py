@@ -26,6 +26,7 @@ from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.trust.inputs import (
     Finding,
     count_points_in_view,
+    describe_brightness,
     describe_out_of_view,
     describe_repeats,
     explain_guess,
@@ -96,12 +97,13 @@ def diagnose(
     choice = choose_frames(data, data.rig, MOST_FRAMES)
     examined = choice.dataset
     findings += [Finding("note", choice.text)] if choice.text else []
-    clouds = _examine_frames(examined.frames, data.rig, findings)
+    readable = _examine_frames(examined.frames, data.rig, findings)
     findings += _examine_places(examined)
     seen: dict[str, int] = {}
     written: list[Path] = []
-    if clouds:
-        frame, cloud = clouds[len(clouds) // 2]
+    if readable:
+        frame = readable[len(readable) // 2]
+        cloud = frame.load_cloud()
         seen = count_points_in_view(data.rig, cloud)
         findings += _examine_guess(examined, (frame, cloud), seen)
         if pictures is not None and not any(finding.level == "error" for finding in findings):
@@ -128,7 +130,9 @@ def _load(
     try:
         given = rig if rig is not None else load_rig(folders[0])
         cameras = list(given.cameras)
-        found = [f for path in folders for f in frames_of_folder(path, cameras, complete=False)]
+        found = [
+            f for path in folders for f in frames_of_folder(path, cameras, complete=False).files
+        ]
         paired = [str(i) for i, files in enumerate(found) if files.images.keys() >= set(cameras)]
         return load_dataset(folders, rig, frames=",".join(paired)) if paired else None
     except (CalibrationError, OSError):
@@ -152,41 +156,49 @@ def _describe(data: Dataset) -> Iterator[Finding]:
         )
 
 
-def _examine_frames(
-    frames: Sequence[Frame], rig: Rig, findings: list[Finding]
-) -> list[tuple[Frame, NDArray[np.float32]]]:
-    """The clouds that can be read, by frame; with findings about clouds and images."""
+def _examine_frames(frames: Sequence[Frame], rig: Rig, findings: list[Finding]) -> list[Frame]:
+    """The frames whose clouds can be read, with findings about clouds and images."""
     read = map_on_cores(_examine_frame, frames, [rig] * len(frames))
     for source in ("", *rig.cameras):
-        problems = [each[source] for _, each in read if source in each]
+        problems = [each.problems[source] for each in read if source in each.problems]
         if problems:
             others = f"; {len(problems) - 1} more of its frames have errors" if problems[1:] else ""
             findings.append(Finding("error", problems[0] + others))
-    clouds = [(f, cloud) for f, (cloud, _) in zip(frames, read, strict=True) if cloud is not None]
-    findings += _repeats("cloud", [(f.name, f.cloud_path) for f, _ in clouds])
     for name in rig.cameras:
-        images = [(f.name, f.image_paths[name]) for f, _ in clouds]
+        text = describe_brightness(name, [e.brightness[name] for e in read if name in e.brightness])
+        findings += [Finding("warning", text)] if text else []
+    readable = [f for f, each in zip(frames, read, strict=True) if "" not in each.problems]
+    findings += _repeats("cloud", [(f.name, f.cloud_path) for f in readable])
+    for name in rig.cameras:
+        images = [(f.name, f.image_paths[name]) for f in readable]
         findings += _repeats(f"image of {name}", images)
-    return clouds
+    return readable
 
 
-def _examine_frame(frame: Frame, rig: Rig) -> tuple[NDArray[np.float32] | None, dict[str, str]]:
-    """The cloud if readable, and the problems of the cloud ("") and of each camera's image."""
-    problems: dict[str, str] = {}
-    cloud = None
+@dataclass
+class _Examined:
+    """A frame: problems of its cloud ("") and of images, and the mean levels of these."""
+
+    problems: dict[str, str] = field(default_factory=dict)
+    brightness: dict[str, float] = field(default_factory=dict)
+
+
+def _examine_frame(frame: Frame, rig: Rig) -> _Examined:
+    found = _Examined()
     try:
-        cloud = frame.load_cloud()
+        frame.load_cloud()
     except (CalibrationError, OSError) as error:
-        problems[""] = str(error)
+        found.problems[""] = str(error)
     for name, camera in rig.cameras.items():
         try:
             gray = frame.load_gray(name, camera)
         except (CalibrationError, OSError) as error:
-            problems[name] = str(error)
+            found.problems[name] = str(error)
             continue
         if np.ptp(gray) == 0:
-            problems[name] = f"{frame.image_paths[name]}: all pixels are {gray[0, 0]}"
-    return cloud, problems
+            found.problems[name] = f"{frame.image_paths[name]}: all pixels are {gray[0, 0]}"
+        found.brightness[name] = float(gray.mean())
+    return found
 
 
 def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> list[Finding]:

@@ -2,8 +2,10 @@
 
 import errno
 import hashlib
+import io
 import json
 import os
+import re
 import tempfile
 import textwrap
 from collections.abc import Callable
@@ -170,11 +172,42 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_text(path: Path) -> str:
-    """Read a text file."""
+    """Read a text file in UTF-8, with a byte order mark or without."""
+    return decode_text(require_file(path).read_bytes(), path)
+
+
+def decode_text(data: bytes, path: Path | str) -> str:
+    """The text of a file.
+
+    Raises:
+        FileError: if it is of another encoding, which is named, or no text.
+    """
+    if encoding := wide_encoding(data):
+        raise FileError(
+            path, f"is {encoding}, as PowerShell and Notepad write it; save it as UTF-8"
+        )
+    data = data.removeprefix(b"\xef\xbb\xbf")
     try:
-        return require_file(path).read_text("utf-8")
+        return io.StringIO(data.decode(), newline=None).read()
     except UnicodeDecodeError as error:
-        raise FileError(path, f"is not a text file ({error.reason})") from error
+        if b"\0" in data:
+            raise FileError(path, f"is not a text file ({error.reason})") from error
+        line = data.count(b"\n", 0, error.start) + 1
+        raise FileError(
+            path,
+            f"is not UTF-8: line {line} holds the byte 0x{data[error.start]:02x}, a letter "
+            "of Latin-1 or Windows-1252, say; save it as UTF-8",
+        ) from error
+
+
+def wide_encoding(data: bytes) -> str:
+    """UTF-16 or UTF-32, if a text is in them by its mark or its zero bytes; else empty."""
+    head = data[:64]
+    if head.startswith((b"\xff\xfe\0\0", b"\0\0\xfe\xff")):
+        return "UTF-32"
+    zeros = [head[start::2].count(0) * 2 >= len(head) - 1 for start in (0, 1)]
+    is_wide = len(head) > 1 and zeros[0] != zeros[1]
+    return "UTF-16" if is_wide or head.startswith((b"\xff\xfe", b"\xfe\xff")) else ""
 
 
 def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> None:
@@ -234,6 +267,9 @@ def load_model(model: type[Model], path: Path | str | None, **given: Any) -> Mod
     return checked_model(model, {**content, **given}, path or model.__name__)
 
 
+_DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+(e[-+]?[0-9]+)?")
+
+
 def describe(error: ValidationError) -> str:
     """First problem of a pydantic error, in one line; a misspelt key before a missing one."""
     first = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
@@ -246,4 +282,6 @@ def describe(error: ValidationError) -> str:
     if first["type"] in ("model_type", "dict_type"):  # its message names a class or a dictionary
         message = "expected keys with values, as in {key: value}"
     found = "" if first["type"] == "value_error" else f", found {describe_value(first['input'])}"
+    if isinstance(first["input"], str) and _DECIMAL_COMMA.fullmatch(first["input"].strip()):
+        found += f": write {first['input'].strip().replace(',', '.')}, with a point"
     return f"{where}: {message}{found}" if where else f"{message}{found}"

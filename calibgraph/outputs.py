@@ -21,7 +21,6 @@ AUDIT_PAGE_MARK = b'<meta name="generator" content="calibgraph check">'
 DOT_MARK = "// calibgraph graph"
 VIEW_MARK = "calibgraph-view"
 WEIGHTS_MARK = "calibgraph-cmrnext/1"
-WINDOW_WEIGHTS_MARK = "calibgraph-window-weights/1"
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,11 @@ def parse_yaml_documents(text: str, path: Path | str) -> list[dict[str, Any]]:
         raise FileError(path, why)
     if _bracket_depth(text) > MAX_YAML_DEPTH:
         raise FileError(path, _TOO_DEEP)
+    if pairs := _DECIMAL_COMMAS.search(text):
+        raise FileError(
+            path, f"{pairs[0]} looks like decimal commas; write points, 1.5 for 1,5, or a space "
+            "after each comma if these are whole numbers"
+        )  # fmt: skip
     try:
         documents = list(yaml.load_all(text, Loader=_Loader))
         documents = [each for each in documents if each is not None] or documents[:1]
@@ -59,6 +64,9 @@ def parse_yaml_documents(text: str, path: Path | str) -> list[dict[str, Any]]:
 
 _SEPARATORS = (",", "\n", ": ", "- ", "? ", "[", "{")
 """One of these is before every value but the first."""
+
+_DECIMAL_COMMAS = re.compile(r"\[ *[-+]?[0-9]+,[0-9]+(?:, +[-+]?[0-9]+,[0-9]+)+ *\]")
+"""A list of pairs, each without a space: PyYAML would read twice as many whole numbers."""
 
 _CUT_OFF = "it ends within a line: if it was cut off, write or copy it again"
 _TOO_DEEP = "is nested too deeply; expected a mapping of keys to values"
@@ -105,10 +113,16 @@ class _Loader(_FastLoader):  # type: ignore[misc, valid-type]
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[Any] = set()
-        for key_node, _ in node.value:
+        for key_node, value_node in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":
                 continue
             key = self.construct_object(key_node, deep=True)
+            if isinstance(key, (int, float)) and value_node.value == "" and node.flow_style:
+                raise yaml.MarkedYAMLError(
+                    problem=f"{key_node.value} after a comma has no value: is it a decimal comma? "
+                    "write 1.5 for 1,5; found at",
+                    problem_mark=key_node.start_mark,
+                )
             if isinstance(key, (str, int)) and key in seen:
                 raise yaml.MarkedYAMLError(
                     problem=f"key {key!r} is given twice", problem_mark=key_node.start_mark

@@ -38,20 +38,6 @@ def tracking_settings() -> str:
     return settings_table(Tracking)
 
 
-def training_settings() -> str:
-    """The settings of `calibgraph train`."""
-    from calibgraph.matching.cmrnext.training.settings import TrainSettings
-
-    return settings_table(TrainSettings)
-
-
-def window_settings() -> str:
-    """The settings of `calibgraph train-windows`."""
-    from calibgraph.matching.structure.training.settings import WindowSettings
-
-    return settings_table(WindowSettings)
-
-
 def presets() -> str:
     """The settings in which the presets differ."""
     from calibgraph.model.config import PRESETS, preset
@@ -82,14 +68,31 @@ def api(*names: str) -> str:
     )
 
 
+def made_wrong(part: str) -> str:
+    """The ``headline`` or the ``table`` of how results that were made wrong are judged."""
+    from benchmarks.tables import RESULTS, Entry
+
+    lines = (RESULTS / "accuracy.made_wrong.jsonl").read_text("utf-8").splitlines()
+    tables = [each for line in lines for each in Entry.from_json(line).tables]
+    counts = [each for each in tables if "PASS" in each.columns]
+    rows = [row for each in counts for row in each.rows]
+    if part == "table":
+        return table(counts[0].columns, rows)
+    wrong, passed = (sum(int(row[at]) for row in rows) for at in (1, 2))
+    exceptions = [f"{error} off ({cause})" for each in tables if each not in counts
+                  for error, cause in each.rows]  # fmt: skip
+    if len(exceptions) != passed:
+        raise ValueError(f"{passed} wrong results got PASS, and {len(exceptions)} are described")
+    return f"Of {wrong} results made wrong on purpose, {passed} got PASS: {', '.join(exceptions)}."
+
+
 GENERATED: Mapping[str, Callable[..., str]] = {
     "thresholds": thresholds,
     "settings": settings,
     "tracking settings": tracking_settings,
-    "training settings": training_settings,
-    "window settings": window_settings,
     "presets": presets,
     "commands": commands,
+    "made wrong": made_wrong,
     "api": api,
 }
 """By the first word or words after ``generated:``; what follows a colon are arguments."""
@@ -214,5 +217,6 @@ def _shown_default(option: click.Parameter) -> str:
 
 
 if __name__ == "__main__":
-    for _page in sorted(Path(__file__).parent.glob("*.md")):
+    _docs = Path(__file__).parent
+    for _page in (_docs.parent / "README.md", *sorted(_docs.glob("*.md"))):
         _page.write_text(with_generated_parts(_page.read_text("utf-8")), "utf-8")

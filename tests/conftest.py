@@ -28,7 +28,7 @@ from calibgraph import (
 )
 from calibgraph.cli import app as cli
 from calibgraph.cli import terminal
-from calibgraph.report import drawing, plots
+from calibgraph.report import plots
 from calibgraph.trust import assess, image_checks, inputs
 
 Call = Callable[..., tuple[int, str, str]]
@@ -118,7 +118,6 @@ def stereo_relative_pose(rig: Rig, a: str = "left", b: str = "right") -> Relativ
 def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
     """Run the command line in this process: exit code, stdout, stderr without lines of progress."""
     monkeypatch.setattr(terminal, "LINE_EVERY_S", float("inf"))
-    monkeypatch.setattr(drawing, "count_cores", lambda: 1)  # loading Matplotlib again takes long
 
     def run(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["calibgraph", *map(str, arguments)])
@@ -142,7 +141,6 @@ class CommandRun:
 
 
 def leave_out_diagrams(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(drawing, "count_cores", lambda: 1)  # another process would have the diagrams
     for name in (
         "convergence", "coverage", "distances", "error_bars", "residual_by_distance",
         "residual_map", "residual_scatter",

@@ -13,7 +13,6 @@ from typer.main import get_command
 
 import calibgraph
 from calibgraph.cli.app import app
-from calibgraph.matching.cmrnext.training.settings import TrainSettings
 from calibgraph.model.config import Config
 from docs.tables import GENERATED, PART, with_generated_parts
 from tests.conftest import ROOT
@@ -130,8 +129,6 @@ def yaml_blocks(page: str) -> list[object]:
 def test_examples_of_settings_are_settings() -> None:
     for example in yaml_blocks("docs/settings.md"):
         Config.model_validate(example)
-    for example in yaml_blocks("docs/learned_matcher.md"):
-        TrainSettings.model_validate(example)
 
 
 def test_the_api_page_has_every_public_name() -> None:

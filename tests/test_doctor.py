@@ -100,8 +100,8 @@ def test_a_guess_in_millimetres_is_named_by_what_the_images_show_first() -> None
     found = diagnose([SAMPLE], rig.moved_to({"left": T}))
     assert found.points_in_image["left"] == 0
     assert texts(found, "error") == [
-        "the images of left fit far better if the guess has a translation in millimetres: correct "
-        "it",
+        "the images of left fit clearly better if the guess has a translation in millimetres: "
+        "correct it",
         "left: by the guess, no point of the cloud lies in the image",
     ]
     assert texts(found, "warning") == [
@@ -118,7 +118,7 @@ def test_axes_of_the_lidar_turned_about_z_are_the_only_hint(folder: Path) -> Non
     change_clouds(folder, lambda cloud: cloud * np.float32([-1, -1, 1, 1][: cloud.shape[1]]))
     errors = texts(diagnose([folder], frames="0"), "error")
     assert errors[0] == (
-        "the images fit far better if the LiDAR's axes are turned by 180 deg about z (its x "
+        "the images fit clearly better if the LiDAR's axes are turned by 180 deg about z (its x "
         "points backward): correct it"
     )
     assert all("no point of the cloud lies in the image" in error for error in errors[1:])
@@ -127,15 +127,15 @@ def test_axes_of_the_lidar_turned_about_z_are_the_only_hint(folder: Path) -> Non
 @pytest.mark.parametrize(
     ("scale", "expected"),
     [
-        (1000, "9332 m is above 1000 m: are the clouds in millimetres?"),
-        (100, "933 m is above 200 m: are the clouds in centimetres?"),
+        (1000, "9332 m, above the limit 1000 m: are the clouds in millimetres?"),
+        (100, "933 m, above the limit 200 m: are the clouds in centimetres?"),
     ],
 )
 def test_clouds_in_other_units_are_named_with_their_distance(
     folder: Path, scale: float, expected: str
 ) -> None:
     change_clouds(folder, lambda cloud: cloud * np.float32([scale] * 3 + [1])[: cloud.shape[1]])
-    assert texts(diagnose([folder]), "warning") == [f"median distance of the points {expected}"]
+    assert texts(diagnose([folder]), "warning") == [f"median distance of the points: {expected}"]
 
 
 @pytest.mark.usefixtures("no_image_checks")
@@ -177,3 +177,16 @@ def test_doctor_replaces_its_own_pictures_and_no_others(tmp_path: Path, call: Ca
     cv2.imwrite(str(picture), np.zeros((4, 4, 3), np.uint8))
     code, _, err = call(*given)
     assert code == 2 and "was not written by calibgraph doctor" in err
+
+
+@pytest.mark.parametrize(("scale", "lift", "word"), [(0.12, 0, "dark"), (0.2, 215, "bright")])
+@pytest.mark.usefixtures("no_image_checks")
+def test_the_brightness_of_images_that_show_too_little_is_named(
+    scale: float, lift: float, word: str, folder: Path
+) -> None:
+    for path in folder.glob("cameras/left/*"):
+        image = cv2.imread(str(path))
+        assert image is not None
+        cv2.imwrite(str(path), np.clip(image * scale + lift, 0, 255).astype(np.uint8))
+    (found,) = texts(diagnose([folder]), "warning")
+    assert found.startswith(f"the images of left are too {word} to show structure: their mean")

@@ -110,7 +110,7 @@ def test_merge_keys_of_a_rig_are_read(tmp_path: Path) -> None:
 
 
 def test_binary_files_and_folders_and_nothing_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "rig.bin").write_bytes(b"\xff\xfe\x00\x81")
+    (tmp_path / "rig.bin").write_bytes(b"\xff\x00\x81\xfe")
     with pytest.raises(FileError, match="not a text file"):
         load_rig(tmp_path / "rig.bin")
     with pytest.raises(FileError, match="holds none of"):
@@ -215,3 +215,37 @@ def test_numbers_of_base_60_are_texts() -> None:
     assert found["frames"] == "10:40"
     assert found["negative"] == "-1:30.5"
     assert found["plain"] == [12, -3, 1.5e-3, "0x10", float("inf")]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [("lidar: a\n".encode("utf-16"), "is UTF-16, .*; save it as UTF-8"),
+     ("lidar: a\n".encode("utf-16-be"), "is UTF-16"),
+     ("lidar: a\n".encode("utf-32"), "is UTF-32"),
+     ("lidar: a\n# Prüfstand\n".encode("latin-1"), "is not UTF-8: line 2 holds the byte 0xfc"),
+     (b"\xff\0\x01\x02", "is not a text file"),
+     (b"lens: {fx: 481,3, fy: 480,6}", "3 after a comma has no value: is it a decimal comma"),
+     (b"distortion: [-0,31, 0,12]", "looks like decimal commas; write points")],
+)  # fmt: skip
+def test_texts_as_other_programs_save_them_are_named(
+    content: bytes, words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_bytes(content)
+    with pytest.raises(FileError, match=words) as caught:
+        read_yaml(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_bytes("\ufefflidar: a\r\n".encode())
+    assert read_yaml(path) == {"lidar": "a"}
+
+
+def test_a_decimal_comma_in_a_value_is_named(pair: Rig, tmp_path: Path) -> None:
+    path = written(pair, tmp_path)
+    text = re.sub(r"fx: [0-9.]+", "fx: '718,85'", path.read_text())
+    path.write_text(text)
+    with pytest.raises(FileError, match=r"found '718,85': write 718.85, with a point"):
+        load_rig(path)

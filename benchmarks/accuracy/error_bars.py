@@ -39,9 +39,9 @@ from calibgraph import (
     perturb,
     simulate_street,
 )
-from calibgraph.simulation.lens_errors import draw_lens_errors
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.simulation.scan_errors import draw_scan_errors
+from tools.scenes.lens_errors import draw_lens_errors
 
 STREETS = 5
 _FURTHER = 100_000  # seeds of more streets than that

@@ -80,8 +80,8 @@ def check(
     Args:
         rig: the deployed calibration, of alignments.
         dataset: a recent recording: a dataset, its folder, a KITTI odometry sequence, or several.
-        tolerance_deg: largest deviation about an axis of a camera that is OK.
-        tolerance_cm: largest deviation along an axis of a camera that is OK.
+        tolerance_deg: largest turn of a camera that is OK.
+        tolerance_cm: largest shift of a camera that is OK.
         matcher: as of :func:`calibgraph.calibrate`.
         seed: of everything random.
         progress: called as the work goes on.

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from calibgraph.arrays import Array, Mask
+from calibgraph.audit.significance import axes_beyond
 from calibgraph.model.geometry import twists_between
 
 
@@ -69,11 +70,11 @@ def poses_of(results: list[int], T_camera_lidar: Array, covariance: Array, freed
 
 @dataclass(frozen=True)
 class Limits:
-    """An axis deviates if both limits are exceeded.
+    """An axis deviates if it is significant, and such axes together exceed the tolerance.
 
     Attributes:
         tail: probability of a larger deviation by chance, to either side.
-        tolerance: (6,) rotation [rad], translation [m].
+        tolerance: (2,) of a turn [rad], of a shift [m].
     """
 
     tail: float
@@ -85,9 +86,8 @@ class Limits:
 
     def exceeded(self, deviation: Array, sigma: Array, freedom: Array) -> Mask:
         """(..., 6) True for axes beyond both limits."""
-        size = np.abs(deviation)
-        beyond: Mask = (size > self.sigmas(freedom) * sigma) & (size > self.tolerance)
-        return beyond
+        significant = np.abs(deviation) > self.sigmas(freedom) * sigma
+        return axes_beyond(deviation, significant, self.tolerance)
 
 
 @dataclass(frozen=True, eq=False)

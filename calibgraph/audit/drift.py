@@ -21,7 +21,7 @@ from calibgraph.audit.judgement import (
     SINGLE_CAMERA,
     describe_motion,
     find_lidar_motion,
-    judge_axes,
+    judge_deviation,
 )
 from calibgraph.audit.result import LidarAudit
 from calibgraph.audit.significance import Quantiles, Tolerance, detectable
@@ -61,8 +61,8 @@ def drift(
     Args:
         results: two or more, or their folders or files; of a mapping the keys are their names.
         days: when each was recorded, for the trend; the order given if None.
-        tolerance_deg: largest deviation about an axis of a camera that is OK.
-        tolerance_cm: largest deviation along an axis of a camera that is OK.
+        tolerance_deg: largest turn of a camera that is OK.
+        tolerance_cm: largest shift of a camera that is OK.
         own_lenses: whether the parameters of the lenses may differ, as between vehicles.
 
     Returns:
@@ -152,8 +152,9 @@ def _judge_camera(
         return tuple(judged)
     for row, place in enumerate(found.poses.results):
         deviation, sigma = found.leave_one_out.deviation[row], found.leave_one_out.sigma[row]
+        covariance = found.leave_one_out.covariance[row]
         quantiles = Quantiles.from_freedom(found.leave_one_out.freedom[row], limits.tail)
-        audit, reason = judge_axes(deviation, sigma, quantiles, tolerance)
+        audit, reason = judge_deviation(deviation, covariance, quantiles, tolerance)
         status: DriftStatus = "CHANGED" if audit == "WRONG" else audit
         axes: tuple[int, ...] = ()
         if status == "CHANGED":

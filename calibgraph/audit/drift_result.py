@@ -72,7 +72,7 @@ class Drift:
         trends: per camera with an error bar in three results or more.
         lidar: per result, the motion of the LiDAR where one explains the deviations of all
             cameras; None otherwise.
-        tolerance_deg, tolerance_cm: largest deviation per axis that is OK.
+        tolerance_deg, tolerance_cm: largest turn and shift that are OK.
         false_alarm_rate: probability of one CHANGED or more in this call if nothing has changed.
         same_recording: pairs of results that were made from the same files.
     """

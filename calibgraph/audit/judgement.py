@@ -1,19 +1,21 @@
 """From a measured rig and its covariance to OK, WRONG or CANNOT TELL, per camera.
 
-Four statements about the deviation d of an axis with standard deviation sigma:
+Statements about the turn and the shift of a camera, and about their axes with deviation d and
+standard deviation sigma:
 
-* it is significant: |d| > q sigma, with q such that one of 1000 rigs without any deviation has a
-  significant axis;
-* it is beyond the tolerance: |d| > tolerance;
-* it is certainly within: |d| + p sigma <= tolerance, with 95 % confidence (p is 1.64 or more).
+* an axis is significant: |d| > q sigma, with q such that one of 1000 rigs without any deviation has
+  a significant axis;
+* a turn or a shift is beyond the tolerance: the length of its significant axes exceeds it;
+* it is certainly within: its length exceeds the tolerance with a probability of at most 5 %, given
+  d and the covariance.
+* these data would show a change as large as the tolerance: the smallest detectable one is below it
+  on every axis.
 
-Both are quantiles of Student's t: sigma is itself estimated, from the scatter of few frames. The
-stated part of it, for the error that all frames share, is taken as known.
+Quantiles are of Student's t: sigma is itself estimated, from the scatter of few frames. The stated
+part of it, for the error that all frames share, is taken as known.
 
-* these data would show a change as large as the tolerance: the smallest detectable one is below.
-
-WRONG: an axis is significant and beyond the tolerance. OK: all axes are certainly within, and their
-smallest detectable changes are below the tolerance. Else the data cannot tell.
+WRONG: a turn or shift is beyond the tolerance. OK: both are certainly within, and the smallest
+detectable changes are below the tolerance. Else the data cannot tell.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -24,10 +26,12 @@ from scipy.special import chdtri, ndtri
 from calibgraph.arrays import Array, Mask
 from calibgraph.audit.result import AuditStatus, CameraAudit, LidarAudit
 from calibgraph.audit.significance import (
+    CONFIDENCE,
     DISPLAY,
     FALSE_ALARM_RATE,
     Quantiles,
     Tolerance,
+    axes_beyond,
     detectable,
     tail_of_axis,
 )
@@ -37,6 +41,7 @@ from calibgraph.model.geometry import to_T_lidar_camera, twist_between
 from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
 from calibgraph.tracking.cause import Steps, find_cause
 from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.probability import probability_outside
 from factors import pose_sigmas
 
 CAMERA_AXES = ("x (pitch)", "y (yaw)", "z (roll)", "x (right)", "y (down)", "z (ahead)")
@@ -75,12 +80,12 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
     sigma = np.sqrt(np.diag(covariance))
     quantiles = _quantiles(evidence, name, covariance)
     least = _least_share(evidence.error_sources.get(name))
-    status, reason = judge_axes(deviation, sigma, quantiles, tolerance, least=least)
+    status, reason = judge_deviation(deviation, covariance, quantiles, tolerance, least=least)
     if status == "WRONG" and name in evidence.posteriors:
         posterior = evidence.posteriors[name]
-        widest = np.sqrt(np.diag(posterior.widest(covariance)))
+        widest = posterior.widest(covariance)
         allowed = posterior.log_ratio < quantiles.significant.max() ** 2
-        if allowed or judge_axes(deviation, widest, quantiles, tolerance)[0] != "WRONG":
+        if allowed or judge_deviation(deviation, widest, quantiles, tolerance)[0] != "WRONG":
             status, reason = "CANNOT TELL", f"{_IMAGES_ALLOW}; {reason}"
     if doubt:
         status, reason = "CANNOT TELL", doubt
@@ -131,9 +136,9 @@ def _deviation(evidence: Evidence, name: str) -> Array:
     return twist_between(deployed[name], solved[name])
 
 
-def judge_axes(
+def judge_deviation(
     deviation: Array,
-    sigma: Array,
+    covariance: Array,
     quantiles: Quantiles,
     tolerance: Tolerance,
     *,
@@ -143,27 +148,43 @@ def judge_axes(
 
     Args:
         deviation: (6,) of all axes.
-        sigma: (6,) its standard deviations.
-        quantiles: of these.
-        tolerance: on each axis.
+        covariance: (6, 6) of it.
+        quantiles: of its standard deviations.
+        tolerance: of the turn and of the shift.
         least: (6,) share of sigma that remains however many frames are recorded.
     """
-    size, significant = np.abs(deviation), np.abs(deviation) > quantiles.significant * sigma
-    wrong = significant & (size > tolerance.twist)
+    sigma, size = np.sqrt(np.diag(covariance)), np.abs(deviation)
+    significant = size > quantiles.significant * sigma
+    wrong = axes_beyond(deviation, significant, tolerance.twist)
     if wrong.any():
         return "WRONG", describe_motion(deviation, sigma, wrong, CAMERA_AXES)
-    needed = detectable(sigma, quantiles.confident)
-    blind = needed > tolerance.twist
-    unsure = (size + quantiles.confident * sigma > tolerance.twist) | blind
+    needed, most = detectable(sigma, quantiles.confident), np.repeat(tolerance.twist, 3)
+    blind = needed > most
+    unsure = blind | _may_be_beyond(deviation, covariance, quantiles, tolerance)
     if unsure.any():
         found = describe_motion(deviation, sigma, unsure, CAMERA_AXES)
-        recording_helps = not (least * needed > tolerance.twist).any()
+        recording_helps = not (least * needed > most).any()
         advice = _advise(needed, blind, recording_helps=recording_helps)
         return "CANNOT TELL", f"may be beyond the tolerance: {found}; {advice}"
     if significant.any():
         moved = describe_motion(deviation, sigma, significant, CAMERA_AXES)
         return "OK", f"within the tolerance, though significant: {moved}"
-    return "OK", "no significant deviation, and all axes are within the tolerance"
+    return "OK", "no significant deviation, and within the tolerance"
+
+
+def _may_be_beyond(
+    deviation: Array, covariance: Array, quantiles: Quantiles, tolerance: Tolerance
+) -> Mask:
+    """(6,) the largest axes of a turn or shift that is not certainly within the tolerance."""
+    wider = quantiles.confident / ndtri(CONFIDENCE)  # as few frames have it
+    covariance = covariance * np.outer(wider, wider)
+    reach = np.abs(deviation) + quantiles.confident * np.sqrt(np.diag(covariance))
+    unsure = np.zeros(6, np.bool_)
+    for part, most in zip((slice(0, 3), slice(3, 6)), tolerance.twist, strict=True):
+        beyond = probability_outside(deviation[part], covariance[part, part], most)
+        if beyond > 1 - CONFIDENCE:
+            unsure[part] = reach[part] > 0.5 * reach[part].max()
+    return unsure
 
 
 def _advise(needed: Array, blind: Mask, *, recording_helps: bool) -> str:

@@ -69,14 +69,15 @@ def audit_html(audit: Audit) -> str:
 
 
 def _reasons(audit: Audit) -> list[Reason]:
-    """The findings of the LiDAR and of each camera; the same of several is one line."""
+    """The findings of the LiDAR and of each camera, the worst first; the same of several is one."""
     alike: dict[tuple[str, str], tuple[str, ...]] = {}
     if audit.lidar is not None:
         alike["WRONG", f"{audit.lidar.reason}; all cameras agree on it"] = ("LiDAR",)
     for name, camera in audit.cameras.items():
         key = camera.status, camera.reason
         alike[key] = (*alike.get(key, ()), name)
-    return [Reason(status, names, text) for (status, text), names in alike.items()]
+    reasons = [Reason(status, names, text) for (status, text), names in alike.items()]
+    return sorted(reasons, key=lambda reason: ("WRONG", "CANNOT TELL", "OK").index(reason.status))
 
 
 def _detectable(audit: Audit) -> str:
@@ -161,23 +162,23 @@ def charts_of(camera: CameraAudit, tolerance_deg: float, tolerance_cm: float) ->
         return ()
     twists = (camera.deviation, camera.sigma, camera.detectable)
     rows = np.stack([np.full(6, np.nan) if t is None else t * DISPLAY for t in twists], axis=1)
-    tolerances = [tolerance_deg] * 3 + [tolerance_cm] * 3
-    bars = [
-        Bar(name, deviation, sigma, detectable, _style(camera, deviation, tolerance))
-        for name, (deviation, sigma, detectable), tolerance in zip(
-            CAMERA_AXES, rows.tolist(), tolerances, strict=True
-        )
-    ]
-    return (
-        Chart("rotation [deg]", tuple(bars[:3]), tolerance_deg),
-        Chart("translation [cm]", tuple(bars[3:]), tolerance_cm),
+    parts = (
+        (slice(0, 3), "rotation", "deg", tolerance_deg),
+        (slice(3, 6), "translation", "cm", tolerance_cm),
     )
-
-
-def _style(camera: CameraAudit, deviation: float, tolerance: float) -> str:
-    if camera.status == "CANNOT TELL":
-        return "unsure"
-    return "beyond" if abs(deviation) > tolerance else "within"
+    charts = []
+    for part, word, unit, tolerance in parts:
+        total = float(np.linalg.norm(rows[part, 0]))
+        style = "beyond" if total > tolerance else "within"
+        style = "unsure" if camera.status == "CANNOT TELL" else style
+        bars = (
+            Bar(name, deviation, sigma, detectable, style)
+            for name, (deviation, sigma, detectable) in zip(
+                CAMERA_AXES[part], rows[part].tolist(), strict=True
+            )
+        )
+        charts.append(Chart(f"{word} [{unit}], {total:.2f} in all", tuple(bars), tolerance))
+    return tuple(charts)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Rig
+from calibgraph.model.threshold import fixed
 from calibgraph.model.verdict import Status
 
 AuditStatus = Literal["OK", "CANNOT TELL", "WRONG"]
@@ -97,7 +98,7 @@ class Audit:
         deployed: the rig that was compared.
         shown: the frame that a page shows, in the middle of the recording.
         recording: the sources of the frames.
-        tolerance_deg, tolerance_cm: largest deviation per axis that is OK.
+        tolerance_deg, tolerance_cm: largest turn and shift that are OK.
         frames: number of frames that were matched.
         timings_s: wall time per stage.
         versions: of this package and the libraries that matter.
@@ -194,8 +195,9 @@ def by_unit(name: str, twist: Array | None) -> dict[str, list[float] | None]:
     }
 
 
-def twist_cells(twist: Array | None, form: str) -> list[str]:
+def twist_cells(twist: Array | None, decimals: int, sign: str = "") -> list[str]:
     """Six numbers in degrees and centimetres; dashes if there are none."""
     if twist is None:
         return ["-"] * 6
-    return [format(value, form) for value in (*np.degrees(twist[:3]), *(100 * twist[3:]))]
+    numbers = (*np.degrees(twist[:3]), *(100 * twist[3:]))
+    return [fixed(value, decimals, sign) for value in numbers]

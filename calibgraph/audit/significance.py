@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtri, stdtrit
 
-from calibgraph.arrays import Array
+from calibgraph.arrays import Array, Mask
 
 FALSE_ALARM_RATE = 1e-3
 """Probability of a significant axis on a rig, of all its cameras, that has not changed."""
@@ -25,7 +25,7 @@ DISPLAY = np.array([180 / np.pi] * 3 + [100.0] * 3)
 
 @dataclass(frozen=True)
 class Tolerance:
-    """The largest deviation per axis that is OK.
+    """The largest turn and the largest shift that are OK, whatever their axes.
 
     Raises:
         ValueError: if one is not positive.
@@ -41,9 +41,22 @@ class Tolerance:
 
     @property
     def twist(self) -> Array:
-        """(6,) rotation [rad], translation [m]."""
-        twist: Array = np.repeat([self.degrees, self.centimetres], 3) / DISPLAY
+        """(2,) rotation [rad], translation [m]."""
+        twist: Array = np.array([self.degrees, self.centimetres]) / DISPLAY[::3]
         return twist
+
+
+def axes_beyond(deviation: Array, significant: Mask, tolerance: Array) -> Mask:
+    """(..., 6) True for the significant axes of a turn or a shift that are too large together.
+
+    Args:
+        deviation: (..., 6) rotation and translation.
+        significant: (..., 6) the axes that count.
+        tolerance: (2,) largest turn and shift.
+    """
+    parts = np.where(significant, deviation, 0.0).reshape(*deviation.shape[:-1], 2, 3)
+    beyond: Mask = significant & np.repeat(np.linalg.norm(parts, axis=-1) > tolerance, 3, axis=-1)
+    return beyond
 
 
 @dataclass(frozen=True, eq=False)

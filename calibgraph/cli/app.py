@@ -25,9 +25,10 @@ from calibgraph.cli.exchange import export, import_
 from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
 from calibgraph.cli.guess import bag, guess, init
 from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
-from calibgraph.cli.learned import train, train_windows, weights
+from calibgraph.cli.learned import weights
 from calibgraph.cli.outputs import keep_files
-from calibgraph.cli.serve import pick, serve, token
+from calibgraph.cli.pick import pick
+from calibgraph.cli.serve import serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
 
@@ -75,7 +76,7 @@ def _options(
 
 COMMANDS: tuple[Callable[..., None], ...] = (
     calibrate, check, drift, match, solve, report, view, evaluate, perturb, bag, doctor, init,
-    guess, export, import_, simulate, weights, train, train_windows, track, pick, fleet,
+    guess, export, import_, simulate, weights, track, pick, fleet,
     fleet_model, fleet_report, serve, token,
 )  # fmt: skip
 """In the order of the help."""

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from calibgraph.model.config import Config, Terms
 
 _SEARCH_OPTIONS = ("search_deg", "search_m")
-_OF_STRUCTURE = (*_SEARCH_OPTIONS, "window_weights")
 
 
 @contextmanager
@@ -88,11 +87,10 @@ def matcher_from(
         weights: of cmrnext.
         seed: of everything random.
         all_frames: match all frames, as when the user has selected them.
-        options: of cmrnext, and the search_deg, search_m and window_weights of structure; None if
-            not given.
+        options: of cmrnext, and the search_deg and search_m of structure; None if not given.
     """
     given = {key: value for key, value in options.items() if value is not None}
-    own = {key: given.pop(key) for key in _OF_STRUCTURE if key in given}
+    own = {key: given.pop(key) for key in _SEARCH_OPTIONS if key in given}
     if own and name != "structure":
         raise ValueError(f"{_flag(next(iter(own)))} is for --matcher structure only")
     if name == "cmrnext" and weights:
@@ -119,9 +117,7 @@ def _structure_matcher(given: dict[str, Any], *, seed: int, all_frames: bool) ->
     search = {key: _parse_range(key, given[key]) for key in _SEARCH_OPTIONS if key in given}
     if len(search) == len(_SEARCH_OPTIONS) and len({n is None for n in search.values()}) > 1:
         raise ValueError("--search-deg and --search-m: give numbers, or none for no search")
-    settings: dict[str, Any] = {**given, **search}
-    if given.get("window_weights") == "none":
-        settings["window_weights"] = None
+    settings: dict[str, Any] = dict(search)
     if None in search.values():
         settings.update(dict.fromkeys(_SEARCH_OPTIONS))
     if all_frames:

@@ -9,10 +9,9 @@ from rich.table import Table
 from calibgraph.audit import Audit, Drift
 from calibgraph.audit.result import twist_cells
 from calibgraph.cli.tables import CAMERA_AXES_COLUMNS, add_number_columns, empty_table
-from calibgraph.cli.terminal import print_plain
+from calibgraph.cli.terminal import elapsed_s, print_plain
 
 _COLOURS = {"OK": "green", "CANNOT TELL": "yellow", "WRONG": "red", "CHANGED": "red"}
-_LETTERS = 13  # of a result's name in a table; reasons have all of it
 
 
 def print_audit(console: Console, audit: Audit, page: Path | None = None) -> None:
@@ -31,9 +30,10 @@ def print_audit(console: Console, audit: Audit, page: Path | None = None) -> Non
         "with 90 % probability at 95 % confidence; changed intrinsics, and distances in the clouds "
         "that are all too long or too short, look like a motion"
     )
-    time = f"{sum(audit.timings_s.values()):.1f} s"
     written = "nothing was written" if page is None else f"{page}: written"
-    print_plain(console, f"{_tolerance(audit)}; {audit.frames} frames; {time}; {written}")
+    print_plain(
+        console, f"{_tolerance(audit)}; {audit.frames} frames; {elapsed_s():.1f} s; {written}"
+    )
 
 
 def print_drift(console: Console, drift: Drift) -> None:
@@ -61,23 +61,23 @@ def _print_status(console: Console, status: str, question: str) -> None:
 
 
 def _tolerance(of: Audit | Drift) -> str:
-    return f"tolerance {of.tolerance_deg:g} deg, {of.tolerance_cm:g} cm per axis"
+    return f"tolerance {of.tolerance_deg:g} deg, {of.tolerance_cm:g} cm"
 
 
-def _axes_table(title: str, *names: str) -> Table:
+def _axes_table(title: str, *names: str, words: tuple[str, ...] = ()) -> Table:
     """An empty table with a number per axis of a camera behind its names."""
-    table = empty_table(title, *names)
+    table = empty_table(title, *names, words=words)
     add_number_columns(table, *CAMERA_AXES_COLUMNS)
     return table
 
 
 def audit_table(audit: Audit) -> Table:
     """Three rows per camera: deviation, sigma, smallest detectable change."""
-    table = _axes_table("Deviation from the deployed calibration", "camera", "")
+    table = _axes_table("Deviation from the deployed calibration", "camera", words=("",))
     for name, camera in audit.cameras.items():
-        table.add_row(escape(name), "deviation", *twist_cells(camera.deviation, "+z.2f"))
-        table.add_row("", "sigma", *twist_cells(camera.sigma, ".2f"))
-        table.add_row("", "detectable", *twist_cells(camera.detectable, ".2f"))
+        table.add_row(escape(name), "deviation", *twist_cells(camera.deviation, 2, "+z"))
+        table.add_row("", "sigma", *twist_cells(camera.sigma, 2))
+        table.add_row("", "detectable", *twist_cells(camera.detectable, 2))
     return table
 
 
@@ -100,16 +100,16 @@ def _reasons(drift: Drift) -> list[str]:
 
 def _deviation_table(drift: Drift) -> Table:
     """A row per camera and result, and one for the trend."""
-    table = _axes_table("Deviation from the other results", "camera", "result", "")
+    table = _axes_table("Deviation from the other results", "camera", "result", words=("",))
     for name, entries in drift.cameras.items():
         for row, (result, each) in enumerate(zip(drift.results, entries, strict=True)):
             status = f"[{_COLOURS[each.status]}]{each.status}[/]"
-            cells = twist_cells(each.deviation, "+.2f")
-            table.add_row("" if row else escape(name), _short(result), status, *cells)
+            cells = twist_cells(each.deviation, 2, "+")
+            table.add_row("" if row else escape(name), escape(result), status, *cells)
         trend = drift.trends.get(name)
         if trend is not None:
-            table.add_row("", "trend", f"per {trend.unit}", *twist_cells(trend.slope, "+.3f"))
-            table.add_row("", "sigma", "", *twist_cells(trend.sigma, ".3f"))
+            table.add_row("", "trend", f"per {trend.unit}", *twist_cells(trend.slope, 3, "+"))
+            table.add_row("", "sigma", "", *twist_cells(trend.sigma, 3))
     return table
 
 
@@ -118,11 +118,6 @@ def _detectable_table(drift: Drift) -> Table:
     table = _axes_table("Smallest detectable change", "camera", "result")
     for name, entries in drift.cameras.items():
         for row, (result, each) in enumerate(zip(drift.results, entries, strict=True)):
-            cells = twist_cells(each.detectable, ".2f")
-            table.add_row("" if row else escape(name), _short(result), *cells)
+            cells = twist_cells(each.detectable, 2)
+            table.add_row("" if row else escape(name), escape(result), *cells)
     return table
-
-
-def _short(name: str) -> str:
-    """The end of a name that would leave no place for numbers on 80 columns."""
-    return escape(name if len(name) <= _LETTERS else f"…{name[1 - _LETTERS :]}")

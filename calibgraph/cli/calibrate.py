@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from calibgraph.io.dataset import Dataset
     from calibgraph.model.calibration import Calibration
     from calibgraph.model.correspondences import Correspondences
-    from calibgraph.report.drawing import Draw
 
 
 def calibrate(
@@ -30,10 +29,7 @@ def calibrate(
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
-    from calibgraph.report.drawing import drawing_processes
-
-    with drawing_processes() as draw:  # at once: they load while this process does
-        result, data, written = _calibrate(dataset, matching, out, solving, draw)
+    result, data, written = _calibrate(dataset, matching, out, solving)
     checks = next(iter(result.camera_verdicts.values())).checks
     copies = next((check.value for check in checks if check.name == "copies"), None)
     _print_frames_used(len(result.frames), data, int(copies or 0))
@@ -41,7 +37,7 @@ def calibrate(
 
 
 def _calibrate(
-    dataset: list[Path], matching: MatchingOptions, out: Path, solving: SolveOptions, draw: Draw
+    dataset: list[Path], matching: MatchingOptions, out: Path, solving: SolveOptions
 ) -> tuple[Calibration, Dataset, list[Path]]:
     """The result, the data, and the files that were written."""
     from calibgraph.cli.compile_ahead import compile_ahead
@@ -65,7 +61,7 @@ def _calibrate(
             progress=progress,
         )
         result = _warned_of_same_data(result, matching.rig)
-        return result, data, write_result(result, out, data, draw=draw)
+        return result, data, write_result(result, out, data)
 
 
 def match(

@@ -116,8 +116,8 @@ def export(
         lidar_frame (FRAME): Frame id of the LiDAR. (default: its name in the rig)
         camera_frame (TEXT): Frame id of optical frames; {camera} is the name. (default: the bag's,
             kept in the rig, or {camera}_optical_frame)
-        lidar_pose ("X Y Z ROLL PITCH YAW"): Of autoware and nuscenes: where the LiDAR is mounted,
-            in sensor_kit_base_link or ego, metres and radians as in URDF. (default: at its origin)
+        lidar_pose ("X Y Z ROLL PITCH YAW"): Of autoware: where the LiDAR is mounted,
+            in sensor_kit_base_link, metres and radians as in URDF. (default: at its origin)
         even_if_failed: Export although the verdict is FAIL.
     """
     import numpy as np

@@ -74,10 +74,14 @@ def init(
         force: Replace the file, and the values in it.
     """
     from calibgraph.guessing.template import write_rig_template
+    from calibgraph.io.dataset_folders import describe_pairing
 
     with checked_arguments():
         words = parse_names("--mount", mount)
         path = write_rig_template(dataset, out, mountings=words, forward=forward, replace=force)
+        pairing = describe_pairing(dataset)
+    if pairing:
+        print_plain(terminal(), pairing)
     print_plain(terminal(), f"{path}: written; replace every FILL_IN, then run calibgraph doctor")
 
 

@@ -177,6 +177,6 @@ def doctor(
         for path in found.pictures:
             print_plain(terminal(), f"{path}: written")
         if all(finding.level == "note" for finding in found.findings):
-            print_plain(terminal(), "nothing to mend; next: calibgraph calibrate")
+            print_plain(terminal(), "no faults; next: calibgraph calibrate")
     if not found.healthy:
         raise typer.Exit(1)

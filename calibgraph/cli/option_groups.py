@@ -71,8 +71,6 @@ class MatchingOptions(DatasetOptions):
         search_deg (DEG|none): Largest rotation error of the guess, per axis; none: no search, for a
             guess within about 2.5 deg and 25 cm. The guess itself is tried first. (default: 20)
         search_m (M|none): Largest translation error of the guess, per axis; or none. (default: 1.5)
-        window_weights (FILE|none): Weights of windows of train-windows, in place of the package's;
-            none: all windows count alike.
         start_from (frame|joint): Where a network starts: at each frame's own pose by the network
             before, or at the joint solve. (default: frame)
         iterations: Iterations of each network's recurrent update (default: 12).
@@ -86,7 +84,6 @@ class MatchingOptions(DatasetOptions):
     time_limit_s: Annotated[float | None, typer.Option(min=0.001)] = None
     search_deg: Annotated[str | None, _structure_option()] = None
     search_m: Annotated[str | None, _structure_option()] = None
-    window_weights: Annotated[str | None, _structure_option()] = None
     weights: options.WeightsOption = None
     start_from: Annotated[str | None, _cmrnext_option()] = None
     device: options.DeviceOption = None
@@ -123,8 +120,8 @@ class SolveOptions:
         bootstrap: Check the covariance: solve N times with frames drawn with replacement.
         tolerance_deg (DEG): Rotation by which a PASS may be off; by default 0.5.
         tolerance_cm (CM): Distance by which a PASS may be off; by default 10.
-        of (alignment|mount): Poses to report: where the LiDAR's points meet the images, or where
-            the sensors are mounted, less certain. (default: alignment)
+        of (alignment|mount): Poses to report. alignment: for projecting points. mount: the physical
+            pose, with a wider error bar. (default: alignment)
         estimate (PART,...): Estimate each camera's lens and clock too: focal, aspect, centre,
             distortion, or lens for all but aspect; offset, readout, or clock for both. The rig may
             state how well they are known.

@@ -13,7 +13,6 @@ from calibgraph.outputs import (
     PAGE_MARK,
     VIEW_MARK,
     WEIGHTS_MARK,
-    WINDOW_WEIGHTS_MARK,
     Output,
     marked_yaml,
     png_mark,
@@ -49,7 +48,6 @@ PLOT_OF_DRIFT = _named("drift", png_mark("drift"), ".png")
 PAGE_OF_AUDIT = _named("check", AUDIT_PAGE_MARK, *PAGE_SUFFIXES)
 FLEET_PAGE = _named("fleet-report", PAGE_MARK, *PAGE_SUFFIXES)
 WEIGHTS = _named("weights", WEIGHTS_MARK, ".safetensors")
-WINDOW_WEIGHTS = _named("train-windows", WINDOW_WEIGHTS_MARK, ".json")
 GRAPH = _named("solve --graph", DOT_MARK, ".dot")
 RERUN, MCAP = (_named("view", VIEW_MARK, suffix) for suffix in (".rrd", ".mcap"))
 RESULT = Writes(lambda folder, _: outputs_of_result(folder))
@@ -79,20 +77,14 @@ def _pictures(folder: Path | None, _: Given) -> list[Output]:
     return [Output(path, "doctor", (png_mark("doctor"),)) for path in found]
 
 
-def _training(path: Path, given: Given) -> list[Output]:
-    """Settings beside the weights, which the library refuses to replace but with ``--resume``."""
-    beside = path.with_suffix(".settings.yaml")
-    return [] if given["resume"] else [marked_yaml(beside, "train")]
-
-
 def _picked(folder: Path, _: Given) -> list[Output]:
-    from calibgraph.service.pick.reference import outputs_of_pick
+    from calibgraph.pick.workspace import outputs_of_pick
 
     return outputs_of_pick(folder)
 
 
 PAGE, FLEET_MODEL, EXPORTED = Writes(_page), Writes(_fleet_model), Writes(_exported)
-PICTURES, TRAINING, PICKED = Writes(_pictures), Writes(_training), Writes(_picked)
+PICTURES, PICKED = Writes(_pictures), Writes(_picked)
 
 
 def writes_of(command: Callable[..., None]) -> dict[str, Writes]:

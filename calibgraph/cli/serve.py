@@ -1,13 +1,11 @@
-"""The commands of the service: serve, token, pick."""
+"""The commands of the service: serve, token."""
 
-import webbrowser
 from pathlib import Path
 from typing import Annotated, TypeVar
 
 import typer
 
-from calibgraph.cli import outputs
-from calibgraph.cli.arguments import dataset_from, require_service
+from calibgraph.cli.arguments import require_service
 from calibgraph.cli.terminal import print_plain, terminal
 from calibgraph.errors import CalibrationError
 
@@ -137,39 +135,3 @@ def _one_of(known: tuple[Word, ...], option: str, word: str) -> Word:
         if word == each:
             return each
     raise CalibrationError(f"{option} {word}: known are {', '.join(known)}")
-
-
-PORT = 8765
-
-
-def pick(
-    dataset: list[Path],
-    out: Annotated[Path, typer.Option(), outputs.PICKED],
-    rig: Path | None = None,
-    frames: str | None = None,
-    port: Annotated[int, typer.Option(min=0, max=65535)] = PORT,
-    show: Annotated[bool, typer.Option("--show/--no-show")] = True,
-) -> None:
-    """Pick a reference by hand: a page on which pixels and LiDAR points are paired.
-
-    The server answers this machine only. Ends with Ctrl-C; every change is saved at once.
-
-    Args:
-        out (DIR): Folder of the session, which is continued if it is there, and of what it gives:
-            reference.yaml and picked.parquet.
-        port: Of this machine; 0 for any that is free.
-        show: Open the page in the browser.
-    """
-    require_service()
-    from calibgraph.files import require_place_for_folder
-    from calibgraph.service.pick.router import loopback_socket, pick_server
-    from calibgraph.service.pick.workspace import Workspace
-
-    require_place_for_folder(out)
-    workspace = Workspace(dataset_from(dataset, rig, frames), out)
-    with loopback_socket(port) as listening:
-        address = f"http://127.0.0.1:{listening.getsockname()[1]}/pick"
-        print_plain(terminal(), f"{address}: pick there; end with Ctrl-C")
-        if show:
-            webbrowser.open(address)
-        pick_server(workspace).run(sockets=[listening])

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from calibgraph.model.rig import Rig
 
 STREET = "street"
-SURROUNDINGS = STREET, "meadow", "motorway", "tunnel", "deck", "quay"
 RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # defaults of simulate_street, but for the rig
 _street_option = partial(typer.Option, rich_help_panel="Scenario street")
 
@@ -30,8 +29,6 @@ class StreetOptions:
     Attributes:
         sensor_errors: Of the LiDAR: 0 for an ideal one, 1 for errors as real ones have them: beam
             angles and widths, motion during a turn, ranges on dark surfaces. (default: 0)
-        lens_errors: Of the lenses in the rig files: 0 for exact ones, 1 for errors that a good
-            calibration with a target leaves. (default: 0)
         vary_layout: Draw also the street's width, curves, gardens and heights by the seed;
             otherwise all streets are laid out alike.
     """
@@ -59,16 +56,7 @@ class StreetOptions:
         ),
     ] = None
     sensor_errors: Annotated[float | None, _street_option()] = None
-    lens_errors: Annotated[float | None, _street_option()] = None
     vary_layout: Annotated[bool, _street_option()] = False
-    surroundings: Annotated[
-        str | None,
-        _street_option(
-            metavar="|".join(SURROUNDINGS),
-            help="What the road leads through; all but a street have little to calibrate by. "
-            f"(default: {STREET})",
-        ),
-    ] = None
 
     @property
     def given(self) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.box import SIMPLE
 from rich.console import Console
@@ -13,17 +13,15 @@ from rich.markup import escape
 from rich.table import Table
 
 from calibgraph.arrays import Array
-from calibgraph.cli.terminal import print_plain
+from calibgraph.cli.terminal import elapsed_s, print_plain
 from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.geometry import degrees_and_centimetres
 from calibgraph.model.metrics import Evaluation, PoseError, pose_error
 from calibgraph.model.places import describe_places
+from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.summary import Summary
+from calibgraph.model.threshold import fixed
 
-if TYPE_CHECKING:
-    from calibgraph.matching.cmrnext.training.validation import Validation
-
-_DETAILS = "report.html or calibration.yaml"
 CAMERA_AXES_COLUMNS = (
     "pitch x\ndeg", "yaw y\ndeg", "roll z\ndeg", "x right\ncm", "y down\ncm", "z ahead\ncm",
 )  # fmt: skip
@@ -32,33 +30,34 @@ _COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red"}
 
 def print_result(console: Console, result: Calibration, written: list[Path]) -> None:
     """Print the verdict with its reasons, a line per camera, and the files that were written."""
-    print_summary(console, result.summary)
+    details = next((path.name for path in written if path.suffix == ".html"), CALIBRATION_FILE)
+    print_summary(console, result.summary, details)
     console.print(result_table(result))
     config = result.config
     console.print(
-        "off: probability of an error over "
-        f"{config.tolerance_deg:g} deg or {config.tolerance_cm:g} cm, - where data for it are "
-        "missing; moved: from the guess; median: error of all matches, in pixels; inliers, "
-        "matches: within the gate"
+        f"off: probability of an error above {config.tolerance_deg:g} deg or "
+        f"{config.tolerance_cm:g} cm, - if data for it are missing. moved: change from the guess. "
+        "median: residual of all matches. inliers, matches: within the gate."
     )
     if result.places:
         print_plain(console, describe_places(result.places))
     console.print(error_bar_table(result))
+    unknown = any(not result.error_bar_holds(name) for name in result.covariance)
     console.print(
-        f"one standard deviation of the {config.of}: scatter between frames, and the error that "
-        f"the matcher reports as common to its frames; {result.not_included}"
-        f"{result.verdict.images_note}; A->B: of the transform from A to B, in B's axes"
+        f"1 sigma per axis of the {config.of}. Not included: {result.not_included}."
+        f"{result.verdict.images_note} A->B is the relative pose, in B's axes."
+        + " A FAIL has no error bar."
+        * unknown
     )
     if result.lens:
         console.print(lens_table(result))
-    time = f"{sum(result.timings_s.values()):.1f} s; " if result.timings_s else ""
-    console.print(f"{time}{FRAMES_SENTENCE}; written:", highlight=False)
+    print_plain(console, f"{elapsed_s():.1f} s; {FRAMES_SENTENCE}; written:")
     for path in written:
         print_plain(console, f"  {path}")
 
 
-def print_summary(console: Console, summary: Summary) -> None:
-    """Print the verdict, at most three reasons, what to do, and how much is folded."""
+def print_summary(console: Console, summary: Summary, details: str) -> None:
+    """Print the verdict, its reasons, what to do, and how much is in the file of the details."""
     status = summary.status
     probability = f": {summary.error_probability}" if summary.error_probability else ""
     console.print(
@@ -66,16 +65,15 @@ def print_summary(console: Console, summary: Summary) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    for reason in summary.reasons:
-        print_plain(console, f"  {reason.status}  {', '.join(reason.cameras)}: {reason.text}")
+    lines = [f"  {each.status}  {', '.join(each.cameras)}: {each.text}" for each in summary.reasons]
     if summary.actions:
-        print_plain(console, "What to do:")
-    for action in summary.actions:
-        print_plain(console, f"  {action}")
-    if summary.error_bar:
-        print_plain(console, summary.error_bar)
-    if summary.others:
-        print_plain(console, f"{len(summary.others)} more findings: see {_DETAILS}")
+        lines += ["What to do:", *(f"  {action}" for action in summary.actions)]
+    lines += summary.moves
+    lines += filter(None, [summary.error_bar])
+    if more := len(summary.others):
+        lines.append(f"{more} more finding{'s' if more > 1 else ''}: see {details}")
+    for line in lines:
+        print_plain(console, line)
 
 
 def print_weights(console: Console, summary: Mapping[str, Any], converted: Path | None) -> None:
@@ -89,21 +87,9 @@ def print_weights(console: Console, summary: Mapping[str, Any], converted: Path 
         print_plain(console, f"{converted}: written")
 
 
-def print_validation(console: Console, validation: Validation) -> None:
-    """Print the errors of a network in training, on held-out frames."""
-    v = validation
-    print_plain(
-        console,
-        f"step {v.step}: loss {v.train_loss:.4g}; held out: flow error {v.epe_px:.2f} px (median "
-        f"{v.median_px:.2f}) of {v.zero_px:.2f}; pose of a frame {v.pose_deg:.3f} deg "
-        f"{v.pose_cm:.1f} cm of {v.start_deg:.3f} deg {v.start_cm:.1f} cm (medians; "
-        f"{v.failed_share:.0%} failed)",
-    )
-
-
 def result_table(result: Calibration) -> Table:
     """One row per camera: verdict, change from the guess, residuals and matches."""
-    table = empty_table("Calibration", "camera", "verdict")
+    table = empty_table("Calibration", "camera", words=("verdict",))
     numbers = ("moved\ndeg", "moved\ncm", "median\npx", "inliers", "matches", "frames", "prior")
     add_number_columns(table, "off", *numbers)
     for name, T in result.T_camera_lidar.items():
@@ -114,9 +100,9 @@ def result_table(result: Calibration) -> Table:
             escape(name),
             f"[{_COLOURS[verdict.status]}]{verdict.status}[/]",
             verdict.percent,
-            f"{moved.rotation_error_deg:.2f}",
-            f"{moved.translation_error_cm:.1f}",
-            "-" if residuals is None else f"{residuals.median_px:.2f}",
+            fixed(moved.rotation_error_deg, 2),
+            fixed(moved.translation_error_cm, 1),
+            "-" if residuals is None else fixed(residuals.median_px, 2),
             "-" if residuals is None else f"{residuals.inlier_share:.0%}",
             str(result.counts[name]["used"]),
             str(result.counts[name]["frames_used"]),
@@ -151,23 +137,22 @@ def lens_table(result: Calibration) -> Table:
 
 
 def _error_bar_cells(result: Calibration, name: str) -> list[str]:
-    """Six numbers, or why there are none."""
+    """Six numbers; a dash each if there are none, or they do not hold."""
     sigmas = result.error_bar(name)
-    if sigmas is not None:
-        return _sigma_cells(*sigmas)
-    why = "not determined" if result.error_bar_holds(name) else "unknown: FAIL"
-    return [*why.split(), *[""] * 6][:6]
+    return ["-"] * 6 if sigmas is None else _sigma_cells(*sigmas)
 
 
 def _sigma_cells(rotation_deg: Array, translation_cm: Array) -> list[str]:
-    return [f"{v:.3f}" for v in rotation_deg] + [f"{v:.2f}" for v in translation_cm]
+    return [fixed(v, 3) for v in rotation_deg] + [fixed(v, 2) for v in translation_cm]
 
 
-def empty_table(title: str, *names: str) -> Table:
-    """An empty table, narrow enough not to cut numbers on 80 columns."""
+def empty_table(title: str, *names: str, words: tuple[str, ...] = ()) -> Table:
+    """An empty table: on 80 columns its names fold, and words and numbers are never cut."""
     table = Table(title=title, box=SIMPLE, padding=0)
     for name in names:
-        table.add_column(name, no_wrap=True)
+        table.add_column(name, overflow="fold")
+    for word in words:
+        table.add_column(word, no_wrap=True)
     return table
 
 
@@ -230,15 +215,15 @@ def deviation_table(errors: Evaluation) -> Table:
         table, "pitch x", "yaw y", "roll z", "x right", "y down", "z ahead", "p of\nall six", "of"
     )
     for name, found in errors.deviations.items():
-        cells = [f"{value:+.1f}" for value in (*found.rotation, *found.translation)]
+        cells = [fixed(value, 1, "+") for value in (*found.rotation, *found.translation)]
         table.add_row(escape(name), *cells, f"{found.p:.2g}", found.of)
     return table
 
 
 def _cells(error: PoseError) -> list[str]:
     return [
-        f"{error.rotation_error_deg:.3f}",
-        f"{error.translation_error_cm:.2f}",
-        *(f"{value:.2f}" for value in (error.x_cm, error.y_cm, error.z_cm)),
-        *(f"{value:.3f}" for value in (error.roll_deg, error.pitch_deg, error.yaw_deg)),
+        fixed(error.rotation_error_deg, 3),
+        fixed(error.translation_error_cm, 2),
+        *(fixed(value, 2) for value in (error.x_cm, error.y_cm, error.z_cm)),
+        *(fixed(value, 3) for value in (error.roll_deg, error.pitch_deg, error.yaw_deg)),
     ]

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from calibgraph.progress import Progress
 
+_STARTED = time.monotonic()
 LINE_EVERY_S = 5.0
 """The least time before the first line of progress and between two: short work is silent."""
 
@@ -45,6 +46,11 @@ def terminal() -> Console:
 def print_plain(console: Console, text: str) -> None:
     """Print a line as it is: no markup, no colours, no line breaks of rich's own."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def elapsed_s() -> float:
+    """Seconds since the program started, by the clock on the wall."""
+    return time.monotonic() - _STARTED
 
 
 def print_json(content: dict[str, Any]) -> None:

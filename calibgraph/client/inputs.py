@@ -9,7 +9,6 @@ from typing import IO, Any
 
 from calibgraph.errors import FileError
 from calibgraph.io.dataset_folders import folder_layout
-from calibgraph.io.videos import STAMPS_SUFFIX
 
 _BESIDE = ("rig.yaml", "calib.txt", "times.txt", "metadata.yaml")
 _BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -67,8 +66,7 @@ def files_of(folder: Path) -> list[Path]:
     layout = folder_layout(folder)
     found = [folder / name for name in _BESIDE if (folder / name).is_file()]
     for part in (layout.clouds, *layout.images.values()):
-        files = (part, part.with_suffix(STAMPS_SUFFIX)) if part.is_file() else part.glob("*")
-        found += [path for path in sorted(files) if path.is_file()]
+        found += [path for path in sorted(part.glob("*")) if path.is_file()]
     found += [path for path in sorted(folder.glob("*")) if path.suffix in _BAG_SUFFIXES]
     if not found:
         raise FileError(folder, "holds no dataset; see the formats of datasets")

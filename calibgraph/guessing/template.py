@@ -16,7 +16,6 @@ from calibgraph.io.frame_files import files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES, image_size
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import FILL_IN, RIG_FILE
-from calibgraph.io.videos import PICTURE_SUFFIX, load_picture
 from calibgraph.model.rig import RIG_FORMAT
 from calibgraph.outputs import yaml_mark
 from calibgraph.yaml_text import yaml_text
@@ -94,10 +93,7 @@ def _require_plain_folder(folder: Path) -> None:
 
 
 def _size(source: Path) -> tuple[int, int]:
-    """Width and height of a camera's first image, or of the first picture of its video."""
-    if source.is_file():
-        height, width = load_picture(source / f"{0:06}{PICTURE_SUFFIX}").shape[:2]
-        return width, height
+    """Width and height of a camera's first image."""
     return image_size(next(iter(files_by_stem(source, IMAGE_SUFFIXES).values())))
 
 

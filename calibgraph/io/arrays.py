@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import DatasetError, FileError
-from calibgraph.io.clouds import check_points, cloud_of_array, describe_cloud
+from calibgraph.io.clouds import check_points, cloud_of_array, describe_cloud, with_intensity
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.io.point_fields import RawCloud
@@ -127,7 +127,7 @@ def _frame(
         name=name,
         cloud_path=root / "lidar" / name,
         image_paths={camera: root / camera / name for camera in images},
-        cloud=_cloud(clouds[number], number).points,
+        cloud=with_intensity(_cloud(clouds[number], number).points),
         images={
             camera: _image(images[camera][number], rig.cameras[camera], camera, number)
             for camera in rig.cameras

@@ -30,6 +30,11 @@ from calibgraph.model.verdict import Check, ErrorProbability, Status, Verdict
 Table = TypeVar("Table")
 
 _POSE = 6  # numbers of one
+_LARGEST = 1e24  # of a covariance: that of a pose that nothing determines is smaller
+_MEASURED = (
+    "timings_s", "residuals", "rounds", "prior_share", "error_sources", "lens", "covariance",
+    "joint_covariance", "pair_covariance", "bootstrap_covariance", "lens_covariance", "sigmas",
+)  # fmt: skip
 _ROUNDING = 1e-6  # of correlations: other programs may write fewer digits
 
 
@@ -47,6 +52,8 @@ def load_calibration(path: Path | str) -> Calibration:
             path, f"has format {content.get('format')!r}, expected {CALIBRATION_FORMAT}"
         )
     _require_whole(content, path)
+    for key in _MEASURED:
+        _require_possible(content.get(key), f"{path}: {key}")
     parts = checked_model(_Parts, content, path)
     found = Calibration(
         rig=checked_model(Rig, parts.rig, path),
@@ -66,6 +73,17 @@ def load_calibration(path: Path | str) -> Calibration:
     return found
 
 
+def _require_possible(value: Any, where: str) -> None:
+    """Check that the numbers below a key are finite, and none that no measurement has."""
+    if isinstance(value, (dict, list)):
+        for key, each in value.items() if isinstance(value, dict) else enumerate(value):
+            _require_possible(each, f"{where}.{key}")
+    elif isinstance(value, float) and not abs(value) <= _LARGEST:
+        raise FileError(
+            where, f"is {value}, no number of a result; the file was edited, write it again"
+        )
+
+
 def _square(value: Any) -> Array:
     """A square matrix of finite numbers as an array."""
     try:
@@ -74,7 +92,7 @@ def _square(value: Any) -> Array:
         raise ValueError("expected a matrix of numbers") from error
     if holds_truth_value(value):
         raise ValueError("expected a matrix of numbers, found a truth value in it")
-    if found.ndim != 2 or len({*found.shape}) != 1 or not np.isfinite(found).all():  # noqa: PLR2004
+    if found.ndim != 2 or len({*found.shape}) != 1 or not (np.abs(found) <= _LARGEST).all():  # noqa: PLR2004
         raise ValueError(f"expected a square matrix of finite numbers, found {found.shape}")
     return found
 
@@ -156,6 +174,7 @@ class _Parts(BaseModel):
     residuals: dict[str, Residuals]
     weaknesses: dict[str, tuple[str, ...]]
     frames_used: tuple[_FrameEntry, ...]
+    moves: tuple[str, ...] = ()
     places: tuple[tuple[int, ...], ...] = ()
     rounds: tuple[dict[str, Any], ...]
     warnings: tuple[str, ...] = ()
@@ -191,6 +210,11 @@ def _require_consistent(
     names, joint = set(found.rig.cameras), found.joint_covariance
     right = {part: names == {*getattr(found, part)} for part in _OF_ALL_CAMERAS}
     right |= {part: names >= {*getattr(found, part)} for part in _OF_SOME_CAMERAS}
+    right["counts"] &= all("used" in of_camera for of_camera in found.counts.values())
+    right["sigmas"] = all(
+        covariance is None or _is_whole(content.get("sigmas"), name)
+        for name, covariance in found.covariance.items()
+    )
     right["initial_rig"] = names == {*found.initial_rig.cameras}
     right["joint_covariance"] = joint is None or len(joint) == _POSE * len(names)
     right["lens_covariance"] = all(
@@ -200,6 +224,12 @@ def _require_consistent(
     )
     for part in (part for part, is_right in right.items() if not is_right):
         raise FileError(path, f"its {part} are not of the cameras of its rig; write it again")
+
+
+def _is_whole(sigmas: Any, camera: str) -> bool:
+    """Whether the sigmas of a file, which repeat the covariances, have three numbers each."""
+    found = sigmas.get(camera) if isinstance(sigmas, dict) else None
+    return isinstance(found, dict) and [len(each) for each in found.values()] == [3, 3]
 
 
 _OF_ALL_CAMERAS = ("covariance", "camera_verdicts", "counts")
@@ -215,7 +245,7 @@ _OF_SOME_CAMERAS = (
 _PLAIN = (
     "covariance", "joint_covariance", "pair_covariance", "stage1_T_camera_lidar", "residuals",
     "weaknesses", "rounds", "counts", "timings_s", "terms", "prior_share", "error_sources",
-    "inputs", "versions", "date", "warnings", "lens", "places",
+    "inputs", "versions", "date", "warnings", "lens", "moves", "places",
 )  # fmt: skip
 assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}
 

@@ -44,7 +44,7 @@ def load_camera_matches(path: Path | str) -> CameraMatches:
         raise FileError(path, f"has the format {form!r}, expected {FORMAT!r}")
     try:
         return _from_arrow(table)
-    except (CorrespondenceError, ValueError, TypeError, KeyError) as error:
+    except (CorrespondenceError, ValueError, TypeError, LookupError, RecursionError) as error:
         raise FileError(path, f"holds a wrong value: {error}") from error
 
 

@@ -1,4 +1,4 @@
-"""Point clouds from disk: .npy, .bin, .pcd, .ply, .las, .laz, .feather; and notes on them."""
+"""Point clouds from disk: .npy, .bin, .pcd, .ply, .feather; and notes on them."""
 
 import threading
 import tokenize
@@ -17,7 +17,6 @@ from calibgraph.io.bags import MESSAGE_SUFFIX, load_bag_cloud
 from calibgraph.io.bags.messages import read_message
 from calibgraph.io.bin_columns import read_bin
 from calibgraph.io.feather import feather_columns, read_feather
-from calibgraph.io.las import read_las
 from calibgraph.io.motion import ScanMotion
 from calibgraph.io.pcd import read_pcd
 from calibgraph.io.ply import read_ply
@@ -45,8 +44,8 @@ def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np
 
     Args:
         path: a .npy array (n, 3), (n, 4+) or with named fields, rows of numbers in a .bin (KITTI,
-            nuScenes), .pcd, .ply, .las, .laz, or a .feather of Argoverse 2; or the address of a
-            message in a bag.
+            nuScenes), .pcd, .ply, or a .feather of Argoverse 2; or the address of a message in a
+            bag.
         motion: for which points of a bag's message are corrected; None for none.
 
     Returns:
@@ -59,8 +58,8 @@ def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np
     """
     path = Path(path)
     if path.suffix == MESSAGE_SUFFIX:
-        return load_bag_cloud(path, motion)
-    return check_points(read_cloud(path).points, path)
+        return with_intensity(load_bag_cloud(path, motion))
+    return with_intensity(check_points(read_cloud(path).points, path))
 
 
 def read_cloud(path: Path) -> RawCloud:
@@ -100,7 +99,44 @@ def check_points(cloud: NDArray[np.float32], path: Path | str) -> NDArray[np.flo
     return cloud if returned.all() else cloud[returned]
 
 
+_MOST_MISSING, _MOST_RATIO = 0.1, 1e12
+
+
+def intensity_fault(cloud: NDArray[np.float32]) -> str:
+    """Why the intensities of a cloud (n, 4) are none, as if of another field; empty if they are."""
+    values = np.abs(cloud[:, 3])
+    finite = values[np.isfinite(values)]
+    missing = 1 - len(finite) / max(1, len(values))
+    if missing == 1:
+        return ""
+    if missing > _MOST_MISSING:
+        return f"is no finite number at {100 * missing:.0f} % of the points"
+    positive = finite[finite > 0]
+    if len(positive) and positive.max() > _MOST_RATIO * positive.min(initial=np.inf):
+        low, high = np.quantile(positive, (0.02, 0.98))
+        if high > _MOST_RATIO * low:
+            return f"spans {low:.0e} to {high:.0e}"
+    return ""
+
+
+def with_intensity(cloud: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The cloud, NaN in place of intensities that are none."""
+    if intensity_fault(cloud):
+        cloud = cloud.copy()
+        cloud[:, 3] = np.nan
+    return cloud
+
+
 def _read_npy(path: Path) -> RawCloud:
+    return cloud_of_array(read_npy(path), path)
+
+
+def read_npy(path: Path) -> NDArray[Any]:
+    """The array in a .npy file.
+
+    Raises:
+        FileError: if it is damaged, or holds something else.
+    """
     try:
         with _PARSER, path.open("rb") as file, warnings.catch_warnings(action="ignore"):
             array = np.load(file, allow_pickle=False)  # warns of headers by Python 2
@@ -115,7 +151,7 @@ def _read_npy(path: Path) -> RawCloud:
         raise FileError(
             path, f"goes on after the {array.shape} numbers of its header; write it again"
         )
-    return cloud_of_array(array, path)
+    return array
 
 
 def cloud_of_array(array: NDArray[Any], path: Path | str) -> RawCloud:
@@ -151,7 +187,7 @@ def _read_sweep(path: Path) -> RawCloud:
 
 _READERS: dict[str, Callable[[Path], RawCloud]] = {
     ".npy": _read_npy, ".bin": read_bin, ".pcd": read_pcd, ".ply": read_ply,
-    ".las": read_las, ".laz": read_las, ".feather": _read_sweep, ".txt": _read_rows,
+    ".feather": _read_sweep, ".txt": _read_rows,
 }  # fmt: skip
 CLOUD_SUFFIXES = tuple(suffix for suffix in _READERS if suffix != ".txt")
 """Of clouds in folders of any data set: a .txt may be anything there."""
@@ -180,7 +216,9 @@ def describe_cloud(where: str, cloud: RawCloud) -> Iterator[str]:
     if cloud.told:
         yield f"{where}: {cloud.told}"
     intensity = cloud.points[:, 3]
-    if np.isnan(intensity).all():
+    if fault := intensity_fault(cloud.points):
+        yield f"{where}: the intensity {fault}: it is none, and is left out; {_COST}"
+    elif np.isnan(intensity).all():
         yield f"{where}: no intensity among its fields {' '.join(cloud.fields)}; {_COST}"
     elif np.nanmin(intensity) == np.nanmax(intensity):
         yield f"{where}: the intensity is {np.nanmax(intensity) + 0:g} at all points; {_COST}"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.files import require_file
+from calibgraph.files import require_file, wide_encoding
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import Places
 from calibgraph.model.table_columns import (
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 
 _PART_ROWS = 2**18
+_FEW_ROWS, _FEW_BYTES, _MOST_RATIO = 2**20, 2**26, 64
+"""What any file may hold, and how many times its bytes otherwise: a row of five random coordinates
+takes 12 bytes and more, however packed."""
 _MOST_NAME_BYTES = 400  # 100 letters of 4 bytes
 
 
@@ -127,11 +130,26 @@ def read_arrow(
 
     with arrow_reads(path):
         if path.suffix == ".csv":
+            _require_commas(path)
             column_types = {**dict.fromkeys(names, pa.string()), **(types or {})}
             options = csv.ConvertOptions(column_types=column_types)
             return csv.read_csv(path, convert_options=options)
         with open_parquet(path, names) as file:
             return file.read()
+
+
+def _require_commas(path: Path) -> None:
+    """Check the encoding of a CSV file, and what separates the columns of its first line."""
+    with path.open("rb") as file:
+        head = file.readline(2**16)
+    if encoding := wide_encoding(head):
+        raise FileError(path, f"is {encoding}; save it as UTF-8 (in Excel: CSV UTF-8)")
+    for separator, name in ((b";", "semicolons"), (b"\t", "tabs")):
+        if separator in head and b"," not in head:
+            raise FileError(
+                path, f"its columns are separated by {name}; save it with commas between columns, "
+                "and points in numbers"
+            )  # fmt: skip
 
 
 def open_parquet(path: Path, names: Sequence[str] = ("camera",)) -> Any:
@@ -140,9 +158,24 @@ def open_parquet(path: Path, names: Sequence[str] = ("camera",)) -> Any:
 
     checked = partial(parquet.ParquetFile, path, page_checksum_verification=True)
     try:
-        return checked(read_dictionary=list(names))
+        found = checked(read_dictionary=list(names))
     except KeyError:  # a column is missing, which is reported with the columns that are there
-        return checked()
+        found = checked()
+    _require_plausible_size(path, found.metadata)
+    return found
+
+
+def _require_plausible_size(path: Path, footer: Any) -> None:
+    """Check what a footer states of the rows, before memory is taken for them."""
+    size = path.stat().st_size
+    groups = [footer.row_group(i) for i in range(footer.num_row_groups)]
+    unpacked = sum(group.total_byte_size for group in groups)
+    rows_fit = 0 <= footer.num_rows <= max(_FEW_ROWS, size)
+    if not rows_fit or unpacked > max(_FEW_BYTES, _MOST_RATIO * size):
+        raise FileError(
+            path, f"states {footer.num_rows} rows of {unpacked / 1e6:.0f} MB in {size / 1e6:.1f} "
+            "MB: matches do not pack so; write it again"
+        )  # fmt: skip
 
 
 @contextmanager

@@ -17,17 +17,25 @@ from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.frames import BagFrame, frames_of_bag
 from calibgraph.io.bags.messages import CLOUDS, Bag
+from calibgraph.io.bags.options import NEAR_S
 from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.clouds import read_cloud_notes
-from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, published_format
+from calibgraph.io.dataset_folders import (
+    FolderFrames,
+    folder_layout,
+    frames_of_folder,
+    published_format,
+)
 from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import Frame, twist_by_scans
-from calibgraph.io.frame_files import RigRead
+from calibgraph.io.frame_files import RigRead, way_out
 from calibgraph.io.rigs import read_rig
+from calibgraph.memory import available_bytes
 from calibgraph.model.rig import Rig
 
 Item = TypeVar("Item")
+_BYTES_PER_PIXEL = 24  # of an image: BGR, gray, gradients and depths of a frame
 
 LEAST_INTERVAL_S, MOST_INTERVAL_S = 0.005, 10.0
 
@@ -102,7 +110,7 @@ def load_dataset(
         rig: used instead of the rig in the folder or bag.
         frames: which to keep, see :meth:`Dataset.select`; all if None. Those left out may lack
             images.
-        bag: how ROS bags are read.
+        bag: how ROS bags are read; its tolerance is also that of names that are stamps.
         interval_s: between neighbouring clouds of folders, all of one drive: the motion of the
             LiDAR is then found by registration of neighbours, where it is needed.
 
@@ -133,7 +141,10 @@ def load_dataset(
         if is_bag(path):
             data = _with_bag(data, path, prefix, bag)
         else:
-            data = _with_folder(data, path, prefix, frames is None, interval_s=interval_s)
+            found = frames_of_folder(
+                path, list(data.rig.cameras), complete=frames is None, tolerance_s=bag.tolerance_s
+            )
+            data = _with_folder(data, path, prefix, found, interval_s=interval_s)
     if data.recorded == data.frames:
         data = replace(data, recorded=())
     data = data if frames is None else _complete(data.select(frames))
@@ -148,22 +159,35 @@ def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -
     for path, other in zip(paths, read, strict=True):
         _require_same_lenses(paths[0], first, path, other.rig)
     notes = [note for each in read for note in each.notes]
+    _require_memory(paths[0], first)
     if rig is None and is_bag(paths[0]):
         notes = [*describe_rig(first), *doubtful_axes(first), *notes]
     return Dataset(rig=first, frames=(), folders=paths, notes=tuple(dict.fromkeys(notes)))
 
 
+def _require_memory(path: Path, rig: Rig) -> None:
+    """Check that one image of each camera fits into memory, in all forms that matching holds."""
+    pixels = sum(camera.width_px * camera.height_px for camera in rig.cameras.values())
+    if (needed := pixels * _BYTES_PER_PIXEL) > (free := available_bytes()):
+        raise DatasetError(
+            f"{path}: the images of its {len(rig.cameras)} cameras have {pixels / 1e6:.0f} million "
+            f"pixels together, which take {needed / 2**30:.1f} GB to match, and {free / 2**30:.1f} "
+            "GB are free; scale images and intrinsics down, or calibrate fewer cameras at once"
+        )
+
+
 def _with_folder(
-    data: Dataset, path: Path, prefix: str, complete: bool, *, interval_s: float | None
+    data: Dataset, path: Path, prefix: str, of_folder: FolderFrames, *, interval_s: float | None
 ) -> Dataset:
-    """The dataset with the frames of a folder; of complete ones if not all are needed."""
-    start = _next_index(data)
+    """The dataset with the frames of a folder; of complete ones where names are stamps."""
+    start, cameras = _next_index(data), data.rig.cameras.keys()
     found = tuple(
         Frame(start + number, prefix + files.stem, files.cloud, files.images)
-        for number, files in enumerate(
-            frames_of_folder(path, list(data.rig.cameras), complete=complete)
-        )
+        for number, files in enumerate(of_folder.files)
+        if not of_folder.pairing or cameras <= files.images.keys()
     )
+    if of_folder.pairing:
+        data = replace(data, notes=(*data.notes, of_folder.pairing))
     if interval_s is not None:
         found = _driven(found, interval_s)
     published = published_format(path)
@@ -257,9 +281,12 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
         if is_bag(path) or published_format(path) or folder_layout(path).clouds.is_dir():
             continue
         if not path.is_dir():
+            unread = way_out(path) if path.is_file() else None
             raise FileError(
                 path,
-                "no such folder or ROS bag; expected a dataset, KITTI, nuScenes, Argoverse or bag",
+                unread
+                or "no such folder or ROS bag; expected a dataset, KITTI, nuScenes, Argoverse or "
+                "bag",
             )
         for recorded in (*path.glob("*.mcap"), *path.glob("*.db3")):
             raise FileError(
@@ -267,7 +294,8 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
                 f"has no metadata.yaml, as a ROS 2 bag that was not closed; name {recorded.name}, "
                 "or write the file with `ros2 bag reindex`",
             )
-    if bag is not None and not any(map(is_bag, paths)):
+    of_bags = bag is not None and replace(bag, tolerance_s=NEAR_S) != BagOptions()
+    if of_bags and not any(map(is_bag, paths)):
         raise ValueError("options for ROS bags, such as --every-s, are given without a bag")
 
 

@@ -3,16 +3,29 @@
 Folders of published data sets hold their own rig; each of their formats is one entry here.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import glob
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io import argoverse, kitti, kitti_drives, nuscenes
+from calibgraph.io.bags.options import NEAR_S
+from calibgraph.io.bags.stamps import TopicStamps, describe_offsets, nearest, offsets_of
 from calibgraph.io.clouds import CLOUD_SUFFIXES
-from calibgraph.io.frame_files import FrameFiles, RigRead, files_by_stem, frames_by_stem
+from calibgraph.io.frame_files import (
+    FrameFiles,
+    RigRead,
+    files_by_stem,
+    frames_by_stem,
+    stamp_ns_in_name,
+    way_out,
+)
 from calibgraph.io.images import IMAGE_SUFFIXES
-from calibgraph.io.videos import VIDEO_SUFFIXES, pictures_of_video
 
 
 @dataclass(frozen=True)
@@ -24,33 +37,37 @@ class FolderLayout:
 
 
 def folder_layout(folder: Path) -> FolderLayout:
-    """The layout of a KITTI odometry sequence, or of a dataset folder.
-
-    Raises:
-        FileError: if a camera has a folder of images and a video, or two videos.
-    """
+    """The layout of a KITTI odometry sequence, or of a dataset folder."""
     if (folder / kitti.CALIBRATION_NAME).is_file():
         return FolderLayout(folder / kitti.CLOUD_FOLDER, kitti.camera_folders(folder))
-    cameras: dict[str, Path] = {}
-    for path in sorted((folder / "cameras").glob("*")):
-        is_video = path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
-        name = path.stem if is_video else path.name
-        if (is_video or path.is_dir()) and name in cameras:
-            raise FileError(path, f"and {cameras[name].name} are the same camera; keep one")
-        if is_video or path.is_dir():
-            cameras[name] = path
-    return FolderLayout(folder / "lidar", cameras)
+    cameras = sorted(path for path in (folder / "cameras").glob("*") if path.is_dir())
+    return FolderLayout(folder / "lidar", {path.name: path for path in cameras})
+
+
+class FolderFrames(NamedTuple):
+    """The frames of a folder, one per cloud, in the order of the numbers in their names.
+
+    Attributes:
+        files: of each frame.
+        pairing: how images were paired with clouds by the stamps in their names, in a line; empty
+            where both have the same names.
+    """
+
+    files: list[FrameFiles]
+    pairing: str = ""
 
 
 def frames_of_folder(
-    folder: Path, cameras: Sequence[str], *, complete: bool = True
-) -> list[FrameFiles]:
-    """The frames of a folder, one per cloud, sorted by stem.
+    folder: Path, cameras: Sequence[str], *, complete: bool = True, tolerance_s: float = NEAR_S
+) -> FolderFrames:
+    """The frames of a folder; where names are stamps, those with an image near enough.
 
     Args:
         folder: a dataset folder, a KITTI odometry sequence, or one of a published data set.
         cameras: the rig's.
-        complete: whether every cloud must have an image of every camera, and every image a cloud.
+        complete: whether every cloud must have an image of every camera, and every image a cloud,
+            where names are no stamps.
+        tolerance_s: largest difference of the stamps that name a cloud and its images.
     """
     published = published_format(folder)
     if published is not None:
@@ -58,25 +75,116 @@ def frames_of_folder(
         for name in cameras if complete else ():
             stems = ({f.stem for f in frames}, {f.stem for f in frames if name in f.images})
             _require_pairs(folder, name, *stems)
-        return frames
+        return FolderFrames(frames)
     layout = folder_layout(folder)
     clouds = files_by_stem(layout.clouds, CLOUD_SUFFIXES)
-    images = {name: _images(_image_folder(folder, layout, name), list(clouds)) for name in cameras}
+    images = {
+        name: _of_same_number(
+            clouds, files_by_stem(_image_folder(folder, layout, name), IMAGE_SUFFIXES)
+        )
+        for name in cameras
+    }
+    stamped = _stamps(clouds)
+    if stamped and any(found.keys() != clouds.keys() for found in images.values()):
+        of_images = {name: s for name, found in images.items() if (s := _stamps(found))}
+        if of_images.keys() == images.keys():
+            return _paired_by_stamps(folder, stamped, of_images, tolerance_s=tolerance_s)
     for name in cameras if complete else ():
         _require_pairs(folder, name, set(clouds), set(images[name]))
-    return frames_by_stem(clouds, images)
+    return FolderFrames(frames_by_stem(clouds, images))
 
 
-def _images(source: Path, clouds: Sequence[str]) -> dict[str, Path]:
-    """The images of a camera by stem: files of a folder, or pictures of a video with a cloud."""
-    if source.is_file():
-        return pictures_of_video(source, clouds)
-    return files_by_stem(source, IMAGE_SUFFIXES)
+def _of_same_number(clouds: Mapping[str, Path], images: Mapping[str, Path]) -> dict[str, Path]:
+    """Images by the stems of their clouds: 8, 000008 and image_8 are one frame.
+
+    Names are told apart by their last number; where one number stands twice, they stay as they are.
+    """
+    by_number = _by_last_number(clouds)
+    numbers = _by_last_number(images)
+    if by_number.keys() & numbers.keys() and not clouds.keys() & images.keys():
+        return {by_number.get(number, stem): images[stem] for number, stem in numbers.items()}
+    return dict(images)
+
+
+def _by_last_number(stems: Iterable[str]) -> dict[int, str]:
+    """Stems by the last number in them; none if a stem has none, or two have the same."""
+    found = {int(words[-1]): s for s in stems if (words := re.findall(r"[0-9]+", s))}
+    return found if len(found) == len([*stems]) else {}
+
+
+def _stamps(files: Mapping[str, Path]) -> TopicStamps | None:
+    """The stamps that name files; None if a name states none, or two the same."""
+    stamps = [stamp_ns_in_name(stem) for stem in files]
+    found = [stamp for stamp in stamps if stamp is not None]
+    if len(set(found)) < len(stamps):
+        return None
+    in_order = sorted(zip(found, files.values(), strict=True))
+    stamp_ns = [stamp for stamp, _ in in_order]
+    return TopicStamps([path for _, path in in_order], stamp_ns, stamp_ns)
+
+
+def _paired_by_stamps(
+    folder: Path,
+    clouds: TopicStamps,
+    images: Mapping[str, TopicStamps],
+    *,
+    tolerance_s: float,
+) -> FolderFrames:
+    """Each cloud with the image of every camera that is nearest by its name, as in a bag."""
+    frames = [FrameFiles(path.stem, path, {}) for path in clouds.paths]
+    parts = []
+    for name, found in images.items():
+        rows = nearest(clouds, found, round(tolerance_s * 1e9))
+        paired = np.flatnonzero(rows >= 0)
+        if not len(paired):
+            raise DatasetError(
+                f"{folder}: no cloud has an image of {name} within {tolerance_s:g} s by the stamps "
+                f"in their names: {_apart(clouds, found, name)}; give a larger --tolerance-s, or "
+                "name the files by one clock",
+                camera=name,
+            )
+        for cloud in paired:
+            frames[cloud].images[name] = found.paths[rows[cloud]]
+        apart_ns = np.array(found.stamp_ns)[rows[paired]] - np.array(clouds.stamp_ns)[paired]
+        unused = len(found.paths) - len({*rows[paired]})
+        unused_text = f" ({unused} images not used)" if unused else ""
+        parts.append(describe_offsets(name, apart_ns) + unused_text)
+    complete = sum(len(frame.images) == len(images) for frame in frames)
+    pairing = (
+        f"{folder}: files are paired by the stamps in their names: {complete} of {len(frames)} "
+        f"clouds have all images within {tolerance_s:g} s (--tolerance-s); {'; '.join(parts)}"
+    )
+    if not complete:
+        raise DatasetError(f"{pairing}; calibrate the cameras apart")
+    return FolderFrames(frames, pairing)
+
+
+def _apart(clouds: TopicStamps, images: TopicStamps, name: str) -> str:
+    """How far stamps are apart of which none are near enough."""
+    apart_ns = offsets_of(clouds, images)
+    if len(apart_ns):
+        return describe_offsets(name, apart_ns)
+    spans = [
+        f"{each.stamp_ns[0] / 1e9:.3f} to {each.stamp_ns[-1] / 1e9:.3f} s"
+        for each in (clouds, images)
+    ]
+    return f"clouds are from {spans[0]}, images from {spans[1]}"
+
+
+def describe_pairing(folder: Path) -> str:
+    """How the files of a folder pair by stamps, or which do not pair; empty if all names agree."""
+    try:
+        return frames_of_folder(folder, [*folder_layout(folder).images]).pairing
+    except DatasetError as error:
+        return str(error)
 
 
 def _image_folder(folder: Path, layout: FolderLayout, camera: str) -> Path:
     """The folder of a camera's images."""
     if camera not in layout.images:
+        for path in (folder / "cameras").glob(f"{glob.escape(camera)}.*"):
+            if remedy := way_out(path):
+                raise FileError(path, remedy)
         raise FileError(
             folder,
             f"has no images of the rig's camera {camera!r}; it has "

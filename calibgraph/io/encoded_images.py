@@ -14,6 +14,10 @@ _PNG_MARK = b"\x89PNG\r\n\x1a\n"
 _END = b"\0\0\0\0IEND\xaeB`\x82"
 _AROUND_CHUNK = 12  # bytes of a chunk's length, name and checksum
 
+_FEW_PIXELS, _MOST_PER_BYTE = 2**25, 40
+"""Pixels that any image may have, and how many for each of its bytes otherwise: JPEG at the lowest
+quality has 20, a picture of one colour 85."""
+
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
@@ -29,6 +33,7 @@ def decode_image(data: bytes, kind: int = _COLOUR) -> NDArray[Any]:
         ValueError: if they are damaged, incomplete, or of another format.
     """
     try:
+        _require_plausible_size(data)
         if not is_png(data):
             return _decode_jpeg(data, gray=not kind & cv2.IMREAD_COLOR)
         PngImageFile(io.BytesIO(data)).verify()  # checksums, up to the end mark
@@ -38,6 +43,18 @@ def decode_image(data: bytes, kind: int = _COLOUR) -> NDArray[Any]:
     if image is None:
         raise ValueError("its pixels")
     return np.asarray(image)
+
+
+def _require_plausible_size(data: bytes) -> None:
+    """Check the size that a header states, before memory is taken for the pixels."""
+    if is_png(data):
+        width, height = PngImageFile(io.BytesIO(data)).size
+    else:
+        height, width, *_ = simplejpeg.decode_jpeg_header(data, strict=False)
+    if width * height > max(_FEW_PIXELS, _MOST_PER_BYTE * len(data)):
+        raise ValueError(
+            f"it states {width}x{height} px in {len(data) / 1e3:.0f} kB: no picture packs so"
+        )
 
 
 def _pixels_alone(png: bytes) -> bytes:

@@ -11,6 +11,9 @@ from calibgraph.errors import FileError
 from calibgraph.files import require_file
 from calibgraph.io.correspondence_tables import arrow_reads
 
+_MARKS = np.array([0x184D2204, 0xFD2FB528], np.uint32)
+_FEW_BYTES, _MOST_RATIO = 2**26, 64
+
 
 def feather_columns(path: Path) -> tuple[str, ...]:
     """The names of all columns of a file."""
@@ -32,7 +35,26 @@ def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
 def _read_table(path: Path) -> Any:
     from pyarrow import feather
 
-    return feather.read_table(require_file(path), memory_map=False)
+    _require_plausible_size(require_file(path))
+    table = feather.read_table(path, memory_map=False)
+    table.validate(full=True)  # Arrow believes offsets and lengths, and would read elsewhere
+    return table
+
+
+def _require_plausible_size(path: Path) -> None:
+    """Check what the packed buffers of a file state, before memory is taken for them.
+
+    Each begins with its unpacked length, in 8 bytes, and the mark of LZ4 or Zstandard.
+    """
+    words = np.fromfile(path, "<u4", offset=0)
+    marks = np.flatnonzero(np.isin(words[2::2], _MARKS))
+    lengths = words[2 * marks].astype(np.int64) + (words[2 * marks + 1].astype(np.int64) << 32)
+    unpacked, size = int(lengths[lengths >= 0].sum()), path.stat().st_size
+    if unpacked > max(_FEW_BYTES, _MOST_RATIO * size):
+        raise FileError(
+            path, f"states {unpacked / 1e6:.0f} MB in {size / 1e6:.1f} MB: points do not pack so; "
+            "write it again"
+        )  # fmt: skip
 
 
 def _array(path: Path, table: Any, name: str) -> NDArray[Any]:

@@ -15,6 +15,7 @@ from calibgraph.errors import DatasetError
 from calibgraph.files import sha256
 from calibgraph.io.bags import MESSAGE_SUFFIX, hash_message
 from calibgraph.io.clouds import load_cloud
+from calibgraph.io.frame_files import stamp_ns_in_name
 from calibgraph.io.images import load_image
 from calibgraph.io.motion import (
     PreparedScan,
@@ -23,11 +24,9 @@ from calibgraph.io.motion import (
     register,
     twist_between,
 )
-from calibgraph.io.videos import PICTURE_SUFFIX, hash_picture
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
 
-_MICROSECONDS_DIGITS, _NANOSECONDS_DIGITS = 16, 18  # of a stamp
 _MOST_M_S = 100.0  # of a vehicle
 _MOTION = "motion"
 """The key of an entry's :class:`ScanMotion`, if its cloud is corrected."""
@@ -53,7 +52,7 @@ class Frame:
         index: number of the frame in its dataset, the ``frame`` of its correspondences.
         name: the files' stem, or a bag's stamp; after the sequence's name if there are several.
         cloud_path: the cloud's file, or its address in a bag.
-        image_paths: the image's file or address in a bag or video, per camera that has one.
+        image_paths: the image's file or address in a bag, per camera that has one.
         find_motion: computes the motion during the scan, for which the cloud is then corrected.
         find_twist: computes (6,) the twist of the LiDAR where the cloud is as recorded.
 
@@ -190,24 +189,15 @@ def twist_by_scans(
 
 
 def seconds_between(one: Frame, other: Frame) -> float | None:
-    """How much later another frame was recorded, by the stamps that name both; None without.
-
-    Nanoseconds in bags and Argoverse's logs, microseconds in nuScenes.
-    """
-    stems = [frame.name.rpartition("/")[2] for frame in (one, other)]
-    ticks = [_ticks_per_s(frame, stem) for frame, stem in zip((one, other), stems, strict=True)]
-    if ticks[0] is None or ticks[0] != ticks[1]:
-        return None
-    return (int(stems[1]) - int(stems[0])) / ticks[0]
+    """How much later another frame was recorded, by the stamps that name both; None without."""
+    first, second = _stamp_ns(one), _stamp_ns(other)
+    return None if first is None or second is None else (second - first) / 1e9
 
 
-def _ticks_per_s(frame: Frame, stem: str) -> int | None:
-    """Of the stamp that names a frame; by the digits since 2001, as other names are shorter."""
-    if not stem.isdecimal():
-        return None
-    if frame.cloud_path.suffix == MESSAGE_SUFFIX or len(stem) >= _NANOSECONDS_DIGITS:
-        return 1_000_000_000
-    return 1_000_000 if len(stem) == _MICROSECONDS_DIGITS else None
+def _stamp_ns(frame: Frame) -> int | None:
+    """The stamp that names a frame."""
+    stem = frame.name.rpartition("/")[2]
+    return int(stem) if frame.cloud_path.suffix == MESSAGE_SUFFIX else stamp_ns_in_name(stem)
 
 
 def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
@@ -234,7 +224,5 @@ def twist_of_entry(entry: Mapping[str, Any]) -> Array | None:
 
 
 def hash_source(path: Path) -> str:
-    """SHA-256 of a file, of a message in a bag, or of the pixels of a picture in a video."""
-    if path.suffix == PICTURE_SUFFIX:
-        return hash_picture(path)
+    """SHA-256 of a file, or of a message in a bag."""
     return hash_message(path) if path.suffix == MESSAGE_SUFFIX else sha256(path)

@@ -1,7 +1,9 @@
 """What readers of data sets return: the files of frames, and the rig of the complete cameras."""
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +12,28 @@ from calibgraph.files import checked_model, is_utf8, require_file
 from calibgraph.model.rig import Camera, Rig
 
 _PCD = ".pcd"  # NAME.pcd.bin is a cloud of nuScenes
+_PACKED = "is compressed from outside: unpack it first (`{}`)"
+_WAYS_OUT = {
+    **dict.fromkeys(
+        (".las", ".laz"), "is not read: write it as .ply (`pdal translate {0} {1}.ply`)"
+    ),
+    **dict.fromkeys(
+        (".mp4", ".mkv", ".avi", ".mov"),
+        "is not read: write its pictures into a folder, named as their clouds "
+        "(`ffmpeg -i {0} {1}/%06d.png`)",
+    ),
+    ".drc": "is not read: write it as .ply (`draco_decoder -i {0} -o {1}.ply`)",
+    ".gz": _PACKED.format("gunzip {0}"),
+    **dict.fromkeys((".zst", ".zstd"), _PACKED.format("zstd -d {0}")),
+    ".bz2": _PACKED.format("bunzip2 {0}"),
+    ".xz": _PACKED.format("unxz {0}"),
+    ".lz4": _PACKED.format("unlz4 {0}"),
+    **dict.fromkeys(
+        (".zip", ".7z", ".tar", ".tgz"), "is an archive: unpack it and name its folder"
+    ),
+    ".active": "was not closed: mend it with `rosbag reindex {0}` and name it {1}",
+}
+"""Per suffix that is not read, the way out; {0} is the file's name, {1} that without the suffix."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +45,43 @@ class FrameFiles:
     images: dict[str, Path]
 
 
+def way_out(path: Path) -> str | None:
+    """What to do with a file that is not read; None if nothing is known for its suffix."""
+    line = _WAYS_OUT.get(path.suffix.lower())
+    return None if line is None else line.format(path.name, path.stem)
+
+
+def by_number(name: str) -> list[str | int | Decimal]:
+    """The key that sorts names by the numbers in them: 9 before 10, frame_9 before frame_10."""
+    if re.fullmatch(r"[0-9]+\.[0-9]+", name):  # seconds
+        return ["", Decimal(name), "", name]
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if place % 2 else part for place, part in enumerate(parts)] + [name]
+
+
+_DIGITS = re.compile(
+    r"(?<![0-9])(?P<s>[1-9][0-9]{9})[._](?P<part>[0-9]{1,9})(?![0-9])"
+    r"|(?<![0-9])(?P<whole>[1-9](?:[0-9]{9}|[0-9]{12}|[0-9]{15}|[0-9]{17,18}))(?![0-9])"
+)
+_NS_BY_DIGITS = {10: 1_000_000_000, 13: 1_000_000, 16: 1_000, 18: 1, 19: 1}
+
+
+def stamp_ns_in_name(name: str) -> int | None:
+    """The time that a name states [ns]; None of other names.
+
+    It is the number with as many digits as seconds, milliseconds, microseconds or nanoseconds since
+    1970 have now, or seconds with a fraction or with nanoseconds (1403636579.76, 1403636579_76...).
+    """
+    found = [*_DIGITS.finditer(name)]
+    if len(found) != 1:
+        return None
+    if whole := found[0]["whole"]:
+        return int(whole) * _NS_BY_DIGITS[len(whole)]
+    return int(found[0]["s"]) * _NS_BY_DIGITS[10] + int(found[0]["part"].ljust(9, "0"))
+
+
 def files_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
-    """Files of a folder with one of the suffixes, by stem, in order."""
+    """Files of a folder with one of the suffixes, by stem, in the order of their numbers."""
     kinds = ", ".join(suffixes)
     if not folder.is_dir():
         beside = ", ".join(sorted(path.name for path in folder.parent.glob("*/"))) or "none"
@@ -30,7 +89,7 @@ def files_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
             folder, f"no such folder; put the files ({kinds}) there, found are the folders {beside}"
         )
     files: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
+    for path in sorted(folder.iterdir(), key=lambda path: by_number(path.stem)):
         if path.suffix.lower() in suffixes and not path.name.startswith("."):
             stem = path.stem.removesuffix(_PCD) if path.suffix == ".bin" else path.stem
             if stem in files:
@@ -39,6 +98,9 @@ def files_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
                 raise FileError(path, "its name is not UTF-8; rename it")
             files[stem] = require_file(path)
     if not files:
+        for path in sorted(folder.iterdir()):
+            if remedy := way_out(path):
+                raise FileError(path, remedy)
         raise FileError(folder, f"holds no file of a known kind; write or convert to {kinds}")
     return files
 

@@ -1,4 +1,4 @@
-"""Images: PNG, JPEG, messages of bags and pictures of videos, complete and of the rig's size."""
+"""Images: PNG, JPEG and messages of bags, complete and of the rig's size."""
 
 import io
 from pathlib import Path
@@ -14,7 +14,6 @@ from PIL.PngImagePlugin import PngImageFile
 from calibgraph.errors import FileError
 from calibgraph.io.bags import MESSAGE_SUFFIX, load_bag_image
 from calibgraph.io.encoded_images import decode_image, is_png
-from calibgraph.io.videos import PICTURE_SUFFIX, load_picture
 from calibgraph.model.rig import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -33,8 +32,8 @@ def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
         FileError, DatasetError: if it is missing, damaged, marked as turned, or not of the size
             that the rig gives.
     """
-    if path.suffix in (MESSAGE_SUFFIX, PICTURE_SUFFIX):
-        image = load_bag_image(path) if path.suffix == MESSAGE_SUFFIX else load_picture(path)
+    if path.suffix == MESSAGE_SUFFIX:
+        image = load_bag_image(path)
         _require_size(path, (image.shape[1], image.shape[0]), camera)
         return image
     data, header = _read(path)

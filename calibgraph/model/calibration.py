@@ -89,6 +89,7 @@ class Calibration:
             frames drawn with replacement, like ``covariance``, as a check of it.
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
             ``images``, a file per camera.
+        moves: of ``track``: what moved, since when, how far, in words.
         places: frame numbers of each place; empty if nobody looked for places, and of ``track``.
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
         warnings: of ``calibrate``: about the dataset, its guess, and a lens that did not settle.
@@ -119,6 +120,7 @@ class Calibration:
     lens_covariance: dict[str, Array] = field(default_factory=dict)
     bootstrap: dict[str, Array] = field(default_factory=dict)
     frames: tuple[dict[str, Any], ...] = ()
+    moves: tuple[str, ...] = ()
     places: Groups = ()
     rounds: tuple[Mapping[str, Any], ...] = ()
     warnings: tuple[str, ...] = ()
@@ -156,7 +158,7 @@ class Calibration:
 
     @property
     def summary(self) -> Summary:
-        """The verdict for people: at most three reasons, what to do, and the rest."""
+        """The verdict for people: the worst reasons, what to do, and the rest."""
         return self.summary_of(*self.rig.cameras)
 
     def summary_of(self, *cameras: str) -> Summary:
@@ -164,7 +166,7 @@ class Calibration:
         verdicts = {name: self.camera_verdicts[name] for name in cameras}
         weaknesses = {name: self.weaknesses.get(name, ()) for name in cameras}
         sources = {n: self.error_sources[n] for n in cameras if n in self.error_sources}
-        return summarize(verdicts, weaknesses, sources)
+        return summarize(verdicts, weaknesses, sources, self.moves)
 
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
@@ -187,7 +189,7 @@ class Calibration:
 
     @property
     def not_included(self) -> str:
-        """Sentence about errors that the bars leave out: relative poses show the clouds' scale."""
+        """The errors that the bars leave out: relative poses show the clouds' scale."""
         table = self.correspondences
         moves = table is not None and table.twist_per_s is not None
         return left_out(self.config, self.rig, has_new_lens=bool(self.lens), motion_known=moves)
@@ -280,6 +282,7 @@ class Calibration:
             "residuals": {name: vars(value) for name, value in self.residuals.items()},
             "counts": self.counts,
             "frames_used": list(self.frames),
+            "moves": list(self.moves),
             "places": [list(place) for place in self.places],
             "rounds": list(self.rounds),
             "warnings": list(self.warnings),

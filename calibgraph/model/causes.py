@@ -22,7 +22,7 @@ _FROM_RESULT = "Calibrate again with this result as the guess: the matcher then 
 _STRUCTURE = "Record where image and cloud both have structure: edges, poles, facades at 5 to 40 m."
 _FRAMES = "Look at the frames that disagree: leave out those in which a sensor moved or lagged."
 _SPREAD = "Give more matches, spread over the image and over distances."
-_LEARNED = "Use the matcher structure, or train the network on recordings of this kind."
+_LEARNED = "Use the matcher structure."
 
 _ESTIMATED_AS = {
     "focal_length": "focal",
@@ -33,6 +33,11 @@ _ESTIMATED_AS = {
 
 # fmt: off
 CAUSES: dict[str, Cause] = {
+    "brightness": Cause(
+        "images that are too dark or too bright",
+        "Record by daylight, or with another exposure.",
+        {"brightness of the images": ""},
+    ),
     "repeats": Cause(
         "frames that repeat others",
         "See why the named images or clouds repeat, and leave the repeats out.",

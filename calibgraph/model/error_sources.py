@@ -42,8 +42,24 @@ _ADVICE = {
 }
 """Where most of the error bar is of one of these sources."""
 
+SHRINKS_WITH = {
+    MATCHES: "more frames",
+    PLACES: "frames at more places",
+    UNMODELLED: "the preset auto",
+    COMMON: "measured relative_poses or priors",
+    ELEVATION: "measured relative_poses",
+    STRETCH: "measured relative_poses",
+    MOTION: "frames at lower speed",
+    PAIRS: "measured relative_poses or priors",
+    PRIORS: "better measurements of priors and relative_poses",
+    LENSES: "a calibration of the lens",
+    ESTIMATED: "a calibration of the lens",
+    FLAT: "frames at more places, with walls, poles or vehicles",
+}
+"""What would shrink an error bar that is mostly of this source."""
+
 _MOST = 0.5  # share of a source that is most of the error bar
-_MENTIONED = 0.05  # share of a source: smaller ones are left out of the sentence
+_MENTIONED = 0.05  # share of a source that is worth advice
 
 
 @dataclass(frozen=True)
@@ -69,11 +85,11 @@ class ErrorSources:
         return max(self.rotation_deg / tolerance[0], self.translation_cm / tolerance[1])
 
     def describe(self, tolerance: tuple[float, float]) -> str:
-        """The error bar that is larger beside the tolerance [deg, cm], and its sources."""
+        """The error bar that is larger beside the tolerance [deg, cm], and what would shrink it."""
         bar = self._larger(tolerance)
-        ordered = sorted(bar.shares.items(), key=lambda item: -item[1])
-        parts = [f"{share:.0%} {name}" for name, share in ordered if share >= _MENTIONED]
-        return f"{in_unit(bar.sigma, bar.unit)} ({', '.join(parts)})"
+        most = SHRINKS_WITH.get(max(bar.shares, key=bar.shares.__getitem__, default=""), "")
+        advice = f" {most[:1].upper()}{most[1:]} would help most." if most else ""
+        return f"{in_unit(bar.sigma, bar.unit, 2)} (1 sigma).{advice}"
 
     def action(self, tolerance: tuple[float, float]) -> str:
         """The action that shrinks the error bar enough for a PASS, in one sentence; empty if it is.
@@ -86,8 +102,8 @@ class ErrorSources:
             return ""
         if bar.shares.get(FLAT, 0.0) > _MOST:  # more frames of the same scenes are as flat
             return (
-                "Record frames at more places, of walls, poles or vehicles: these images hardly "
-                f"tell poses {in_unit(bar.sigma, bar.unit, 2)} apart."
+                f"Record {SHRINKS_WITH[FLAT]}: poses {in_unit(bar.sigma, bar.unit, 2)} apart "
+                "explain these images almost equally well."
             )
         for source, advice in _ADVICE.items():
             if bar.shares.get(source, 0.0) > _MOST:
@@ -126,7 +142,7 @@ def _is_enough(error_bar: tuple[float, float], tolerance: tuple[float, float]) -
 
 
 def left_out(config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool) -> str:
-    """Sentence about errors that the bars leave out: relative poses show the clouds' scale.
+    """The errors that the bars leave out: relative poses show the clouds' scale.
 
     Args:
         config: what was estimated, and of what the poses are.
@@ -135,13 +151,11 @@ def left_out(config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool
         motion_known: whether the correspondences come with the LiDAR's motion.
     """
     free = has_new_lens and {*config.estimate} - {"offset", "readout"}
-    lens = "errors of the other intrinsics" if free else "errors of the intrinsics"
-    is_mount = config.of == "mount" and config.preset == "auto"  # lenses and clocks are uncertain
-    if is_mount:
-        lens += ", beyond what the rig states or a calibration with a target leaves"
+    lens = "other intrinsics" if free else "intrinsics"
+    if config.of == "mount" and config.preset == "auto":  # lenses and clocks are uncertain
+        lens += " (beyond what the rig states, or a calibration with a target leaves)"
     stated = motion_known and all(each.time_offset_sigma_s for each in rig.cameras.values())
     times = "offset" in config.estimate or (config.preset == "auto" and stated)
-    others = [] if times else ["of the time of the images"]
-    others += [] if rig.relative_poses else ["of the clouds' scale"]
-    joint = ", and " if is_mount or len(others) > 1 else " and "
-    return f"{joint.join([', '.join([lens, *others[:-1]]), *others[-1:]])} are not included"
+    others = [] if times else ["time offset"]
+    others += [] if rig.relative_poses else ["range scale"]
+    return ", ".join([lens, *others])

@@ -1,4 +1,4 @@
-"""A verdict for people: at most three reasons by their causes, and actions; the rest folded.
+"""A verdict for people: the worst reasons of every camera, and actions; the rest folded.
 
 Terminal, report, service, fleet and files show the same :class:`Summary`.
 """
@@ -11,12 +11,11 @@ from typing import Any
 from calibgraph.model.causes import CAUSES, action_of, cause_of
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.threshold import beside, in_unit
-from calibgraph.model.verdict import TOLERANCE, Check, Status, Verdict, rig_verdict
+from calibgraph.model.verdict import BRIGHTNESS, TOLERANCE, Check, Status, Verdict, rig_verdict
 
-MOST = 3
-"""Reasons and actions that are shown; the others are folded."""
+LEAST = 3
+"""Reasons that are shown if there are so many: more only where each is the worst of a camera."""
 
-_CANNOT_TELL = "cannot tell: "
 _OF_DATA = ("error bar", "data", "repeats")  # causes
 _WORST_FIRST: tuple[Status, ...] = ("FAIL", "WARN", "PASS")
 _PARTS = re.compile(r"--estimate [a-z,]+")
@@ -52,11 +51,13 @@ class Summary:
         status: PASS, WARN or FAIL.
         cannot_tell: whether the first reason is that the data cannot tell.
         error_probability: per camera, that it is off, in one sentence; empty for a PASS.
-        reasons: at most three, each of another cause, the worst first.
-        actions: what to do, at most three sentences, each once.
-        error_bar: the largest error bar beside the tolerance, and the shares of its sources; empty
+        reasons: one per camera and cause, the worst first: every camera's worst, and others up to
+            three in all.
+        actions: what to do about these, each sentence once, with the cameras that it is for.
+        error_bar: the largest error bar beside the tolerance, and what would shrink it most; empty
             if there is none.
         others: the other findings, the worst first, then the weaknesses.
+        moves: of ``track``: what moved, since when, how far.
     """
 
     status: Status
@@ -66,6 +67,7 @@ class Summary:
     actions: tuple[str, ...]
     error_bar: str
     others: tuple[Reason, ...]
+    moves: tuple[str, ...] = ()
 
     def to_mapping(self) -> dict[str, Any]:
         """As plain values, for YAML and JSON."""
@@ -82,53 +84,90 @@ def summarize(
     verdicts: Mapping[str, Verdict],
     weaknesses: Mapping[str, Sequence[str]] | None = None,
     sources: Mapping[str, ErrorSources] | None = None,
+    moves: Sequence[str] = (),
 ) -> Summary:
     """The verdict of a rig, or of one camera, in few words."""
     of_rig, known = rig_verdict(verdicts, named=False), sources or {}
     tolerance = (
         TOLERANCE if of_rig.error_probability is None else of_rig.error_probability.tolerance
     )
-    findings = [*_unsure(verdicts), *_findings(verdicts)] or _nearest(verdicts)
-    by_cause: dict[str, list[Reason]] = {}
-    for finding in sorted(findings, key=_rank):
-        by_cause.setdefault(finding.cause, []).append(finding)
-    grouped = [_with_other_cameras(each) for each in by_cause.values()]
+    worst, others = _by_cause(verdicts)
+    reasons = sorted([*_unsure(verdicts), *_findings(worst), *_nearest(verdicts)], key=_rank)
     if of_rig.cannot_tell:
-        grouped = _unsure_first(grouped)
-    shown = [*grouped[:MOST]]
-    shown[:1] = [_with_action_for(reason, known, tolerance) for reason in shown[:1]]
-    known = {name: one for name, one in known.items() if verdicts[name].status != "FAIL"}
-    shown[1:] = [_with_action_for(reason, known, tolerance) for reason in shown[1:]]
-    folded = [reason for each in by_cause.values() for reason in each[1:]] + grouped[MOST:]
-    actions = dict.fromkeys(reason.action for reason in shown if reason.action)
+        reasons = _unsure_first(reasons)
+    shown = _shown(reasons)
+    folded = [*_findings(others), *(reason for reason in reasons if reason not in shown)]
+    explained: set[str] = set()  # cameras that FAIL for a worse reason: their bar does not hold
+    for at, reason in enumerate(shown):
+        of = [known[name] for name in reason.cameras if name in known and name not in explained]
+        shown[at] = _with_action_for(reason, of, tolerance)
+        explained.update(n for n in reason.cameras if verdicts[n].status == "FAIL")
+    hold = {name: one for name, one in known.items() if verdicts[name].status != "FAIL"}
     return Summary(
         of_rig.status,
         of_rig.cannot_tell,
         _error_probabilities(verdicts),
         tuple(shown),
-        tuple(actions)[:MOST],
-        _error_bar(known, tolerance),
+        _actions(shown, verdicts),
+        _error_bar(hold, tolerance),
         (*sorted(folded, key=_rank), *_group_sentences(weaknesses or {})),
+        tuple(moves),
+    )
+
+
+_Checks = dict[str, list[Check]]
+
+
+def _by_cause(verdicts: Mapping[str, Verdict]) -> tuple[_Checks, _Checks]:
+    """Per camera, the worst check of each cause that is not PASS; and the others."""
+    worst: _Checks = {}
+    others: _Checks = {}
+    for camera, verdict in verdicts.items():
+        causes: set[str] = set()
+        for check in sorted(_unexplained(verdict.checks), key=lambda check: -check.severity):
+            cause = cause_of(check.kind or check.name)
+            if check.status != "PASS":
+                (others if cause in causes else worst).setdefault(camera, []).append(check)
+                causes.add(cause)
+    return worst, others
+
+
+def _shown(reasons: Sequence[Reason]) -> list[Reason]:
+    """The worst reason of every camera, and others up to ``LEAST`` in all; in their order."""
+    first = {name: at for at, reason in reversed([*enumerate(reasons)]) for name in reason.cameras}
+    chosen = dict.fromkeys([*first.values(), *range(len(reasons))])
+    most = max(LEAST, len({*first.values()}))
+    return [reasons[at] for at in sorted([*chosen][:most])]
+
+
+def _actions(reasons: Sequence[Reason], verdicts: Mapping[str, Verdict]) -> tuple[str, ...]:
+    """What to do, each sentence once, with its cameras unless it is for all."""
+    cameras: dict[str, dict[str, None]] = {}
+    for reason in reasons:
+        if reason.action:
+            cameras.setdefault(reason.action, {}).update(dict.fromkeys(reason.cameras))
+    return tuple(
+        action if len(names) == len(verdicts) else f"{', '.join(names)}: {action}"
+        for action, names in cameras.items()
     )
 
 
 def _with_action_for(
-    reason: Reason, sources: Mapping[str, ErrorSources], tolerance: tuple[float, float]
+    reason: Reason, sources: Sequence[ErrorSources], tolerance: tuple[float, float]
 ) -> Reason:
     """The reason with the action that shrinks the largest error bar, if the bar is the reason."""
-    known = [sources[name] for name in reason.cameras if name in sources]
-    if CAUSES[reason.cause].action or not known:
+    if CAUSES[reason.cause].action or not sources:
         return reason
-    largest = max(known, key=lambda one: one.over_tolerance(tolerance))
+    largest = max(sources, key=lambda one: one.over_tolerance(tolerance))
     return replace(reason, action=largest.action(tolerance))
 
 
 def _error_bar(sources: Mapping[str, ErrorSources], tolerance: tuple[float, float]) -> str:
-    """The camera whose error bar is largest beside the tolerance, in one sentence."""
+    """The camera whose error bar is largest beside the tolerance, and what would help."""
     if not sources:
         return ""
     name = max(sources, key=lambda one: sources[one].over_tolerance(tolerance))
-    return f"accuracy of {name}, 1 sigma: {sources[name].describe(tolerance)}"
+    return f"Least certain: {name}, {sources[name].describe(tolerance)}"
 
 
 def _rank(reason: Reason) -> tuple[int, int]:
@@ -139,32 +178,23 @@ def _rank(reason: Reason) -> tuple[int, int]:
 def _unsure_first(reasons: Sequence[Reason]) -> list[Reason]:
     """Reasons about too little data before others, the first marked "cannot tell"."""
     first, *others = sorted(reasons, key=lambda reason: reason.cause not in _OF_DATA)
-    text = f"{_CANNOT_TELL}{first.text.removeprefix(_CANNOT_TELL)}"
-    return [replace(first, text=text), *others]
-
-
-def _with_other_cameras(reasons: Sequence[Reason]) -> Reason:
-    """The first reason of a cause, and at which other cameras a check of its kind is not PASS."""
-    first = reasons[0]
-    alike = (reason for reason in reasons if reason.kind == first.kind)
-    others = dict.fromkeys(name for reason in alike for name in reason.cameras)
-    names = [name for name in others if name not in first.cameras]
-    also = f" (also noticed at {', '.join(names)})" if names else ""
-    return replace(first, text=f"{first.text}{also}")
+    return [replace(first, text=f"cannot tell: {first.text}"), *others]
 
 
 def _unsure(verdicts: Mapping[str, Verdict]) -> list[Reason]:
-    """The reason that the error bar is too wide for the tolerance, with its cameras."""
-    found = {
-        n: v.error_probability
-        for n, v in verdicts.items()
-        if v.error_probability is not None and v.error_probability.of_error_bar
-    }
-    if not found:
-        return []
-    tolerated = next(iter(found.values())).tolerated
-    text = f"{_CANNOT_TELL}the error bar is too wide for a tolerance of {tolerated}"
-    return [Reason("WARN", tuple(found), text, "error bar")]
+    """The reasons that the error bar is too wide for the tolerance, with their cameras."""
+    found: dict[tuple[Status, str], tuple[str, ...]] = {}
+    for name, verdict in verdicts.items():
+        one = verdict.error_probability
+        if one is not None and one.of_error_bar:
+            key = one.status, one.tolerated
+            found[key] = (*found.get(key, ()), name)
+    return [
+        Reason(
+            status, names, f"the error bar is too wide for a tolerance of {tolerated}", "error bar"
+        )
+        for (status, tolerated), names in found.items()
+    ]
 
 
 def _error_probabilities(verdicts: Mapping[str, Verdict]) -> str:
@@ -181,32 +211,38 @@ def _error_probabilities(verdicts: Mapping[str, Verdict]) -> str:
     return f"{ordered[0][1].sentence}: {percents}"
 
 
-def _findings(verdicts: Mapping[str, Verdict]) -> list[Reason]:
-    """The checks that are not PASS, equal ones of several cameras once, the most severe first."""
+def _findings(checks: Mapping[str, Sequence[Check]]) -> list[Reason]:
+    """One reason per check, equal ones of several cameras together, the most severe first."""
     alike: dict[tuple[str, ...], dict[str, Check]] = {}
-    for camera, verdict in verdicts.items():
-        for check in verdict.checks:
+    for camera, of_camera in checks.items():
+        for check in of_camera:
             key = (check.name, check.unit, "" if check.is_graded else _NUMBER.sub("", check.text))
-            if check.status != "PASS":
-                alike.setdefault(key, {})[camera] = check
+            alike.setdefault(key, {})[camera] = check
     severest = sorted(alike.values(), key=lambda of: -max(check.severity for check in of.values()))
     return [_reason(each) for each in severest]
 
 
+def _unexplained(checks: Sequence[Check]) -> Sequence[Check]:
+    """The checks without those that dark images explain: their advice would be untrue."""
+    dark = [check for check in checks if check.name == BRIGHTNESS]
+    return dark or checks
+
+
 def _nearest(verdicts: Mapping[str, Verdict]) -> list[Reason]:
-    """The check nearest its limit, of cameras that may be off though all their checks PASS."""
-    doubtful = {
-        n: v
-        for n, v in verdicts.items()
-        if v.error_probability and v.error_probability.status != "PASS"
-    }
-    checks = [(name, check) for name, verdict in doubtful.items() for check in verdict.checks]
-    if not checks:
-        return []
-    name, check = max(checks, key=lambda item: item[1].severity)
-    kind, status = check.kind or check.name, rig_verdict(doubtful).status
-    text = f"no check is beyond its limit; nearest to it is {check.text}"
-    return [Reason(status, (name,), text, cause_of(kind), action_of(kind), kind)]
+    """The check nearest its limit, of each camera that may be off though all its checks PASS."""
+    reasons = []
+    for name, verdict in verdicts.items():
+        found = verdict.error_probability
+        all_pass = all(check.status == "PASS" for check in verdict.checks)
+        if found and found.status != "PASS" and not found.of_error_bar and all_pass:
+            check = max(verdict.checks, key=lambda check: check.severity, default=None)
+            if check is not None:
+                kind = check.kind or check.name
+                text = f"no check is beyond its limit; nearest to it is {check.text}"
+                reasons.append(
+                    Reason(verdict.status, (name,), text, cause_of(kind), action_of(kind), kind)
+                )
+    return reasons
 
 
 def _reason(checks: Mapping[str, Check]) -> Reason:
@@ -234,7 +270,7 @@ def _sentence(checks: Mapping[str, Check]) -> str:
     texts = [check.text for check in checks.values()]
     if len(set(texts)) == 1 or not first.is_graded:
         return _merge_numbers(texts)
-    meaning = first.text.removeprefix(first.name).partition(": ")[2]
+    meaning = first.text.removeprefix(f"{first.name}: ").partition(": ")[2]
     text = f"{first.name}: {_values(checks)}"
     return f"{text}: {meaning}" if meaning else text
 

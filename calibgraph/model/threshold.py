@@ -10,6 +10,7 @@ from calibgraph.model.verdict import TOLERANCE, Check, Status, grade
 
 Direction = Literal["at most", "at least"]
 
+_CELL = 7  # characters of a number, of which eight and a name fit on 80 columns
 _LARGEST = {"share": 1.0, "deg": 180.0}  # that a value can be
 
 
@@ -62,10 +63,11 @@ class Threshold:
         """The check of a value."""
         status, name, meaning = self.grade(value), name or self.name, advice or self.advice
         limit = self.fail if status == "FAIL" else self.warn
-        text = f"{name} {beside(value, limit, self.unit)}"
+        text = f"{name}: {beside(value, limit, self.unit)}"
         if status != "PASS":
             side = "above" if self.direction == "at most" else "below"
-            text += f" is {side} {in_unit(limit, self.unit)}" + (f": {meaning}" if meaning else "")
+            text += f", {side} the limit {in_unit(limit, self.unit)}"
+            text += f": {meaning}" if meaning else ""
         return self.describe(float(value), status, text, name=name)
 
     def describe(self, value: float, status: Status, text: str, *, name: str = "") -> Check:
@@ -98,6 +100,12 @@ def in_unit(value: float, unit: str, digits: int = 3) -> str:
     if 10**digits <= abs(scaled) < math.inf:
         return f"{scaled:.0f}{sign}"
     return f"{scaled:.{digits}g}{sign}"
+
+
+def fixed(value: float, decimals: int, sign: str = "") -> str:
+    """A number for a cell, of at most seven characters: a large one has fewer decimals."""
+    texts = (f"{value:{sign}.{places}f}" for places in range(decimals, -1, -1))
+    return next((text for text in texts if len(text) <= _CELL), f"{value:{sign}.0e}")
 
 
 def beside(value: float, limit: float, unit: str) -> str:

@@ -15,6 +15,8 @@ PASS_BELOW, FAIL_ABOVE = 0.005, 0.2
 """Probabilities that a result is off by more than the tolerance, where verdicts are cut."""
 TOLERANCE = (0.5, 10.0)
 """Rotation [deg] and distance [cm] that users tolerate if they state nothing else."""
+START = "start"
+"""Kind of the check of a tracked camera that has no estimate yet."""
 COMMON_ERROR = "common_error"
 """Kind of the check that a table states the error that its frames share."""
 ABOUT_THE_DATA = frozenset(
@@ -34,6 +36,7 @@ ABOUT_THE_DATA = frozenset(
         "repeated_frames",
         "sigma_rotation",
         "sigma_translation",
+        START,
         "terms",
         "went_on",
     }
@@ -45,6 +48,8 @@ and keeps from a PASS, since the same posterior cannot vouch for it."""
 FLAT_EVIDENCE = "flat_evidence"
 """Kind of the check that compares the error bars by images and by matches. The wider one is in the
 result, so that the check itself changes no verdict."""
+BRIGHTNESS = "brightness of the images"
+"""Kind of the check that explains all others of a camera: its images show too little."""
 IMAGES_ELSEWHERE = "images"
 """Kind of the check that the images of a table were compared with another pose, lens or time."""
 _SURE, _LEAST = 0.99, 0.001  # beyond these, probabilities are not known
@@ -148,8 +153,9 @@ class ErrorProbability:
 
     @property
     def status(self) -> Status:
-        """PASS, WARN or FAIL; a wide error bar alone is no FAIL, since it shows nothing wrong."""
-        return grade(not self.probability < PASS_BELOW, not self.by_checks <= FAIL_ABOVE)
+        """PASS, WARN or FAIL; a wide error bar alone is a FAIL only if an error is sure."""
+        sure = self.probability > _SURE
+        return grade(not self.probability < PASS_BELOW, sure or not self.by_checks <= FAIL_ABOVE)
 
     @property
     def percent(self) -> str:
@@ -179,15 +185,9 @@ class ErrorProbability:
 
     @property
     def of_error_bar(self) -> bool:
-        """Whether it is a WARN, and rather by a wide error bar than by checks."""
-        return self.status == "WARN" and self.by_error_bar >= self.by_checks
-
-    @property
-    def advice(self) -> str:
-        """The note that the data cannot tell more; empty if something seems wrong."""
-        if not self.of_error_bar:
-            return ""
-        return ": cannot tell, by the error bar"
+        """Whether a wide error bar, rather than checks, keeps it from a PASS."""
+        by_bar = self.by_checks <= min(self.by_error_bar, FAIL_ABOVE)
+        return self.status != "PASS" and by_bar
 
 
 @dataclass(frozen=True)
@@ -222,10 +222,10 @@ class Verdict:
 
     @property
     def images_note(self) -> str:
-        """A clause on error bars that no images have tested; empty if they have."""
+        """A sentence on error bars that no images have tested; empty if they have."""
         if any(check.kind == FLAT_EVIDENCE for check in self.checks):
             return ""
-        return "; no images tested it: where they are flat, as over grass, errors can be larger"
+        return " No images tested it: over grass and other flat scenes errors can be larger."
 
     @property
     def percent(self) -> str:
@@ -265,7 +265,8 @@ class Verdict:
         if self.error_probability is None or self.error_probability.status == "PASS":
             return tuple(texts)
         found = self.error_probability
-        return (f"{found.sentence} of {found.percent}{found.advice}", *texts)
+        wide = ": the error bar is too wide" if found.of_error_bar else ""
+        return (f"{found.sentence} of {found.percent}{wide}", *texts)
 
     def to_mapping(self) -> dict[str, Any]:
         """As plain values, without the checks."""

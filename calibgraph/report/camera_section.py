@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,7 +15,6 @@ from calibgraph.model.rig import Camera
 from calibgraph.model.threshold import Direction, beside, in_unit, is_reachable
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.report import plots
-from calibgraph.report.drawing import Diagrams
 from calibgraph.report.figure import ImageSize
 from calibgraph.report.match_errors import BeforeAfter, ReprojectionErrors
 from calibgraph.report.page_overlays import Overlays, width_on_page
@@ -219,25 +217,25 @@ def _why_no_error_bar(result: Calibration, name: str) -> str:
     return "not by these correspondences" if result.sigmas(name) is None else ""
 
 
-def camera_diagrams(result: Calibration, name: str, errors: BeforeAfter | None) -> Diagrams:
-    """Residuals, coverage, error bars and convergence of a camera, to be drawn."""
-    found: dict[str, partial[str]] = {}
+def camera_diagrams(result: Calibration, name: str, errors: BeforeAfter | None) -> dict[str, str]:
+    """Residuals, coverage, error bars and convergence of a camera, as data URIs by name."""
+    found: dict[str, str] = {}
     before, camera = result.initial_rig.cameras[name], result.rig.cameras[name]
     if errors is not None:
         size, after = ImageSize.of(camera), errors.after
         sigma_px = result.residuals[name].sigma_px
-        found["residuals"] = partial(plots.residual_scatter, after, sigma_px)
-        found["by_distance"] = partial(plots.residual_by_distance, after)
-        found["over_image"] = partial(plots.residual_map, size, after)
-        found["coverage"] = partial(plots.coverage, size, after)
-        found["distances"] = partial(plots.distances, after)
+        found["residuals"] = plots.residual_scatter(after, sigma_px)
+        found["by_distance"] = plots.residual_by_distance(after)
+        found["over_image"] = plots.residual_map(size, after)
+        found["coverage"] = plots.coverage(size, after)
+        found["distances"] = plots.distances(after)
     if name in result.lens and has_other_lens(before, camera):
-        found["lens"] = partial(plots.lens_change, before, camera)
+        found["lens"] = plots.lens_change(before, camera)
     sigmas, bootstrap = result.error_bar(name), result.bootstrap.get(name)
     if sigmas is not None:
         others = None if bootstrap is None else degrees_and_centimetres(bootstrap)
-        found["error_bars"] = partial(plots.error_bars, sigmas, others)
+        found["error_bars"] = plots.error_bars(sigmas, others)
     rounds = [cameras[name] for cameras in result.rounds if name in cameras]
     if len(rounds) > 1:
-        found["convergence"] = partial(plots.convergence, rounds)
+        found["convergence"] = plots.convergence(rounds)
     return found

@@ -1,8 +1,6 @@
 """The page: the template, filled with all of a result; and the files of a result in its folder."""
 
 import shlex
-from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 
 import yaml
@@ -12,7 +10,6 @@ from calibgraph.files import write_text
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
-from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
@@ -23,17 +20,15 @@ from calibgraph.model.result_files import (
 )
 from calibgraph.outputs import require_writable
 from calibgraph.report.camera_section import camera_diagrams, camera_section
-from calibgraph.report.drawing import Draw, Drawn, draw_here
 from calibgraph.report.frames import recording_name
 from calibgraph.report.kit import load_template
-from calibgraph.report.match_errors import BeforeAfter
 from calibgraph.report.page_overlays import draw_overlays
 from calibgraph.report.page_pairs import match_scale, pair_sections
 from calibgraph.report.point_overlay import write_overlays
 from calibgraph.report.reprojection_errors import errors_before_after
 
 
-def write_report(result: Calibration, path: Path | str, *, draw: Draw = draw_here) -> Path:
+def write_report(result: Calibration, path: Path | str) -> Path:
     """Write a result as one HTML page that needs nothing else: no network, no files beside it.
 
     Images and clouds are read from the files that the result names; if they cannot be read, the
@@ -42,7 +37,6 @@ def write_report(result: Calibration, path: Path | str, *, draw: Draw = draw_her
     Args:
         result: any result; without correspondences the residuals' pictures are left out.
         path: of the page.
-        draw: how the diagrams are drawn, see :func:`calibgraph.report.drawing.drawing_processes`.
 
     Returns:
         The path.
@@ -52,26 +46,18 @@ def write_report(result: Calibration, path: Path | str, *, draw: Draw = draw_her
         FileError: if the page cannot be written.
     """
     path = Path(path)
-    write_text(path, begin_page(result, draw)())
+    write_text(path, render_page(result))
     return path
 
 
-def begin_page(result: Calibration, draw: Draw) -> Callable[[], str]:
-    """Begin to draw the diagrams; the result waits for them, and gives the page as text."""
+def render_page(result: Calibration) -> str:
+    """The page as text, its diagrams drawn into it."""
     errors = errors_before_after(result)
-    drawn = {name: draw(camera_diagrams(result, name, errors.get(name)))
-             for name in result.rig.cameras}  # fmt: skip
-    return partial(_page, result, errors, drawn)
-
-
-def _page(
-    result: Calibration, errors: Mapping[str, BeforeAfter], drawn: Mapping[str, Callable[[], Drawn]]
-) -> str:
     overlays, overlays_left_out = draw_overlays(result, errors)
     cameras = [
         camera_section(result, name, index, overlays.get(name), errors=errors.get(name),
-                       diagrams=diagrams())
-        for index, (name, diagrams) in enumerate(drawn.items())
+                       diagrams=camera_diagrams(result, name, errors.get(name)))
+        for index, name in enumerate(result.rig.cameras)
     ]  # fmt: skip
     summary = result.summary
     return load_template("page.html.j2").render(
@@ -89,19 +75,9 @@ def _page(
         overlays_left_out=overlays_left_out,
         residuals_left_out=not errors,
         config=yaml.safe_dump(result.config.model_dump(), sort_keys=False, allow_unicode=True),
-        window_weights=_describe_weights(result.correspondences),
         frames_sentence=FRAMES_SENTENCE,
         tangent_sentence=TANGENT_SENTENCE,
     )
-
-
-def _describe_weights(table: Correspondences | None) -> str:
-    """The weights of the matcher's windows; empty if the table does not state them."""
-    found = None if table is None else table.metadata.get("window_weights")
-    if not isinstance(found, dict):
-        return ""
-    digest = f", SHA-256 {found['sha256']}" if "sha256" in found else ""
-    return f"{found.get('how', 'unknown')}{digest}"
 
 
 def _export_command(result: Calibration) -> str:
@@ -121,7 +97,6 @@ def write_result(
     data: Dataset | None = None,
     *,
     with_report: bool = True,
-    draw: Draw = draw_here,
 ) -> list[Path]:
     """Write a result in place of an older one: of images with an overlay picture per camera.
 
@@ -133,17 +108,18 @@ def write_result(
     outputs = outputs_of_result(folder)
     require_writable(outputs)
     stale = [output.path for output in outputs if output.is_ours]
-    page = begin_page(result, draw) if with_report else None  # drawn while the rest is written
     with written_together(folder, last=CALIBRATION_FILE) as new:
         written = [result.save(new)]
         tables = (new / CORRESPONDENCES_FILE, new / CAMERA_MATCHES_FILE)
         written += [table for table in tables if table.exists()]
         if data is not None:
             middle = data.frames[len(data.frames) // 2]
-            mark = "FAIL, do not use: " if result.verdict.status == "FAIL" else ""
-            written += write_overlays(middle, result.initial_rig, result.rig, new, mark=mark)
-        if page is not None:
-            write_text(new / REPORT_FILE, page())
+            verdicts = {name: one.status for name, one in result.camera_verdicts.items()}
+            written += write_overlays(
+                middle, result.initial_rig, result.rig, new, verdicts=verdicts
+            )
+        if with_report:
+            write_text(new / REPORT_FILE, render_page(result))
             written.append(new / REPORT_FILE)
         names = {path.name for path in new.iterdir()}
     for path in (path for path in stale if path.name not in names):

@@ -1,5 +1,6 @@
 """The cloud projected into an image, coloured by depth; and before-and-after PNG files of it."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from calibgraph.files import write_atomically
 from calibgraph.io.frame import Frame
 from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.verdict import Status
 from calibgraph.outputs import with_png_mark
 
 Image = NDArray[np.uint8]
@@ -21,17 +23,21 @@ _MAX_WIDTH_PX = 1280  # of a file, so that those of many cameras stay small
 _BAR_PX = 34
 _COVERED_SHARE = 0.2  # of the image, covered by points
 _MAX_DOT_PX = 7
+_MARKS: dict[Status, str] = {"PASS": "PASS", "WARN": "WARN", "FAIL": "FAIL, do not use"}
 
 
 def write_overlays(
-    frame: Frame, initial: Rig, final: Rig, folder: Path, *, mark: str = ""
+    frame: Frame, initial: Rig, final: Rig, folder: Path, *, verdicts: Mapping[str, Status]
 ) -> list[Path]:
-    """Write ``overlay_CAMERA.png`` for every camera: before above, after below.
+    """Write ``overlay_CAMERA.png`` for every camera: before above, after below, its verdict.
 
     Raises:
         CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
     """
-    titles = f"{{name}}, frame {frame.name}: before", f"{mark}{{name}}, frame {frame.name}: after"
+    titles = {
+        name: (f"{name}, frame {frame.name}: before", f"{name}, after: {_MARKS[status]}")
+        for name, status in verdicts.items()
+    }
     return _write_overlays(frame, (initial, final), titles, folder / "overlay_{name}.png")
 
 
@@ -41,17 +47,17 @@ def write_guess_overlays(frame: Frame, guess: Rig, folder: Path) -> list[Path]:
     Raises:
         CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
     """
-    return _write_overlays(
-        frame,
-        (guess,),
-        (f"{{name}}, frame {frame.name}: guess",),
-        folder / "guess_{name}.png",
-        command="doctor",
-    )
+    titles = {name: (f"{name}, frame {frame.name}: guess",) for name in guess.cameras}
+    return _write_overlays(frame, (guess,), titles, folder / "guess_{name}.png", command="doctor")
 
 
 def _write_overlays(
-    frame: Frame, rigs: tuple[Rig, ...], titles: tuple[str, ...], path: Path, *, command: str = ""
+    frame: Frame,
+    rigs: tuple[Rig, ...],
+    titles: Mapping[str, tuple[str, ...]],
+    path: Path,
+    *,
+    command: str = "",
 ) -> list[Path]:
     """Per camera, the points as each rig places them, below each other."""
     cloud = frame.load_cloud()[:, :3].astype(np.float64)
@@ -61,9 +67,9 @@ def _write_overlays(
         panels = [
             _titled(
                 draw_points(image, cloud, when_taken(rig.cameras[name], frame.twist_per_s)),
-                title.replace("{name}", name),
+                title,
             )
-            for rig, title in zip(rigs, titles, strict=True)
+            for rig, title in zip(rigs, titles[name], strict=True)
         ]
         paths.append(path.with_name(path.name.replace("{name}", name)))
         picture = shrink(np.vstack([*panels, _depth_bar(image.shape[1])]), _MAX_WIDTH_PX)

@@ -29,8 +29,8 @@ REPORT_POLICY = (
 
 _SUFFIXES = {
     "kalibr": ".yaml", "ros1": ".txt", "ros2": ".txt", "ros2-launch": ".launch.xml",
-    "tf2": ".yaml", "urdf": ".urdf", "autoware": ".yaml", "nuscenes": ".json", "koide": ".json",
-    "camera_info": ".zip", "opencv": ".yaml", "npz": ".npz", "json": ".json",
+    "tf2": ".yaml", "urdf": ".urdf", "autoware": ".yaml",
+    "camera_info": ".zip", "opencv": ".yaml", "json": ".json",
 }  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """A simulated recording: the dataset of a rig that drives along a street."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,20 +22,21 @@ from calibgraph.model.perturbation import perturb
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, no_progress
 from calibgraph.simulation.cameras import camera_rays, render
-from calibgraph.simulation.lens_errors import draw_lens_errors
 from calibgraph.simulation.lidar import Lidar, lidar_of, ring_gains, scan
+from calibgraph.simulation.mesh import Mesh
 from calibgraph.simulation.scan_errors import ScanErrors, draw_scan_errors
 from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, to_transform
 from calibgraph.simulation.street import (
     LANE_Y_M,
     Centreline,
     Layout,
+    build_street,
     draw_layout,
     winding_line,
 )
-from calibgraph.simulation.surroundings import SURROUNDINGS
 from calibgraph.simulation.world import World, build_world
 
+SceneBuilder = Callable[[Centreline, float, np.random.Generator], Mesh]
 MAX_STREET_M = 2000
 """Longer streets take gigabytes of memory."""
 MAX_SIDE_PX, MAX_PIXELS = 16_000, 50_000_000
@@ -44,7 +46,7 @@ _JPEG_QUALITY = 92
 _MAX_ERRORS = 10.0
 _WRITTEN = ("lidar", "cameras", REFERENCE_FILE, RIG_FILE)  # rig.yaml last: it makes a dataset
 # Each has its own random stream.
-_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE, _SENSOR, _LAYOUT, _LENS = range(8)
+_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE, _SENSOR, _LAYOUT = range(7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +73,8 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     rotation_deg: float = 5.0,
     translation_m: float = 0.3,
     sensor_errors: float | ScanErrors = 0.0,
-    lens_errors: float = 0.0,
     vary_layout: bool = False,
-    surroundings: str = "street",
+    build_scene: SceneBuilder = build_street,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Simulate a drive along a procedural street and write it as a dataset.
@@ -94,11 +95,10 @@ def simulate_street(  # noqa: PLR0913 - each of its own
         sensor_errors: of the LiDAR; or their size, 0 for an ideal one, 1 for what real ones have:
             elevations of beams, width of beams, motion during a turn, ranges on dark surfaces, as
             the seed draws them.
-        lens_errors: size of the errors of the lenses in the rig files, 1 for those that a good
-            calibration with a target leaves; the truth is then what goes best with these lenses.
         vary_layout: draw the street's width, curves, gardens, heights and objects by the
             seed. Otherwise all streets are laid out alike: kerbs and fronts are equally far away.
-        surroundings: street, meadow, motorway, tunnel, deck or quay.
+        build_scene: what the road leads through, if not a street: from the line of the road, the
+            length that stays free and a generator.
         progress: called with the stage, its steps done, and their number.
 
     Returns:
@@ -113,18 +113,17 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     lidar = replace(lidar_of(beams), errors=_draw_errors(sensor_errors, beams, seed))
     _require_range(frames, step_m)
     _require_sizes(rig)
-    stated = draw_lens_errors(rig, _size("lens", lens_errors), np.random.default_rng([seed, _LENS]))
-    guess = perturb(stated, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
+    guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
     _require_empty(out)
     progress = progress or no_progress
     progress("building the street", 0, frames)
     drive = build_drive(
-        frames=frames, step_m=step_m, seed=seed, vary_layout=vary_layout, surroundings=surroundings
+        frames=frames, step_m=step_m, seed=seed, vary_layout=vary_layout, build_scene=build_scene
     )
     with written_together(out, last=RIG_FILE) as made:
         _write_scans(made / "lidar", lidar, drive, seed, progress=progress)
         _write_images(made / "cameras", rig, drive, seed, progress=progress)
-        stated.save(made / REFERENCE_FILE)
+        rig.save(made / REFERENCE_FILE)
         guess.save(made / RIG_FILE)
     return [out / name for name in reversed(_WRITTEN)]
 
@@ -133,13 +132,9 @@ def _draw_errors(wanted: float | ScanErrors, beams: int, seed: int) -> ScanError
     if isinstance(wanted, ScanErrors):
         return wanted
     rng = np.random.default_rng([seed, _SENSOR])
-    return draw_scan_errors(beams, wanted, rng) if _size("sensor", wanted) else ScanErrors()
-
-
-def _size(of: str, wanted: float) -> float:
     if not 0 <= wanted <= _MAX_ERRORS:
-        raise ValueError(f"{of} errors of {wanted}: 0 to {_MAX_ERRORS:g} expected")
-    return wanted
+        raise ValueError(f"sensor errors of {wanted}: 0 to {_MAX_ERRORS:g} expected")
+    return draw_scan_errors(beams, wanted, rng) if wanted else ScanErrors()
 
 
 def build_drive(
@@ -148,17 +143,14 @@ def build_drive(
     step_m: float = 4.0,
     seed: int = 0,
     vary_layout: bool = False,
-    surroundings: str = "street",
+    build_scene: SceneBuilder = build_street,
 ) -> Drive:
     """Build a street and drive along it; see :func:`simulate_street`."""
-    build = SURROUNDINGS.get(surroundings)
-    if build is None:
-        raise ValueError(f"surroundings {surroundings!r}: known are {', '.join(SURROUNDINGS)}")
     rng = np.random.default_rng([seed, _WORLD])
     length_m = (frames - 1) * step_m * (1 + _SWAY_STEP)
     drawn = draw_layout(np.random.default_rng([seed, _LAYOUT])) if vary_layout else Layout()
     line = winding_line(length_m, drawn, rng)
-    world = build_world(build(line, length_m, rng), _draw_sun(rng), rng)
+    world = build_world(build_scene(line, length_m, rng), _draw_sun(rng), rng)
     return Drive(world, _draw_stops(line, frames, step_m, np.random.default_rng([seed, _DRIVE])))
 
 

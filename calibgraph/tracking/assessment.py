@@ -14,7 +14,7 @@ from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
 from calibgraph.model.lens_estimate import LensEstimate, with_sigmas
 from calibgraph.model.rig import RelativePose, Rig
-from calibgraph.model.verdict import Check, Status, Verdict
+from calibgraph.model.verdict import START, Check, Status, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.lens_estimates import estimates_of
@@ -194,7 +194,7 @@ def _start_check(state: State, one: CameraState) -> Verdict:
         return Verdict((_stuck_check(one, "FAIL"),))
     waiting = (f"{len(one.waiting)} of {needed} frames with matches",)
     reasons = (f"no estimate yet: {reason}" for reason in one.refused or waiting)
-    return Verdict(tuple(Check("start", "FAIL", reason) for reason in reasons))
+    return Verdict(tuple(Check(START, "WARN", reason) for reason in reasons))
 
 
 def _recent_checks(state: State, one: CameraState, lens: tuple[LensEstimate, ...]) -> list[Check]:
@@ -294,4 +294,5 @@ def to_calibration(
         config=state.config,
         error_sources=error_sources(state, known) if sources else {},
         lens=assessment.lens,
+        moves=tuple(map(str, state.moves)),
     )

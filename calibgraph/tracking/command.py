@@ -21,6 +21,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.places import as_groups
 from calibgraph.model.result_files import OVERLAYS, REPORT_FILE
 from calibgraph.model.rig import Rig
+from calibgraph.model.verdict import START, Verdict
 from calibgraph.outputs import PAGE_MARK, is_marked
 from calibgraph.report.as_json import print_line, require_stdout
 from calibgraph.tracking.dataset_frames import DatasetDrive
@@ -95,8 +96,20 @@ def track(
     run.report_counts()
     named = as_groups([*run.places.values()]) if any(run.places) else ()
     # The guess, not where the first batch has located it.
-    result = replace(result, initial_rig=settings.rig, places=named)
+    verdicts = {name: _at_the_end(one) for name, one in result.camera_verdicts.items()}
+    result = replace(result, initial_rig=settings.rig, places=named, camera_verdicts=verdicts)
     return result, _write_results(settings.out, result, history if run.updates else None)
+
+
+def _at_the_end(verdict: Verdict) -> Verdict:
+    """A camera without an estimate fails at the end, as one that `calibrate` does not find."""
+    return replace(
+        verdict,
+        checks=tuple(
+            replace(check, status="FAIL") if check.name == START else check
+            for check in verdict.checks
+        ),
+    )
 
 
 def _result(

@@ -67,4 +67,4 @@ def report_drift(state: State) -> tuple[State, list[Event]]:
     for camera in range(len(state.cameras)) if cause.lidar else (watch.camera,):
         camera_state = changed(state.cameras[camera], drift_reported_at=state.updates)
         state = state.with_camera(camera, camera_state)
-    return changed(state, drift=None), [event]
+    return changed(state, drift=None).with_moves([event]), [event]

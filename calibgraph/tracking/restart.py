@@ -70,7 +70,7 @@ def restart_after_step(state: State, detected: DetectedStep) -> tuple[State, tup
         )
     if not cause.lidar:
         state = _drop_pairs_of(state, targets)
-    return state, events
+    return state.with_moves(events), events
 
 
 def _date_step(state: State, detected: DetectedStep) -> tuple[DetectedStep, Measured]:

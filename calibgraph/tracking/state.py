@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import chain
@@ -20,6 +21,7 @@ from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.tracking.events import Event
 from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import NO_DISTORTION, Epoch, LiveFrame
 from calibgraph.tracking.noise import inflation, widening
@@ -33,6 +35,7 @@ Item = TypeVar("Item")
 
 LEAST_FRAMES = 15  # for the scatter of a six-vector
 HISTORY = 50  # frames over which the residuals' size and the share of inliers are taken
+_MOST_MOVES = 100  # that are kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +80,7 @@ class State:
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
         updates: number of updates.
+        moves: the last events of moves and drifts.
     """
 
     rig: Rig
@@ -99,6 +103,7 @@ class State:
     frame: int | None = None
     stamp_ns: int | None = None
     updates: int = 0
+    moves: tuple[Event, ...] = ()
 
     @staticmethod
     def initial(rig: Rig, config: Config) -> State:
@@ -173,6 +178,10 @@ class State:
     def with_camera(self, index: int, camera: CameraState) -> State:
         """The state with one camera replaced."""
         return changed(self, cameras=replace_item(self.cameras, index, camera))
+
+    def with_moves(self, events: Sequence[Event]) -> State:
+        """The state with further moves."""
+        return changed(self, moves=(*self.moves, *events)[-_MOST_MOVES:])
 
     @property
     def width(self) -> int:

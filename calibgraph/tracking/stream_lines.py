@@ -153,7 +153,7 @@ def frames_of_lines(chunks: Iterable[bytes], where: str) -> Iterator[Item]:
             found = f"is longer than {MAX_LINE_BYTES} bytes"
             yield refused(place, f"{found}; send one frame a line, or fewer correspondences")
         elif line.strip():
-            parsed = _parse(line, place, header)
+            parsed = _parse(line.removeprefix(b"\xef\xbb\xbf"), place, header)
             if isinstance(parsed, dict):
                 header = parsed
             else:

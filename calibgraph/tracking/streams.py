@@ -41,6 +41,7 @@ _NOT_LINES = {
     b"PAR1": "a Parquet file",
     b"ARROW1": "an Arrow file",
     b"\xff\xff\xff\xff": "an Arrow stream",
+    b"\xff\xfe": "text in UTF-16, as PowerShell pipes it, expected UTF-8",
 }
 
 

@@ -33,7 +33,7 @@ class Update:
         T_camera_lidar: per camera, (4, 4): p_camera = T_camera_lidar * p_lidar. The guess, as long
             as the camera has no estimate.
         covariance: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
-            [rad], translation [m]) in the camera's axes; None with too few frames.
+            [rad], translation [m]) in the camera's axes; None until the camera has enough frames.
         verdicts: per camera, whether its estimate can be used now, with reasons.
         events: the events detected with this frame.
         used: per camera whose matches were absorbed, how many.

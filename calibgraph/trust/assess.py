@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import Check
+from calibgraph.model.verdict import ABOUT_THE_DATA, BRIGHTNESS, Check
 from calibgraph.trust.clock_checks import image_offset_checks, offset_checks
 from calibgraph.trust.competing_solution import competing_solution_checks
 from calibgraph.trust.conventions import likely_intended_guess
@@ -24,6 +24,7 @@ from calibgraph.trust.guess import (
 )
 from calibgraph.trust.image_checks import image_checks
 from calibgraph.trust.image_record import RunChecks
+from calibgraph.trust.inputs import describe_brightness
 from calibgraph.trust.intrinsics import intrinsics_checks
 from calibgraph.trust.lens_parameter import advise_together
 from calibgraph.trust.matcher_checks import matcher_checks
@@ -46,6 +47,8 @@ from calibgraph.trust.solution_checks import (
     prior_share_checks,
     repeated_frame_checks,
 )
+
+_LOOKED_AT = 6  # frames whose brightness is measured
 
 SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     guess_checks,               # does a convention error explain the distance from the guess?
@@ -94,8 +97,23 @@ def assess_run(evidence: RunEvidence) -> RunChecks:
     checks = concatenate([of_solution, of_run], cameras)
     convention = _intended_guess_checks(evidence, checks)
     implausible = implausible_checks(evidence.run.guess, checks)
-    causes = concatenate([convention, implausible], cameras)
+    dark = _brightness_checks(evidence, checks)
+    causes = concatenate([dark, convention, implausible], cameras)
     return RunChecks(of_solution, of_run, causes)
+
+
+def _brightness_checks(evidence: RunEvidence, checks: Checks) -> Checks:
+    """Images too dark or bright to show structure, at cameras with which something is wrong."""
+    found: dict[str, list[Check]] = {}
+    data = evidence.run.dataset.spread_out(_LOOKED_AT)
+    for name, of_camera in checks.items():
+        wrong = [c for c in of_camera if c.status != "PASS" and c.kind not in ABOUT_THE_DATA]
+        camera = evidence.run.guess.cameras[name]
+        grays = [frame.load_gray(name, camera).mean() for frame in data.frames if wrong]
+        if wrong and (text := describe_brightness(name, grays)):
+            decided = any(check.decisive for check in wrong)
+            found[name] = [Check(BRIGHTNESS, "FAIL" if decided else "WARN", text)]
+    return found
 
 
 def in_order(checks: RunChecks, cameras: Sequence[str]) -> dict[str, list[Check]]:

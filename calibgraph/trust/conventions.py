@@ -143,7 +143,7 @@ class _Trial:
                 if error is None:
                     continue
                 images = "the images" if len(lost) == len(some) else f"the images of {name}"
-                return f"{images} fit far better if {error}"
+                return f"{images} fit clearly better if {error}"
         return None
 
     def _is_better(self, name: str, found: Candidate, given: Candidate) -> bool:

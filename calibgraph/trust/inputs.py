@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -61,6 +61,26 @@ def describe_copies(copies: Iterable[tuple[str, str]]) -> str:
     """
     named = [(name, first) for copy, first in copies for name in (first, copy)]
     return describe_repeats("cloud and images", named)
+
+
+_DARK, _BRIGHT = 30.0, 225.0  # of 255; images by day have 80 to 140, of a lit street at night 40
+
+
+def describe_brightness(name: str, means: Sequence[float]) -> str:
+    """Why the images of a camera show too little, by their mean gray levels; empty if they do not.
+
+    Args:
+        name: of the camera.
+        means: of each image that was looked at, 0 to 255.
+    """
+    level = float(np.median(means)) if len(means) else _DARK
+    if _DARK <= level <= _BRIGHT:
+        return ""
+    found, remedy = ("dark", "longer") if level < _DARK else ("bright", "shorter")
+    return (
+        f"the images of {name} are too {found} to show structure: their mean brightness is "
+        f"{level:.0f} of 255; record by daylight, uncover the lens, or expose {remedy}"
+    )
 
 
 def find_doubts(rig: Rig, frame: Frame, cloud: Cloud) -> list[str]:

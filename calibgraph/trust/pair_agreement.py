@@ -75,8 +75,8 @@ def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairA
     row, name = threshold("pair_agreement"), f"relative pose of {found.a} and {found.b} by images"
     status, other = row.grade(found.sigmas), found.b if camera == found.a else found.a
     text = (
-        f"the {name} differs from that by the correspondences by {found.degrees:.2g} deg, "
-        f"{found.centimetres:.2g} cm, {found.sigmas:.3g} sigma"
+        f"images and correspondences contradict each other on the pose of {found.a} to {found.b} "
+        f"by {found.degrees:.2g} deg, {found.centimetres:.2g} cm, {found.sigmas:.3g} sigma"
     )
     own, of_other = (_elsewhere(one, found, all_found) for one in (camera, other))
     if status == "PASS" or not of_other > max(row.warn, own + BLAME_SIGMAS):

@@ -4,7 +4,7 @@ Three ways to be off. Grossly, in a way that checks notice: a logistic model of 
 sign of an error is, and single checks besides, which can only grow as a check gets worse. By a
 wrong lens, or by a pose that a search found by chance: checks whose value is a probability. And by
 the error bar itself, if it is wide beside the tolerance. The last two hold as far as they did in
-the cases fitted to. The weights are fitted by ``benchmarks.accuracy.probability``, on results that
+the cases fitted to. The weights are fitted by ``tools.probability``, on results that
 were made wrong on purpose and right ones, and kept in ``probability.json``, with how they were got.
 """
 
@@ -18,7 +18,7 @@ from operator import mul
 from typing import Any
 
 import numpy as np
-from scipy.special import expit, gammaincc
+from scipy.special import expit, gammainc, gammaincc
 
 from calibgraph.arrays import Array
 from calibgraph.model.verdict import (
@@ -134,22 +134,33 @@ def steps(severity: float) -> tuple[float, float, float]:
 def probability_beyond(covariance: Array | None, tolerance: tuple[float, float]) -> float:
     """The probability that an error of this covariance exceeds the tolerance; 0 without one.
 
+    Rotation and distance count as independent.
+
     Args:
         covariance: (6, 6) rotation [rad] and translation [m].
         tolerance: rotation [deg] and distance [cm].
     """
     if covariance is None:
         return 0.0
-    rotation = _beyond(covariance[:3, :3], np.radians(tolerance[0]))
-    return min(rotation + _beyond(covariance[3:, 3:], tolerance[1] / 100), 1.0)
+    centre = np.zeros(3)
+    rotation = probability_outside(centre, covariance[:3, :3], np.radians(tolerance[0]))
+    shift = probability_outside(centre, covariance[3:, 3:], tolerance[1] / 100)
+    return rotation + shift - rotation * shift
 
 
-def _beyond(covariance: Array, radius: float) -> float:
-    """P(|x| > radius) of x with (3, 3) covariance: over directions, of the chi distribution."""
+def probability_outside(mean: Array, covariance: Array, radius: float) -> float:
+    """P(|x| > radius) of a Gaussian x with (3,) mean and (3, 3) covariance.
+
+    Over directions from the mean, of the chi distribution before and behind the ball.
+    """
     variances, axes = np.linalg.eigh(covariance)
-    root = axes * np.sqrt(np.maximum(variances, 1e-24))  # zero, or below by rounding
-    squared = radius**2 / np.sum((_directions() @ root.T) ** 2, axis=1)
-    return float(np.mean(gammaincc(1.5, squared / 2)))  # of chi-squared, three degrees of freedom
+    rays = _directions() @ (axes * np.sqrt(np.maximum(variances, 1e-24))).T  # zero, or rounded
+    squares, towards = np.sum(rays**2, axis=1), rays @ mean
+    inside = towards**2 - squares * (mean @ mean - radius**2)
+    chord = np.sqrt(np.maximum(inside, 0.0))
+    near, far = (np.maximum(end, 0.0) / squares for end in (-towards - chord, -towards + chord))
+    outside = gammainc(1.5, near**2 / 2) + gammaincc(1.5, far**2 / 2)  # three degrees of freedom
+    return float(np.mean(outside))
 
 
 @cache

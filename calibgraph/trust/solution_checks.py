@@ -72,9 +72,9 @@ def check_sigmas(what: str, sigmas: Array | None, tolerance: tuple[float, float]
         100 * float(sigmas[3:].max()),
     )
     return [
-        threshold("sigma_rotation", tolerance).check(rotation_deg, name=f"{what}: rotation"),
+        threshold("sigma_rotation", tolerance).check(rotation_deg, name=f"{what}, rotation"),
         threshold("sigma_translation", tolerance).check(
-            translation_cm, name=f"{what}: translation"
+            translation_cm, name=f"{what}, translation"
         ),
     ]
 
@@ -106,7 +106,7 @@ def _check_relative_pose(conflict: Conflict) -> Check:
     centimetres = 100 * np.linalg.norm(conflict.difference[3:])
     status, name = row.grade(sigmas), f"relative pose of {pair.a} and {pair.b}"
     text = (
-        f"the {name} differs from the estimate by the correspondences by "
+        f"the correspondences contradict the measured {name} by "
         f"{degrees:.2g} deg, {centimetres:.2g} cm, {sigmas:.3g} sigma"
     )
     text += "" if status == "PASS" else f": {row.advice}"

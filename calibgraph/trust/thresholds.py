@@ -48,12 +48,12 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "Can the points be in metres?", "LiDARs do not measure farther.",
               "are the clouds in millimetres?"),
     # the estimate
-    Threshold("sigma_rotation", "sigma: rotation", "at most", 0.15, 0.5, "deg",
+    Threshold("sigma_rotation", "sigma, rotation", "at most", 0.15, 0.5, "deg",
               "How large is the standard deviation about the worst axis; its lower bound from the "
               "data alone; the error that the matcher's frames share?",
               "0.15 deg displaces a point at 20 m by 5 cm.",
               of_tolerance=True),
-    Threshold("sigma_translation", "sigma: translation", "at most", 5.0, 15.0, "cm",
+    Threshold("sigma_translation", "sigma, translation", "at most", 5.0, 15.0, "cm",
               "The same, along the worst axis.", _COUNTED,
               of_tolerance=True),
     Threshold("relative_pose", "relative pose", "at most", 4.0, 8.0, "sigma",

@@ -1,8 +1,10 @@
 """An MCAP file of a result for Foxglove, with Foxglove's own message types."""
 
-from importlib import import_module
+from __future__ import annotations
+
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,11 +18,15 @@ from calibgraph.outputs import VIEW_MARK
 from calibgraph.progress import Progress, no_progress
 from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
 
+if TYPE_CHECKING:
+    from foxglove.messages import Timestamp
+
 LIDAR_FRAME = "lidar"
 _DISTORTIONS = {"fisheye": "kannala_brandt"}
 _RATIONAL = 8  # coefficients
 _DOT_PX = 3.0
-_LEVELS = {"PASS": "INFO", "WARN": "WARNING", "FAIL": "ERROR"}
+_LEVELS = {"PASS": "Info", "WARN": "Warning", "FAIL": "Error"}
+_XYZ_RGBA = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)])
 
 
 def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no_progress) -> Path:
@@ -32,20 +38,25 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
     (ImageAnnotations), ``/verdict`` (Log).
 
     Raises:
-        CalibrationError: if mcap is missing, or an image or cloud cannot be read.
+        CalibrationError: if foxglove-sdk is missing, or an image or cloud cannot be read.
     """
-    messages = _Messages()
-    path = Path(path)
+    with needs_extra("view", "--mcap needs foxglove-sdk"):
+        import foxglove.channels
+    path, context, channels = Path(path), foxglove.Context(), dict[str, Any]()
 
     def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            writer = messages.writer(file, profile=VIEW_MARK)
+        options = foxglove.mcap.MCAPWriteOptions(profile=VIEW_MARK)
+        with (
+            temporary.open("wb") as file,
+            foxglove.open_mcap(file, context=context, writer_options=options),
+        ):
             for done, frame in enumerate(read_frames(result)):
                 progress(f"frame {frame.name}", done, len(result.frames))
-                for topic, message in messages.of_frame(frame, result):
-                    stamp = _nanoseconds(frame)
-                    writer.write_message(topic, message, log_time=stamp, publish_time=stamp)
-            writer.finish()
+                for topic, message in _messages(frame, result):
+                    if topic not in channels:
+                        kind = getattr(foxglove.channels, f"{type(message).__name__}Channel")
+                        channels[topic] = kind(topic, context=context)
+                    channels[topic].log(message, log_time=_nanoseconds(frame))
 
     write_atomically(path, write)
     return path
@@ -55,115 +66,96 @@ def _nanoseconds(frame: ViewFrame) -> int:
     return round(frame.time_s * 1e9)
 
 
-class _Messages:
-    """Foxglove's messages, imported when they are needed.
+def _messages(frame: ViewFrame, result: Calibration) -> Iterator[tuple[str, Any]]:
+    """The topics and messages of a frame."""
+    from foxglove import messages as m
 
-    Raises:
-        CalibrationError: if they are not installed.
-    """
+    at = m.Timestamp(*divmod(_nanoseconds(frame), 10**9))
+    level = getattr(m.LogLevel, _LEVELS[result.verdict.status])
+    text = state_verdict(result)
+    yield "/tf", _transforms(result, at)
+    yield "/lidar", _cloud(frame, at)
+    yield "/verdict", m.Log(timestamp=at, level=level, message=text, name="calibgraph")
+    for name, image in frame.images.items():
+        camera, optical = result.rig.cameras[name], f"{name}_optical_frame"
+        yield (
+            f"/{name}/image",
+            m.CompressedImage(timestamp=at, frame_id=optical, format="jpeg", data=image.jpeg),
+        )
+        if camera.model in ("pinhole", "fisheye"):  # Foxglove has no others
+            yield f"/{name}/calibration", _lens(camera, optical, at)
+        for when, points in (("before", image.before), ("after", image.after)):
+            yield f"/{name}/{when}", _annotations(points, at)
 
-    def __init__(self) -> None:
-        with needs_extra(
-            "view", "--mcap needs mcap-protobuf-support and foxglove-schemas-protobuf"
-        ):
-            import foxglove_schemas_protobuf  # noqa: F401
-            from mcap_protobuf.writer import Writer
-        self.writer: Any = Writer
-        self._make = import_module("google.protobuf.json_format").ParseDict
 
-    def _new(self, kind: str, **content: Any) -> Any:
-        """A message of a kind, of plain values."""
-        schema = import_module(f"foxglove_schemas_protobuf.{kind}_pb2")
-        return self._make(content, getattr(schema, kind)())
+def _cloud(frame: ViewFrame, at: Timestamp) -> Any:
+    from foxglove import messages as m
 
-    def of_frame(self, frame: ViewFrame, result: Calibration) -> list[tuple[str, Any]]:
-        """The topics and messages of a frame, stamped."""
-        found = [("/tf", self._transforms(result)), ("/lidar", self._cloud(frame))]
-        found.append(("/verdict", self._verdict(result)))
-        for name, image in frame.images.items():
-            camera = result.rig.cameras[name]
-            found.append((f"/{name}/image", self._image(name, image.jpeg)))
-            found += [(f"/{name}/calibration", m) for m in self._lenses(name, camera)]
-            for when, points in (("before", image.before), ("after", image.after)):
-                found.append((f"/{name}/{when}", self._annotations(points, frame)))
-        for _, message in found:
-            _stamp(message, frame)
-        return found
+    packed = np.empty(len(frame.points_lidar_m), _XYZ_RGBA)
+    packed["xyz"], packed["rgba"][:, :3] = frame.points_lidar_m, frame.colours
+    packed["rgba"][:, 3] = 255
+    number, byte = m.PackedElementFieldNumericType.Float32, m.PackedElementFieldNumericType.Uint8
+    numbers = [(name, 4 * i, number) for i, name in enumerate("xyz")]
+    colours = [(n, 12 + i, byte) for i, n in enumerate(("red", "green", "blue", "alpha"))]
+    return m.PointCloud(
+        timestamp=at,
+        frame_id=LIDAR_FRAME,
+        pose=m.Pose(position=m.Vector3(), orientation=m.Quaternion(w=1.0)),
+        point_stride=_XYZ_RGBA.itemsize,
+        fields=[
+            m.PackedElementField(name=name, offset=offset, type=kind)
+            for name, offset, kind in (*numbers, *colours)
+        ],
+        data=packed.tobytes(),
+    )
 
-    def _cloud(self, frame: ViewFrame) -> Any:
-        packed = np.empty(len(frame.points_lidar_m), [("xyz", "<f4", 3), ("rgba", "u1", 4)])
-        packed["xyz"], packed["rgba"][:, :3] = frame.points_lidar_m, frame.colours
-        packed["rgba"][:, 3] = 255
-        numbers = (("x", 0), ("y", 4), ("z", 8))
-        colours = (("red", 12), ("green", 13), ("blue", 14), ("alpha", 15))
-        message = self._new(
-            "PointCloud",
-            frame_id=LIDAR_FRAME,
-            pose={"orientation": {"w": 1.0}},
-            point_stride=packed.dtype.itemsize,
-            fields=[{"name": name, "offset": offset, "type": kind}
-                    for kind, of in (("FLOAT32", numbers), ("UINT8", colours))
-                    for name, offset in of],
-        )  # fmt: skip
-        message.data = packed.tobytes()
-        return message
 
-    def _transforms(self, result: Calibration) -> Any:
-        transforms = [
-            {
-                "parent_frame_id": LIDAR_FRAME,
-                "child_frame_id": f"{name}_{suffix}",
-                "translation": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
-                "rotation": dict(zip("xyzw", quaternion_xyzw(T), strict=True)),
-            }
+def _transforms(result: Calibration, at: Timestamp) -> Any:
+    from foxglove import messages as m
+
+    return m.FrameTransforms(
+        transforms=[
+            m.FrameTransform(
+                timestamp=at,
+                parent_frame_id=LIDAR_FRAME,
+                child_frame_id=f"{name}_{suffix}",
+                translation=m.Vector3(**dict(zip("xyz", T[:3, 3].tolist(), strict=True))),
+                rotation=m.Quaternion(**dict(zip("xyzw", quaternion_xyzw(T), strict=True))),
+            )
             for rig, suffix in ((result.rig, "optical_frame"), (result.initial_rig, "before"))
             for name, T in ((name, invert(T)) for name, T in rig.T_camera_lidar.items())
         ]
-        return self._new("FrameTransforms", transforms=transforms)
-
-    def _image(self, name: str, jpeg: bytes) -> Any:
-        message = self._new("CompressedImage", frame_id=f"{name}_optical_frame", format="jpeg")
-        message.data = jpeg
-        return message
-
-    def _lenses(self, name: str, camera: Camera) -> list[Any]:
-        """The lens, if Foxglove has it."""
-        if camera.model not in ("pinhole", "fisheye"):
-            return []
-        rational = len(camera.distortion) == _RATIONAL
-        K = camera.matrix_px
-        pinhole = "rational_polynomial" if rational else "plumb_bob"
-        return [
-            self._new(
-                "CameraCalibration",
-                frame_id=f"{name}_optical_frame",
-                width=camera.width_px,
-                height=camera.height_px,
-                distortion_model=_DISTORTIONS.get(camera.model, pinhole),
-                D=[*camera.distortion] or [0.0] * 5,
-                K=K.ravel().tolist(),
-                R=np.eye(3).ravel().tolist(),
-                P=np.column_stack([K, np.zeros(3)]).ravel().tolist(),
-            )
-        ]
-
-    def _annotations(self, points: Projected, frame: ViewFrame) -> Any:
-        message = self._new("ImageAnnotations", points=[{"type": "POINTS", "thickness": _DOT_PX}])
-        one = message.points[0]
-        _stamp(one, frame)
-        for u, v in points.pixels_px.tolist():
-            one.points.add(x=u, y=v)
-        for red, green, blue in (points.colours / 255.0).tolist():
-            one.outline_colors.add(r=red, g=green, b=blue, a=1.0)
-        return message
-
-    def _verdict(self, result: Calibration) -> Any:
-        level, text = _LEVELS[result.verdict.status], state_verdict(result)
-        return self._new("Log", level=level, message=text, name="calibgraph")
+    )
 
 
-def _stamp(message: Any, frame: ViewFrame) -> None:
-    """Set the time of a message, and of the transforms in it."""
-    for one in getattr(message, "transforms", [message]):
-        if hasattr(one, "timestamp"):
-            one.timestamp.FromNanoseconds(_nanoseconds(frame))
+def _lens(camera: Camera, frame_id: str, at: Timestamp) -> Any:
+    from foxglove import messages as m
+
+    K = camera.matrix_px
+    rational = len(camera.distortion) == _RATIONAL
+    pinhole = "rational_polynomial" if rational else "plumb_bob"
+    return m.CameraCalibration(
+        timestamp=at,
+        frame_id=frame_id,
+        width=camera.width_px,
+        height=camera.height_px,
+        distortion_model=_DISTORTIONS.get(camera.model, pinhole),
+        D=[*camera.distortion] or [0.0] * 5,
+        K=K.ravel().tolist(),
+        R=np.eye(3).ravel().tolist(),
+        P=np.column_stack([K, np.zeros(3)]).ravel().tolist(),
+    )
+
+
+def _annotations(points: Projected, at: Timestamp) -> Any:
+    from foxglove import messages as m
+
+    colours = (points.colours / 255.0).tolist()
+    one = m.PointsAnnotation(
+        timestamp=at,
+        type=m.PointsAnnotationType.Points,
+        points=[m.Point2(x=u, y=v) for u, v in points.pixels_px.tolist()],
+        outline_colors=[m.Color(r=red, g=green, b=blue, a=1.0) for red, green, blue in colours],
+        thickness=_DOT_PX,
+    )
+    return m.ImageAnnotations(timestamp=at, points=[one])

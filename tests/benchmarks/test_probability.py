@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.accuracy.ledger import Record
-from benchmarks.accuracy.probability import fit
-from benchmarks.accuracy.probability_tables import cuts, discrimination, reliability
-from benchmarks.accuracy.verdict_samples import Sample, probabilities, samples_of
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW
 from calibgraph.trust.probability import STRUCTURE, WORST
+from tools.probability import fit
+from tools.probability_tables import cuts, discrimination, reliability
+from tools.verdict_samples import Sample, probabilities, samples_of
 
 MODEL = {
     "intercept": -8.0, "weights": {"outliers": [0.0, 0.0, 16.0]}, "other": [0.0, 0.0, 0.0],

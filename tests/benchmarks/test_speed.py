@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.speed import calibrate, ceres, gate, kernel, paired
+from benchmarks.speed import ceres, gate, kernel, paired
 from benchmarks.speed.solvers import Problem, solve_ours
 from benchmarks.speed.stages import STAGES, StageSampler
-from benchmarks.speed.streets import link_dataset, street_rig
-from calibgraph import load_rig, perturb, preset, simulate_correspondences, solve
+from calibgraph import perturb, preset, simulate_correspondences, solve
 from calibgraph.simulation.rigs import rig_of
 
 BUSY_S = 0.2  # of 5 ms between samples: 40 of them
@@ -67,53 +66,6 @@ def test_stages_of_parallel_threads_share_the_wall_time() -> None:
     assert (sums <= clocks() - before).all()
     assert sampler.cpu_s["solve"] == pytest.approx(BUSY_S, rel=0.2)
     assert sampler.cpu_s["checks"] == pytest.approx(BUSY_S, rel=0.2)
-
-
-def test_growth_is_the_exponent_of_each_variable() -> None:
-    variables = np.array([(c, f, 1000) for c in (1, 2, 6) for f in (5, 10)], float)
-    values = 3.0 * variables[:, 0] ** 0.9 * variables[:, 1] ** 0.4
-    found = calibrate.exponents(variables, values)
-    np.testing.assert_allclose(found[:2], [0.9, 0.4], rtol=1e-9)
-    assert np.isnan(found[2])  # all images have one size
-
-
-def test_the_expected_time_is_in_proportion_to_the_images() -> None:
-    runs = {calibrate.Case(640, 480, 2, 5): calibrate.Run(10.0, 0, 0)}
-    assert calibrate.expected(runs, calibrate.Case(640, 480, 6, 10)) == 60.0
-    assert calibrate.expected(runs, calibrate.Case(640, 480, 1, 100)) == 0.0  # nothing to go by
-
-
-def test_finished_cases_are_kept_failed_ones_run_again_and_long_ones_are_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ran = []
-
-    def run_case(case: calibrate.Case, *_: object, warm_up: bool) -> calibrate.Run:
-        ran.append((case.frames, warm_up))
-        return calibrate.Run(2.0 * case.frames, 1, 1, verdict="PASS" if case.frames > 5 else "lost")
-
-    monkeypatch.setattr(calibrate, "run_case", run_case)
-    cases = [calibrate.Case(640, 480, 1, frames) for frames in (100, 5, 10)]
-    assert [case.frames for case in calibrate.run_cases(cases, tmp_path, 100.0)] == [5, 10]
-    calibrate.run_cases(cases, tmp_path, 1000.0)
-    assert ran == [(5, True), (10, False), (5, False), (100, False)]
-
-
-def test_a_dataset_repeats_the_frames_of_the_first_cameras(tmp_path: Path) -> None:
-    rig, rendered = street_rig(3, 640, 480), tmp_path / "rendered"
-    for part in (f"cameras/{name}/{i}.jpg" for name in rig.cameras for i in "01"):
-        (rendered / part).parent.mkdir(parents=True, exist_ok=True)
-        (rendered / part).write_text(part)
-    (rendered / "lidar").mkdir()
-    np.save(rendered / "lidar" / "0.npy", np.arange(12).reshape(3, 4))
-    rig.save(rendered / "reference.yaml")
-    link_dataset(rendered, tmp_path / "made", 2, 3)
-    names = list(load_rig(tmp_path / "made" / "rig.yaml").cameras)
-    assert names == list(rig.cameras)[:2]
-    texts = [f.read_text() for f in sorted((tmp_path / "made" / "cameras" / names[1]).iterdir())]
-    assert texts == [f"cameras/{names[1]}/{i}.jpg" for i in "010"]
-    clouds = [np.load(f)[:, 0].tolist() for f in sorted((tmp_path / "made" / "lidar").iterdir())]
-    assert clouds == [[0, 4, 8], [8, 0, 4], [4, 8, 0]]  # no copies
 
 
 def test_multiply_adds_are_those_of_the_shifts_inside_the_image() -> None:

@@ -168,7 +168,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
     for command in (
         "calibrate", "match", "solve", "report", "evaluate", "perturb", "export", "import",
-        "simulate", "weights", "train", "train-windows", "track",
+        "simulate", "weights", "track",
     ):  # fmt: skip
         assert command in done.stdout
 

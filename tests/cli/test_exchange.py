@@ -72,10 +72,8 @@ def test_wrong_exports_are_one_line(call: Call, tmp_path: Path) -> None:
         "format 'ros'": ("--format", "ros"),
         "camera 'rear'": ("--format", "tf2", "--camera", "rear"),
         "--lidar-pose '1 2'": ("--format", "autoware", "--lidar-pose", "1 2"),
-        "autoware and nuscenes only": ("--format", "tf2", "--lidar-pose", "0 0 0 0 0 0"),
+        "autoware only": ("--format", "tf2", "--lidar-pose", "0 0 0 0 0 0"),
         "not finite": ("--format", "autoware", "--lidar-pose", "0 0 nan 0 0 0"),
-        "holds no distortion": ("--format", "nuscenes"),
-        "holds one camera": ("--format", "koide"),
         "two are the same": ("--format", "tf2", "--camera-frame", "camera"),
     }
     for said, arguments in cases.items():

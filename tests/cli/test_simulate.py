@@ -75,10 +75,7 @@ def test_the_command_writes_a_table_and_a_guess_that_is_off(
         (("kitti", "--beams", 16, "--rig", "fisheye"), "--rig and --beams would change nothing"),
         (("walkley", "--step-m", 0), "--step-m would change nothing"),
         (("walkley", "--sensor-errors", 0), "--sensor-errors would change nothing"),
-        (("walkley", "--lens-errors", 1), "--lens-errors would change nothing"),
         (("walkley", "--vary-layout"), "--vary-layout would change nothing"),
-        (("walkley", "--surroundings", "deck"), "--surroundings would change nothing"),
-        (("street", "--surroundings", "sea"), "surroundings 'sea': known are street, meadow"),
         (("nowhere", "--beams", 16), "unknown scenario 'nowhere'"),
     ],
 )

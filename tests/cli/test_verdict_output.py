@@ -44,9 +44,9 @@ def test_the_error_bar_of_cameras_and_pairs_is_printed(
     )  # fmt: skip
     code, _, text = call(*command)
     assert code == 0
-    for words in ("left->right", "left (bootstrap)", "accuracy of ", "scatter of the matches"):
+    for words in ("left->right", "left (bootstrap)", "Least certain: ", "would help most"):
         assert words in text
-    assert "more findings: see report.html or calibration.yaml" in text  # the weakest directions
+    assert "more findings: see report.html" in text  # the weakest directions
     code, stdout, _ = call(*command, "--json")
     summary = yaml.safe_load(stdout)
     assert len(summary["pairs"]["left->right"]["translation_sigma_cm"]) == 3
@@ -126,7 +126,7 @@ def test_the_common_error_of_a_table_without_one_is_an_option(
     assert "cannot tell: scatter only: " in call(*command)[2]
     code, _, text = call(*command, "--common-deg", 0.05, "--common-cm", 1)
     assert code == 0 and text.startswith("PASS\n")
-    assert "common error of the matcher" in text
+    assert "Least certain: " in text
 
 
 def test_the_sources_of_an_error_bar_are_kept_in_the_file(tmp_path: Path, pair: Rig) -> None:

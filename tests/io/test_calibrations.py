@@ -26,6 +26,7 @@ WRONG: dict[str, Any] = {
     "frames_used": [1, 2],
     "rounds": [["a"]],
     "counts": {"left": {"used": "many"}},
+    "sigmas": {},
     "timings_s": {"solve": "long"},
     "terms": "all",
     "prior_share": {"left": "half"},
@@ -34,6 +35,28 @@ WRONG: dict[str, Any] = {
     "config": [1],
     "rig": 5,
 }
+
+
+@pytest.mark.parametrize("number", [float("inf"), float("nan"), 1e308, -1e308])
+@pytest.mark.parametrize("key", ["covariance", "timings_s", "residuals", "rounds", "error_sources"])
+def test_numbers_that_no_measurement_has_are_refused(
+    key: str, number: float, calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    def first_number(part: Any) -> tuple[Any, Any]:
+        """The list or mapping, and the place in it, of the first number below a part."""
+        for place, value in part.items() if isinstance(part, dict) else enumerate(part):
+            if isinstance(value, float):
+                return part, place
+            if isinstance(value, (dict, list)) and value:
+                return first_number(value)
+        raise AssertionError
+
+    part = content_of(calibrated_sample)[key]
+    owner, place = first_number(part)
+    owner[place] = number
+    path = edited({key: part}, calibrated_sample, tmp_path)
+    with pytest.raises(FileError, match=f"{key}.*no number of a result"):
+        load_calibration(path)
 
 
 @pytest.mark.parametrize("key", WRONG)

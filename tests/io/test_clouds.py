@@ -5,14 +5,13 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-import laspy
 import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import feather
 
 from calibgraph import FileError
-from calibgraph.io.clouds import load_cloud
+from calibgraph.io.clouds import load_cloud, read_cloud_notes
 from tests.io.kitti_files import CLOUD
 
 
@@ -28,7 +27,7 @@ def test_npy_and_bin_clouds_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("nothing", [np.nan, 0.0])
-@pytest.mark.parametrize("suffix", [".npy", ".bin", ".las", ".feather"])
+@pytest.mark.parametrize("suffix", [".npy", ".bin", ".feather"])
 def test_points_without_a_return_are_left_out(suffix: str, nothing: float, tmp_path: Path) -> None:
     organised, path = CLOUD.astype(np.float64), tmp_path / f"cloud{suffix}"
     organised[::5, :3] = nothing
@@ -36,13 +35,9 @@ def test_points_without_a_return_are_left_out(suffix: str, nothing: float, tmp_p
         np.save(path, organised)
     elif suffix == ".bin":
         organised.astype("<f4").tofile(path)
-    elif suffix == ".feather":
+    else:
         columns = dict(zip(("x", "y", "z", "Intensity"), organised.T, strict=True))
         feather.write_feather(pa.table(columns), path)
-    else:
-        points = laspy.LasData(laspy.LasHeader(point_format=0))
-        points.x, points.y, points.z = np.nan_to_num(organised[:, :3]).T
-        points.write(path)
     assert len(load_cloud(path)) == 400
 
 
@@ -60,7 +55,6 @@ def test_bad_clouds_are_named(tmp_path: Path) -> None:
     (tmp_path / "empty.npy").write_bytes(b"")
     (tmp_path / "odd.bin").write_bytes(b"12345")
     (tmp_path / "empty.bin").write_bytes(b"")
-    (tmp_path / "cloud.las").write_bytes(b"LASF")
     np.savez(tmp_path / "archive.npz", CLOUD)
     (tmp_path / "archive.npz").rename(tmp_path / "archive.npy")
     np.save(tmp_path / "transposed.npy", np.tile(CLOUD, (20, 1)).T)
@@ -174,3 +168,35 @@ def test_random_bytes_are_refused_without_a_warning(tmp_path: Path) -> None:
     (tmp_path / "random.bin").write_bytes(data.tobytes())
     with pytest.raises(FileError, match=r"random.bin: (point \d+ is not finite|holds a coord)"):
         load_cloud(tmp_path / "random.bin")
+
+
+@pytest.mark.parametrize("kind", ["packed", "half", "infinite"])
+def test_an_intensity_of_another_field_is_left_out_with_a_note(kind: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    cloud, path = np.tile(CLOUD, (20, 1)), tmp_path / "cloud.npy"
+    if kind == "packed":  # colours
+        cloud[:, 3] = rng.integers(0, 2**32, len(cloud), dtype=np.uint32).view(np.float32)
+    else:
+        cloud[:: 2 if kind == "half" else len(cloud), 3] = np.nan if kind == "half" else np.inf
+    np.save(path, cloud)
+    left_out = kind != "infinite"  # at one point
+    assert np.isnan(load_cloud(path)[:, 3]).all() == left_out
+    notes = [note for note in read_cloud_notes(path) if "it is none, and is left out" in note]
+    assert len(notes) == left_out
+
+
+def test_points_without_a_return_may_have_no_intensity(tmp_path: Path) -> None:
+    cloud, path = np.tile(CLOUD, (20, 1)), tmp_path / "cloud.npy"
+    cloud[::2] = np.nan
+    np.save(path, cloud)
+    assert np.isfinite(load_cloud(path)[:, 3]).all()
+    assert not any("left out" in note for note in read_cloud_notes(path))
+
+
+def test_a_feather_file_that_states_more_than_it_can_hold_is_refused(tmp_path: Path) -> None:
+    zeros = np.zeros(10_000_000, np.float32)
+    for packing in ("zstd", "lz4"):
+        path = tmp_path / f"{packing}.feather"
+        feather.write_feather(pa.table(dict.fromkeys("xyz", zeros)), path, compression=packing)
+        with pytest.raises(FileError, match="states 120 MB in .* points do not pack so"):
+            load_cloud(path)

@@ -262,3 +262,26 @@ def test_csv_says_that_it_holds_no_metadata(
         caplog.clear()
         one.save(tmp_path / f"table.{suffix}")
         assert len(caplog.records) == expected
+
+
+def test_rows_that_a_file_cannot_hold_are_refused_by_its_footer(tmp_path: Path) -> None:
+    path, rows = tmp_path / "table.parquet", 2_000_000
+    columns = {name: np.zeros(rows, np.float32) for name in ("u_px", "v_px", "x_m", "y_m", "z_m")}
+    columns |= {"frame": np.zeros(rows, np.int64)}
+    names = pa.DictionaryArray.from_arrays(np.zeros(rows, np.int8), ["a"])
+    parquet.write_table(pa.table({"camera": names, **columns}), path)
+    with pytest.raises(FileError, match=r"states 2000000 rows of .* MB: matches do not pack so"):
+        load_correspondences(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [(b"camera;frame\na;0\n", "separated by semicolons"),
+     (b"camera\tframe\na\t0\n", "separated by tabs"),
+     ("camera,frame\na,0\n".encode("utf-16"), "is UTF-16"),
+     ("camera,frame\na,0\n".encode("utf-16-le"), "is UTF-16")],
+)  # fmt: skip
+def test_csv_as_other_programs_save_it_is_named(content: bytes, words: str, tmp_path: Path) -> None:
+    (tmp_path / "table.csv").write_bytes(content)
+    with pytest.raises(FileError, match=words):
+        load_correspondences(tmp_path / "table.csv")

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from calibgraph import DatasetError, FileError, load_dataset
+from calibgraph.io.bags import BagOptions
+from calibgraph.io.dataset_folders import describe_pairing
 from tests.conftest import SAMPLE
 
 
@@ -108,3 +112,94 @@ def test_clouds_of_nuscenes_have_the_stem_of_their_images(sample: Path) -> None:
     np.testing.assert_array_equal(
         data.frames[0].load_cloud(), load_dataset(SAMPLE).frames[0].load_cloud()
     )
+
+
+START_NS = 1_403_636_579_000_000_000
+
+
+def at(frame: int, later_ms: float = 0.0) -> int:
+    """The stamp of a frame of a recording at 2 Hz [ns]."""
+    return START_NS + round((500 * frame + later_ms) * 1e6)
+
+
+def renamed(folder: Path, cloud: Callable[[int], str], image: Callable[[int], str]) -> Path:
+    """The sample with other names; an empty one takes the file away."""
+    for path in [*folder.glob("lidar/*"), *folder.glob("cameras/*/*")]:
+        name = (cloud if path.parent.name == "lidar" else image)(int(path.stem))
+        path.rename(path.with_name(f"new{name}{path.suffix}")) if name else path.unlink()
+    for path in [*folder.glob("lidar/*"), *folder.glob("cameras/*/*")]:
+        path.rename(path.with_name(path.name.removeprefix("new")))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("cloud", "image"),
+    [
+        (lambda i: f"{i + 8}", lambda i: f"{i + 8}"),
+        (lambda i: f"drive1_{i + 8}", lambda i: f"drive1_{i + 8}"),
+        (lambda i: f"{9 + 0.25 * i}", lambda i: f"{9 + 0.25 * i}"),
+        (lambda i: f"{i + 8}", lambda i: f"{i + 8:06}"),
+        (lambda i: f"scan_{i + 8}", lambda i: f"image{i + 8:03}"),
+        (lambda i: f"{at(i)}", lambda i: f"{at(i, 4 + 3 * i)}"),
+        (lambda i: f"{at(i) / 1e9:.6f}", lambda i: f"{at(i, 12)}"),
+        (lambda i: f"{at(i) // 10**9}_{at(i) % 10**9:09}", lambda i: f"cam_{at(i, -20) // 1000}"),
+        (lambda i: f"{at(i) // 10**6}", lambda i: f"{at(i, 20) // 10**6}"),
+    ],
+)
+def test_frames_follow_the_numbers_in_names(
+    cloud: Callable[[int], str], image: Callable[[int], str], sample: Path
+) -> None:
+    data = load_dataset(renamed(sample, cloud, image))
+    assert [frame.name for frame in data.frames] == [cloud(i) for i in range(6)]
+    for i, frame in enumerate(data.frames):
+        assert {path.stem for path in frame.image_paths.values()} == {image(i)}
+
+
+def test_files_that_stamps_do_not_pair_are_left_out_and_counted(sample: Path) -> None:
+    renamed(
+        sample,
+        lambda i: str(at(i)) * (i != 2),  # noqa: PLR2004
+        lambda i: str(at(i, 9)) * (i != 4),  # noqa: PLR2004
+    )
+    data = load_dataset(sample)
+    assert [frame.index for frame in data.frames] == [0, 1, 2, 4]
+    words = r"4 of 5 clouds .* within 0.05 s .* left \+9 ms .* 0.09 m at 10 m/s \(1 images not used"
+    assert any(re.search(words, note) for note in data.notes)
+    assert re.search(words, describe_pairing(sample))
+
+
+@pytest.mark.parametrize(
+    ("later_ms", "message"),
+    [(80, r"\+80 ms \(median\), at most 80: 0.80 m at 10 m/s; give a larger --tolerance-s"),
+     (1e9, r"clouds are from 1403636579.000 to .* images from 1404636579.000")],
+)  # fmt: skip
+def test_stamps_that_are_far_apart_are_named(later_ms: float, message: str, sample: Path) -> None:
+    renamed(sample, lambda i: str(at(i)), lambda i: str(at(i, later_ms)))
+    with pytest.raises(DatasetError, match=message):
+        load_dataset(sample)
+    if later_ms < 100:  # noqa: PLR2004
+        assert len(load_dataset(sample, bag=BagOptions(tolerance_s=0.1)).frames) == 6
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("run.bag.active", "was not closed.*rosbag reindex"), ("run.mcap.zst", "zstd -d run.mcap.zst"),
+     ("run.bag.gz", "gunzip run.bag.gz"), ("drive.zip", "is an archive")],
+)  # fmt: skip
+def test_a_file_that_is_not_read_is_named_with_the_way_out(
+    name: str, words: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(b"\x28\xb5\x2f\xfd")
+    with pytest.raises(FileError, match=words):
+        load_dataset(tmp_path / name)
+
+
+def test_videos_and_clouds_of_other_programs_name_what_converts_them(sample: Path) -> None:
+    shutil.rmtree(sample / "cameras" / "left")
+    (sample / "cameras" / "left.mp4").write_bytes(b"")
+    with pytest.raises(FileError, match=r"ffmpeg -i left.mp4 left/%06d.png"):
+        load_dataset(sample)
+    for path in (sample / "lidar").iterdir():
+        path.rename(path.with_suffix(".las"))
+    with pytest.raises(FileError, match=r"pdal translate 000000.las 000000.ply"):
+        load_dataset(sample)

@@ -127,3 +127,15 @@ def test_a_png_may_be_followed_by_other_bytes(tmp_path: Path) -> None:
     (tmp_path / "plain.png").write_bytes(data)
     more, plain = (load_image(tmp_path / f"{name}.png", camera) for name in ("more", "plain"))
     np.testing.assert_array_equal(more, plain)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_an_image_that_states_more_pixels_than_its_bytes_hold_is_refused(
+    suffix: str, tmp_path: Path
+) -> None:
+    side = 6000
+    path, size = tmp_path / f"image{suffix}", {"width_px": side, "height_px": side}
+    camera = make_camera().model_copy(update=size)
+    cv2.imwrite(str(path), np.zeros((side, side), np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 5])
+    with pytest.raises(FileError, match=r"it states 6000x6000 px in \d+ kB: no picture packs so"):
+        load_image(path, camera)

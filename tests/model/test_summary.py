@@ -19,8 +19,8 @@ from calibgraph.model.error_sources import (
     UNMODELLED,
     ErrorSources,
 )
-from calibgraph.model.summary import MOST, summarize
-from calibgraph.model.verdict import COMMON_ERROR, Check, ErrorProbability, Verdict
+from calibgraph.model.summary import LEAST, summarize
+from calibgraph.model.verdict import BRIGHTNESS, COMMON_ERROR, Check, ErrorProbability, Verdict
 from calibgraph.trust.lens_parameter import LENS_KINDS
 from calibgraph.trust.thresholds import THRESHOLDS, threshold
 
@@ -67,29 +67,33 @@ def test_sentences_that_differ_in_a_number_are_one_reason() -> None:
     )  # fmt: skip
 
 
-def test_checks_of_one_cause_are_one_reason_that_names_its_own_cameras_alone() -> None:
-    summary = summarize({"left": of_kinds("own_clouds"), "right": of_kinds("time_offset")})
-    (reason,) = summary.reasons
-    assert (reason.cause, reason.cameras) == ("time", ("left",))
-    assert reason.text == "own_clouds is odd"
-    assert [other.text for other in summary.others] == ["time_offset is odd"]
-    assert summary.actions == (CAUSES["time"].action,)
+def test_every_camera_has_its_own_reason_and_action() -> None:
+    """A wrong centre is shown though causes of other cameras come before it."""
+    wrong = {"left": ("search", "z_score"), "rear": ("guess_rotation", "time_offset"),
+             "right": ("principal_point", "frames")}  # fmt: skip
+    summary = summarize({name: of_kinds(*kinds) for name, kinds in wrong.items()})
+    assert [(r.cameras, r.cause) for r in summary.reasons] == [
+        (("left",), "guess"), (("rear",), "guess"), (("right",), "lens")
+    ]  # fmt: skip
+    assert [action.partition(":")[0] for action in summary.actions] == ["left", "rear", "right"]
+    assert [r.cause for r in summary.others] == ["time", "agreement", "data"]
 
 
-def test_cameras_with_a_check_of_the_same_kind_in_other_words_are_named() -> None:
-    other = Check("own_clouds", "WARN", "own_clouds is missing", kind="own_clouds")
-    found = summarize({"left": of_kinds("own_clouds"), "right": Verdict((other,))})
-    (reason,) = found.reasons
-    assert reason.text == "own_clouds is odd (also noticed at right)"
-
-
-def test_of_many_causes_the_worst_three_are_shown_and_the_others_folded() -> None:
+def test_a_fail_comes_before_what_explains_it_if_that_only_warns() -> None:
     verdict = of_kinds("competing_solution", "frames", "lens", "own_clouds", "guess_rotation")
     summary = summarize({"left": Verdict((*verdict.checks, FAILED))}, {"left": ("loose height",)})
     assert [reason.cause for reason in summary.reasons] == ["solver", "guess", "time"]
-    assert len(summary.actions) == MOST
+    assert len(summary.reasons) == len(summary.actions) == LEAST
     assert [o.cause for o in summary.others] == ["lens", "matches", "data", ""]
     assert summary.others[-1].text == "loose height"
+
+
+def test_of_the_checks_of_one_cause_a_camera_has_the_worst_as_its_reason() -> None:
+    mild, bad = (Check(kind, "WARN", f"{kind} is odd", value, 1.0, 2.0, kind=kind)
+                 for kind, value in (("own_clouds", 1.1), ("time_offset", 1.9)))  # fmt: skip
+    summary = summarize({"left": Verdict((mild, bad))})
+    assert [reason.text for reason in summary.reasons] == ["time_offset is odd"]
+    assert [other.text for other in summary.others] == ["own_clouds is odd"]
 
 
 def test_an_action_is_stated_once() -> None:
@@ -113,6 +117,14 @@ def test_cannot_tell_is_a_reason_and_no_status() -> None:
         summary.error_probability
         == "off by more than 0.5 deg or 10 cm with a probability: left 30%"
     )
+
+
+def test_over_99_percent_is_a_fail_even_by_the_error_bar_alone() -> None:
+    verdicts = {"left": Verdict((), ErrorProbability(0.0, 0.995)), "right": of_kinds("lens")}
+    summary = summarize(verdicts, sources={"left": WIDE})
+    assert (summary.status, summary.cannot_tell) == ("FAIL", False)
+    assert summary.reasons[0].status == "FAIL" and "too wide" in summary.reasons[0].text
+    assert summary.actions[0].startswith("left: Tolerate more") and summary.error_bar == ""
 
 
 def test_every_kind_of_check_has_a_cause() -> None:
@@ -149,7 +161,9 @@ def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
         "left": Verdict((threshold("sigma_rotation").check(0.3),), ErrorProbability(0.001, 0.1))
     }
     summary = summarize(unsure, sources={"left": WIDE})
-    assert summary.error_bar == f"accuracy of left, 1 sigma: 0.3 deg (90% {COMMON}, 10% {MATCHES})"
+    assert summary.error_bar == (
+        "Least certain: left, 0.3 deg (1 sigma). Measured relative_poses or priors would help most."
+    )
     (action,) = summary.actions
     assert "0.28 deg of common error remain" in action or "0.29 deg of common error" in action
     few = replace(WIDE, forecast={2: (0.2, 1.5), 3: (0.14, 1.0), MOST_TIMES: (0.01, 0.1)})
@@ -188,6 +202,14 @@ def test_a_doubt_without_a_check_beyond_its_limit_names_the_nearest_one() -> Non
     assert (reason.status, reason.cause) == ("WARN", "matches")
     assert reason.text == (
         "no check is beyond its limit; nearest to it is "
-        "matches of a competing solution over those of this one 24%"
+        "matches of a competing solution over those of this one: 24%"
     )
     assert summary.actions == (CAUSES["matches"].action,)
+
+
+def test_images_that_are_too_dark_are_the_only_reason_of_their_camera() -> None:
+    dark = Check(BRIGHTNESS, "WARN", "the images of a are too dark: 13 of 255; expose longer")
+    checks = (dark, *of_kinds("guess_rotation", "lens", "z_score", "range_rotation").checks)
+    found = summarize({"a": Verdict(checks)})
+    assert [reason.text for reason in found.reasons] == [dark.text]
+    assert not found.others

@@ -9,6 +9,7 @@ from calibgraph.model.verdict import (
     ABOUT_THE_DATA,
     COMMON_ERROR,
     IMAGES_ELSEWHERE,
+    START,
     WENT_ON,
     ErrorProbability,
     rig_verdict,
@@ -32,7 +33,7 @@ def test_the_worst_check_decides_and_its_reason_comes_first() -> None:
     )
     assert verdict.status == "FAIL"
     assert [reason[0] for reason in verdict.reasons] == ["c", "a"]
-    assert rig_verdict({"front": verdict}).reasons[0] == "front: c 0 is below 1"
+    assert rig_verdict({"front": verdict}).reasons[0] == "front: c: 0, below the limit 1"
 
 
 @pytest.mark.parametrize("direction", ["at most", "at least"])
@@ -43,14 +44,15 @@ def test_nan_fails(direction: Direction) -> None:
 def test_a_number_next_to_its_limit_is_told_from_it_in_three_digits() -> None:
     assert (
         check_of("kept", 0.59999, "at least", 0.6, 0.3, unit="share").text
-        == "kept 59.9% is below 60%"
+        == "kept: 59.9%, below the limit 60%"
     )
     assert (
         check_of("x", 0.150057698, "at most", 0.15, 0.5, unit="deg").text
-        == "x 0.151 deg is above 0.15 deg"
+        == "x: 0.151 deg, above the limit 0.15 deg"
     )
     assert (
-        check_of("x", 0.2, "at most", 0.15, 0.5, unit="deg").text == "x 0.2 deg is above 0.15 deg"
+        check_of("x", 0.2, "at most", 0.15, 0.5, unit="deg").text
+        == "x: 0.2 deg, above the limit 0.15 deg"
     )
     assert beside(0.14999, 0.15, "deg") == "0.149 deg"
     assert beside(-0.2001, -0.2, "share") == "-20.1%"
@@ -109,7 +111,7 @@ def test_a_rig_cannot_tell_if_none_of_its_cameras_looks_odd() -> None:
 
 def test_kinds_of_checks_of_the_data_are_those_of_the_table_or_have_no_number() -> None:
     without_a_row = {"copies", "correspondences", "image evidence", "terms", COMMON_ERROR, WENT_ON}
-    without_a_row |= {IMAGES_ELSEWHERE}
+    without_a_row |= {IMAGES_ELSEWHERE, START}
     names = {"difference between even and odd frames"}
     assert threshold("halves_rotation").name in names
     for key in ABOUT_THE_DATA - without_a_row - names:

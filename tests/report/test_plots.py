@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from calibgraph import Calibration, Rig
 from calibgraph.report import plots
 from calibgraph.report.camera_section import camera_diagrams
-from calibgraph.report.drawing import draw
 from calibgraph.report.match_errors import BeforeAfter
 from calibgraph.report.reprojection_errors import errors_before_after
 from tests.conftest import make_camera
@@ -28,7 +27,7 @@ def test_diagrams_of_hardly_any_matches_are_drawn(
     """Inside the gate, and beyond it."""
     after = errors_before_after(solved_pair)["left"].after
     few = replace(after.select(np.arange(len(after.frame)) < count), gate_px=gate_px)
-    drawn = draw(camera_diagrams(solved_pair, "left", BeforeAfter(few, few)))
+    drawn = camera_diagrams(solved_pair, "left", BeforeAfter(few, few))
     assert len(set(drawn.values())) == 6
 
 
@@ -72,6 +71,6 @@ def test_a_change_of_the_lens_is_drawn_where_it_was_estimated(solved_pair: Calib
         rig=solved_pair.rig.model_copy(update={"cameras": cameras}),
         lens={name: () for name in cameras},
     )
-    lens = draw(camera_diagrams(moved, "left", None))["lens"]
+    lens = (camera_diagrams(moved, "left", None))["lens"]
     assert lens.startswith("data:image/png;base64,")
     assert "lens" not in camera_diagrams(moved, "right", None)

@@ -44,7 +44,7 @@ def test_a_mistake_is_recognised_by_the_images_at_a_rough_guess(words: str, seed
     rough = rough_guess(seed)
     T = {name: mistaken(words, T) for name, T in rough.T_camera_lidar.items()}
     found = likely_intended_guess(one_frame(), rough.moved_to(T))
-    assert found == f"the images fit far better if {words}"
+    assert found == f"the images fit clearly better if {words}"
 
 
 def test_the_camera_is_named_if_only_its_guess_is_wrong() -> None:
@@ -52,7 +52,7 @@ def test_the_camera_is_named_if_only_its_guess_is_wrong() -> None:
     wrong = np.linalg.inv(rough.T_camera_lidar["left"])
     found = likely_intended_guess(one_frame(), rough.moved_to({"left": wrong}))
     assert found == (
-        "the images of left fit far better if the guess is inverted (it is T_lidar_camera)"
+        "the images of left fit clearly better if the guess is inverted (it is T_lidar_camera)"
     )
 
 

@@ -55,8 +55,8 @@ def test_malformed_findings_are_refused(
 def test_a_matchers_own_error_is_reported_once(pair: Rig) -> None:
     """It is part of the error bar; where there is none, it stands alone."""
     for terms, reason in (
-        ("full", "sigma: rotation"),
-        ("priors", "error that the matcher's frames share: rotation"),
+        ("full", "sigma, rotation"),
+        ("priors", "error that the matcher's frames share, rotation"),
     ):
         table = calibgraph.simulate_correspondences(pair, frames=8, matches=200)
         with_error = replace(table, metadata={"systematic_rotation_rad": 0.02})
@@ -138,6 +138,6 @@ def test_a_camera_that_few_frames_do_not_show_fails_for_that_reason(pair: Rig) -
     first = result.summary.reasons[0]
     assert first.cameras == ("left",) and first.text.startswith("not found: ")
     assert "with a probability of 0.3" in first.text
-    assert result.summary.actions[0].startswith("Record at least 5 frames")
+    assert result.summary.actions[0].startswith("left: Record at least 5 frames")
     assert not [text for text in result.verdict.reasons if "swapped" in text]
     assert result.camera_verdicts["right"].status == "WARN"

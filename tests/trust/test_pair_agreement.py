@@ -105,7 +105,7 @@ def test_the_verdict_names_a_pair_whose_images_disagree(pair: Rig) -> None:
         assert passed.status == "PASS" and passed.value is not None and passed.value < 1
         (failed,) = named(wrong, name, "by images")
         assert failed.status != "PASS"
-        assert "relative pose of left and right by images differs" in failed.text
+        assert "contradict each other on the pose of left to right" in failed.text
 
 
 def test_what_the_correspondences_say_alone_is_checked_without_the_pairs(pair: Rig) -> None:

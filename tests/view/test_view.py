@@ -30,7 +30,8 @@ from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
 
 pytest.importorskip("rerun")
-pytest.importorskip("mcap_protobuf")
+pytest.importorskip("foxglove")
+pytest.importorskip("mcap_protobuf")  # reads what foxglove-sdk writes
 
 FRAMES = 2
 CAMERA = "left"
@@ -195,9 +196,7 @@ def test_a_result_without_frames_has_nothing_to_show(result: Calibration, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("write", "package"), [(write_rerun, "rerun"), (write_mcap, "mcap_protobuf")]
-)
+@pytest.mark.parametrize(("write", "package"), [(write_rerun, "rerun"), (write_mcap, "foxglove")])
 def test_a_missing_package_is_named(
     write: Callable[..., Path],
     package: str,

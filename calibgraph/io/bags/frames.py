@@ -11,7 +11,15 @@ from calibgraph.errors import DatasetError
 from calibgraph.io.bags.messages import Bag
 from calibgraph.io.bags.options import BagOptions, Motion
 from calibgraph.io.bags.point_clouds import time_fields
-from calibgraph.io.bags.stamps import TopicStamps, nearest, read_stamps, to_every_ns, windows_of
+from calibgraph.io.bags.stamps import (
+    TopicStamps,
+    describe_offsets,
+    nearest,
+    offsets_of,
+    read_stamps,
+    to_every_ns,
+    windows_of,
+)
 from calibgraph.io.bags.topics import RigTopics, choose_topics
 
 _S = 1_000_000_000
@@ -162,6 +170,12 @@ def _advice(stamps: Mapping[str, TopicStamps], topics: RigTopics, pairs: Mapping
         if not stamps[topic].paths:
             return f"{topic} has nothing to use; choose another topic"
     worst = min(pairs, key=lambda name: int(np.sum(pairs[name] >= 0)))
+    apart = offsets_of(stamps[topics.lidar], stamps[topics.cameras[worst].image])
+    if len(apart):
+        return (
+            f"the nearest images of {describe_offsets(worst, apart)}; give --stamps record if the "
+            "clocks differ, or a larger --tolerance-s if that is acceptable"
+        )
     spans = [
         f"{topic} {stamps[topic].stamp_ns[0] / _S:.3f} to {stamps[topic].stamp_ns[-1] / _S:.3f} s"
         for topic in (topics.lidar, topics.cameras[worst].image)

@@ -8,6 +8,9 @@ from typing import Literal, get_args
 
 Stamps = Literal["header", "record"]
 Motion = Literal["none", "odometry", "tf", "scans"]
+NEAR_S = 0.05
+"""Largest difference of the stamps of a cloud and its images, if none is given: half a turn of a
+LiDAR at 10 Hz, so that streams of equal rates pair, whatever their phase."""
 LIDAR, ODOMETRY = "lidar", "odometry"
 """The keys of the clouds' topic and of the odometry's in :attr:`BagOptions.topics`."""
 
@@ -21,8 +24,8 @@ class BagOptions:
             and that of the ``odometry``; those that are
             not given are found by their types.
         every_s: seconds between frames; only their surroundings are read. All frames if None.
-        tolerance_s: largest difference of the stamps of a cloud and its images. The default is half
-            a turn of a LiDAR at 10 Hz: streams of equal rates pair, whatever their phase.
+        tolerance_s: largest difference of the stamps of a cloud and its images, also of folders
+            whose files are named by stamps.
         stamps: ``header``, those of the sensors; or ``record``, when a message was recorded, for
             sensors whose clocks differ.
         motion: how clouds are corrected for the motion of the vehicle, to the median stamp of a
@@ -37,7 +40,7 @@ class BagOptions:
 
     topics: Mapping[str, str] = field(default_factory=dict)
     every_s: float | None = None
-    tolerance_s: float = 0.05
+    tolerance_s: float = NEAR_S
     stamps: Stamps = "header"
     motion: Motion = "none"
     beside: tuple[Path, ...] = ()

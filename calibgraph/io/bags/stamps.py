@@ -86,6 +86,25 @@ def to_every_ns(every_s: float) -> int:
     return max(1, round(every_s * _S))
 
 
+_USUAL_M_S = 10.0
+
+
+def describe_offsets(name: str, offsets_ns: NDArray[np.int64]) -> str:
+    """By how much the images of a camera are after their clouds, and what that costs at speed."""
+    ms = offsets_ns / 1e6
+    median = float(np.median(ms))
+    text = f"{name} {median:+.0f} ms (median), at most {np.abs(ms).max():.0f}"
+    return f"{text}: {abs(median) / 1e3 * _USUAL_M_S:.2f} m at {_USUAL_M_S:g} m/s"
+
+
+def offsets_of(clouds: TopicStamps, images: TopicStamps) -> NDArray[np.int64]:
+    """(n,) by how much the nearest image is after each cloud within a second of one [ns]."""
+    rows = nearest(clouds, images, _S)
+    found = np.flatnonzero(rows >= 0)
+    stamp_ns = np.array(images.stamp_ns, dtype=np.int64)
+    return stamp_ns[rows[found]] - np.array(clouds.stamp_ns, dtype=np.int64)[found]
+
+
 def nearest(clouds: TopicStamps, images: TopicStamps, tolerance_ns: int) -> NDArray[np.int64]:
     """(n,) for each cloud the image with the nearest stamp, -1 if none is within the tolerance.
 

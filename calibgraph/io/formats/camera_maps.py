@@ -8,11 +8,9 @@ keys                               program                      direction
 =================================  ===========================  ==================================
 T_camera_lidar, T_cam_lidar, T_C_L calibgraph, Kalibr-like      p_camera = T p_lidar
 Rcl, Pcl                           FAST-LIVO                    p_camera = Rcl p_lidar + Pcl
-sensor_calib                       SensorsCalibration           p_target = T p_sensor
-CameraExtrinsicMat, T_lidar_camera Autoware.AI                  p_lidar = T p_camera
+T_lidar_camera, T_L_C              calibgraph, Kalibr-like      p_lidar = T p_camera
 extrinsicRotation, -Translation    VINS-Mono, LVI-SAM           p_imu = R p_camera + t
 body_T_cam0, body_T_cam1           VINS-Fusion                  p_imu = T p_camera
-camera_ext_R, camera_ext_t         R3LIVE                       p_imu = R p_camera + t
 Tbc, IMU.T_b_c1                    ORB-SLAM3                    p_imu = T p_camera
 extrinsic_R, extrinsic_T           FAST-LIO, FAST-LIVO          p_imu = R p_lidar + t
 =================================  ===========================  ==================================
@@ -38,25 +36,23 @@ from calibgraph.model.rig import rigid_transform
 
 _LIDAR = "lidar"
 _T_CAMERA_LIDAR = (
-    ("tcameralidar",), ("tcamlidar",), ("tcl",), ("sensorcalib",), ("rcl", "pcl"),
+    ("tcameralidar",), ("tcamlidar",), ("tcl",), ("rcl", "pcl"),
 )  # fmt: skip
-_T_LIDAR_CAMERA = (("cameraextrinsicmat",), ("tlidarcamera",), ("tlidarcam",), ("tlc",))
+_T_LIDAR_CAMERA = (("tlidarcamera",), ("tlidarcam",), ("tlc",))
 _T_IMU_CAMERA = (
-    ("extrinsicrotation", "extrinsictranslation"), ("cameraextr", "cameraextt"), ("tbc",),
-    ("tbc1",),
+    ("extrinsicrotation", "extrinsictranslation"), ("tbc",), ("tbc1",),
 )  # fmt: skip
 _T_IMU_LIDAR = ("extrinsicr", "extrinsict")
 _BODY = ("bodytcam0", "bodytcam1")
 _NOT_READ = {
     "lidartocamtx": "versions of LVI-SAM mean different axes by it",
     "extrinsicrot": "versions of LIO-SAM mean different axes by it",
-    "cameraposes": "it places cameras against each other, not against a LiDAR",
     "cameraposematrix": "it places cameras against each other, not against a LiDAR",
 }
 _DEEPEST = 6
 _SAME = 1e-6  # of transforms that are given twice: they may be rounded
 _PROGRAMS = (
-    "ros__parameters", "camera", "cameras", "r3live_vio", "extrin_calib", "mapping", "param",
+    "ros__parameters", "camera", "cameras", "extrin_calib", "mapping", "param",
     "intrinsic", "value0",
 )  # fmt: skip
 """Keys above a camera that are no name of it."""
@@ -91,8 +87,6 @@ def read_camera_maps(content: Mapping[str, Any], path: Path, name: str | None) -
 
 def _camera_of(each: _Map, owner: str, path: Path, *, single: bool) -> str:
     """The camera that a mapping is about: its own, or the whole file's."""
-    if each.target:
-        return each.target
     return owner if single or not each.numbers.hold_a_lens else each.name or path.stem
 
 
@@ -127,10 +121,9 @@ class _Map:
     def __init__(self, above: tuple[str, ...], where: str, content: Mapping[str, Any]) -> None:
         self.numbers = LensKeys(content, where)
         self._where = where
-        given = self.numbers.text("cameraname", "name", "sensorname").strip("/").replace("/", "_")
+        given = self.numbers.text("cameraname", "name").strip("/").replace("/", "_")
         keys = [key for key in above if key not in _PROGRAMS and re.fullmatch(r"[\w.-]+", key)]
         self.name = given or (keys[-1] if keys else "")
-        self.target = self.numbers.text("targetsensorname") if self._has("sensorcalib") else ""
 
     def _has(self, *names: str) -> bool:
         return all(self.numbers.has(name) for name in names)

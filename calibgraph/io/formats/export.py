@@ -6,15 +6,14 @@ from typing import Final
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.files import read_yaml, require_place_for_folder, write_bytes, write_text
+from calibgraph.files import read_yaml, require_place_for_folder, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
 from calibgraph.io.formats.autoware import write_autoware
 from calibgraph.io.formats.camera_info import LENS_MARK, write_camera_infos
 from calibgraph.io.formats.documents import commented
 from calibgraph.io.formats.kalibr import write_kalibr
-from calibgraph.io.formats.koide import write_koide
 from calibgraph.io.formats.names import EXPORT_FORMATS
-from calibgraph.io.formats.plain import write_json, write_npz, write_opencv
+from calibgraph.io.formats.plain import write_json, write_opencv
 from calibgraph.io.formats.rig_export import RigExport, prepare_export
 from calibgraph.io.formats.ros_transforms import (
     write_ros1,
@@ -23,15 +22,14 @@ from calibgraph.io.formats.ros_transforms import (
     write_tf2,
     write_urdf,
 )
-from calibgraph.io.formats.undistorted import kitti_statement, write_kitti, write_nuscenes
+from calibgraph.io.formats.undistorted import kitti_statement, write_kitti
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Rig, rigid_transform
 from calibgraph.outputs import Output, is_marked, require_writable
 
-Content = str | bytes
-Writer = Callable[[RigExport], Content | Mapping[str, Content]]
+Writer = Callable[[RigExport], str | Mapping[str, str]]
 """Of one file, or of the files of a folder by name."""
 
 WRITERS: Final[Mapping[str, Writer]] = {
@@ -43,14 +41,11 @@ WRITERS: Final[Mapping[str, Writer]] = {
     "urdf": write_urdf,
     "autoware": write_autoware,
     "kitti": write_kitti,
-    "nuscenes": write_nuscenes,
-    "koide": write_koide,
     "camera_info": write_camera_infos,
     "opencv": write_opencv,
-    "npz": write_npz,
     "json": write_json,
 }
-_WITH_BASE = ("autoware", "nuscenes")
+_WITH_BASE = "autoware"
 _WITHOUT_COMMENTS, _FOLDER = "kitti", "camera_info"
 _MARKS = (b"calibgraph export", b"calibgraph_export")
 
@@ -77,8 +72,8 @@ def export_calibration(
         lidar_frame: frame id of the LiDAR; the rig's name of it if None.
         camera_frame: id of optical frames, with ``{camera}`` for the camera's name; that of the
             rig, as its bag names it, or ``{camera}_optical_frame`` if None.
-        T_base_lidar: (4, 4) pose of the LiDAR in ``sensor_kit_base_link`` (autoware) or ego
-            (nuscenes); the identity if None.
+        T_base_lidar: (4, 4) pose of the LiDAR in ``sensor_kit_base_link`` (autoware); the
+            identity if None.
         even_if_failed: whether to write cameras whose verdict is FAIL.
 
     Returns:
@@ -122,8 +117,8 @@ def _require_known(format: str, *, with_base: bool) -> None:
     """Check the format, and that it has a base frame if one is given."""
     if format not in WRITERS:
         raise ValueError(f"format {format!r}: known are {', '.join(EXPORT_FORMATS)}")
-    if with_base and format not in _WITH_BASE:
-        raise ValueError(f"the LiDAR's pose is for the formats {' and '.join(_WITH_BASE)} only")
+    if with_base and format != _WITH_BASE:
+        raise ValueError(f"the LiDAR's pose is for the format {_WITH_BASE} only")
 
 
 def _loaded(path: Path | str) -> Calibration | Rig:
@@ -155,7 +150,7 @@ def _outputs(files: Iterable[Path]) -> list[Output]:
 def _write(export: RigExport, path: Path, format: str, *, whole: bool) -> tuple[Path, ...]:
     """Write all files or, if one may not be replaced, none; of a whole rig no others stay."""
     written = WRITERS[format](export)
-    contents = {path: written} if isinstance(written, (str, bytes)) else {
+    contents = {path: written} if isinstance(written, str) else {
         path / name: content for name, content in written.items()
     }  # fmt: skip
     if format == _WITHOUT_COMMENTS:
@@ -166,8 +161,5 @@ def _write(export: RigExport, path: Path, format: str, *, whole: bool) -> tuple[
         if file not in contents and is_marked(file, LENS_MARK.encode()):
             file.unlink()
     for file, content in contents.items():
-        if isinstance(content, bytes):
-            write_bytes(file, content)
-        else:
-            write_text(file, content)
+        write_text(file, content)
     return tuple(contents)

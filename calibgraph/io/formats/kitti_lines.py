@@ -20,6 +20,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
+from calibgraph.io.clouds import read_npy
 from calibgraph.io.formats.part import ONLY_CAMERA, FrameLink, Part
 from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.io.kitti import matrix_of_line
@@ -45,7 +46,7 @@ def is_kitti_lines(text: str) -> bool:
 
 def read_kitti_lines(path: Path, name: str | None) -> Part:
     """The lenses and transforms of a file."""
-    lines = dict(_lines(path))
+    lines = _matrix_of_npy(path) if path.suffix == ".npy" else dict(_lines(path))
     transforms = {key: row for key, row in lines.items() if re.fullmatch(r"image_\d+", key)}
     rectified = sorted(key[-2:] for key in lines if re.fullmatch(r"P_rect_\d\d", key))
     if transforms:
@@ -114,6 +115,14 @@ def _lines(path: Path) -> Iterator[tuple[str, list[float]]]:
             bare += _row(line)
     if bare:
         yield "", bare
+
+
+def _matrix_of_npy(path: Path) -> dict[str, list[float]]:
+    """The one matrix of an array file."""
+    array = read_npy(path)
+    if array.dtype.kind not in "fiu" or array.size not in (12, 16):
+        raise FileError(path, f"holds {array.shape} of {array.dtype}, expected 3 x 4 or 4 x 4")
+    return {"": array.astype(np.float64).ravel().tolist()}
 
 
 def _row(text: str) -> list[float]:

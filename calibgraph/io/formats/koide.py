@@ -6,9 +6,7 @@ from typing import Any
 
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
-from calibgraph.io.formats.documents import stated_json
 from calibgraph.io.formats.part import Part
-from calibgraph.io.formats.rig_export import RigExport, carried_coefficients, no_place_for
 from calibgraph.io.lenses import (
     CameraLens,
     listed_coefficients,
@@ -16,42 +14,9 @@ from calibgraph.io.lenses import (
     stated_model,
     unified_coefficients,
 )
-from calibgraph.io.rotations import pose_of_quaternion, quaternion_xyzw
+from calibgraph.io.rotations import pose_of_quaternion
 from calibgraph.model.geometry import invert
-from calibgraph.model.rig import Camera as RigCamera
 from calibgraph.model.rig import Finite, Positive
-
-
-def write_koide(export: RigExport) -> str:
-    """The camera, and its pose under ``results``."""
-    name, camera = export.only_camera("koide3's calib.json")
-    T = export.T_lidar_camera(name)
-    statement = export.statement(
-        "T_lidar_camera: [x, y, z, qx, qy, qz, qw] maps camera to LiDAR coordinates: "
-        "p_lidar = T_lidar_camera * p_camera, the inverse of T_camera_lidar"
-    )
-    content = {
-        "camera": _projection(name, camera),
-        "meta": {"camera": name},
-        "results": {"T_lidar_camera": [*T[:3, 3].tolist(), *quaternion_xyzw(T)]},
-    }
-    return stated_json(statement, content)
-
-
-def _projection(name: str, camera: RigCamera) -> dict[str, Any]:
-    k = camera.intrinsics_px
-    intrinsics = [k.fx, k.fy, k.cx, k.cy]
-    if camera.model == "omnidirectional":
-        xi, *coefficients = camera.distortion
-        model, intrinsics = "omnidir", [*intrinsics, xi]
-    elif camera.model == "fisheye":
-        model, coefficients = "fisheye", list(camera.distortion)
-    elif camera.model == "pinhole":
-        what = "koide3's plumb_bob"
-        model, coefficients = "plumb_bob", carried_coefficients(name, camera, 5, what)
-    else:
-        raise no_place_for(name, camera, "koide3's calib.json")
-    return {"camera_model": model, "intrinsics": intrinsics, "distortion_coeffs": coefficients}
 
 
 class _Camera(StrictNumbers):
@@ -85,7 +50,7 @@ def is_koide(content: dict[str, Any]) -> bool:
 
 
 def read_koide(content: dict[str, Any], path: Path, name: str | None) -> Part:
-    """The lens and the result, or else an initial guess; a file written here has its own name."""
+    """The lens and the result, or else an initial guess."""
     found = checked_model(_Calibration, content, path)
     name = str(found.meta.get("camera", name or path.stem))
     r = found.results

@@ -1,7 +1,7 @@
 """The lens of a mapping, under the keys that calibration and SLAM programs give its numbers.
 
-One table of keys serves OpenCV, camera_info files, Autoware.AI, camodocal (VINS), ORB-SLAM, vikit
-(FAST-LIVO), R3LIVE, multical and SensorsCalibration. Capitals, underscores and what stands before
+One table of keys serves OpenCV, camera_info files, camodocal (VINS), ORB-SLAM and vikit
+(FAST-LIVO). Capitals, underscores and what stands before
 a dot or slash do not count: ``Camera.fx``, ``cam_fx``.
 """
 

@@ -12,19 +12,16 @@ EXPORT_FORMATS: Final[Mapping[str, str]] = {
     "urdf": "URDF with one fixed joint per camera, LiDAR -> optical frames",
     "autoware": "Autoware's sensor_kit_calibration.yaml: camera_link, not optical",
     "kitti": "KITTI odometry's calib.txt: P0 to P3 and Tr",
-    "nuscenes": "nuScenes' calibrated_sensor.json: sensor -> ego, quaternions w x y z",
-    "koide": "koide3's calib.json (direct_visual_lidar_calibration): one camera, T_lidar_camera",
     "camera_info": "folder of a ROS camera_info YAML per camera: lenses, no extrinsics",
     "opencv": "OpenCV FileStorage YAML: matrices, distortion, T_camera_lidar",
-    "npz": "NumPy archive: T_camera_lidar, T_lidar_camera, lenses, covariance",
     "json": "plain JSON: T_camera_lidar, T_lidar_camera, lenses, covariance",
 }
 """What ``calibgraph export --format`` writes."""
 
 IMPORT_FORMATS: Final = (
     "Kalibr camchain, ROS camera_info and transforms (files, or as ros2 topic echo prints them), "
-    "OpenCV FileStorage (.yaml, .xml, .json), Autoware sensor kit, Autoware.AI, parameters of "
-    "VINS, LVI-SAM, FAST-LIVO and R3LIVE, multical, Basalt and SensorsCalibration (.json), URDF, "
+    "OpenCV FileStorage (.yaml, .xml, .json), Autoware sensor kit, parameters of "
+    "VINS, LVI-SAM and FAST-LIVO, Basalt (.json), URDF, "
     "COLMAP cameras.txt, koide3 calib.json, KITTI and KITTI-360 (calib_cam_to_velo.txt, "
     "perspective.txt), a ROS bag, a rig file, a result or a JSON export of calibgraph"
 )

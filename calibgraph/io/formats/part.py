@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -34,11 +34,12 @@ class RelativeCamera:
 
 @dataclass(frozen=True, eq=False)
 class FrameLink:
-    """The (4, 4) pose of a child frame in its parent, as in TF and URDF."""
+    """The (4, 4) pose of a child frame in its parent, as in TF and URDF; a note if it can move."""
 
     parent: str
     child: str
     T_parent_child: Array
+    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +139,17 @@ class FrameTree:
             )
         T_frame_lidar: Array = invert(T_root_frame) @ T_root_lidar
         return T_frame_lidar if is_optical(camera_frame) else T_OPTICAL_LINK @ T_frame_lidar
+
+    def notes_between(self, frame: str, other: str) -> list[str]:
+        """The notes on the links between two frames."""
+        above = [set(self._above(each)) for each in (frame, other)]
+        return [note for each in sorted(above[0] ^ above[1]) if (note := self._links[each].note)]
+
+    def _above(self, frame: str) -> Iterator[str]:
+        """A frame and its ancestors but for the root."""
+        while frame in self._links:
+            yield frame
+            frame = self._links[frame].parent
 
     def _in_root(self, frame: str) -> tuple[str, Array]:
         if frame not in self.names:

@@ -1,13 +1,10 @@
-"""Plain JSON, NumPy archives and OpenCV FileStorage: extrinsics, lenses, covariance."""
+"""Plain JSON and OpenCV FileStorage: extrinsics, lenses, covariance."""
 
-import io
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 
-from calibgraph.arrays import Array
 from calibgraph.io.formats.documents import stated_json
 from calibgraph.io.formats.rig_export import COVARIANCE_SENTENCE, RigExport
 from calibgraph.model.calibration import FRAMES_SENTENCE
@@ -39,33 +36,6 @@ def _content(export: RigExport, name: str) -> dict[str, Any]:
         "T_lidar_camera": export.T_lidar_camera(name).tolist(),
         "covariance": None if covariance is None else covariance.ravel().tolist(),
     }
-
-
-def write_npz(export: RigExport) -> bytes:
-    """Arrays over the n cameras; times and covariance are NaN where there are none."""
-    cameras = list(export.cameras.values())
-    covariances = [export.ros_covariance(name) for name in export.cameras]
-    file = io.BytesIO()
-    np.savez(
-        file,
-        calibgraph_export=np.array(export.statement(*_DIRECTION)),
-        cameras=np.array(list(export.cameras)),
-        T_camera_lidar=np.array([camera.T_camera_lidar for camera in cameras]),
-        T_lidar_camera=np.array([export.T_lidar_camera(name) for name in export.cameras]),
-        camera_matrix_px=np.array([camera.matrix_px for camera in cameras]),
-        size_px=np.array([(camera.width_px, camera.height_px) for camera in cameras]),
-        model=np.array([camera.model for camera in cameras]),
-        distortion=np.array([[*c.distortion, *[0.0] * 8][:8] for c in cameras]),
-        time_offset_s=_numbers([camera.time_offset_s for camera in cameras]),
-        readout_s=_numbers([camera.readout_s for camera in cameras]),
-        covariance=np.array([np.full((6, 6), np.nan) if c is None else c for c in covariances]),
-    )
-    return file.getvalue()
-
-
-def _numbers(values: Sequence[float | None]) -> Array:
-    """(n,) with NaN in place of None."""
-    return np.array([np.nan if value is None else value for value in values])
 
 
 def write_opencv(export: RigExport) -> str:

@@ -22,7 +22,6 @@ from calibgraph.io.formats.documents import (
 from calibgraph.io.formats.kalibr import is_kalibr, read_kalibr
 from calibgraph.io.formats.kitti_lines import is_kitti_lines, read_kitti_lines
 from calibgraph.io.formats.koide import is_koide, read_koide
-from calibgraph.io.formats.names import IMPORT_FORMATS
 from calibgraph.io.formats.part import Part, RelativeCamera
 from calibgraph.io.formats.ros_transforms import is_tf2, read_tf2, read_urdf
 from calibgraph.io.kitti import CALIBRATION_NAME
@@ -30,7 +29,7 @@ from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rigs import is_exported_rig, read_rig
 from calibgraph.model.rig import Camera
 
-_MAX_BYTES = 32 * 2**20
+_MAX_BYTES, _HEAD_BYTES = 32 * 2**20, 2**16
 _COLMAP_NAME = "cameras.txt"
 
 
@@ -52,23 +51,41 @@ def read_part(path: Path, name: str | None) -> Part:
         if root.tag != "opencv_storage":
             return read_urdf(root, path)
         return _read_content([content_of_storage(root)], path, name)
-    if suffix == ".txt":
+    if suffix in (".txt", ".csv", ".npy"):
         return _read_lines(path, name)
     if suffix in (*YAML_SUFFIXES, ".json"):
         return _read_content(read_documents(path), path, name)
-    raise FileError(path, f"its format is not known; known are {IMPORT_FORMATS}")
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES).decode("utf-8", "replace")
+    raise FileError(path, _unknown(f"a file {suffix or 'without a suffix'} is", head))
 
 
 def _read_lines(path: Path, name: str | None) -> Part:
     """What a text file of lines holds."""
+    if path.suffix.lower() == ".npy":
+        return read_kitti_lines(path, name)
     text = read_text(path)
     if is_colmap(text) or path.name == _COLMAP_NAME:
         return read_colmap(path)
     if is_kitti_lines(text):
         return read_kitti_lines(path, name)
     first = next((line for line in text.splitlines() if line.strip()), "")
-    raise FileError(
-        path, f"its line {first[:40]!r} is of no known format; known are {IMPORT_FORMATS}"
+    raise FileError(path, _unknown(f"its line {first[:40]!r} is", text))
+
+
+def _unknown(what: str, text: str = "") -> str:
+    """The error of a format that is not known, with the way to a file that is."""
+    if "static_transform_publisher" in text or "Rotation: in Quaternion" in text:
+        return (
+            "states transforms of ROS in lines that are not read; start what publishes them, and "
+            "write them into a file that is: `ros2 topic echo --once /tf_static > tf.yaml`"
+        )
+    if "camera matrix" in text:
+        return "is the .ini of camera_calibration; give the .yaml that it writes beside it"
+    return (
+        f"{what} of no known format; known are those of Kalibr, ROS (camera_info, /tf_static, "
+        "URDF), OpenCV, Autoware, KITTI, COLMAP and others in docs/formats.md; or write "
+        "T_camera_lidar into rig.yaml"
     )
 
 
@@ -87,9 +104,7 @@ def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None)
     found = read_camera_maps(content, path, name)
     if found is None:
         keys = ", ".join(str(key) for key in list(content)[:5])
-        raise FileError(
-            path, f"its keys ({keys}) are of no known format; known are {IMPORT_FORMATS}"
-        )
+        raise FileError(path, _unknown(f"its keys ({keys}) are"))
     return found
 
 

@@ -67,15 +67,6 @@ class RigExport:
             return None
         return ros_pose_covariance(self.covariance[name], self.cameras[name].T_camera_lidar)
 
-    def only_camera(self, what: str) -> tuple[str, Camera]:
-        """The one camera, for a format that holds no more."""
-        if len(self.cameras) > 1:
-            raise CalibrationError(
-                f"{what} holds one camera, these are {', '.join(self.cameras)}: name one with "
-                "--camera, and write one file per camera"
-            )
-        return next(iter(self.cameras.items()))
-
     @property
     def origin(self) -> str:
         """The first line of a comment: the mark of exports, and the verdict."""

@@ -151,7 +151,7 @@ def read_rig_parts(
     notes = [note for part in parts for note in part.notes]
     notes += [NO_LIDAR_IN_IMU] if missing and len(tied) < len(links) else []
     try:
-        T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen)
+        T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen, notes=notes)
     except CalibrationError as error:
         raise CalibrationError("; ".join([str(error), *notes])) from error
     pairs = [pair for part in parts for pair in part.relative_poses]
@@ -220,14 +220,21 @@ def _is_same(one: Array, other: Array) -> bool:
 
 
 def _by_frames(
-    tree: FrameTree, cameras: Iterable[str], lidar_frame: str | None, chosen: Mapping[str, str]
+    tree: FrameTree,
+    cameras: Iterable[str],
+    lidar_frame: str | None,
+    chosen: Mapping[str, str],
+    *,
+    notes: list[str],
 ) -> dict[str, Array]:
-    """T_camera_lidar of the cameras that have a frame in the tree."""
+    """T_camera_lidar of the cameras that have a frame in the tree; with notes on their links."""
     frames = {name: find_camera_frame(tree, name, chosen) for name in cameras}
     found = {name: frame for name, frame in frames.items() if frame is not None}
     if not found:
         return {}
     lidar = lidar_frame or find_lidar_frame(tree)
+    for frame in found.values():
+        notes += [note for note in tree.notes_between(frame, lidar) if note not in notes]
     return {name: tree.T_camera_lidar(frame, lidar) for name, frame in found.items()}
 
 

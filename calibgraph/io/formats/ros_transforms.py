@@ -212,7 +212,28 @@ def _link_of_joint(joint: ElementTree.Element, path: Path) -> FrameLink:
         T = pose_of_angles(xyz, rpy)
     except ValueError as error:
         raise FileError(path, f"joint {joint.get('name')!r}: {error}") from error
-    return FrameLink(parent.get("link", ""), child.get("link", ""), T)
+    note = f"{path}: {_movement(joint)}" if joint.get("type") in _MOVABLE else ""
+    return FrameLink(parent.get("link", ""), child.get("link", ""), T, note)
+
+
+_MOVABLE = ("revolute", "continuous", "prismatic", "planar", "floating")
+
+
+def _movement(joint: ElementTree.Element) -> str:
+    """That a joint between LiDAR and camera can move, and between which limits."""
+    limit = joint.find("limit")
+    unit = "m" if joint.get("type") == "prismatic" else "rad"
+    found = {} if limit is None or joint.get("type") == "continuous" else limit.attrib
+    try:
+        low, high = (float(found.get(key, "0")) for key in ("lower", "upper"))
+    except ValueError:
+        low = high = 0.0
+    limits = f" from {low:g} to {high:g} {unit}" if low < high else ""
+    zero = "at zero" if low <= 0 <= high else "at zero, which is outside its limits"
+    return (
+        f"joint {joint.get('name')!r} lies between LiDAR and camera and can move{limits}; it is "
+        f"taken {zero}: if it stands elsewhere, write its position into <origin>"
+    )
 
 
 def _three_numbers(text: str, joint: ElementTree.Element, path: Path) -> list[float]:

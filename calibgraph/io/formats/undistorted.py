@@ -1,15 +1,12 @@
-"""Formats of undistorted cameras: KITTI odometry's calib.txt and nuScenes' calibrated_sensor."""
+"""The calib.txt of KITTI odometry, of undistorted cameras."""
 
-import json
 import re
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError
 from calibgraph.io.formats.rig_export import RigExport, require_undistorted
-from calibgraph.io.rotations import quaternion_xyzw
 
 _SAME = 1e-9  # of rotation matrices: rounding in double precision
 _MOST = 4
@@ -66,33 +63,3 @@ def _numbers(export: RigExport) -> dict[str, int]:
 
 def _line(key: str, matrix: NDArray[np.float64]) -> str:
     return f"{key}: {' '.join(repr(float(value)) for value in matrix.ravel())}\n"
-
-
-def write_nuscenes(export: RigExport) -> str:
-    """One record per camera and one of the LiDAR, whose frame is ego's without ``--lidar-pose``."""
-    T_base_lidar = np.eye(4) if export.T_base_lidar is None else export.T_base_lidar
-    ego = "the LiDAR frame, as no --lidar-pose was given" if export.T_base_lidar is None else (
-        "where --lidar-pose puts it"
-    )  # fmt: skip
-    statement = export.statement(
-        "translation and rotation (w x y z) are the pose of the sensor in ego: "
-        "p_ego = R(rotation) * p_sensor + translation",
-        f"ego is {ego}; tokens are the names of the sensors",
-    )
-    records = [_record(export.lidar_frame, T_base_lidar, [])]
-    for name, camera in export.cameras.items():
-        require_undistorted(name, camera, "nuScenes' calibrated_sensor")
-        records.append(_record(name, export.T_base_camera(name), camera.matrix_px.tolist()))
-    records[0]["calibgraph_export"] = statement
-    return json.dumps(records, indent=2, allow_nan=False) + "\n"
-
-
-def _record(name: str, T_ego_sensor: NDArray[np.float64], matrix: list[Any]) -> dict[str, Any]:
-    x, y, z, w = quaternion_xyzw(T_ego_sensor)
-    return {
-        "token": name,
-        "sensor_token": name,
-        "translation": T_ego_sensor[:3, 3].tolist(),
-        "rotation": [w, x, y, z],
-        "camera_intrinsic": matrix,
-    }

@@ -1,4 +1,4 @@
-"""The learned matcher CMRNext: its network, weights, matcher and training. Needs torch."""
+"""The learned matcher CMRNext: its network, weights and matcher. Needs torch."""
 
 from calibgraph.errors import needs_extra
 
@@ -11,15 +11,5 @@ with needs_extra(
 
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint, load_checkpoint
 from calibgraph.matching.cmrnext.matcher import CmrNextMatcher
-from calibgraph.matching.cmrnext.training.settings import TrainSettings
-from calibgraph.matching.cmrnext.training.train import train
-from calibgraph.matching.cmrnext.training.validation import Validation
 
-__all__ = [
-    "Checkpoint",
-    "CmrNextMatcher",
-    "TrainSettings",
-    "Validation",
-    "load_checkpoint",
-    "train",
-]
+__all__ = ["Checkpoint", "CmrNextMatcher", "load_checkpoint"]

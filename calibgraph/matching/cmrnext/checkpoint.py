@@ -23,13 +23,11 @@ from calibgraph.matching.cmrnext.torch_file import MAX_BYTES, read_torch_file
 from calibgraph.outputs import WEIGHTS_MARK
 
 SAFETENSORS = ".safetensors"
-TORCH_SUFFIXES = (".tar", ".pt", ".pth")
 
 DOWNLOAD = (
     "the published weights are at "
     "https://cmrnext.cs.uni-freiburg.de/downloads/cmrnext_calibration_weights.zip; they are not "
-    "part of calibgraph: GPL-3.0 for academic use, for other use ask their authors; or train your "
-    "own with calibgraph train"
+    "part of calibgraph: GPL-3.0 for academic use, for other use ask their authors"
 )
 
 _Number = Annotated[float, Field(strict=True, ge=0)]
@@ -120,17 +118,6 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
         raise FileError(path, f"no such file of weights; {DOWNLOAD}")
     read = _read_safetensors if path.suffix == SAFETENSORS else _read_torch
     return _to_checkpoint(path, *read(path))
-
-
-def load_training(path: Path | str) -> tuple[Checkpoint, dict[Any, Any]]:
-    """Read the checkpoint of a training run, and all content of its file.
-
-    Raises:
-        FileError: as :func:`load_checkpoint`.
-    """
-    path = Path(path)
-    content = read_torch_file(path)
-    return _to_checkpoint(path, *_weights_in(content, path)), content
 
 
 def _to_checkpoint(

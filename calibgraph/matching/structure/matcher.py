@@ -6,7 +6,6 @@ from concurrent.futures import Executor, Future
 from copy import copy
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,7 @@ from calibgraph.matching.structure.shift_scores import (
     concatenate_scores,
     score_frame,
 )
-from calibgraph.matching.structure.window_weights import PACKAGE_FILE, load_window_network
+from calibgraph.matching.structure.window_weights import window_network
 from calibgraph.model.clock import clock_of
 from calibgraph.model.config import LensPart, Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
@@ -55,7 +54,6 @@ MOST_FRAMES = 30  # bounds time and memory, which are proportional from SHARING_
 SEARCH_FRAMES = 7
 SEARCH_DEG, SEARCH_M = 20.0, 1.5
 MAX_SEARCH_DEG, MAX_SEARCH_M = 45.0, 5.0
-NO_WEIGHTS = {"how": "none: all windows count alike"}
 LEAST_WINDOWS, TRIED_WINDOWS = 300, 2_000
 """Least number of fine windows with structure, of those tried; with fewer the search fails. Of
 scans thinned to 2000, 3000, 4000 and 5000 points 25, 250, 750 and 1300 have it: with 4000 cameras
@@ -74,10 +72,8 @@ class StructureMatcher:
         search_m: the same of the translation [m].
         most_frames: most frames of a dataset that are used, chosen of more; None for all.
         levels: the rounds, coarse to fine.
-        window_weights: file of a network that weighs the windows; None: all count alike.
 
     Raises:
-        FileError: if that file is missing or malformed.
         ValueError: if only one of the ranges is None, or one is out of bounds, or no frame is left.
     """
 
@@ -93,16 +89,13 @@ class StructureMatcher:
         search_m: float | None = SEARCH_M,
         most_frames: int | None = MOST_FRAMES,
         levels: Sequence[Level] = LEVELS,
-        window_weights: Path | str | None = PACKAGE_FILE,
     ) -> None:
         if most_frames is not None and most_frames < 1:
             raise ValueError(f"at least one frame must be used, found most_frames={most_frames}")
         self.seed = seed
         self.search_range = _to_search_range(search_deg, search_m)
         self.most_frames = most_frames
-        network = None if window_weights is None else load_window_network(window_weights)
-        self.levels = [level.with_network(network) for level in levels]
-        self._window_weights = NO_WEIGHTS if network is None else network.origin
+        self.levels = list(levels)
         self.estimate: tuple[LensPart, ...] = ()
         self.rounds = len(levels)
         self._cache = FrameCache()
@@ -267,7 +260,7 @@ class StructureMatcher:
             "matcher": "structure",
             "round": round_index,
             "seed": self.seed,
-            "window_weights": self._window_weights,
+            "window_weights": window_network().origin,
         }
         return {STAGE1: self.stage1, **settings, **findings.to_metadata()}
 

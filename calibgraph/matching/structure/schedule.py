@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibgraph.matching.structure.window_weights import WindowNetwork
-
 
 @dataclass(frozen=True)
 class Level:
@@ -23,7 +21,6 @@ class Level:
             where sensors are far apart). Windows keep their linear parts. Their log-likelihoods
             are summed, so that one window that fits well outweighs many that fit somewhat.
         weighed: count windows by their weights, see :mod:`.window_weights`.
-        network: gives the weights; None for the package's.
         stride_spacings: spacing of the windows, in sample spacings.
         blur_steps: standard deviation of the Gaussian blur of the image, in steps.
         group_rad: cell of directions in which the shift is nearly constant.
@@ -41,17 +38,12 @@ class Level:
     spacing_rad: float
     fine: bool = False
     weighed: bool = False
-    network: WindowNetwork | None = None
     stride_spacings: float = 2.0
     blur_steps: float = 1.0
     group_rad: float = np.radians(3.8)
     max_windows: int = 20_000
     searches: int = 3
     min_quality: float = 0.05
-
-    def with_network(self, network: WindowNetwork | None) -> Level:
-        """The level with another network, or without weights."""
-        return replace(self, network=network, weighed=self.weighed and network is not None)
 
 
 def _level(

@@ -183,7 +183,7 @@ def select_windows(
     )
     max_covered = 0.0 if level.fine else MAX_COVERED
     windows = table.cut(in_view, clear, max_covered=max_covered, max_windows=max_windows)
-    return windows.weighed(level.network or window_network()) if level.weighed else windows
+    return windows.weighed(window_network()) if level.weighed else windows
 
 
 def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:

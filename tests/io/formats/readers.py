@@ -152,35 +152,11 @@ def kitti(path: Path) -> Poses:
     return poses
 
 
-def nuscenes(path: Path) -> Poses:
-    """The devkit: p_ego = Quaternion(rotation: w x y z) p_sensor + translation."""
-    records = {r["sensor_token"]: r for r in json.loads(path.read_text())}
-    T_ego = {}
-    for token, record in records.items():
-        w, x, y, z = record["rotation"]
-        T_ego[token] = quaternion_pose(record["translation"], x, y, z, w)
-    return {token: inverse(T) @ T_ego["lidar"] for token, T in T_ego.items() if token != "lidar"}
-
-
-def koide(path: Path) -> Poses:
-    """koide3: p_lidar = T_lidar_camera p_camera, [x y z qx qy qz qw]."""
-    content = json.loads(path.read_text())
-    x, y, z, *quaternion = content["results"]["T_lidar_camera"]
-    return {content["meta"]["camera"]: inverse(quaternion_pose([x, y, z], *quaternion))}
-
-
 def opencv(path: Path) -> Poses:
     """By OpenCV."""
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     cameras = [file.getNode(key) for key in file.root().keys()]  # noqa: SIM118 - no dict
     return {c.getNode("name").string(): c.getNode("T_camera_lidar").mat() for c in cameras}
-
-
-def npz(path: Path) -> Poses:
-    with np.load(path, allow_pickle=False) as arrays:
-        for T, back in zip(arrays["T_camera_lidar"], arrays["T_lidar_camera"], strict=True):
-            np.testing.assert_allclose(T @ back, np.eye(4), atol=1e-12)
-        return dict(zip(arrays["cameras"].tolist(), arrays["T_camera_lidar"], strict=True))
 
 
 def plain_json(path: Path) -> Poses:
@@ -197,10 +173,7 @@ READERS = {
     "urdf": urdf,
     "autoware": autoware,
     "kitti": kitti,
-    "nuscenes": nuscenes,
-    "koide": koide,
     "opencv": opencv,
-    "npz": npz,
     "json": plain_json,
 }
 

@@ -156,7 +156,7 @@ def test_unknown_and_unexpanded_files_are_named(tmp_path: Path) -> None:
     (xacro,) = write(tmp_path, car__xacro=macro)
     assert "expand it: xacro FILE > robot.urdf" in message_of(xacro)
     (other,) = write(tmp_path, a__yaml="speed: 3\n")
-    assert "its keys (speed) are of no known format; known are Kalibr" in message_of(other)
+    assert "its keys (speed) are of no known format; known are those of Kalibr" in message_of(other)
     (other,) = write(tmp_path, a__csv="1,2\n")
     assert "its format is not known" in message_of(other)
     assert "no such file" in message_of(tmp_path / "nothing.yaml")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ from calibgraph import (
     import_rig,
     load_rig,
 )
+from calibgraph.io.formats.rig_import import read_rig_parts
 from tests.conftest import KANNALA, RADTAN5, RADTAN8, make_camera, stereo_relative_pose
 from tests.io.formats.calibration_files import (
     CAMERA_INFO,
@@ -156,11 +158,10 @@ def test_colmap_lenses_project_as_colmap_does(tmp_path: Path) -> None:
         np.testing.assert_allclose(ours + 0.5, theirs.reshape(1, 2), atol=1e-9)
 
 
-@pytest.mark.parametrize("format", ["kalibr", "tf2", "urdf", "autoware", "opencv", "koide"])
+@pytest.mark.parametrize("format", ["kalibr", "tf2", "urdf", "autoware", "opencv"])
 def test_what_was_exported_is_imported_again(format: str, tmp_path: Path) -> None:
     rig = rig_for(format)
-    suffix = {"urdf": "urdf", "koide": "json"}.get(format, "yaml")
-    path = tmp_path / f"file.{suffix}"
+    path = tmp_path / f"file.{'urdf' if format == 'urdf' else 'yaml'}"
     export_calibration(rig, path, format)
     files = [path]
     if format in ("tf2", "urdf", "autoware"):  # frames alone: with the lenses of a rig
@@ -251,3 +252,58 @@ def test_two_files_that_differ_are_refused(tmp_path: Path) -> None:
     files = write(tmp_path, a__yaml=CAMERA_INFO, b__yaml=other, kit__yaml=SENSOR_KIT)
     with pytest.raises(CalibrationError, match="another lens of camera 'front'"):
         import_rig(files)
+
+
+LIDAR_TO_CAM = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1.0]])
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".csv", ".npy"])
+def test_a_matrix_is_read_in_the_direction_of_its_name(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"lidar_to_cam{suffix}"
+    if suffix == ".npy":
+        np.save(path, LIDAR_TO_CAM)
+    else:
+        np.savetxt(path, LIDAR_TO_CAM, delimiter="," if suffix == ".csv" else " ")
+    (lens,) = write(tmp_path, front__yaml=CAMERA_INFO)
+    (camera,) = import_rig([lens, path]).cameras.values()
+    np.testing.assert_allclose(camera.T_camera_lidar, LIDAR_TO_CAM)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [("tf.sh", "ros2 run tf2_ros static_transform_publisher --x 0.3\n", "ros2 topic echo --once"),
+     ("echo.txt", "At time 0.0\n- Rotation: in Quaternion (xyzw) [0, 0, 0, 1]\n", "topic echo"),
+     ("ost.ini", "[front]\n\ncamera matrix\n480 0 320\n", "give the .yaml"),
+     ("rig.ini", "[front]\n", "a file .ini is of no known format; known are those of Kalibr")],
+)  # fmt: skip
+def test_a_file_of_no_known_format_is_one_short_line(
+    name: str, text: str, words: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(CalibrationError, match=words) as caught:
+        import_rig([tmp_path / name])
+    assert len(str(caught.value)) < 300 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("joint", "limit", "words"),
+    [("revolute", '<limit lower="0.6" upper="2.2"/>', "from 0.6 to 2.2 rad.*outside its limits"),
+     ("prismatic", '<limit lower="-1" upper="1"/>', "from -1 to 1 m; it is taken at zero:"),
+     ("continuous", "", "can move; it is taken at zero:"),
+     ("fixed", "", "")],
+)  # fmt: skip
+def test_a_joint_that_can_move_is_noted_if_it_lies_between_lidar_and_camera(
+    joint: str, limit: str, words: str, tmp_path: Path
+) -> None:
+    def hung(child: str, parent: str, kind: str = "fixed", more: str = "") -> str:
+        return (
+            f'<link name="{child}"/><joint name="j_{child}" type="{kind}"><parent link="{parent}"/>'
+            f'<child link="{child}"/><origin xyz="0 0 1"/>{more}</joint>'
+        )
+
+    body = hung("velodyne", "base") + hung("mast", "base", joint, limit)
+    body += hung("front_optical_frame", "mast") + hung("wheel", "base", "continuous")
+    files = {"front__yaml": CAMERA_INFO, "car__urdf": f"<robot><link name='base'/>{body}</robot>"}
+    notes = read_rig_parts(write(tmp_path, **files)).notes
+    assert len(notes) == bool(words)
+    assert not words or re.search(f"j_mast.*{words}", notes[0])

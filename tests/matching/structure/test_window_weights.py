@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import itertools
-import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 import calibgraph
-from calibgraph import FileError, Rig, StructureMatcher
-from calibgraph.files import sha256
+from calibgraph import Rig
 from calibgraph.matching.structure.consensus import z_score
-from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.shift_scores import score_frame
 from calibgraph.matching.structure.window_kernels import FEATURES, ROOM, fill_features
-from calibgraph.matching.structure.window_weights import (
-    PACKAGE_FILE,
-    WindowNetwork,
-    load_window_network,
-    window_network,
-)
+from calibgraph.matching.structure.window_weights import WindowNetwork, window_network
 from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows
 from tests.conftest import SAMPLE, make_camera
+from tools.scenes.surroundings import build_meadow
 
 Array = NDArray[np.float64]
 
@@ -133,7 +124,7 @@ def test_weights_make_the_truth_stand_out_more_among_leaves(tmp_path: Path) -> N
     """On a rendered meadow that took no part in the training."""
     rig = Rig(cameras={"left": make_camera()})
     calibgraph.simulate_street(
-        tmp_path / "meadow", rig, frames=1, seed=5, vary_layout=True, surroundings="meadow"
+        tmp_path / "meadow", rig, frames=1, seed=5, vary_layout=True, build_scene=build_meadow
     )
     frame, camera = calibgraph.load_dataset(tmp_path / "meadow", rig).frames[0], rig.cameras["left"]
     gray = frame.load_gray("left", camera)
@@ -167,97 +158,3 @@ def test_weights_stay_within_0_and_1() -> None:
     network = WindowNetwork(np.zeros(1), np.ones(1), (layer,))
     weights = network.weights(np.array([[-9.0], [0.0], [9.0]]))
     assert 0 < weights[0] < 1e-4 and weights[1] == 0.5 and 1 - 1e-4 < weights[2] <= 1
-
-
-def test_a_network_is_read_as_it_was_written(tmp_path: Path) -> None:
-    rng, path = np.random.default_rng(4), tmp_path / "own.json"
-    layers = tuple((rng.normal(size=size), rng.normal(size=size[1])) for size in ((14, 5), (5, 1)))
-    WindowNetwork(rng.normal(size=14), rng.uniform(1, 2, 14), layers, how="a test").save(path)
-    read = load_window_network(path)
-    read.save(tmp_path / "again.json")
-    assert (tmp_path / "again.json").read_bytes() == path.read_bytes()
-    assert read.how == "a test" and read.sha256 == sha256(path)
-    assert [matrix.shape for matrix, _ in read.layers] == [(14, 5), (5, 1)]
-
-
-def transpose(layer: dict[str, Any]) -> None:
-    layer["matrix"] = [list(column) for column in zip(*layer["matrix"], strict=True)]
-
-
-HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "other features": (lambda c: c["features"].reverse(), "features are not those"),
-    "a number that is none": (lambda c: c["mean"].__setitem__(3, float("nan")), "mean.3"),
-    "a number beyond": (lambda c: c["layers"][1]["bias"].__setitem__(0, 1e300), "layers.1.bias.0"),
-    "a spread of 0": (lambda c: c["spread"].__setitem__(0, 0), "spread.0"),
-    "a spread that overflows": (lambda c: c["spread"].__setitem__(0, 1e-300), "spread.0"),
-    "true for a number": (lambda c: c["mean"].__setitem__(0, True), "mean.0"),
-    "true for a spread": (lambda c: c["spread"].__setitem__(0, True), "spread.0"),
-    "a transposed matrix": (lambda c: transpose(c["layers"][0]), "do not fit"),
-    "a ragged row": (lambda c: c["layers"][0]["matrix"].__setitem__(0, [0.0] * 14), "do not fit"),
-    "a layer cut off": (lambda c: c["layers"].pop(), "do not fit"),
-    "a ragged matrix": (lambda c: c["layers"][0]["matrix"][2].pop(), "do not fit"),
-    "a short mean": (lambda c: c["mean"].pop(), "do not fit"),
-    "a wide layer": (lambda c: c["layers"][0]["bias"].extend([0.0] * 300), "layers.0.bias"),
-    "no layers": (lambda c: c.update(layers=[]), "layers"),
-    "an unknown key": (lambda c: c.update(exec="rm"), "unknown key 'exec'"),
-    "another format": (lambda c: c.update(format="calibgraph-window-weights/9"), "format"),
-    "a file of another kind": (lambda c: c.pop("format"), "no window weights: "),
-    "control characters": (lambda c: c.update(how="\x1b[2J"), "control characters"),
-    "text for a number": (lambda c: c["layers"][0]["bias"].__setitem__(0, "x"), "layers.0.bias.0"),
-}
-
-
-@pytest.mark.parametrize("kind", HOSTILE)
-def test_a_hostile_file_is_refused_in_one_line(tmp_path: Path, kind: str) -> None:
-    change, message = HOSTILE[kind]
-    content, path = json.loads(PACKAGE_FILE.read_text()), tmp_path / "bad.json"
-    change(content)
-    path.write_text(json.dumps(content))
-    with pytest.raises(FileError) as caught:
-        load_window_network(path)
-    assert message in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"\x00\xff" * 50, b"[" * 100_000, b"[1]", b'{"format": 1e999}']
-)
-def test_a_file_that_is_no_network_is_refused(tmp_path: Path, data: bytes) -> None:
-    path = tmp_path / "bad.json"
-    path.write_bytes(data)
-    with pytest.raises(FileError) as caught:
-        load_window_network(path)
-    assert "\n" not in str(caught.value)
-
-
-def test_the_matcher_uses_and_names_the_weights_of_a_file_or_none(tmp_path: Path) -> None:
-    path, shipped = tmp_path / "own.json", window_network()
-    matrix, bias = shipped.layers[-1]
-    opposite = replace(shipped, layers=(*shipped.layers[:-1], (-matrix, -bias)), how="opposite")
-    opposite.save(path)
-    data = calibgraph.load_dataset(SAMPLE).select("0")
-    others = (StructureMatcher(window_weights=file) for file in (path, None))
-    matchers = (StructureMatcher(), *others)
-    tables = [
-        matcher.match(
-            data, calibgraph.load_rig(SAMPLE / "reference.yaml"), round_index=5,
-            progress=lambda *_: None,
-        )
-        for matcher in matchers
-    ]  # fmt: skip
-    assert [table.metadata["window_weights"] for table in tables] == [
-        {"sha256": sha256(PACKAGE_FILE), "how": shipped.how},
-        {"sha256": sha256(path), "how": "opposite"},
-        {"how": "none: all windows count alike"},
-    ]
-    z_scores = [table.findings.z_score["front_left"] for table in tables]
-    assert len(set(z_scores)) == len(tables)
-
-
-def test_without_weights_all_windows_are_scored_alike() -> None:
-    data, rig = calibgraph.load_dataset(SAMPLE), calibgraph.load_rig(SAMPLE / "reference.yaml")
-    frame, (name, camera) = data.frames[0], next(iter(rig.cameras.items()))
-    cache = FrameCache()
-    gray, cloud = cache.image(frame, name, camera), cache.cloud(frame)
-    level = StructureMatcher(window_weights=None).levels[-1]
-    scores = score_frame(gray, cloud, camera, level, frame=0, max_windows=2000)
-    assert (scores.weights == np.rint(scores.weights)).all()  # numbers of windows

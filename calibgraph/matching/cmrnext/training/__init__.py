@@ -1,1 +1,0 @@
-"""Training of the matcher ``cmrnext`` on trusted extrinsics."""

@@ -1,0 +1,1 @@
+"""A reference by hand: pairs of a pixel and a LiDAR point, picked on a page, and their solve."""

@@ -1,0 +1,185 @@
+"""What the pairs determine: PnP by the paper's three solvers, then one solve of all cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from calibgraph.arrays import Array
+from calibgraph.errors import CalibrationError
+from calibgraph.model.config import Config
+from calibgraph.model.geometry import transform
+from calibgraph.model.rig import Camera, Rig
+from calibgraph.pick.session import Pair, to_table
+from calibgraph.pipeline import solve
+from calibgraph.solver.pnp import view_plane
+
+MIN_PAIRS = 6
+"""Of a camera, on different structures (paper, "Reference by manual picking")."""
+SOLVERS = {
+    "iterative": cv2.SOLVEPNP_ITERATIVE, "EPnP": cv2.SOLVEPNP_EPNP, "SQPnP": cv2.SOLVEPNP_SQPNP,
+}  # fmt: skip
+SOLVE = Config(
+    loss="l2", loss_scale_px=1.0, gate_px=1000.0, learnt_weights=False, grid_columns=400,
+    grid_rows=400, common_deg=0.0, common_cm=0.0,
+)  # fmt: skip
+"""Plain least squares over all pairs: with a dozen of them a robust loss would hide a wrong one.
+The picker removes it; :attr:`CameraEstimate.left_out_px` shows which it is."""
+_LINE_M = 0.05  # scatter of the points off a line, below which a camera turns about it
+_WRONG, _WRONG_PX = 5.0, 5.0  # of a left-out pair: times the median, and pixels
+
+
+@dataclass(frozen=True, eq=False)
+class CameraEstimate:
+    """What the pairs of one camera give.
+
+    Attributes:
+        solver: the one whose median error is least; empty if there is none.
+        solver_px: median error of each solver.
+        residuals_px: (n, 2) projected minus picked, at the estimate, or at the guess without one.
+        left_out_px: (n,) distance of each pair from the pose of all others; NaN if not known.
+        problem: why there is no estimate, in words.
+    """
+
+    solver: str
+    solver_px: dict[str, float]
+    residuals_px: Array
+    left_out_px: Array
+    problem: str
+
+    @property
+    def wrong(self) -> list[bool]:
+        """Which pairs contradict the others."""
+        limit = max(_WRONG_PX, _WRONG * float(np.median(self.left_out_px)))
+        return [bool(value > limit) for value in self.left_out_px]  # NaN is not above
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The rig that the pairs determine.
+
+    Attributes:
+        rig: of the cameras that are solved, with their covariances; None if none is.
+        cameras: by name, of each with pairs.
+    """
+
+    rig: Rig | None
+    cameras: dict[str, CameraEstimate] = field(default_factory=dict)
+
+
+def estimate_from_pairs(rig: Rig, pairs: Sequence[Pair]) -> Estimate:
+    """Estimate all cameras with enough pairs, jointly.
+
+    Args:
+        rig: lenses, the guess, and measured relative poses.
+        pairs: all of them.
+    """
+    of = {name: [pair for pair in pairs if pair.camera == name] for name in rig.cameras}
+    of = {name: some for name, some in of.items() if some}
+    poses = {name: _poses(rig.cameras[name], some) for name, some in of.items()}
+    starts = {name: next(iter(found.values()))[0] for name, found in poses.items() if found}
+    solved = _solve(rig, starts, [pair for name in starts for pair in of[name]]) if starts else None
+    cameras = {}
+    for name, some in of.items():
+        camera = (solved or rig).cameras[name] if name in starts else rig.cameras[name]
+        cameras[name] = CameraEstimate(
+            solver=next(iter(poses[name]), ""),
+            solver_px={solver: error for solver, (_, error) in poses[name].items()},
+            residuals_px=_residuals(camera, camera.T_camera_lidar, some),
+            left_out_px=_left_out(camera, some) if name in starts else np.full(len(some), np.nan),
+            problem="" if poses[name] else _problem(some),
+        )
+    return Estimate(solved, cameras)
+
+
+def _solve(rig: Rig, starts: dict[str, Array], pairs: Sequence[Pair]) -> Rig:
+    """The rig of these cameras, each with its covariance."""
+    ties = tuple(tie for tie in rig.relative_poses if {tie.a, tie.b} <= starts.keys())
+    part = rig.model_copy(
+        update={"cameras": {n: rig.cameras[n] for n in starts}, "relative_poses": ties}
+    )
+    found = solve(part.moved_to(starts), to_table(pairs), SOLVE, terms="reprojection")
+    cameras = {}
+    for name, camera in found.rig.cameras.items():
+        covariance, freedom = found.covariance[name], 2 * sum(p.camera == name for p in pairs) - 6
+        if covariance is not None:  # the scatter of few pairs is uncertain itself: Student's law
+            covariance = covariance * freedom / (freedom - 2)
+        cameras[name] = camera.model_copy(update={"covariance": covariance})
+    return found.rig.model_copy(update={"cameras": cameras})
+
+
+def reference_rig(estimate: Estimate) -> Rig:
+    """The rig of the cameras that the pairs determine.
+
+    Raises:
+        CalibrationError: if there is none.
+    """
+    if estimate.rig is None:
+        reasons = [f"{name}: {one.problem}" for name, one in estimate.cameras.items()]
+        raise CalibrationError(
+            f"the pairs determine no camera yet ({'; '.join(reasons) or 'there is none'}); pick at "
+            f"least {MIN_PAIRS} of one camera, on different structures"
+        )
+    return estimate.rig
+
+
+def _poses(camera: Camera, pairs: Sequence[Pair]) -> dict[str, tuple[Array, float]]:
+    """T_camera_lidar and median error [px] by each solver, the best first; none of few pairs."""
+    if len(pairs) < MIN_PAIRS or _problem(pairs):
+        return {}
+    found = {}
+    for name, method in SOLVERS.items():
+        T = _pnp(camera, pairs, method)
+        if T is not None:
+            found[name] = T, float(np.median(np.linalg.norm(_residuals(camera, T, pairs), axis=1)))
+    return dict(sorted(found.items(), key=lambda one: one[1][1]))
+
+
+def _pnp(camera: Camera, pairs: Sequence[Pair], method: int) -> Array | None:
+    pixels, points = _arrays(pairs)
+    turn, plane = view_plane(camera, pixels)
+    usable = np.isfinite(plane[:, 0])
+    if np.count_nonzero(usable) < MIN_PAIRS - 1:
+        return None
+    try:
+        found, turned, shift = cv2.solvePnP(
+            points[usable], plane[usable], np.eye(3), None, flags=method
+        )
+    except cv2.error:  # a degenerate layout
+        return None
+    T = transform(turn.T @ cv2.Rodrigues(turned)[0], turn.T @ shift.ravel())
+    return T if found and np.isfinite(T).all() else None
+
+
+def _left_out(camera: Camera, pairs: Sequence[Pair]) -> Array:
+    """(n,) distance [px] of each pair from the pose that all others give; NaN of too few."""
+    distances = np.full(len(pairs), np.nan)
+    for i, pair in enumerate(pairs if len(pairs) > MIN_PAIRS else ()):
+        others = [*pairs[:i], *pairs[i + 1 :]]
+        T = _pnp(camera, others, cv2.SOLVEPNP_SQPNP)
+        if T is not None:
+            distances[i] = np.linalg.norm(_residuals(camera, T, [pair]))
+    return distances
+
+
+def _residuals(camera: Camera, T: Array, pairs: Sequence[Pair]) -> Array:
+    """(n, 2) projected minus picked; infinite of points that the lens does not see."""
+    pixels, points = _arrays(pairs)
+    projected, valid = camera.lens.project(points @ T[:3, :3].T + T[:3, 3])
+    return np.where(valid[:, None], projected - pixels, np.inf)
+
+
+def _arrays(pairs: Sequence[Pair]) -> tuple[Array, Array]:
+    return np.array([p.pixel_px for p in pairs]), np.array([p.point_lidar_m for p in pairs])
+
+
+def _problem(pairs: Sequence[Pair]) -> str:
+    """Why pairs determine no pose; empty if they may."""
+    points = _arrays(pairs)[1]
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
+    if len(pairs) < MIN_PAIRS:
+        return f"{len(pairs)} of {MIN_PAIRS} pairs"
+    return "its points lie on one line" if np.hypot(*spread[1:]) < _LINE_M else ""

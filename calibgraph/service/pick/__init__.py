@@ -1,1 +1,0 @@
-"""A reference by hand: pairs of a pixel and a LiDAR point, and what they determine."""

@@ -1,0 +1,1 @@
+"""Scenes and lens errors for experiments; the package renders streets alone."""
