@@ -111,10 +111,17 @@ PoseCovariance = Annotated[
 
 def _checked_name(name: str) -> str:
     """A camera's name is part of file names and messages."""
-    if not re.fullmatch(r"[^/\\\x00-\x1f\x7f]{1,100}", name) or name in (".", ".."):
+    if not re.fullmatch(r"[^/\\]{1,100}", name) or not name.isprintable() or name in (".", ".."):
         raise ValueError(
-            f"camera name {name!r}: expected 1 to 100 characters without slashes, and not a dot"
+            f"camera name {name!r}: expected 1 to 100 printable characters without slashes, "
+            "and not a dot"
         )
+    return name
+
+
+def _require_printable(name: str) -> str:
+    if not name.isprintable():
+        raise ValueError(f"{name!r} holds characters that are not seen; rename it")
     return name
 
 
@@ -127,7 +134,7 @@ def _checked_model(name: Any) -> Any:
 
 
 CameraName = Annotated[str, AfterValidator(_checked_name)]
-FrameId = Annotated[str, Field(pattern=r"^\S{1,200}$")]
+FrameId = Annotated[str, Field(pattern=r"^\S{1,200}$"), AfterValidator(_require_printable)]
 Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # below, LM stalls
 Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

@@ -18,9 +18,8 @@ from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching import places
 from calibgraph.matching.places import Motion, PlaceFinder, PlaceWalk, find_places, motions
-from calibgraph.simulation.recording import Drive
 from tests.conftest import SAMPLE, make_camera
-from tests.matching.streets import displaced, scan_at
+from tests.matching.streets import STOPS, displaced, scan_at
 
 Array = NDArray[np.float64]
 
@@ -159,22 +158,22 @@ def test_a_frame_whose_motion_cannot_be_found_is_of_the_place_before(what: str) 
 # Places that were visited before
 
 
-def scanned(drive: Drive, folder: Path, poses: Iterable[Array], first: int = 0) -> list[Frame]:
+def scanned(folder: Path, poses: Iterable[Array], first: int = 0) -> list[Frame]:
     """Frames without images, numbered from the first; their noise is drawn by the number."""
     folder.mkdir(exist_ok=True)
     frames = []
     for number, T_world_lidar in enumerate(poses, start=first):
         path = folder / f"{number:06d}.npy"
-        np.save(path, scan_at(drive, T_world_lidar, seed=number))
+        np.save(path, scan_at(T_world_lidar, seed=number))
         frames.append(Frame(number, path.stem, path, {}))
     return frames
 
 
 @pytest.fixture(scope="module")
-def there_and_back(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> list[Frame]:
+def there_and_back(tmp_path_factory: pytest.TempPathFactory) -> list[Frame]:
     """Stops 9 m apart; no image shows how far it drove, so the clouds do."""
-    back = [displaced(T, left_m=2.5, turned_deg=180.0) for T in reversed(drive.T_world_lidar)]
-    return scanned(drive, tmp_path_factory.mktemp("scans"), [*drive.T_world_lidar, *back])
+    back = [displaced(T, left_m=2.5, turned_deg=180.0) for T in reversed(STOPS)]
+    return scanned(tmp_path_factory.mktemp("scans"), [*STOPS, *back])
 
 
 def walked(walk: PlaceWalk, frames: Iterable[Frame]) -> list[int]:
@@ -195,17 +194,17 @@ def test_a_restart_finds_the_same_places(there_and_back: list[Frame]) -> None:
     assert walked(again, there_and_back[3:]) == found[3:]
 
 
-def test_two_recordings_of_a_street_have_the_same_places(drive: Drive, tmp_path: Path) -> None:
-    once = scanned(drive, tmp_path / "once", drive.T_world_lidar[:4])
-    again = scanned(drive, tmp_path / "again", drive.T_world_lidar[:4], first=4)
+def test_two_recordings_of_a_street_have_the_same_places(tmp_path: Path) -> None:
+    once = scanned(tmp_path / "once", STOPS[:4])
+    again = scanned(tmp_path / "again", STOPS[:4], first=4)
     rig = Rig(cameras={"front": make_camera()})
     data = Dataset(rig=rig, frames=(*once, *again), folders=(tmp_path,))
     assert find_places(data, "front", rig.cameras["front"]) == [[0, 1, 2, 4, 5, 6], [3, 7]]
 
 
-def test_places_that_were_not_visited_lately_are_forgotten(drive: Drive, tmp_path: Path) -> None:
-    poses = [drive.T_world_lidar[stop] for stop in (0, 5, 0)]
-    frames = scanned(drive, tmp_path, poses)
+def test_places_that_were_not_visited_lately_are_forgotten(tmp_path: Path) -> None:
+    poses = [STOPS[stop] for stop in (0, 5, 0)]
+    frames = scanned(tmp_path, poses)
     for most_places, expected in ((2, [0, 1, 0]), (1, [0, 1, 2])):
         walk = PlaceWalk(most_places)
         steps = [None, driving(45.0), driving(-45.0)]
@@ -213,9 +212,9 @@ def test_places_that_were_not_visited_lately_are_forgotten(drive: Drive, tmp_pat
         assert found == expected
 
 
-def test_a_remembered_place_is_recognised(drive: Drive, tmp_path: Path) -> None:
-    poses = [drive.T_world_lidar[0], drive.T_world_lidar[5], drive.T_world_lidar[1]]
-    frames = scanned(drive, tmp_path, poses)
+def test_a_remembered_place_is_recognised(tmp_path: Path) -> None:
+    poses = [STOPS[0], STOPS[5], STOPS[1]]
+    frames = scanned(tmp_path, poses)
     walk = PlaceWalk()
     for frame in frames[:2]:
         walk.remember(frame)
