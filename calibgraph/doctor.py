@@ -221,7 +221,7 @@ def _examine_guess(
     frame, cloud = cloud_of
     doubts = find_doubts(data.rig, frame, cloud)
     intended = explain_guess(data, data.rig, cloud)
-    yield from [Finding("error", f"{intended}: correct it")] if intended else []
+    yield from [Finding("error", intended)] if intended else []
     yield from (Finding("error", text) for text in describe_out_of_view(seen))
     yield from (Finding("warning", text) for text in doubts)
     for name, count in seen.items():

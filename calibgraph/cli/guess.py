@@ -87,6 +87,7 @@ def bag(
     topic: TopicOption = None,
     tie_deg: Annotated[float | None, typer.Option(min=0.001)] = None,
     tie_m: Annotated[float | None, typer.Option(min=1e-5)] = None,
+    correct: list[str] | None = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the topics of a ROS bag, and write its rig: camera_info and /tf_static.
@@ -102,6 +103,7 @@ def bag(
     from calibgraph.io.formats.describe import describe_rig
     from calibgraph.model.plausibility import find_implausible
     from calibgraph.outputs import yaml_mark
+    from calibgraph.trust.conventions import correct_guess
 
     with checked_arguments():
         sigmas = _sigmas(tie_deg, tie_m)
@@ -111,7 +113,7 @@ def bag(
         for name, kind, count in topics:
             print_plain(terminal(), f"{name}  {kind}  {count}")
     read = read_bag_rig(path, options)
-    rig = read.to_rig(sigmas)
+    rig = correct_guess(read.to_rig(sigmas), correct or ())
     if out is not None:
         rig.save(out, first_line=yaml_mark("bag"))
     notes = [*doubtful_axes(rig), *read.notes]
