@@ -180,6 +180,7 @@ def import_(
         tie_m (M): The sigma in translation, per axis.
     """
     from calibgraph.io.formats.describe import describe_rig
+    from calibgraph.model.lens_knowledge import state_calibrated
     from calibgraph.outputs import yaml_mark
     from calibgraph.trust.conventions import correct_guess
 
@@ -190,7 +191,7 @@ def import_(
             relative_sigma_deg=tie_deg,
             relative_sigma_cm=100.0 * tie_m,
         )
-        rig = correct_guess(rig, correct or ())
+        rig = state_calibrated(correct_guess(rig, correct or ()))
     rig.save(out, first_line=yaml_mark("import"))
     print_doubts(rig, parts.notes)
     for sentence in describe_rig(rig):
