@@ -91,10 +91,15 @@ def init(
             dataset, out, mountings=words, lenses=known, forward=forward, replace=force
         )
     left = "FILL_IN" in path.read_text(encoding="utf-8").partition("\nformat:")[2]
-    first = "replace every FILL_IN, then run" if left else "next:"
-    print_plain(terminal(), f"{path}: written; {first} calibgraph doctor")
+    where = f"{dataset}" if out is None else f"{dataset} --rig {out}"
+    first = "replace every FILL_IN; then" if left else "next"
+    print_plain(terminal(), f"{path}: written; {first}: calibgraph doctor {where}")
     if any(how != CALIBRATION for how in known.values()):
-        print_plain(terminal(), "a lens is known to 2 %: calibrate with --estimate lens")
+        print_plain(
+            terminal(),
+            "a lens from a spec sheet or a field of view is known to 2 %, so estimate it: "
+            f"calibgraph calibrate {where} --estimate lens",
+        )
 
 
 def _lenses(given: list[str] | None, cameras: list[str]) -> dict[str, str]:
@@ -102,7 +107,7 @@ def _lenses(given: list[str] | None, cameras: list[str]) -> dict[str, str]:
     from calibgraph.guessing.lens_words import CALIBRATION, LENS_GRAMMAR
 
     for_all = [how for how in given or () if "=" not in how]
-    if not given and sys.stdin.isatty() and sys.stderr.isatty():
+    if not given and _is_terminal():
         answers = [CALIBRATION]
         for name in cameras:
             question = f"{name}: how is its lens known? {LENS_GRAMMAR}"
@@ -110,6 +115,10 @@ def _lenses(given: list[str] | None, cameras: list[str]) -> dict[str, str]:
         return dict(zip(cameras, answers[1:], strict=True))
     named = parse_names("--lens", [how for how in given or () if "=" in how])
     return dict.fromkeys(cameras, for_all[-1] if for_all else CALIBRATION) | named
+
+
+def _is_terminal() -> bool:
+    return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def bag(

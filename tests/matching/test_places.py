@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph import Dataset, Rig
@@ -18,6 +19,7 @@ from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching import places
 from calibgraph.matching.places import Motion, PlaceFinder, PlaceWalk, find_places, motions
+from calibgraph.model.geometry import invert, transform
 from calibgraph.simulation.recording import Drive
 from tests.conftest import SAMPLE, make_camera
 from tests.matching.streets import displaced, scan_at
@@ -69,6 +71,33 @@ def test_another_recording_is_another_place(monkeypatch: pytest.MonkeyPatch) -> 
     data = replace(data, frames=(*data.frames[:3], *elsewhere))
     monkeypatch.setattr(places, "motions", lambda *_, **__: [None] * 5)
     assert find_places(data, data.rig, name) == [[0, 1, 2], [3, 4, 5]]
+
+
+@pytest.mark.parametrize("axes", [("y", 180.0), ("x", 90.0), ("y", 45.0)])
+def test_the_places_do_not_depend_on_the_axes_of_the_clouds(
+    axes: tuple[str, float], tmp_path: Path
+) -> None:
+    """Upside down, on its side and tilted, with a rig that fits."""
+    data, name = sample()
+    T_axes_lidar = transform(Rotation.from_euler(*axes, degrees=True))
+    turned = []
+    for frame in data.frames:
+        cloud = np.load(frame.cloud_path)
+        cloud[:, :3] = cloud[:, :3] @ T_axes_lidar[:3, :3].T
+        np.save(tmp_path / frame.cloud_path.name, cloud)
+        turned.append(replace(frame, cloud_path=tmp_path / frame.cloud_path.name))
+    T = {n: T @ invert(T_axes_lidar) for n, T in data.rig.T_camera_lidar.items()}
+    other = replace(data, frames=tuple(turned))
+    expected = find_places(data, data.rig, name)
+    assert len(expected) == 2
+    assert find_places(other, data.rig.moved_to(T), name) == expected
+
+
+def test_where_up_is_unknown_frames_are_of_one_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, name = sample()
+    monkeypatch.setattr(places, "motions", lambda *_, **__: [None] * 5)
+    monkeypatch.setattr(places, "find_up", aligned_with_none)
+    assert find_places(data, data.rig, name) == [[0, 1, 2, 3, 4, 5]]
 
 
 def test_a_vehicle_that_stands_does_not_move() -> None:
