@@ -47,8 +47,9 @@ def describe_other_frame(guess: Mapping[str, Array], results: Mapping[str, Array
     x, y, z = first[:3, 3]
     moved = "the camera is" if alone else "all cameras are"
     return (
-        f"{moved} moved as if the guess were of another frame of the vehicle, as base_link, with "
-        f"the LiDAR at x {x:.2f}, y {y:.2f}, z {z:.2f} m: put this pose between both"
+        f"{moved} moved as if the guess were of another frame of the vehicle, as base_link, in "
+        f"which the LiDAR is at x {x:.2f}, y {y:.2f}, z {z:.2f} m: multiply its T_camera_lidar by "
+        "this pose from the right"
     )
 
 
