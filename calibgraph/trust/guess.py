@@ -12,64 +12,29 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import angle_deg, invert, pose_difference, relative_transform
+from calibgraph.model.geometry import (
+    angle_deg,
+    invert,
+    pose_difference,
+    relative_transform,
+    transform,
+)
 from calibgraph.model.verdict import Check
 from calibgraph.trust.conventions import convention_error_between, in_words
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import limit, threshold
 
-_FRAME_M, _ALIKE_DEG, _ALIKE_CM = 1.0, 5.0, 50.0
-"""From how far on a motion of all cameras is that of a frame, and how alike it is, of rough guesses
-(the sample's are 2 deg and 20 cm off)."""
-
-
-def describe_other_frame(guess: Mapping[str, Array], results: Mapping[str, Array]) -> str:
-    """The frame of the guesses, where all cameras are moved alike; empty if they are not.
-
-    A single camera is if it is moved without a turn.
-
-    Args:
-        guess: (4, 4) T_camera_lidar.
-        results: (4, 4) T_camera_lidar of the cameras to compare.
-    """
-    T_frame_lidar = [invert(guess[name]) @ T for name, T in results.items()]
-    if not T_frame_lidar:
-        return ""
-    first, alone = T_frame_lidar[0], len(T_frame_lidar) == 1
-    unturned = first.copy()
-    unturned[:3, :3] = np.eye(3)
-    apart = [pose_difference(first, T) for T in (T_frame_lidar[1:] if not alone else [unturned])]
-    if np.linalg.norm(first[:3, 3]) < _FRAME_M or not all(
-        degrees < _ALIKE_DEG and centimetres < _ALIKE_CM for degrees, centimetres in apart
-    ):
-        return ""
-    x, y, z = first[:3, 3]
-    moved = "the camera is" if alone else "all cameras are"
-    return (
-        f"{moved} moved as if the guess were of another frame of the vehicle, as base_link, in "
-        f"which the LiDAR is at x {x:.2f}, y {y:.2f}, z {z:.2f} m: multiply its T_camera_lidar by "
-        "this pose from the right"
-    )
-
 
 def guess_checks(evidence: Evidence) -> Checks:
     """Whether a result is so far from its guess that the guess follows another convention."""
-    guess, results = evidence.guess.T_camera_lidar, evidence.solution.T_camera_lidar
-    frame = describe_other_frame(guess, _found(results, evidence.findings))
     return {
-        name: compare_with_guess(guess[name], T, evidence.findings, frame)
-        for name, T in results.items()
+        name: compare_with_guess(evidence.guess.T_camera_lidar[name], T, evidence.findings)
+        for name, T in evidence.solution.T_camera_lidar.items()
     }
 
 
-def _found(results: Mapping[str, Array], findings: MatcherFindings) -> dict[str, Array]:
-    return {name: T for name, T in results.items() if name not in findings.missed}
-
-
-def compare_with_guess(
-    guess: Array, result: Array, findings: MatcherFindings, frame: str = ""
-) -> list[Check]:
+def compare_with_guess(guess: Array, result: Array, findings: MatcherFindings) -> list[Check]:
     """The distance of one camera's result from its guess, and the guess's length.
 
     A result may lie as far away as its matcher searches.
@@ -78,7 +43,6 @@ def compare_with_guess(
         guess: (4, 4) T_camera_lidar.
         result: (4, 4) T_camera_lidar.
         findings: of the matcher, with its range.
-        frame: as of :func:`describe_other_frame`.
     """
     rotation, translation = threshold("guess_rotation"), threshold("guess_translation")
     range_deg = math.sqrt(3) * (findings.range_rotation_deg or 0.0)
@@ -91,7 +55,7 @@ def compare_with_guess(
     )
     is_far = any(row.grade(value) != "PASS" for row, value in rows)
     error = convention_error_between(guess, result) if is_far else None
-    advice = frame if error is None else f"it seems that {in_words(error)}"
+    advice = "" if error is None else f"it seems that {in_words(error)}"
     return [
         *(row.check(value, advice=advice) for row, value in rows),
         threshold("guess_length").check(float(np.linalg.norm(guess[:3, 3]))),
@@ -100,8 +64,8 @@ def compare_with_guess(
 
 def swap_checks(evidence: Evidence) -> Checks:
     """Whether a camera ended where another one's guess is; of those that have been found."""
-    guesses = evidence.guess.T_camera_lidar
-    results = _found(evidence.solution.T_camera_lidar, evidence.findings)
+    guesses, missed = evidence.guess.T_camera_lidar, evidence.findings.missed
+    results = {n: T for n, T in evidence.solution.T_camera_lidar.items() if n not in missed}
     return {name: compare_with_other_guesses(name, guesses, results) for name in results}
 
 
@@ -165,11 +129,45 @@ def _lengths(points: Array) -> Array:
     return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
+_FRAME_M, _ALIKE_DEG, _ALIKE_CM = 1.0, 5.0, 50.0
+"""From how far on a motion of all cameras is that of a frame, and how alike it is, of rough guesses
+(the sample's are 2 deg and 20 cm off)."""
+
+
+def describe_other_frame(guess: Mapping[str, Array], results: Mapping[str, Array]) -> str:
+    """The frame of the guesses, where all cameras are moved alike; empty if they are not.
+
+    A single camera is if it is moved without a turn.
+
+    Args:
+        guess: (4, 4) T_camera_lidar.
+        results: (4, 4) T_camera_lidar of the cameras to compare.
+    """
+    T_frame_lidar = [invert(guess[name]) @ T for name, T in results.items()]
+    if not T_frame_lidar:
+        return ""
+    first = T_frame_lidar[0]
+    others = T_frame_lidar[1:] or [transform(np.eye(3), first[:3, 3])]
+    apart = [pose_difference(first, T) for T in others]
+    if np.linalg.norm(first[:3, 3]) < _FRAME_M or not all(
+        degrees < _ALIKE_DEG and centimetres < _ALIKE_CM for degrees, centimetres in apart
+    ):
+        return ""
+    x, y, z = first[:3, 3]
+    moved = "the camera is" if len(results) == 1 else "all cameras are"
+    return (
+        f"{moved} moved as if the guess were of another frame of the vehicle, as base_link, in "
+        f"which the LiDAR is at x {x:.2f}, y {y:.2f}, z {z:.2f} m: multiply its T_camera_lidar by "
+        "this pose from the right"
+    )
+
+
 def range_checks(evidence: RunEvidence) -> Checks:
     """Whether a result lies within the matcher's range around the guess."""
     findings, guess = evidence.run.correspondences.findings, evidence.run.guess.T_camera_lidar
     results = evidence.run.solution.T_camera_lidar
-    frame = describe_other_frame(guess, _found(results, findings))
+    found = {name: T for name, T in results.items() if name not in findings.missed}
+    frame = describe_other_frame(guess, found)
     return {
         name: compare_with_range(guess[name], T, findings, frame) for name, T in results.items()
     }
