@@ -49,6 +49,8 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
         f"the matcher reports as common to its frames; {result.not_included}"
         f"{result.verdict.images_note}; A->B: of the transform from A to B, in B's axes"
     )
+    if result.unstated_lenses:
+        print_plain(console, result.unstated_lenses)
     if result.lens:
         console.print(lens_table(result))
     time = f"{sum(result.timings_s.values()):.1f} s; " if result.timings_s else ""

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from calibgraph.model.config import Config
-from calibgraph.model.lens_knowledge import describe_unstated
 from calibgraph.model.rig import Rig
 from calibgraph.model.threshold import in_unit
 
@@ -145,8 +144,4 @@ def left_out(config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool
     others = [] if times else ["of the time of the images"]
     others += [] if rig.relative_poses else ["of the clouds' scale"]
     joint = ", and " if is_mount or len(others) > 1 else " and "
-    unstated = "" if free else describe_unstated(rig)
-    return "; ".join(
-        [f"{joint.join([', '.join([lens, *others[:-1]]), *others[-1:]])} are not included"]
-        + ([unstated] if unstated else [])
-    )
+    return f"{joint.join([', '.join([lens, *others[:-1]]), *others[-1:]])} are not included"

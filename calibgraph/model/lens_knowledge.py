@@ -53,5 +53,6 @@ def describe_unstated(rig: Rig) -> str:
     ]
     if not names:
         return ""
-    lenses = "all lenses" if len(names) == len(rig.cameras) else f"the lenses of {', '.join(names)}"
-    return f"{lenses} count as calibrated, since the rig states no intrinsics_sigma_px"
+    return (
+        f"lens of {', '.join(names)}: counts as calibrated (the rig states no intrinsics_sigma_px)"
+    )

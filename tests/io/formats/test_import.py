@@ -18,6 +18,7 @@ from calibgraph import (
     import_rig,
     load_rig,
 )
+from calibgraph.model.rig import KNOWLEDGE, IntrinsicsSigma
 from tests.conftest import KANNALA, RADTAN5, RADTAN8, make_camera, stereo_relative_pose
 from tests.io.formats.calibration_files import (
     CAMERA_INFO,
@@ -251,3 +252,22 @@ def test_two_files_that_differ_are_refused(tmp_path: Path) -> None:
     files = write(tmp_path, a__yaml=CAMERA_INFO, b__yaml=other, kit__yaml=SENSOR_KIT)
     with pytest.raises(CalibrationError, match="another lens of camera 'front'"):
         import_rig(files)
+
+
+def test_what_a_rig_states_of_lens_and_times_survives_an_import(tmp_path: Path) -> None:
+    """Sigmas and read-out, with which a corrected guess is written again."""
+    camera = make_camera().model_copy(
+        update={
+            "intrinsics_sigma_px": IntrinsicsSigma(focal=3.0, centre=4.0),
+            "distortion_sigma": 0.01,
+            "time_offset_s": 0.02,
+            "time_offset_sigma_s": 0.005,
+            "readout_s": 0.03,
+            "readout_sigma_s": 0.002,
+        }
+    )
+    Rig(cameras={"front": camera}).save(tmp_path / "rig.yaml")
+    found = import_rig([tmp_path / "rig.yaml"]).cameras["front"]
+    assert {name: getattr(found, name) for name in KNOWLEDGE} == {
+        name: getattr(camera, name) for name in KNOWLEDGE
+    }
