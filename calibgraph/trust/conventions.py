@@ -245,14 +245,14 @@ class _Trial:
             k = k.model_copy(update={"cx": camera.width_px - 1 - k.cx})
             cameras[name] = camera.model_copy(update={"intrinsics_px": k})
         trial = _Trial(frames, self.guess.model_copy(update={"cameras": cameras}))
-        for name, T in lost.items():
-            found = trial._refine(trial._approach(name, T))
-            if _is_accepted(found) and _gains(found, given[name]):
-                return (
-                    f"the images of {name} are mirrored: record them unmirrored, or flip the files "
-                    "left to right"
-                )
-        return None
+        found = {name: trial._refine(trial._approach(name, T)) for name, T in lost.items()}
+        names = [n for n, one in found.items() if _is_accepted(one) and _gains(one, given[n])]
+        if not names:
+            return None
+        return (
+            f"the images of {' and '.join(names)} are mirrored: record them unmirrored, or flip "
+            "the files left to right"
+        )
 
     def _is_better(self, name: str, found: Candidate, given: Candidate) -> bool:
         """Whether a pose agrees better than the guess, which no search from there would reach."""
