@@ -52,8 +52,8 @@ Motion = NDArray[np.float64] | None
 
 
 UNKNOWN_UP = (
-    "which way is up in the clouds is unknown, so that they are not compared: frames are of one "
-    "place unless images show a way of over 20 m"
+    "which way is up in the clouds is unknown, so that they are not compared: all frames are taken "
+    "to be of one place"
 )
 
 
@@ -130,7 +130,7 @@ class PlaceWalk:
         if found and _distance_m(found[1]) <= PLACE_M:
             self._first, self._T_now_first = known[found[0]], found[1]
             self._visit(self._first, self._known[self._first])
-        elif found or not may_stay:
+        elif self._first < 0 or not (may_stay or self._R_up_lidar is None) or found:
             self._first, self._T_now_first = frame.index, np.eye(4)
             self._visit(frame.index, cloud)
 

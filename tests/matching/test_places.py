@@ -95,7 +95,8 @@ def test_the_places_do_not_depend_on_the_axes_of_the_clouds(
 
 def test_where_up_is_unknown_frames_are_of_one_place(monkeypatch: pytest.MonkeyPatch) -> None:
     data, name = sample()
-    monkeypatch.setattr(places, "motions", lambda *_, **__: [None] * 5)
+    steps = [None, driving(30.0), None, driving(9.0), driving(30.0)]
+    monkeypatch.setattr(places, "motions", lambda *_, **__: steps)
     monkeypatch.setattr(places, "find_up", aligned_with_none)
     assert find_places(data, data.rig, name) == [[0, 1, 2, 3, 4, 5]]
 
