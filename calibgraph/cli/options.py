@@ -3,6 +3,8 @@
 Args:
     as_json: Print JSON on stdout.
     config (FILE): Settings of the solve, YAML.
+    correct ([CAMERA=]MISTAKE): Undo a mistake of the guess, by the name that doctor gives it, as
+        inverse or camera-flu; of all cameras or of one. May be repeated.
     dataset (DATASET...): Dataset folder (rig.yaml, lidar/, cameras/NAME/), KITTI odometry sequence
         or raw drive, nuScenes folder or scene, or ROS bag; several of one rig are calibrated
         together.

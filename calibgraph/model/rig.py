@@ -146,14 +146,9 @@ class _Model(StrictNumbers):
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
 
-_LEFT_OUT = (
-    "covariance",
-    "frame_id",
-    "mount",
-    "intrinsics_sigma_px",
-    "distortion_sigma",
-    *IMAGE_TIMES,
-)
+KNOWLEDGE = "intrinsics_sigma_px", "distortion_sigma", *IMAGE_TIMES
+"""Fields of a camera on its times, and how well these and the lens are known."""
+_LEFT_OUT = "covariance", "frame_id", "mount", *KNOWLEDGE
 """Of a camera, where they are None."""
 
 _LENS = "intrinsics_px", "distortion", "time_offset_s", "readout_s"

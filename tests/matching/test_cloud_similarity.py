@@ -7,8 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calibgraph.matching.cloud_similarity import UprightCloud, align_with_any
-from calibgraph.model.geometry import invert
+from calibgraph.io.rigs import load_rig
+from calibgraph.matching.cloud_similarity import Z_UP, UprightCloud, align_with_any, find_up
+from calibgraph.model.geometry import invert, transform
 from tests.conftest import SAMPLE
 from tests.matching.streets import STOPS, displaced, scan_at
 
@@ -57,3 +58,34 @@ def test_where_nothing_is_upright_nothing_is_known() -> None:
             align_with_any(UprightCloud.from_cloud(cloud), [UprightCloud.from_cloud(cloud)]) is None
         )
     assert align_with_any(UprightCloud.from_cloud(flat), []) is None
+
+
+AXES = {
+    "optical": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+    "on its side": Rotation.from_euler("x", 90, degrees=True).as_matrix(),
+    "upside down": Rotation.from_euler("x", 180, degrees=True).as_matrix(),
+    "tilted": Rotation.from_euler("yx", (45, 20), degrees=True).as_matrix(),
+}
+
+
+@pytest.mark.parametrize("axes", AXES)
+def test_up_is_found_in_clouds_of_other_axes_by_cameras_and_ground(axes: str) -> None:
+    """To 3 deg, as exactly as the ground is level; with z up nothing is turned, to the last bit."""
+    rig, cloud = load_rig(SAMPLE / "reference.yaml"), np.load(SAMPLE / "lidar" / "000000.npy")
+    cameras = [*rig.T_camera_lidar.values()]
+    assert find_up(cloud, cameras) is Z_UP
+    T_axes_lidar = transform(AXES[axes])
+    turned = cloud[:, :3] @ AXES[axes].T
+    R_up_axes = find_up(turned, [T @ invert(T_axes_lidar) for T in cameras])
+    assert R_up_axes is not None
+    assert (R_up_axes @ AXES[axes])[2, 2] > np.cos(np.radians(3.0))
+
+
+def test_z_stays_up_for_a_camera_on_its_side_and_nothing_is_up_without_a_ground() -> None:
+    rig, cloud = load_rig(SAMPLE / "reference.yaml"), np.load(SAMPLE / "lidar" / "000000.npy")
+    rolled = transform(Rotation.from_euler("z", 90, degrees=True))
+    portrait = [rolled @ T for T in rig.T_camera_lidar.values()]
+    assert find_up(cloud, portrait) is Z_UP
+    noise = np.random.default_rng(0).normal(0.0, 5.0, (5000, 3))
+    assert find_up(noise, portrait) is None
+    assert find_up(noise[:10], portrait) is None

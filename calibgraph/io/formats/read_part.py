@@ -33,7 +33,7 @@ from calibgraph.io.formats.ros_transforms import (
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rigs import is_exported_rig, read_rig
-from calibgraph.model.rig import Camera
+from calibgraph.model.rig import KNOWLEDGE, Camera
 
 _MAX_BYTES, _HEAD_BYTES = 32 * 2**20, 2**16
 _COLMAP_NAME = "cameras.txt"
@@ -177,4 +177,5 @@ def _part_of_rig(path: Path) -> Part:
 
 def _lens(camera: Camera) -> CameraLens:
     size = (camera.width_px, camera.height_px)
-    return CameraLens(camera.model, size, camera.intrinsics_px, camera.distortion)
+    stated = {name: getattr(camera, name) for name in KNOWLEDGE}
+    return CameraLens(camera.model, size, camera.intrinsics_px, camera.distortion, stated=stated)
