@@ -16,9 +16,10 @@ from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
+from calibgraph.matching.cloud_similarity import find_up
 from calibgraph.matching.frame_choice import FrameChoice, choose_frames, without_copies
 from calibgraph.matching.named import find_matcher
-from calibgraph.matching.places import find_places
+from calibgraph.matching.places import UNKNOWN_UP, find_places
 from calibgraph.matching.protocol import Matcher
 from calibgraph.matching.run import (
     MatchingRun,
@@ -128,7 +129,8 @@ def assign_places(run: MatchingRun) -> MatchingRun:
         return run
     camera, config = max(found, key=lambda name: found[name]), run.solution.config
     try:
-        groups = find_places(run.dataset, camera, rig.cameras[camera], seed=config.seed)
+        groups = find_places(run.dataset, rig, camera, seed=config.seed)
+        up = find_up(run.dataset.frames[0].load_cloud(), rig.T_camera_lidar.values())
     except (CalibrationError, OSError):  # the checks on images report it
         return run
     places = replace(run.correspondences.places, places=as_groups(groups))
@@ -140,7 +142,8 @@ def assign_places(run: MatchingRun) -> MatchingRun:
         run.solution.terms,
         camera_matches=run.solution.camera_matches,
     )
-    return replace(run, correspondences=table, solution=solution)
+    warnings = run.warnings if up is not None else (*run.warnings, UNKNOWN_UP)
+    return replace(run, correspondences=table, solution=solution, warnings=warnings)
 
 
 def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[FrameChoice, Rig]:

@@ -89,7 +89,7 @@ def test_a_vehicle_that_stands_is_named(folder: Path) -> None:
             shutil.copy(camera / "000002.jpg", camera / f"{name}.jpg")
     warnings = texts(diagnose([folder]), "warning")
     assert warnings[-1].startswith(
-        "6 frames are of 4 places: the vehicle stands, as in 3 frames from 000002 to 000004;"
+        "6 frames count as 4: the vehicle stands, as in 3 frames from 000002 to 000004;"
     )
 
 
@@ -100,8 +100,8 @@ def test_a_guess_in_millimetres_is_named_by_what_the_images_show_first() -> None
     found = diagnose([SAMPLE], rig.moved_to({"left": T}))
     assert found.points_in_image["left"] == 0
     assert texts(found, "error") == [
-        "the images of left fit clearly better if the guess has a translation in millimetres: "
-        "correct it",
+        "the images of left fit clearly better if the guess has a translation in millimetres; undo "
+        "it with calibgraph import RIG --correct left=millimetres --out FILE.yaml",
         "left: by the guess, no point of the cloud lies in the image",
     ]
     assert texts(found, "warning") == [
@@ -119,7 +119,8 @@ def test_axes_of_the_lidar_turned_about_z_are_the_only_hint(folder: Path) -> Non
     errors = texts(diagnose([folder], frames="0"), "error")
     assert errors[0] == (
         "the images fit clearly better if the LiDAR's axes are turned by 180 deg about z (its x "
-        "points backward): correct it"
+        "points behind, y right, z up); undo it with calibgraph import RIG --correct "
+        "cloud-behind-right-up --out FILE.yaml"
     )
     assert all("no point of the cloud lies in the image" in error for error in errors[1:])
 

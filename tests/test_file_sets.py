@@ -6,6 +6,7 @@ import errno
 import subprocess
 import sys
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -42,6 +43,25 @@ def test_files_that_are_written_together_appear_together_or_not_at_all(tmp_path:
     write_all(tmp_path, "new")
     assert texts(tmp_path) == dict.fromkeys(NAMES, "new")
     assert len([*tmp_path.iterdir()]) == len(NAMES)
+
+
+def test_two_sets_are_not_mixed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second one waits while the files of the first are moved."""
+    replace, moved = Path.replace, list[Path]()
+    second = Thread(target=write_all, args=(tmp_path, "second"))
+
+    def move(path: Path, target: Path) -> Path:
+        if target.parent == tmp_path:
+            moved.append(target)
+            if len(moved) == 2:
+                second.start()
+                second.join(0.3)
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", move)
+    write_all(tmp_path, "first")
+    second.join()
+    assert texts(tmp_path) == dict.fromkeys(NAMES, "second")
 
 
 def test_the_last_file_is_moved_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

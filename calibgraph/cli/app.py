@@ -175,10 +175,12 @@ def _repeat_weights_option(arguments: Iterable[str]) -> Iterator[str]:
 
 
 def _one_line(error: Exception) -> str:
+    from calibgraph.errors import printable
+
     if isinstance(error, OSError) and error.filename:
-        return f"{error.filename}: {error.strerror}"
+        return printable(f"{error.filename}: {error.strerror}")
     text = error.format_message() if hasattr(error, "format_message") else str(error)
-    return " ".join(text.split()).removesuffix(".") + _help_hint(error)
+    return printable(" ".join(text.split())).removesuffix(".") + _help_hint(error)
 
 
 def _crash(error: Exception) -> str:

@@ -218,7 +218,7 @@ def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
 def _with_bag(data: Dataset, path: Path, prefix: str, options: BagOptions) -> Dataset:
     """The dataset with the frames of a bag."""
     start = _next_index(data)
-    found = frames_of_bag(path, list(data.rig.cameras), options)
+    found = frames_of_bag(path, data.rig.cameras, options)
     find = None if options.motion == "none" else motion_finder(path, found.recorded, options)
     recorded = tuple(_bag_frame(each, start, prefix, find) for each in found.recorded)
     data = replace(data, notes=(*data.notes, f"{path}: {found.summary}"))
@@ -303,7 +303,7 @@ def _require_same_lenses(first: Path, rig: Rig, path: Path, other: Rig) -> None:
     """Check that two rigs differ in their extrinsics at most."""
     lenses = [
         {
-            name: camera.model_dump(exclude={"T_camera_lidar", "covariance", "frame_id"})
+            name: camera.model_dump(exclude={"T_camera_lidar", "covariance", "frame_id", "mount"})
             for name, camera in r.cameras.items()
         }
         for r in (rig, other)

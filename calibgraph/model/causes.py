@@ -50,7 +50,7 @@ CAUSES: dict[str, Cause] = {
         "Correct the guess: T_camera_lidar maps LiDAR points to x right, y down, z ahead, in "
         "metres.",
         {
-            "convention of the guess": "Undo the named error in the guess's T_camera_lidar, and "
+            "convention of the guess": "Undo the named mistake, and "
             "calibrate again.",
             "guess_rotation": "", "guess_translation": "",
             "guess_length": "Give the translation of T_camera_lidar in metres.",

@@ -133,8 +133,7 @@ def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:
     error = likely_intended_guess(evidence.run.dataset, evidence.run.guess)
     if error is None:
         return {}
-    text = f"{error}: correct it and calibrate again"
-    check = Check("convention of the guess", "FAIL", text)
+    check = Check("convention of the guess", "FAIL", error)
     return dict.fromkeys(failed, [check])
 
 

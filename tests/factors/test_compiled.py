@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,7 @@ NOT_IN_KERNELS = {
 }  # fmt: skip
 """What files with kernels import from files without, for functions that are no kernels."""
 HUBER = "(8.0, 0.6666666666666666)"  # 2 k r - k^2 and k / r at r = 3, k = 2
-NOT_KEPT = "calibgraph: compiled code cannot be kept ("
+NOT_KEPT = "calibgraph: compiled code is not kept ("
 
 # Root may write anywhere; without its capabilities it is held to the permissions like others.
 WITHOUT_PRIVILEGES = ["setpriv", "--bounding-set", "-all", "--inh-caps", "-all"]
@@ -83,10 +84,12 @@ def read_only(tmp_path: Path) -> Path:
 
 
 def test_a_second_process_does_not_compile_again(tmp_path: Path) -> None:
-    """The folder is made where there is none."""
-    folder = str(tmp_path / "new" / "cache")
-    found = [run(LOSS, NUMBA_CACHE_DIR=folder) for _ in range(2)]
+    """The folders are made where there are none, for the user alone."""
+    cache = tmp_path / "new" / "cache"
+    found = [run(LOSS, NUMBA_CACHE_DIR=str(cache)) for _ in range(2)]
     assert found == [(f"{HUBER} 0", ""), (f"{HUBER} 1", "")]
+    made = cache.parent, cache, *cache.iterdir()
+    assert {each.stat().st_mode & 0o777 for each in made} == {0o700}
 
 
 def test_a_second_process_finds_the_kernels_of_a_lens(tmp_path: Path) -> None:
@@ -128,6 +131,34 @@ def test_with_a_read_only_folder_kernels_are_compiled_in_memory_and_one_line_rep
     assert err.startswith(NOT_KEPT) and err.count("\n") == 1
     assert "Permission denied" in err and "set NUMBA_CACHE_DIR" in err
     assert [*read_only.iterdir()] == []
+
+
+BY_ANOTHER = "import os; os.geteuid = lambda: 4242\n"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "code", "why"),
+    [
+        (lambda index: index.parents[1].chmod(0o777), LOSS, ": others may write it"),
+        (lambda index: index.parents[2].chmod(0o777), LOSS, ": others may write it"),
+        (lambda index: index.chmod(0o666), LOSS, ": others may write it"),
+        (lambda index: index.symlink_to(index.rename(index.with_name("x"))), LOSS, ": others may"),
+        (lambda index: None, BY_ANOTHER + LOSS, ": belongs to another user)"),
+    ],
+    ids=["folder", "folder above", "file", "link", "another user's"],
+)
+def test_code_that_another_user_may_have_written_is_not_loaded(
+    tmp_path: Path, spoil: Callable[[Path], object], code: str, why: str
+) -> None:
+    """numba's index is a pickle: this one would make a file."""
+    cache, made = tmp_path / "above" / "cache", tmp_path / "made"
+    run(LOSS, NUMBA_CACHE_DIR=str(cache))
+    (index,) = cache.rglob("*loss_and_weight*.nbi")
+    index.write_bytes(b"cbuiltins\nopen\n(V%b\nVw\ntR." % bytes(made))
+    spoil(index)
+    out, err = run(code, NUMBA_CACHE_DIR=str(cache))
+    assert out == f"{HUBER} 0" and not made.exists()
+    assert err.startswith(NOT_KEPT) and err.count("\n") == 1 and why in err
 
 
 def test_a_file_in_the_place_of_the_folder_is_reported_in_one_line(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from calibgraph import (
     load_rig,
     simulate_correspondences,
 )
-from calibgraph.errors import CalibrationError, FileError
+from calibgraph.errors import CalibrationError, FileError, MotionError
 from calibgraph.matching.run import with_motion
 from calibgraph.model.clock import at_pixels, seen_at_rows, when_taken
 from calibgraph.simulation.rigs import rig_of
@@ -117,6 +117,9 @@ def test_a_table_gets_the_motion_of_its_frames() -> None:
     data = dataset_from_arrays(rig, cloud, images, twists_per_s=TWISTS)
     np.testing.assert_array_equal(with_motion(rows(None), data).twist_per_s, TWISTS)
     assert with_motion(rows(None), dataset_from_arrays(rig, cloud, images)).twist_per_s is None
+    fast = replace(data.frames[0], twist=TWISTS[0] + [0, 0, 0, 300.0, 0, 0])
+    with pytest.raises(MotionError, match="frame .* must be under 6 rad/s, .*the time between"):
+        with_motion(rows(None), replace(data, frames=(fast, *data.frames[1:])))
     with pytest.raises(CalibrationError, match="twists_per_s"):
         dataset_from_arrays(rig, cloud, images, twists_per_s=TWISTS[:1])
 

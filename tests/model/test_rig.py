@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from calibgraph import (
+    Camera,
     FileError,
     RelativePose,
     Rig,
@@ -113,10 +114,31 @@ def test_merge_keys_may_share_a_lens(pair: Rig, tmp_path: Path) -> None:
     assert (cameras["a"].width_px, cameras["b"].width_px) == (640, 320)
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", "../../up", "a/b", "a\\b", "a\nb", "x" * 101])
+UNSEEN = [
+    "a\x7fb",
+    "a\x1b[2Jb",
+    "a\x85b",
+    "a\x9b2Jb",
+    "a\u202eb",
+    "a\u2066b",
+    "a\u200bb",
+    "a\ud800b",
+]
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", "../../up", "a/b", "a\\b", "a\nb", "x" * 101, *UNSEEN]
+)
 def test_camera_names_that_are_no_file_names_are_refused(name: str, pair: Rig) -> None:
     with pytest.raises(ValueError, match="camera name"):
         Rig(cameras={name: pair.cameras["left"]})
+
+
+@pytest.mark.parametrize("name", UNSEEN)
+def test_frames_whose_name_cannot_be_seen_are_refused(name: str, pair: Rig) -> None:
+    camera = pair.cameras["left"].model_dump()
+    with pytest.raises(ValueError, match="frame_id"):
+        Camera.model_validate(camera | {"frame_id": name})
 
 
 def test_a_relative_pose_must_name_two_cameras(pair: Rig) -> None:

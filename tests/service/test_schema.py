@@ -28,7 +28,7 @@ def as_bytes(context, value):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(SCHEMATHESIS is None, reason="schemathesis is not installed")
+@pytest.mark.skipif(SCHEMATHESIS is None, reason="no schemathesis: pip install schemathesis")
 def test_every_answer_is_documented(tmp_path: Path) -> None:
     (tmp_path / "hooks.py").write_text(HOOKS)
     settings = Settings(data=tmp_path / "data", jobs_at_once=1, tracker_processes=1, free_bytes=0)

@@ -20,11 +20,12 @@ from calibgraph import (
     solve,
 )
 from calibgraph.graph.latent_poses import latent_pose_graph
-from calibgraph.graph.lens import LensSigmas, LensVariable
+from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.variables import aligned_key, body_key, lens_key
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import twist_between
 from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.lens_knowledge import LensSigmas
 from calibgraph.model.rig import IntrinsicsSigma
 from calibgraph.report.as_json import result_summary
 from calibgraph.simulation.rigs import rig_of

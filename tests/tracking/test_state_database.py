@@ -297,6 +297,14 @@ def test_a_write_that_fails_at_any_byte_loses_no_acknowledged_input(memory: Path
     pytest.fail("no limit was large enough")
 
 
+def test_a_state_that_a_full_disk_hides_is_not_called_damaged(memory: Path) -> None:
+    truth = filled(memory / "state", 5)
+    full = pytest.raises(FileError, match="cannot be read .*: is the disk full")
+    with file_size_limit(1000), full:
+        StateDatabase(memory / "state")
+    require_usable(memory / "state", truth)
+
+
 def test_an_interrupted_append_is_taken_back(tmp_path: Path) -> None:
     with opened(tmp_path) as database:
         database.append(b"first")

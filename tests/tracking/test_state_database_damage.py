@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sqlite3
+import struct
 import subprocess
 import sys
 from contextlib import closing
@@ -136,7 +137,6 @@ def test_a_damaged_snapshot_is_replaced_by_the_one_before_and_the_inputs_since(
         ("UPDATE journal SET digest = zeroblob(32) WHERE number = 7", "input 7 is missing or"),
         ("UPDATE journal SET number = 9 WHERE number = 7", "input 7 is missing or has a wrong"),
         ("DELETE FROM journal WHERE number = 7", "input 7 is missing or has a wrong checksum"),
-        ("DROP TABLE journal", "is damaged"),
         ("DELETE FROM status", "is damaged"),
         ("UPDATE status SET number = 9", "input 9 is missing"),
         ("UPDATE status SET number = 7", "is damaged"),
@@ -164,6 +164,58 @@ def test_a_database_of_another_layout_or_program_is_refused(
     filled(tmp_path, 5)
     edited(tmp_path, statement)
     require_refused(tmp_path, match)
+
+
+ENDLESS = "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r) SELECT max(n)"
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        "DROP TABLE journal",
+        f"DROP TABLE status; CREATE VIEW status AS {ENDLESS} AS number, 0 AS is_open FROM r",
+        f"CREATE VIEW more AS {ENDLESS} FROM r",
+        "CREATE TRIGGER t AFTER UPDATE ON status BEGIN DELETE FROM journal; END",
+        "CREATE INDEX i ON status (number)",
+        "ALTER TABLE status ADD COLUMN more INTEGER CHECK (length(zeroblob(900000000)) > 0)",
+    ],
+)
+def test_a_database_with_other_tables_is_refused_before_a_query(
+    tmp_path: Path, statements: str
+) -> None:
+    filled(tmp_path, 5)
+    with closing(sqlite3.connect(tmp_path / DATABASE)) as database:
+        database.executescript(statements)
+    require_refused(tmp_path, "holds other tables than a tracker's; choose another folder")
+
+
+def test_pages_that_refer_to_each_other_end_the_reading(tmp_path: Path) -> None:
+    """A tree of 16 levels, each of a page with 3000 references to the next one: 10^55 rows."""
+    filled(tmp_path, 5)
+    data = bytearray((tmp_path / DATABASE).read_bytes())
+    size, first = 32768, len(data) // 32768 + 1
+    row = b"\x06\x00\x00\x00\x00\x0fx"  # a record of four NULLs and a text
+    for level in range(17):
+        last = level == 16
+        cell = bytes([len(row), 1]) + row if last else struct.pack(">IB", first + level, 1)
+        count = 1 if last else 3000
+        starts = range(size - count * len(cell), size, len(cell))
+        page = bytes(data[:100]) if level == 0 else b""
+        page += struct.pack(">BHHHx", 13 if last else 5, 0, count, starts[0])
+        page += (b"" if last else cell[:4]) + struct.pack(f">{count}H", *starts)
+        page = page.ljust(starts[0], b"\0") + cell * count
+        data = bytearray(page) + data[size:] if level == 0 else data + page
+    data[28:32] = struct.pack(">I", len(data) // size)
+    restored(tmp_path, {DATABASE: bytes(data)})
+    require_refused(tmp_path, "is damaged")
+
+
+def test_a_link_in_the_place_of_the_lock_is_not_followed(tmp_path: Path) -> None:
+    (folder := tmp_path / "state").mkdir()
+    (folder / "lock").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(FileError, match="lock: is a link or a folder, expected a file; remove it"):
+        StateDatabase(folder)
+    assert not (tmp_path / "elsewhere").exists()
 
 
 @pytest.mark.parametrize("data", [b"", b"half", b"no database at all" * 1000])

@@ -55,7 +55,7 @@ def test_a_rig_whose_cameras_all_see_no_point_is_refused_before_the_search(
         np.save(path, cloud)
     code, _, err = call("calibrate", folder, "--out", folder / "out")
     assert code == 2
-    assert err.count("turned by 180 deg about z (its x points backward)") == 1
+    assert err.count("turned by 180 deg about z (its x points behind, y right, z up)") == 1
     assert "left: by the guess, no point of the cloud lies in the image" in err
     assert not (folder / "out").exists()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -22,7 +23,7 @@ from calibgraph import (
 )
 from calibgraph.errors import FileError
 from calibgraph.io.bags.rig import read_bag_rig
-from calibgraph.io.bags.transforms import pose_matrix
+from calibgraph.io.mounts import find_mounts
 from calibgraph.model.geometry import invert
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
@@ -30,9 +31,11 @@ from tests.io.bags.writing import (
     Stamped,
     sample_bag,
     sample_messages,
+    tree_of,
     without,
     write_bag,
 )
+from tests.io.formats.readers import READERS
 
 MAKE = Messages("mcap")
 
@@ -82,23 +85,81 @@ def test_an_export_names_the_frames_of_the_bag(result: Path, tmp_path: Path, for
     assert "left_optical" not in chosen
 
 
-def test_the_exported_transforms_join_the_robots_tree(result: Path, tmp_path: Path) -> None:
+EDGES = {child: (parent, T) for parent, child, T in tree_of(load_rig(SAMPLE))}
+
+
+def in_base(tree: dict[str, tuple[str, Any]], frame: str) -> Any:
+    """(4, 4) of a frame in the root, link by link."""
+    T = np.eye(4)
+    while frame in tree:
+        frame, T_parent_child = tree[frame]
+        T = T_parent_child @ T
+    return T
+
+
+@pytest.mark.parametrize("format", ["ros1", "ros2", "ros2-launch", "tf2"])
+def test_the_exported_transforms_replace_those_of_the_robots_tree(
+    result: Path, tmp_path: Path, format: str
+) -> None:
     estimate = load_calibration(result).rig.T_camera_lidar
-    export_calibration(result, tmp_path / "a.launch.xml", "ros2-launch", even_if_failed=True)
-    for node in ElementTree.parse(tmp_path / "a.launch.xml").getroot():
-        words = node.attrib["args"].split()
-        given = dict(zip(words[::2], words[1::2], strict=True))
-        name = next(n for n, frame in IDS.items() if frame == given["--child-frame-id"])
-        T_lidar_camera = pose_matrix(
-            [float(given[f"--{k}"]) for k in "xyz"],
-            [float(given[f"--q{k}"]) for k in "xyzw"],
-        )
-        assert given["--frame-id"] == "velodyne"
-        np.testing.assert_allclose(T_lidar_camera, invert(estimate[name]), atol=1e-12)
+    export_calibration(result, tmp_path / "out", format, even_if_failed=True)
+    T_base_link = READERS[format](tmp_path / "out")
+    assert T_base_link.keys() == {f"{name}_link" for name in IDS}
+    changed = {link: ("base", invert(T)) for link, T in T_base_link.items()}
+    tree = {**EDGES, **changed}  # as tf has it, with one parent for each frame
+    assert tree.keys() == EDGES.keys()
+    for name, frame in IDS.items():
+        T_camera_lidar = invert(in_base(tree, frame)) @ in_base(tree, "velodyne")
+        np.testing.assert_allclose(T_camera_lidar, estimate[name], atol=1e-9)
+
+
+def test_an_exported_robot_is_whole(result: Path, tmp_path: Path) -> None:
     export_calibration(result, tmp_path / "a.urdf", "urdf", even_if_failed=True)
     joints = ElementTree.parse(tmp_path / "a.urdf").getroot().findall("joint")
     links = {(j.find("parent").get("link"), j.find("child").get("link")) for j in joints}  # type: ignore[union-attr]
-    assert links == {("velodyne", frame) for frame in IDS.values()}
+    assert links == {(parent, child) for child, (parent, _) in EDGES.items()}
+
+
+def test_the_exported_transforms_are_read_back_over_the_robots_description(
+    result: Path, bag: Path, tmp_path: Path
+) -> None:
+    estimate = load_calibration(result).rig.T_camera_lidar
+    export_calibration(rig_of_bag(bag), tmp_path / "robot.urdf", "urdf")
+    export_calibration(result, tmp_path / "lenses", "camera_info", even_if_failed=True)
+    for format, name in (("ros2-launch", "a.launch.xml"), ("ros1", "b.sh"), ("ros2", "c.sh")):
+        export_calibration(result, tmp_path / name, format, even_if_failed=True)
+        files = [tmp_path / "robot.urdf", tmp_path / name, *(tmp_path / "lenses").glob("*.yaml")]
+        found = import_rig(files, lidar_frame="velodyne")
+        for camera, T in estimate.items():
+            np.testing.assert_allclose(found.T_camera_lidar[camera], T, atol=1e-9)
+            assert found.cameras[camera].mount is not None
+
+
+MOUNTED = {  # parents by child, and what is expected to be moved
+    "a drivers frames below one link": (
+        {"velodyne": "base", "cam_link": "base", "rgb": "cam_link", "rgb_optical": "rgb"},
+        {"rgb_optical": ("base", "cam_link")},
+    ),
+    "two cameras on one bar": (
+        {"velodyne": "base", "bar": "base", "l": "bar", "l_opt": "l", "r": "bar", "r_opt": "r"},
+        {"l_opt": ("bar", "l"), "r_opt": ("bar", "r")},
+    ),
+    "below the LiDAR": (
+        {"link": "velodyne", "opt": "link", "direct": "velodyne"},
+        {"opt": ("velodyne", "link"), "direct": None},
+    ),
+    "the LiDAR below the camera": ({"velodyne": "opt"}, {"opt": None}),
+    "one frame for two": ({"velodyne": "base", "opt": "base"}, {"opt": None, "opt ": None}),
+}
+
+
+@pytest.mark.parametrize("name", MOUNTED)
+def test_the_link_that_moves_is_the_uppermost_of_the_camera_alone(name: str) -> None:
+    parents, expected = MOUNTED[name]
+    cameras = {camera: (camera.strip(), np.eye(4)) for camera in expected}
+    found = find_mounts(cameras, "velodyne", parents, lambda *_: np.eye(4))
+    moved = {n: (found[n].parent, found[n].child) if n in found else None for n in expected}
+    assert moved == expected
 
 
 def test_autowares_link_is_above_the_optical_frame_of_the_bag(bag: Path, tmp_path: Path) -> None:

@@ -93,6 +93,7 @@ def test_features_have_no_bias(data: Dataset, truth: Rig) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("open3d")
 def test_fisheyes_a_right_angle_apart_have_matches(tmp_path: Path) -> None:
     """Of 190 degrees, to the front, the left and the back; nothing is in the first and the last."""
     rig = Rig(

@@ -119,9 +119,9 @@ def test_the_network_is_two_hidden_layers_as_torch_computes_them() -> None:
     assert sum(matrix.size + bias.size for matrix, bias in network.layers) == 529
 
 
+@pytest.mark.usefixtures("open3d")
 def test_weights_make_the_truth_stand_out_more_among_leaves(tmp_path: Path) -> None:
     """On a rendered meadow that took no part in the training."""
-    pytest.importorskip("open3d", exc_type=ImportError)
     rig = Rig(cameras={"left": make_camera()})
     calibgraph.simulate_street(
         tmp_path / "meadow", rig, frames=1, seed=5, vary_layout=True, build_scene=build_meadow
