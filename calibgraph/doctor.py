@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.bags import BagOptions, is_bag
+from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.dataset_folders import frames_of_folder
 from calibgraph.io.formats.describe import describe_rig
@@ -97,6 +98,8 @@ def diagnose(
     examined = choice.dataset
     findings += [Finding("note", choice.text)] if choice.text else []
     clouds = _examine_frames(examined.frames, data.rig, findings)
+    thinned = describe_thinned(len(cloud) for _, cloud in clouds)
+    findings += [Finding("note", line) for line in thinned]
     findings += _examine_places(examined)
     seen: dict[str, int] = {}
     written: list[Path] = []

@@ -252,7 +252,7 @@ class PoseSearch:
 
 def _mirror(frames: CameraFrames) -> CameraFrames:
     """The frames with the images' left and right swapped."""
-    return replace(frames, grays=[np.ascontiguousarray(gray[:, ::-1]) for gray in frames.grays])
+    return replace(frames, grays=[gray.mirrored() for gray in frames.grays])
 
 
 def _by_z_score(candidate: Candidate) -> float:
