@@ -14,11 +14,16 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
-from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE, least_z_score
+from calibgraph.matching.structure.acceptance import least_z_score
 from calibgraph.matching.structure.bodies import Body, lead, place_member, rigid_bodies
 from calibgraph.matching.structure.box_search import CANDIDATES
 from calibgraph.matching.structure.pose_refinement import CameraFrames, Candidate
-from calibgraph.matching.structure.pose_search import ROLLS_RAD, PoseSearch, SearchRange
+from calibgraph.matching.structure.pose_search import (
+    ROLLS_RAD,
+    PoseSearch,
+    SearchRange,
+    is_accepted,
+)
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.progress import Progress
@@ -82,6 +87,7 @@ class Locator:
 
     def __init__(self, search: PoseSearch, pool: Executor, progress: Progress) -> None:
         self._search, self._pool, self._progress = search, pool, progress
+        search.report = self._report
         self._bodies = {next(iter(body)): body for body in rigid_bodies(search.rig)}
         self._searches = dict.fromkeys(self._bodies, 0)
         self._proposers: list[Candidate] = []  # that have proposed
@@ -114,7 +120,7 @@ class Locator:
         looked_at = self._search.second_look(candidate, tries)
         if name not in self.best or candidate.z_score > self.best[name].z_score:
             self.best[name] = replace(candidate, chance=looked_at.chance)
-        if not _is_accepted(looked_at, tries):
+        if not is_accepted(looked_at, tries):
             return False
         self.located[name] = looked_at
         return True
@@ -216,12 +222,9 @@ class Locator:
         return [name for name in self._bodies if name not in self.located]
 
     def _search_for(self, name: str, effort: int) -> None:
-        tries = TRIES[self._searches[name] + 1]
-        z_score, least = self.best[name].z_score, least_z_score(tries)
-        before = f" (best z-score {z_score:.1f}, accepted from {least:.1f})" if z_score > 0 else ""
-        self._report(f"searching: {name}{before}")
         self._searches[name] += 1
-        found = self._search.everywhere(self._bodies[name], effort)
+        tries = TRIES[self._searches[name]]
+        found = self._search.everywhere(self._bodies[name], effort, tries)
         self._consider(name, found, tries)
 
     def _report(self, what: str) -> None:
@@ -236,12 +239,6 @@ class Locator:
             for name in self._bodies
             for member, camera in found[name].body.items()
         }
-
-
-def _is_accepted(candidate: Candidate, tries: float) -> bool:
-    if candidate.chance is not None:
-        return candidate.chance <= FALSE_ACCEPTANCE
-    return candidate.z_score >= least_z_score(tries)
 
 
 def _distinct(bodies: Iterable[Body]) -> list[Body]:

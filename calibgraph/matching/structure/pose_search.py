@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from calibgraph.matching.structure.acceptance import (
     FALSE_ACCEPTANCE,
     FEW_FRAMES,
+    least_z_score,
     probability_by_chance,
     second_look_chance,
 )
@@ -63,7 +64,11 @@ class SearchRange:
 
 
 class PoseSearch:
-    """Tries poses of bodies, see :func:`locate_cameras`."""
+    """Tries poses of bodies, see :func:`locate_cameras`.
+
+    Attributes:
+        report: called with what is being done.
+    """
 
     def __init__(
         self,
@@ -76,6 +81,7 @@ class PoseSearch:
     ) -> None:
         self.rig, self.guess, self.out_of_time = rig, rig.T_camera_lidar, out_of_time
         self._frames, self._range, self._seed = frames, search_range, seed
+        self.report: Callable[[str], None] = lambda _: None
         most = max((len(one.frames) for one in frames.values()), default=0)
         self._few = 0 < most <= FEW_FRAMES
 
@@ -100,12 +106,18 @@ class PoseSearch:
         """The body near a pose that is off by less than a degree."""
         return self._settle(refine(self._frames, body))
 
-    def everywhere(self, body: Body, effort: int) -> Candidate:
-        """The best pose in all of the range; of those from CONFIDENT on, the first."""
+    def everywhere(self, body: Body, effort: int, tries: float) -> Candidate:
+        """The best pose in all of the range; of those from CONFIDENT on, the first.
+
+        In few frames, the best of the rolls up to the first that is accepted after so many tries.
+        """
         best = Candidate(body, -math.inf)
-        for roll in ROLLS_RAD:
+        for number, roll in enumerate(ROLLS_RAD, 1):
+            self.report(f"searching: {next(iter(body))}, roll {number} of {len(ROLLS_RAD)}")
             best = max(best, self.with_roll(body, roll, effort=effort), key=_by_z_score)
             if best.z_score >= CONFIDENT or self.out_of_time():
+                break
+            if self._few and is_accepted(self.second_look(best, tries), tries):
                 break
         return best
 
@@ -155,7 +167,7 @@ class PoseSearch:
             return replace(candidate, chance=chance)
         fine = look_again(self._frames, candidate.body)
         if chance > FALSE_ACCEPTANCE:
-            mirrored = second_look_chance(self._mirrored_evidence, len(ROLLS_RAD))
+            mirrored = second_look_chance(self._mirrored_evidence)
             chance = probability_by_chance(candidate.z_score + fine.z_score, tries, mirrored)
         return replace(candidate, body=fine.body, chance=chance)
 
@@ -166,14 +178,19 @@ class PoseSearch:
     def _mirrored_evidence(self) -> float:
         """Mean over the bodies of the most that a search finds in mirrored images: by chance.
 
-        These are as alike to the clouds as images of other places of the kind.
+        These are as alike to the clouds as images of other places of the kind. For one roll: the
+        acceptance counts the searches.
         """
         frames = {name: _mirror(one) for name, one in self._frames.items()}
         search = PoseSearch(
             self.rig, frames, self._range, seed=self._seed, out_of_time=self.out_of_time
         )
-        found = [search.everywhere(body, effort=1) for body in rigid_bodies(self.rig)]
-        evidence = [search._evidence(one) for one in found if math.isfinite(one.z_score)]
+        evidence = []
+        for body in rigid_bodies(self.rig):
+            self.report(f"searching mirrored images: {next(iter(body))}")
+            found = search.with_roll(body, ROLLS_RAD[0], effort=1)
+            if math.isfinite(found.z_score):
+                evidence.append(search._evidence(found))
         if self.out_of_time() or not evidence:  # of a search that was cut, chance is not known
             return math.inf
         return float(np.mean(evidence))
@@ -248,6 +265,13 @@ class PoseSearch:
             dense=self._few,
             seed=self._seed + 1000 * (effort - 1),
         )
+
+
+def is_accepted(candidate: Candidate, tries: float) -> bool:
+    """Whether a candidate agrees far better than by chance, after so many tries."""
+    if candidate.chance is not None:
+        return candidate.chance <= FALSE_ACCEPTANCE
+    return candidate.z_score >= least_z_score(tries)
 
 
 def _mirror(frames: CameraFrames) -> CameraFrames:
