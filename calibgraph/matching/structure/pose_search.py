@@ -1,7 +1,7 @@
 """Pose search: tries poses of the bodies of a rig, near a given one or all over the range."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -29,7 +29,7 @@ from calibgraph.matching.structure.pose_refinement import (
     refine,
     refine_on,
 )
-from calibgraph.model.geometry import relative_transform, transform
+from calibgraph.model.geometry import pose_difference, relative_transform, transform
 from calibgraph.model.rig import Camera, Rig
 
 SEARCH_WINDOWS, DENSE_WINDOWS = 2100, 9000  # of the maps, per camera over all frames
@@ -41,6 +41,9 @@ ROLLS_RAD = np.radians([0.0, -12.0, 12.0])
 """Windows lie in the maps as they are seen from the guess: if it is rolled by more than some 8
 degrees, right places stand out no more."""
 SURVIVORS = 2  # candidates of a roll that are refined, those that are best after an approach
+
+SAME_DEG, SAME_CM = 1.0, 30.0
+"""Poses nearer than this are the same: the rounds correct the error that refinements leave."""
 
 DRAWS_AROUND, AROUND_RAD, AROUND_M = 12, np.radians(4.0), 0.8  # per axis
 MAX_LOOKS = 3
@@ -125,7 +128,8 @@ class PoseSearch:
         """The best pose all over the range about a body's guess, with maps for one roll.
 
         All candidates of the box search are approached, and the best are refined; with few
-        frames all are, also without an approach, which may lead away from the right pose.
+        frames all are, also without an approach, which may lead away from the right pose, but not
+        twice at one pose.
         """
         maps = self._correlate(_turn_about_axis(body, roll_rad), effort)
         nothing = Candidate(body, -math.inf)
@@ -139,7 +143,7 @@ class PoseSearch:
         near = list(self._while_time(approach, starts))
         near.sort(key=_by_z_score, reverse=True)
         if self._few:
-            survivors = [*(one.body for one in near), *starts]
+            survivors = distinct([*(one.body for one in near), *starts])
         else:
             survivors = [one.body for one in near[: effort * SURVIVORS]]
         refined = self._while_time(refine, survivors)
@@ -239,8 +243,12 @@ class PoseSearch:
         drawn = box.transforms(unit * box.half_widths)
         near = [approach(self._frames, place(candidate.body, T)) for T in drawn]
         near.sort(key=_by_z_score, reverse=True)
-        refined = [refine(self._frames, one.body) for one in near[:SURVIVORS]]
-        return max(refined, key=_by_z_score)
+        others = [
+            one.body for one in near[:SURVIVORS] if not is_same_pose(one.body, candidate.body)
+        ]
+        return max(
+            (refine(self._frames, body) for body in others), key=_by_z_score, default=candidate
+        )
 
     def _correlate(self, body: Body, effort: int) -> BodyMaps:
         """The maps of those cameras that the clouds are in view of."""
@@ -265,6 +273,21 @@ class PoseSearch:
             dense=self._few,
             seed=self._seed + 1000 * (effort - 1),
         )
+
+
+def is_same_pose(one: Body, two: Body) -> bool:
+    """Whether two poses of a body are so near that refinements and rounds end alike."""
+    degrees, centimetres = pose_difference(lead(one).T_camera_lidar, lead(two).T_camera_lidar)
+    return degrees < SAME_DEG and centimetres < SAME_CM
+
+
+def distinct(bodies: Iterable[Body]) -> list[Body]:
+    """The bodies without those at the pose of an earlier one."""
+    kept: list[Body] = []
+    for body in bodies:
+        if not any(is_same_pose(body, other) for other in kept):
+            kept.append(body)
+    return kept
 
 
 def is_accepted(candidate: Candidate, tries: float) -> bool:
