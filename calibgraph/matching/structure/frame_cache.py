@@ -61,7 +61,7 @@ class FrameCache:
         def load() -> PreparedImage:
             gray = frame.load_gray(name, camera)
             kept = gray if isinstance(frame, KeptFrame) else mmap_copy(gray)
-            return PreparedImage(kept, self._smaller)
+            return PreparedImage.from_gray(kept, camera, self._smaller)
 
         image = self._images.get(key, load)
         self._images.keep_last(MAX_IMAGE_BYTES, lambda image: image.nbytes)

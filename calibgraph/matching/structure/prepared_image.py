@@ -18,6 +18,8 @@ Gray = NDArray[np.uint8]
 SmallImages = KeyedCache[tuple[Hashable, ...], NDArray[np.float32]]
 
 MAX_BYTES = 800_000_000  # of all scaled images of a cache
+FINEST_RAD = np.radians(0.03)
+"""Of a pixel; half the finest step. Images of 20 megapixels keep a quarter of their pixels."""
 LOG_GRAY = np.log1p(np.arange(256, dtype=np.float32))
 
 
@@ -26,7 +28,7 @@ class PreparedImage:
     """A gray image.
 
     Attributes:
-        gray: (height, width).
+        gray: (height, width), reduced if its pixels are finer than ``FINEST_RAD``.
         smaller: where the scaled images of this and other images are kept.
         identity: by which they know this image.
     """
@@ -34,6 +36,15 @@ class PreparedImage:
     gray: Gray
     smaller: SmallImages = field(default_factory=KeyedCache)
     identity: object = field(default_factory=object)
+
+    @staticmethod
+    def from_gray(gray: Gray, camera: Camera, smaller: SmallImages | None = None) -> PreparedImage:
+        """Prepare an image (height, width) of a camera."""
+        factor = int(FINEST_RAD * camera.lens.pixels_per_rad)
+        if factor > 1:
+            size = camera.width_px // factor, camera.height_px // factor
+            gray = mmap_copy(np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA)))
+        return PreparedImage(gray, smaller or KeyedCache())
 
     def log_gray(
         self, camera: Camera, step_rad: float, blur_steps: float
@@ -43,7 +54,7 @@ class PreparedImage:
         A pixel p of the image lies at (p + 0.5) scale - 0.5.
         """
         factor = min(1.0, 1.0 / (camera.lens.pixels_per_rad * step_rad))
-        height, width = self.gray.shape
+        height, width = camera.height_px, camera.width_px
         size = (max(8, round(width * factor)), max(8, round(height * factor)))
 
         def make() -> NDArray[np.float32]:

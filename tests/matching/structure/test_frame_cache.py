@@ -10,6 +10,9 @@ import pytest
 import calibgraph
 from calibgraph.matching.structure import frame_cache, prepared_image
 from calibgraph.matching.structure.frame_cache import FrameCache
+from calibgraph.matching.structure.prepared_image import PreparedImage
+from calibgraph.matching.structure.schedule import LEVELS
+from calibgraph.model.rig import Camera
 from tests.conftest import SAMPLE
 
 
@@ -45,6 +48,26 @@ def test_an_image_is_scaled_once_for_each_size(monkeypatch: pytest.MonkeyPatch) 
     assert image.log_gray(camera, 0.02, 1.0)[0] is not small
     cache.keep_only(data.frames[2:])
     assert not image.smaller.values()
+
+
+def test_images_finer_than_the_finest_level_needs_are_reduced() -> None:
+    """By whole pixels, which moves nothing; their logarithm changes by the rounding of gray."""
+    camera = calibgraph.load_dataset(SAMPLE).rig.cameras["left"]
+    stated = camera.model_dump()
+    stated["intrinsics_px"] = {key: 10 * each for key, each in camera.intrinsics_px if each}
+    stated |= {"width_px": 10 * camera.width_px, "height_px": 10 * camera.height_px}
+    fine = Camera(**stated)
+    rows, columns = np.indices((fine.height_px, fine.width_px))
+    gray = (150 + 50 * np.sin(rows / 300) * np.cos(columns / 200)).astype(np.uint8)
+    whole, reduced = PreparedImage(gray), PreparedImage.from_gray(gray, fine)
+    assert reduced.nbytes * 4 == whole.nbytes
+    (one, scale), (other, same) = (
+        each.log_gray(fine, LEVELS[-1].step_rad, 1.0) for each in (whole, reduced)
+    )
+    np.testing.assert_array_equal(scale, same)
+    assert np.abs(one - other).max() < 0.5 / gray.min()
+    kept = PreparedImage.from_gray(gray[::10, ::10], camera)
+    np.testing.assert_array_equal(kept.gray, gray[::10, ::10])
 
 
 def test_the_frames_used_last_are_kept_up_to_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
