@@ -17,7 +17,7 @@ from calibgraph.parallel import KeyedCache
 Gray = NDArray[np.uint8]
 SmallImages = KeyedCache[tuple[Hashable, ...], NDArray[np.float32]]
 
-MAX_BYTES = 800_000_000  # of all scaled images of a cache
+MAX_BYTES = 400_000_000  # of all scaled images of a cache
 FINEST_RAD = np.radians(0.03)
 """Of a pixel; half the finest step. Images of 20 megapixels keep a quarter of their pixels."""
 LOG_GRAY = np.log1p(np.arange(256, dtype=np.float32))
