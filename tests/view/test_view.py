@@ -196,7 +196,9 @@ def test_a_result_without_frames_has_nothing_to_show(result: Calibration, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("write", "package"), [(write_rerun, "rerun"), (write_mcap, "foxglove")])
+@pytest.mark.parametrize(
+    ("write", "package"), [(write_rerun, "rerun"), (write_mcap, "foxglove")]
+)
 def test_a_missing_package_is_named(
     write: Callable[..., Path],
     package: str,
