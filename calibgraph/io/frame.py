@@ -14,7 +14,7 @@ from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.files import sha256
 from calibgraph.io.bags import MESSAGE_SUFFIX, hash_message
-from calibgraph.io.clouds import load_cloud
+from calibgraph.io.clouds import load_cloud, thin_cloud
 from calibgraph.io.frame_files import stamp_ns_in_name
 from calibgraph.io.images import load_image
 from calibgraph.io.motion import (
@@ -89,8 +89,8 @@ class Frame:
         return None if self.motion is None else self.motion.T_world_lidar
 
     def load_cloud(self) -> NDArray[np.float32]:
-        """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`."""
-        return load_cloud(self.cloud_path, self.motion)
+        """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`; thinned."""
+        return thin_cloud(load_cloud(self.cloud_path, self.motion))
 
     def load_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width, 3) image, BGR; see :func:`calibgraph.io.images.load_image`."""

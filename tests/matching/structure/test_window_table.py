@@ -10,6 +10,7 @@ import calibgraph
 from calibgraph import Rig
 from calibgraph.matching.structure import window_table
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.shift_scores import score_frame, select_windows
 from calibgraph.matching.structure.window_table import WindowTable
@@ -59,7 +60,7 @@ def test_a_table_that_was_dropped_is_made_again_alike(
 ) -> None:
     camera, level = truth.cameras["front_left"], LEVELS[2]
     first = score_frame(
-        calibgraph.load_dataset(SAMPLE).frames[0].load_gray("front_left", camera),
+        PreparedImage(calibgraph.load_dataset(SAMPLE).frames[0].load_gray("front_left", camera)),
         cloud, camera, level, frame=0, max_windows=1_000,
     )  # fmt: skip
     made: list[int] = []
@@ -73,7 +74,7 @@ def test_a_table_that_was_dropped_is_made_again_alike(
     monkeypatch.setattr(WindowTable, "__init__", counted)
     select_windows(cloud, camera, LEVELS[3], max_windows=1_000)  # in place of the other
     again = score_frame(
-        calibgraph.load_dataset(SAMPLE).frames[0].load_gray("front_left", camera),
+        PreparedImage(calibgraph.load_dataset(SAMPLE).frames[0].load_gray("front_left", camera)),
         cloud, camera, level, frame=0, max_windows=1_000,
     )  # fmt: skip
     assert len(made) == 2
