@@ -14,6 +14,7 @@ from calibgraph.errors import DatasetError
 from calibgraph.io.bags import scan_duration_s
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
+from calibgraph.matching.burnt_in import describe_burnt_in
 from calibgraph.model.clock import unused_times
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Camera, Rig
@@ -147,7 +148,7 @@ def check_inputs(data: Dataset, rig: Rig, *, at_guess: bool = True) -> tuple[str
     doubts += motion_doubts(data)
     for text in doubts:
         _log.warning(text)
-    return (*unused_times(rig, is_known=known), *doubts)
+    return (*unused_times(rig, is_known=known), *doubts, *describe_burnt_in(data))
 
 
 def _check_at_guess(data: Dataset, rig: Rig) -> list[str]:
