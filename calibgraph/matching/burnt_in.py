@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.burnt_in import BurntIn, Rectangle
 from calibgraph.io.dataset import Dataset, spread_out
@@ -28,17 +29,18 @@ _FRAMES, _LEAST_VIEWS = 6, 4
 _SIDE_PX = 960  # larger images are reduced
 _LEAST_GRADIENT = 80  # of Sobel: an edge of 20 gray levels
 _ALIKE = 0.5  # share of the edges that two views have in common, from which they show the same
-_PARALLEL = 0.97  # cosine, or length of a mean of unit vectors
+_PARALLEL, _EXACTLY = 0.97, 0.99  # cosine, or length of a mean of unit vectors
 _MISSED = 5  # one of so many views may lack an edge: white on white is none
-_CORNERS = 0.1
-"""Least share of the directions of a thing's edges that is across most of them: what has one
-direction alone, as a lane or a kerb, may move along itself."""
-_GAP_PX, _LEAST_PX, _LEAST_SHARE = 9, 40, 0.4
-"""Of one burnt-in thing, in the reduced image: most that its parts are apart; least number of edge
-pixels that stand still, and their share of the edge pixels in its rectangle, some of which change
-with the time. By chance, parallel edges of different views meet in single places."""
-_BESIDE_PX = 20  # margin beside a line of text, for digits that change
-_LARGEST = 0.15  # share of the image, up to which all of the rectangle is taken, not its edges
+_GAP_PX, _LEAST_PX = 9, 40
+"""Of one thing, in the reduced image: most that its parts are apart; its least edge pixels."""
+_LEAST_STILL, _LEAST_EXACT, _LEAST_ACROSS = 0.3, 0.3, 0.05
+"""Least shares: of a thing's edge pixels, those that stand still, on KITTI up to 0.23 where the far
+scene of a straight drive moves little, in what is drawn into images from 0.36; of these, those that
+do so exactly in all views; and of their directions, those across most: up to 0.02 along lanes and
+roofs, which may move along themselves, and from 0.08."""
+_COMPACT, _BESIDE_PX = 0.6, 20
+"""Share of its rectangle from which a thing is hidden with all of it, since some of a text changes
+with the time; margin then beside it, for digits at its ends."""
 _ELSEWHERE_DEG = 15.0
 """Cameras that look as far apart show nothing at the same pixels, but for what is burnt in."""
 
@@ -126,16 +128,12 @@ def _still(views: Sequence[Edges], rig: Rig, name: str) -> BurntIn | None:
     if len(views) < _LEAST_VIEWS:
         return None
     mean = np.mean(views, axis=0)
+    edges = np.mean([np.any(view, axis=2) for view in views], axis=0)
     least = _PARALLEL * (1 - len(views) // _MISSED / len(views))
-    still, edges = np.linalg.norm(mean, axis=2) >= least, np.any(views[0], axis=2)
     camera = rig.cameras[name]
-    mask, rectangles = np.zeros(still.shape, np.uint8), []
-    for part, rectangle in _things(mean, still, edges):
-        left, top, right, bottom = rectangle
-        if (right - left) * (bottom - top) <= _LARGEST * mask.size:
-            mask[top:bottom, left:right] = 1
-        else:
-            mask |= part
+    mask, rectangles = np.zeros(mean.shape[:2], np.uint8), []
+    for part, rectangle in _things(mean, edges, least):
+        mask |= part
         rectangles.append(rectangle)
     if not rectangles:
         return None
@@ -148,21 +146,35 @@ def _still(views: Sequence[Edges], rig: Rig, name: str) -> BurntIn | None:
     )
 
 
-def _things(mean: Edges, still: Mask, edges: Mask) -> Iterator[tuple[NDArray[np.uint8], Rectangle]]:
-    """The pixels of each thing with a margin, and its rectangle."""
+def _things(
+    mean: Edges, share: Array, least: float
+) -> Iterator[tuple[NDArray[np.uint8], Rectangle]]:
+    """The pixels of each thing with a margin, and its rectangle.
+
+    Args:
+        mean: of the views.
+        share: (height, width) of the views that have an edge there.
+        least: length of it where an edge stands still.
+    """
+    length = np.linalg.norm(mean, axis=2)
     near = cv2.getStructuringElement(cv2.MORPH_RECT, (_GAP_PX, _GAP_PX))
-    joined = cv2.dilate(still.astype(np.uint8), near)
+    joined = cv2.dilate((length >= least).astype(np.uint8), near)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
-    for number, (left, top, width, height, _) in enumerate(stats[1:].tolist(), start=1):
+    for number, (left, top, width, height, area) in enumerate(stats[1:].tolist(), start=1):
         inside = np.s_[top : top + height, left : left + width]
-        part = labels[inside] == number
-        stands = mean[inside][still[inside] & part]
-        if len(stands) < max(_LEAST_PX, _LEAST_SHARE * np.count_nonzero(edges[inside] & part)):
+        still = (labels[inside] == number) & (length[inside] >= least)
+        edges = mean[inside][still]
+        all_edges = share[inside][labels[inside] == number].sum()
+        if len(edges) < max(_LEAST_PX, _LEAST_STILL * all_edges):
             continue
-        if np.linalg.eigvalsh(stands.T @ stands / len(stands))[0] < _CORNERS:
+        if np.mean(length[inside][still] > _EXACTLY) < _LEAST_EXACT:
             continue
-        pixels = np.zeros(still.shape, np.uint8)
-        pixels[inside] = part
-        beside = min(height, _BESIDE_PX)
-        right = min(still.shape[1], left + width + beside)
-        yield pixels, (max(0, left - beside), top, right, top + height)
+        if np.linalg.eigvalsh(edges.T @ edges / len(edges))[0] < _LEAST_ACROSS:
+            continue
+        pixels, start, end = np.zeros(length.shape, np.uint8), left, left + width
+        pixels[inside] = labels[inside] == number
+        if area >= _COMPACT * width * height:
+            beside = min(height, _BESIDE_PX)
+            start, end = max(0, left - beside), min(length.shape[1], end + beside)
+            pixels[top : top + height, start:end] = 1
+        yield pixels, (start, top, end, top + height)

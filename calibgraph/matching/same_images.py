@@ -30,7 +30,7 @@ _BLOCK_PX, _LEAST_CONTRAST, _LEAST_BLOCKS = 16, 6.0, 12
 _LEAST_CORRELATION, _BELOW = 0.75, 25
 """Percentile of the blocks' correlation. Stereo pairs of seven drives had 0.6 at most, copies with
 a shift of brightness, noise or a crop to half the sides 0.8 and more."""
-_SAME_PX = 2.0  # by which the fits of two frames may differ in a corner
+_SAME_PX = 6.0  # by which the fits of two frames may differ in a corner
 
 
 @dataclass(frozen=True, eq=False)
