@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,7 +15,7 @@ from calibgraph import Dataset, DatasetError, dataset_from_arrays
 from calibgraph.matching.same_images import find_same_images, require_different_images
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
-from tests.conftest import SAMPLE
+from tests.conftest import SAMPLE, Call
 
 Image = np.ndarray
 SIZE = (640, 360)
@@ -92,3 +94,30 @@ def test_what_cannot_be_compared_is_not_accused() -> None:
 def test_nothing_is_searched_for_in_the_same_images() -> None:
     with pytest.raises(DatasetError, match="front_left and front_right have the same images"):
         match_in_rounds(copied(as_it_is), progress=no_progress)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("doctor", "DATA"),
+        ("calibrate", "DATA", "--out", "OUT"),
+        ("match", "DATA", "--out", "TABLE"),
+        ("check", "RIG", "DATA"),
+        ("track", "RIG", "DATA", "--matcher", "structure", "--out", "OUT"),
+    ],
+)
+def test_every_command_names_them(command: tuple[str, ...], tmp_path: Path, call: Call) -> None:
+    data = tmp_path / "data"
+    shutil.copytree(SAMPLE, data)
+    for path in (data / "cameras/front_left").iterdir():
+        shutil.copy(path, data / "cameras/front_right")
+    names = {
+        "DATA": data,
+        "RIG": data / "rig.yaml",
+        "OUT": tmp_path / "out",
+        "TABLE": tmp_path / "t.parquet",
+    }
+    code, printed, errors = call(*(str(names.get(word, word)) for word in command))
+    assert code == (1 if command[0] == "doctor" else 2)
+    words = " ".join((printed + errors).split())
+    assert "front_left and front_right have the same images: one device under two names" in words
