@@ -118,7 +118,8 @@ def check(
         lidar = None
     finally:
         full.release()
-    middle, sources = data.frames[len(data.frames) // 2], tuple(map(str, data.folders))
+    middle = data.frames[len(data.frames) // 2].with_burnt_in({})  # as it was recorded
+    sources = tuple(map(str, data.folders))
     return Audit(
         cameras, lidar, deployed, middle, sources,
         tolerance_deg, tolerance_cm, len(data.frames), watch.seconds, package_versions(),
