@@ -16,10 +16,12 @@ from calibgraph.io.dataset_folders import frames_of_folder
 from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import Frame, hash_source
 from calibgraph.io.rigs import load_rig
+from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.camera_pairs import overlapping_pairs
 from calibgraph.matching.cloud_similarity import find_up
 from calibgraph.matching.frame_choice import choose_frames
 from calibgraph.matching.places import UNKNOWN_UP, find_places
+from calibgraph.matching.same_images import find_same_images
 from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.matching.structure.matcher import MOST_FRAMES
 from calibgraph.model.places import as_groups, describe_places
@@ -98,6 +100,9 @@ def diagnose(
     if data is None:
         return Diagnosis(tuple(findings))
     findings += _describe(data)
+    findings += [Finding("error", line) for line in find_same_images(data, data.rig)]
+    data = hide_burnt_in(data, data.rig)
+    findings += [Finding("warning", line) for line in describe_burnt_in(data)]
     choice = choose_frames(data, data.rig, MOST_FRAMES)
     examined = choice.dataset
     findings += [Finding("note", choice.text)] if choice.text else []

@@ -44,8 +44,7 @@ class ArrayFrame(Frame):
         """(n, 4) x y z [m], intensity; thinned."""
         return thin_cloud(self.cloud)
 
-    def load_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
-        """(height, width, 3) image, BGR."""
+    def _decode_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
         return self.images[name]
 
     def hashes(self) -> dict[str, str]:

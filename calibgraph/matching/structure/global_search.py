@@ -48,12 +48,15 @@ class Located:
         accepted: whether that is far better than by chance.
         chance: the probability that a search with nothing to find ends as high; in few frames
             alone, where an accepted camera is at its pose by the fine levels.
+        contradicted_by: a camera that sees it elsewhere, while image and cloud of both are accepted
+            where they are; empty without.
     """
 
     camera: Camera
     z_score: float
     accepted: bool
     chance: float | None = None
+    contradicted_by: str = ""
 
 
 def locate_cameras(
@@ -81,6 +84,7 @@ class Locator:
     Attributes:
         best: the candidate of the highest z-score of each body, by its lead's name.
         located: those that are accepted.
+        contradictions: pairs of these that see each other elsewhere.
     """
 
     def __init__(self, search: PoseSearch, pool: Executor, progress: Progress) -> None:
@@ -93,6 +97,7 @@ class Locator:
         self._near: dict[str, Candidate] = {}
         self.best: dict[str, Candidate] = {}
         self.located: dict[str, Candidate] = {}
+        self.contradictions: list[tuple[Candidate, Candidate]] = []
 
     def locate(self) -> dict[str, Located]:
         """Locate all bodies, as far as time allows."""
@@ -163,17 +168,18 @@ class Locator:
             self._replace(two, moved_two, by=one)
 
     def _replace(self, old: Candidate, new: Candidate, by: Candidate) -> None:
-        """Move a body to where another one sees it.
+        """Move a body to where another one sees it, if it is accepted there, and only once.
 
-        It is not located if it is not accepted there, against one that is; nor if it was moved by
-        the same one before, since then no two poses of theirs agree.
+        Else it remains where it is: what both see in common, as a part of the vehicle, may be no
+        point of the scene, and its own image is no worse for it. But neither of them can be right
+        without a doubt.
         """
         name, mover = next(iter(old.body)), next(iter(by.body))
-        del self.located[name]
-        self._searches[name], self.best[name] = SEARCHES, new
         if (name, mover) not in self._moves:
             self._moves.add((name, mover))
-            self._consider(name, new, ALONE)
+            if self._consider(name, new, ALONE):
+                return
+        self.contradictions.append((old, by))
 
     def _search_next(self) -> bool:
         """Search for the most promising body that has not been searched for."""
@@ -232,8 +238,19 @@ class Locator:
 
     def _result(self) -> dict[str, Located]:
         found = {name: self.located.get(name, self.best[name]) for name in self._bodies}
+        doubts: dict[str, str] = {}
+        for pair in self.contradictions:
+            if all(one in self.located.values() for one in pair):  # and neither has moved since
+                one, two = (next(iter(each.body)) for each in pair)
+                doubts |= {one: two, two: one}
         return {
-            member: Located(camera, found[name].z_score, name in self.located, found[name].chance)
+            member: Located(
+                camera,
+                found[name].z_score,
+                name in self.located,
+                found[name].chance,
+                doubts.get(name, ""),
+            )
             for name in self._bodies
             for member, camera in found[name].body.items()
         }
