@@ -5,9 +5,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-
 from calibgraph.fleet.child import Child
 from calibgraph.fleet.execute import execute
+
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.task import Outcome, Task
 from tests.cli.conftest import error_line

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
-from pyarrow import parquet
-
 from calibgraph.fleet.model import fit_fleet
 from calibgraph.fleet.observations import observe
+from pyarrow import parquet
+
 from calibgraph.fleet.page import STATES, assess_status, changed_poses, write_fleet_report
 from calibgraph.model.geometry import retract_all
 from tests.conftest import Call

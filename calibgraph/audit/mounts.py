@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.fleet.deviations import Centers, Posterior, measured_batches, solve_centers, weigh
-from calibgraph.fleet.observations import Observations
+from calibgraph.audit.model import Posterior, weigh, weighted_mean
+from calibgraph.audit.observations import Observations
 from calibgraph.model.geometry import retract_all, twists_between
 
 MIN_VEHICLES = 8
@@ -62,6 +62,44 @@ def shapes(spread: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
+class Centers:
+    """Where a camera sits in a model of vehicle and in each of its batches.
+
+    Attributes:
+        nominal: (4, 4) T_camera_lidar of the model.
+        nominal_covariance: (6, 6) of xi in T_camera_lidar = exp(xi) estimate.
+        batches: (b, 4, 4).
+        batch_covariance: (b, 6, 6).
+    """
+
+    nominal: Array
+    nominal_covariance: Array
+    batches: Array
+    batch_covariance: Array
+
+
+Batches = tuple[NDArray[np.intp], Array, Array]
+"""What the vehicles alone measure: (m,) batches, (m, 4, 4) their poses, (m, 6, 6) covariances."""
+
+
+def solve_centers(start: Centers, measured: Batches, spread: Array) -> Centers:
+    """Nominal pose and batches: a batch scatters about the nominal pose by (b, 6, 6) ``spread``."""
+    some, T, noise = measured
+    y = twists_between(T, start.nominal)
+    total: Array = np.asarray(np.linalg.inv(spread[some] + noise), np.float64)
+    center, of_center = weighted_mean(y, total)
+    gain, rest = np.zeros_like(spread), np.tile(np.eye(6), (len(spread), 1, 1))
+    gain[some] = spread[some] @ total
+    rest -= gain
+    steps = np.tile(center, (len(spread), 1))
+    steps[some] += np.einsum("bij,bj->bi", gain[some], y - center)
+    starts = np.tile(start.nominal, (len(spread) + 1, 1, 1))
+    poses = retract_all(starts, -np.vstack([center, steps]))
+    bars = rest @ spread + rest @ of_center @ rest.swapaxes(1, 2)
+    return Centers(poses[0], of_center, poses[1:], (bars + bars.swapaxes(1, 2)) / 2)
+
+
+@dataclass(frozen=True, eq=False)
 class Mount:
     """One camera in all vehicles of a model.
 
@@ -87,14 +125,18 @@ class Mount:
         y = twists_between(self.seen.T_camera_lidar, self.centers.batches[self.batch])
         return np.where(self.seen.measured[:, None], y, 0.0)
 
-    def measured_batches(self, vehicles: Posterior) -> tuple[NDArray[np.intp], Array, Array]:
+    def measured_batches(self, vehicles: Posterior) -> Batches:
         """What the vehicles alone measure of the batches' centres, by sums over vehicles."""
         information = np.zeros((len(self.batches), 6, 6))
         weighted = np.zeros((len(self.batches), 6))
         each = np.einsum("nij,nj->ni", vehicles.information, self.deviations())
         np.add.at(information, self.batch, vehicles.information)
         np.add.at(weighted, self.batch, each)
-        return measured_batches(self.centers.batches, information, weighted)
+        some = np.flatnonzero(np.trace(information, axis1=1, axis2=2) > 0)
+        covariance = np.linalg.inv(information[some])
+        covariance = (covariance + covariance.swapaxes(1, 2)) / 2
+        steps = np.einsum("bij,bj->bi", covariance, weighted[some])
+        return some, retract_all(self.centers.batches[some], -steps), covariance
 
     def of_all(self, rows: Observations, pooled: Pooled) -> Mount:
         """The same mount with other rows; unmeasured batches have the model's nominal pose."""

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.fleet.fit import Mount, Pooled, fit_mounts
-from calibgraph.fleet.observations import Observations, concatenate, relative_observations
+from calibgraph.audit.mounts import Mount, Pooled, fit_mounts
+from calibgraph.audit.observations import Observations, concatenate, relative_observations
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,3 +110,14 @@ def fit_model(of: Observations) -> ModelFit:
         {mount.camera: mount for mount in mounts}, pooled,
         {mount.camera: mount for mount in pair_mounts}, pooled_pairs, (cameras or [""])[0],
     )  # fmt: skip
+
+
+def expected_pose(mount: Mount, pooled: Pooled) -> tuple[Array, Array]:
+    """Where a further vehicle's camera is, unless it is moved in its mount.
+
+    Returns:
+        (4, 4) T_camera_lidar; (6, 6) covariance of xi in T_camera_lidar = exp(xi) that, which
+        holds the spread of vehicles and batches and the uncertainty of the nominal pose.
+    """
+    between = mount.centers.nominal_covariance + pooled.batch * mount.spread
+    return mount.centers.nominal, mount.spread + between

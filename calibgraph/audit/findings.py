@@ -13,9 +13,9 @@ import numpy as np
 from scipy.stats import chi2, false_discovery_control, fisher_exact
 
 from calibgraph.arrays import Array
-from calibgraph.audit.trend import fit_slope
-from calibgraph.fleet.fit import Mount, Pooled
-from calibgraph.fleet.model import FALSE_DISCOVERIES, FleetModel, ModelFit
+from calibgraph.audit.fleet_model import FALSE_DISCOVERIES, FleetModel, ModelFit
+from calibgraph.audit.model import fit_slope
+from calibgraph.audit.mounts import Mount, Pooled
 from calibgraph.model.geometry import twists_between
 
 Kind = Literal["mount", "batch", "date", "drift"]
@@ -94,10 +94,9 @@ def _tests(fleet: FleetModel, name: str, model: ModelFit) -> Iterator[Finding]:
         for column, x in columns.items():
             slope = fit_slope(x, mount.batch, information, y)
             if slope is not None:
-                p = _p_value(slope.change, slope.covariance)
                 reach = float(np.nanmax(x) - np.nanmin(x))
-                yield Finding("drift", mount.model, mount.camera, "", p, slope.change,
-                              slope.sigma, column, reach)  # fmt: skip
+                yield Finding("drift", mount.model, mount.camera, "", _p_value(*slope), slope[0],
+                              np.sqrt(np.diag(slope[1])), column, reach)  # fmt: skip
 
 
 def _moved_mounts(fleet: FleetModel, name: str, model: ModelFit) -> Iterator[Finding]:
