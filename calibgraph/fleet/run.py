@@ -115,11 +115,12 @@ def dask_executor(address: str) -> Iterator[Executor]:
         client.wait_for_workers(1, timeout=30)
     except Exception as error:  # of its communication
         raise CalibrationError(f"--dask {address}: no scheduler with workers ({error})") from error
-    with client, client.get_executor(pure=False, retries=0) as executor:
+    with client:
+        executor: Executor = client.get_executor(pure=False, retries=0)
         try:
             yield executor
         finally:
-            executor.shutdown(wait=False, cancel_futures=True)
+            executor.shutdown(wait=False)  # cancels what has not ended
 
 
 def _run(

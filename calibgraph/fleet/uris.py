@@ -111,6 +111,8 @@ def fetch(uri: str, folder: Path, most_bytes: float) -> Path:
     filesystem, path = locate(uri)
     if is_local(filesystem):
         return Path(path)
+    if not filesystem.exists(path):
+        raise FileError(uri, "nothing is there; check the address")
     size = sum(filesystem.du(path, total=False).values())
     if size > most_bytes:
         raise FileError(

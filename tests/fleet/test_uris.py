@@ -71,10 +71,10 @@ def test_tables_in_an_archive_are_fetched_solved_and_removed(
     (tmp_path / "scratch").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
     out = str(tmp_path / "out")
-    summary = run_fleet(str(tmp_path / "fleet.csv"), out, slots=1, allow_missing=True)
+    summary = run_fleet(str(tmp_path / "fleet.csv"), out)
     assert summary.failures == {"bad input": 1}
-    errors = [row["error"] for row in read_rows(out).to_pylist() if row["error"]]
-    assert errors == [f"zip://none.parquet::{archive}: nothing is there"]
+    (error,) = [row["error"] for row in read_rows(out).to_pylist() if row["error"]]
+    assert f"zip://none.parquet::{archive}" in error
     assert sum(summary.verdicts.values()) == 2
     assert not list((tmp_path / "scratch").iterdir())
 
