@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,18 +167,12 @@ class Moments:
     """Sums over vehicles, or over batches, of both cases: regular first.
 
     Attributes:
-        counts: expected number of each case.
-        squares: expected sums of squared deviations over the spread of :func:`shapes`.
-        of: how many there are.
+        counts: (2,) expected number of each case.
+        squares: (2,) expected sums of squared deviations over the spread of :func:`shapes`.
     """
 
-    counts: Array = field(default_factory=lambda: np.zeros(2))
-    squares: Array = field(default_factory=lambda: np.zeros(2))
-    of: int = 0
-
-    def __add__(self, other: Moments) -> Moments:
-        """Of both."""
-        return Moments(self.counts + other.counts, self.squares + other.squares, self.of + other.of)
+    counts: Array
+    squares: Array
 
     def variances(self, defaults: Sequence[float]) -> Array:
         """(2,) variances of both cases, their defaults with the weight of one."""
@@ -187,14 +181,14 @@ class Moments:
 
     def share(self, default: float) -> float:
         """The share of the second case, its default with the weight of 50."""
-        return float((50 * default + self.counts[1]) / (50 + self.of))
+        return float((50 * default + self.counts[1]) / (50 + self.counts.sum()))
 
 
 def moments_of(posterior: Posterior, moments: Array, spread: Array) -> Moments:
     """The sums of deviations with (2, n, 6, 6) second moments."""
     squares = np.einsum("kij,knji->kn", np.linalg.inv(shapes(spread)), moments)
     share = posterior.share
-    return Moments(share.sum(axis=1), (share * squares).sum(axis=1), share.shape[1])
+    return Moments(share.sum(axis=1), (share * squares).sum(axis=1))
 
 
 def fit_mounts(observations: Observations) -> tuple[list[Mount], Pooled]:
@@ -267,7 +261,11 @@ def _between(mount: Mount, pooled: Pooled, some: NDArray[np.intp], batches: Post
 
 def pool(vehicles: Sequence[Moments], batches: Sequence[Moments]) -> Pooled:
     """What the cameras of a model share, from the sums of each."""
-    start, of_vehicles, of_batches = Pooled(), sum(vehicles, Moments()), sum(batches, Moments())
+    start = Pooled()
+    of_vehicles, of_batches = (
+        Moments(sum(each.counts for each in all_), sum(each.squares for each in all_))
+        for all_ in (vehicles, batches)
+    )
     batch, batch_moved = of_batches.variances([start.batch, start.batch_moved])
     return Pooled(
         moved=max(9.0, of_vehicles.variances([1.0, start.moved])[1]),

@@ -8,22 +8,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from scipy.stats import chi2, false_discovery_control
 
 from calibgraph.arrays import Array
 from calibgraph.audit.findings import Finding, find_changes, moved_lidars
-from calibgraph.audit.fleet_model import FALSE_DISCOVERIES, FleetModel, expected_pose, fit_fleet
+from calibgraph.audit.fleet_model import FleetModel, expected_pose, fit_fleet
 from calibgraph.audit.mounts import Mount, Pooled
-from calibgraph.audit.observations import (
-    NAMES,
-    Observations,
-    newest_rows,
-    observe,
-    require_one_quantity,
-    words,
-)
+from calibgraph.audit.observations import NAMES, newest_rows, observe, words
 from calibgraph.fleet.rows import RowStore, encode, read_rows
-from calibgraph.model.geometry import twists_between
 from calibgraph.report.kit import load_template
 
 PAGE_FILE, MODEL_FILE, ESTIMATES_FILE = "fleet.html", "fleet_model.json", "estimates.parquet"
@@ -31,7 +22,6 @@ FORMAT = "calibgraph-fleet-model/2"
 STATES = ("PASS", "WARN", "FAIL", "NO RESULT")
 _PASS, _WARN, _FAIL, _NO_RESULT = range(4)
 _UNITS = np.repeat([np.radians(1e-3), 1e-4], 3)  # thousandths of a degree, tenths of a millimetre
-_WEEK = 7.0
 _LONGEST_REASON = 200  # characters
 
 
@@ -47,8 +37,7 @@ class FleetReport:
 def write_fleet_report(out: str) -> FleetReport:
     """Fit the model of the rows in a folder, and write its files and its page beside them.
 
-    Of several rows of a vehicle and camera the newest counts; a pose is compared with that of a
-    week and more before the newest date.
+    Of several rows of a vehicle and camera the newest counts.
 
     Args:
         out: folder or URI of :func:`calibgraph.run_fleet`.
@@ -56,11 +45,10 @@ def write_fleet_report(out: str) -> FleetReport:
     Raises:
         CalibrationError: if no rows are there, or nothing can be written.
     """
-    rows, store = read_rows(out), RowStore(out)
-    newest = newest_rows(rows)
+    newest, store = newest_rows(read_rows(out)), RowStore(out)
     fleet = fit_fleet(observe(newest))
     report = FleetReport(fleet, find_changes(fleet), moved_lidars(fleet))
-    status = assess_status(newest, report, newest_rows(rows, days_ago=_WEEK))
+    status = assess_status(newest, report)
     store.put(ESTIMATES_FILE, encode(estimates(fleet)))
     store.put(MODEL_FILE, json.dumps(summary(report), indent=1).encode())
     store.put(PAGE_FILE, page_html(report, status).encode())
@@ -73,31 +61,26 @@ class FleetStatus:
 
     Attributes:
         state: (n,) index into STATES. FAIL: that verdict, or the camera was moved in its mount.
-            WARN: that verdict, no error bar, or another pose than before.
-        changed: (n,) whether the pose is another one than before.
+            WARN: that verdict, or no error bar.
         reasons: (n,) in words; empty if PASS.
     """
 
     state: NDArray[np.uint8]
-    changed: NDArray[np.bool_]
     reasons: list[str]
 
 
-def assess_status(rows: pa.Table, report: FleetReport, before: pa.Table) -> FleetStatus:
+def assess_status(rows: pa.Table, report: FleetReport) -> FleetStatus:
     """Where every row stands."""
-    require_one_quantity(rows, before)
     fleet, done = report.fleet, words(rows, "status") == "done"
     verdict, measured = words(rows, "verdict"), fleet.observations.measured
-    changed = changed_poses(fleet.observations, observe(before))
     state = np.full(len(rows), _NO_RESULT, dtype=np.uint8)
     state[done] = _WARN
-    state[measured & (verdict != "WARN") & ~changed] = _PASS
+    state[measured & (verdict != "WARN")] = _PASS
     state[fleet.apart | (done & (verdict == "FAIL"))] = _FAIL
     lidar = np.isin(fleet.observations.vehicle, np.array(report.moved_lidars, dtype=np.str_))
     own = {
         "the LiDAR was moved, or the rig taken apart": lidar,
         "the camera was moved in its mount": fleet.apart & ~lidar,
-        "another pose than before": changed,
         "no error bar": ~measured & done & (verdict != "FAIL"),
     }
     given = [rows.column(name).to_pylist() if name in rows.column_names else [None] * len(rows)
@@ -106,25 +89,7 @@ def assess_status(rows: pa.Table, report: FleetReport, before: pa.Table) -> Flee
     for k, (why, error) in enumerate(zip(*given, strict=True)):
         of_row = [text for text, of in own.items() if of[k]]
         reasons.append("; ".join([*of_row, *(why or ()), *([error] if error else ())]))
-    return FleetStatus(state, changed, reasons)
-
-
-def changed_poses(now: Observations, before: Observations) -> NDArray[np.bool_]:
-    """(n,) which poses are other ones than before, by more than both error bars explain.
-
-    Among all that are reported, one in a hundred is expected not to be (Benjamini and Hochberg).
-    """
-    names, old = (np.char.add(np.char.add(o.vehicle, "\n"), o.camera) for o in (now, before))
-    some, was = np.flatnonzero(now.measured), np.flatnonzero(before.measured)
-    _, i, j = np.intersect1d(names[some], old[was], return_indices=True)
-    changed = np.zeros(len(now.vehicle), dtype=np.bool_)
-    if len(i):
-        one, two = some[i], was[j]
-        xi = twists_between(now.T_camera_lidar[one], before.T_camera_lidar[two])
-        information = np.linalg.inv(now.covariance[one] + before.covariance[two])
-        squared = np.einsum("ni,nij,nj->n", xi, information, xi)
-        changed[one] = false_discovery_control(chi2.sf(squared, 6)) <= FALSE_DISCOVERIES
-    return changed
+    return FleetStatus(state, reasons)
 
 
 def estimates(fleet: FleetModel) -> pa.Table:
@@ -152,10 +117,6 @@ def summary(report: FleetReport) -> dict[str, Any]:
         "models": {
             name: {
                 "cameras": {camera: _mount(m, model.pooled) for camera, m in model.mounts.items()},
-                "reference": model.reference,
-                "relative_poses": {
-                    camera: _mount(m, model.pooled_pairs) for camera, m in model.pairs.items()
-                },
                 "moved_share": model.pooled.share_moved,
             }
             for name, model in report.fleet.models.items()
@@ -209,7 +170,6 @@ def payload(report: FleetReport, status: FleetStatus) -> dict[str, Any]:
         **index, "vehicle": vehicle.tolist(),
         "day": np.nan_to_num(of.day[order][first], nan=-1).astype(int).tolist(),
         "state": status.state[order].tolist(),
-        "changed": status.changed[order].astype(int).tolist(),
         **{name: _integers(np.where(of.measured[:, None], values, np.nan)[order])
            for name, values in (("deviation", report.fleet.deviation), ("sigma", sigma))},
     }  # fmt: skip

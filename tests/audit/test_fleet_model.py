@@ -138,7 +138,6 @@ def test_of_several_rows_of_a_camera_the_newest_counts() -> None:
                           [[np.datetime64("2024-01-01", "us")] * 18])  # fmt: skip
     both = pa.concat_tables([rows, old])
     assert newest_rows(both).sort_by("vehicle")["date"].to_pylist() == rows["date"].to_pylist()
-    assert newest_rows(both, days_ago=366)["date"].to_pylist() == old["date"].to_pylist()
 
 
 @pytest.mark.statistics

@@ -35,7 +35,7 @@ def test_rows_without_a_result_measure_nothing() -> None:
     assert np.isnan(of.day).all()
     assert of.covariates == {}
     report = FleetReport(fit_fleet(of), [], [])
-    standing = assess_status(rows, report, rows.slice(0, 0))
+    standing = assess_status(rows, report)
     assert [STATES[s] for s in standing.state] == ["PASS", "WARN", "NO RESULT"]
     assert standing.reasons == ["", "no error bar; few frames", "no images"]
     assert payload(report, standing)["vehicles"] == ["a", "b"]
@@ -67,10 +67,7 @@ def test_wrong_tables_are_one_line(rows: pa.Table, message: str) -> None:
 
 
 def test_mounts_are_not_mixed_with_alignments() -> None:
-    """Rows of earlier versions, without the column, are alignments; a failed row is neither."""
-    mounts, alignments = rows_of(of=["mount", "mount", None]), rows_of()
-    assert observe(mounts).measured.any()
+    """Rows without the column are alignments; a failed row is neither."""
+    assert observe(rows_of(of=["mount", "mount", None])).measured.any()
     with pytest.raises(CalibrationError, match="vehicle 'a' are of mounts, those of 'a' of align"):
-        assess_status(mounts, FleetReport(fit_fleet(observe(mounts)), [], []), alignments)
-    with pytest.raises(CalibrationError, match="one `of` in their settings"):
         observe(rows_of(of=["mount", None, None]))
