@@ -82,10 +82,8 @@ def fit_fleet(observations: Observations) -> FleetModel:
         for camera, mount in model.mounts.items():
             rows = np.flatnonzero((observations.model == name) & (observations.camera == camera))
             everyone = mount.of_all(observations.select(rows), model.pooled)
-            deviation[rows], moved[rows] = (
-                everyone.deviations(),
-                everyone.weigh(model.pooled).share[1],
-            )
+            deviation[rows] = everyone.deviations()
+            moved[rows] = everyone.weigh(model.pooled).share[1]
             T[rows], covariance[rows] = everyone.shrink(model.pooled)
     return FleetModel(observations, models, T, covariance, deviation, moved)
 

@@ -263,9 +263,10 @@ def pool(vehicles: Sequence[Moments], batches: Sequence[Moments]) -> Pooled:
     """What the cameras of a model share, from the sums of each."""
     start = Pooled()
     of_vehicles, of_batches = (
-        Moments(sum(each.counts for each in all_), sum(each.squares for each in all_))
+        Moments(np.sum([each.counts for each in all_], axis=0),
+                np.sum([each.squares for each in all_], axis=0))
         for all_ in (vehicles, batches)
-    )
+    )  # fmt: skip
     batch, batch_moved = of_batches.variances([start.batch, start.batch_moved])
     return Pooled(
         moved=max(9.0, of_vehicles.variances([1.0, start.moved])[1]),

@@ -15,7 +15,7 @@ from calibgraph.errors import CalibrationError
 Words = NDArray[np.str_]
 
 NAMES = ("vehicle", "camera", "model", "batch")
-_COLUMNS = (*NAMES, "status", "verdict", "T_camera_lidar", "covariance", "seconds", "date")
+_NO_COVARIATES = (*NAMES, "seconds", "probability_off", "date")
 _UNKNOWN = 1e6
 """Variance [rad^2, m^2] of a camera without a usable result: it leaves the prior as it is."""
 
@@ -141,7 +141,7 @@ def _fixed_size(rows: pa.Table, name: str, size: int) -> tuple[Array, NDArray[np
 def _covariates(rows: pa.Table) -> dict[str, Array]:
     """The columns of numbers that are not the fleet's own."""
     plain = (pa.types.is_floating, pa.types.is_integer)
-    others = [field for field in rows.schema if field.name not in _COLUMNS]
+    others = [field for field in rows.schema if field.name not in _NO_COVARIATES]
     numbers = [field.name for field in others if any(test(field.type) for test in plain)]
     return {
         name: rows.column(name).cast(pa.float64()).fill_null(np.nan).to_numpy() for name in numbers

@@ -46,6 +46,7 @@ def test_columns_of_the_manifest_are_understood() -> None:
         rows_of(
             model=[2024, 2024, None], date=["2026-03-01", "2026-03-02T12:00:00", None],
             mileage_km=[10, None, 30], seconds=[1.0, 2.0, 3.0],
+            probability_off=[0.1, 0.2, None],
         )
     )  # fmt: skip
     assert of.model.tolist() == ["2024", "2024", ""]
