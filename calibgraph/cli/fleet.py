@@ -43,10 +43,13 @@ def fleet(
         memory_gb (GB): Most memory of a job. (default: no limit)
         fetch_gb (GB): Most bytes of a remote recording.
     """
+    from calibgraph.errors import CalibrationError
     from calibgraph.fleet.page import write_fleet_report
     from calibgraph.fleet.run import dask_executor, run_fleet, thread_executor
     from calibgraph.fleet.task import Limits
 
+    if dask is not None and jobs is not None:
+        raise CalibrationError("--jobs is of this machine: with --dask the cluster's threads count")
     memory_bytes = None if memory_gb is None else int(memory_gb * 1e9)
     limits = Limits(timeout_s=timeout_s, memory_bytes=memory_bytes, fetch_bytes=fetch_gb * 1e9)
     opened = thread_executor(jobs) if dask is None else dask_executor(dask)

@@ -43,7 +43,7 @@ def run_job(task: Task) -> Outcome:
             f"a worker has calibgraph {release()}, the command {task.release}; install the same "
             "version on all machines"
         )
-    if not hasattr(_kept, "child"):
+    if getattr(_kept, "child", None) not in _children:
         _kept.child = ChildProcess(__name__)
         _children.append(_kept.child)
     with TemporaryDirectory(prefix="calibgraph-fleet-") as folder:

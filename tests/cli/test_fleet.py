@@ -53,6 +53,7 @@ def test_failed_jobs_exit_1(call: Call, tmp_path: Path, monkeypatch: pytest.Monk
         ("vehicle\na\n", [], "column 'recording' is missing"),
         ("vehicle,recording\na,b;\n", [], "row 0: recording 'b;': expected"),
         ("vehicle,recording\na,.\n", ["--dask", "nonsense://x"], "--dask nonsense://x: no sched"),
+        ("vehicle,recording\na,.\n", ["--dask", "tcp://x:1", "--jobs", "2"], "--jobs is of this"),
     ],
 )
 def test_wrong_input_is_one_line_and_writes_nothing(
