@@ -8,7 +8,7 @@ from pathlib import Path
 import fsspec
 import pytest
 
-from calibgraph import FileError
+from calibgraph import CalibrationError, FileError
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.run import run_fleet
 from calibgraph.fleet.uris import fetch, fingerprint, in_arrow, join, read_bytes
@@ -93,3 +93,9 @@ def test_what_arrow_reads_is_none_of_pythons() -> None:
     assert sys.getrefcount(content) == before
     assert reader.read() == content
     assert in_arrow(b"").read() == b""
+
+
+def test_without_fsspec_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(CalibrationError, match=r"pip install 'calibgraph\[fleet\]'"):
+        read_bytes("fleet.csv", 1000)
