@@ -22,7 +22,7 @@ from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.declaration import declare, help_of
 from calibgraph.cli.exchange import export, import_
-from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
+from calibgraph.cli.fleet import fleet
 from calibgraph.cli.guess import bag, guess, init
 from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
 from calibgraph.cli.learned import weights
@@ -77,7 +77,7 @@ def _options(
 COMMANDS: tuple[Callable[..., None], ...] = (
     calibrate, check, drift, match, solve, report, view, evaluate, perturb, bag, doctor, init,
     guess, export, import_, simulate, weights, track, pick, fleet,
-    fleet_model, fleet_report, serve, token,
+    serve, token,
 )  # fmt: skip
 """In the order of the help."""
 for _command in COMMANDS:

@@ -21,7 +21,6 @@ Args:
     preset (auto|kitti|walkley): Settings of the solve by name.
     result (DIR): Result: its folder, or its calibration.yaml.
     rig (RIG): Initial guess, instead of the dataset's own.
-    rows (URI): What calibgraph fleet wrote: a folder or a URI.
     seed: Seed of everything random.
     tolerance_cm (CM): Largest deviation along an axis that is OK.
     tolerance_deg (DEG): Largest deviation about an axis that is OK.

@@ -5,17 +5,21 @@ so of many reports one in a hundred is expected to be wrong, however many tests 
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.stats import chi2, false_discovery_control, fisher_exact
 
 from calibgraph.arrays import Array
-from calibgraph.audit.trend import fit_slope
-from calibgraph.fleet.fit import Mount, Pooled
-from calibgraph.fleet.model import FALSE_DISCOVERIES, FleetModel, ModelFit
+from calibgraph.audit.fleet_model import FALSE_DISCOVERIES, FleetModel, ModelFit
+from calibgraph.audit.judgement import find_lidar_motion
+from calibgraph.audit.model import fit_slope
+from calibgraph.audit.mounts import Mount, Pooled
 from calibgraph.model.geometry import twists_between
 
 Kind = Literal["mount", "batch", "date", "drift"]
@@ -94,10 +98,9 @@ def _tests(fleet: FleetModel, name: str, model: ModelFit) -> Iterator[Finding]:
         for column, x in columns.items():
             slope = fit_slope(x, mount.batch, information, y)
             if slope is not None:
-                p = _p_value(slope.change, slope.covariance)
                 reach = float(np.nanmax(x) - np.nanmin(x))
-                yield Finding("drift", mount.model, mount.camera, "", p, slope.change,
-                              slope.sigma, column, reach)  # fmt: skip
+                yield Finding("drift", mount.model, mount.camera, "", _p_value(*slope), slope[0],
+                              np.sqrt(np.diag(slope[1])), column, reach)  # fmt: skip
 
 
 def _moved_mounts(fleet: FleetModel, name: str, model: ModelFit) -> Iterator[Finding]:
@@ -165,18 +168,23 @@ def _p_value(change: Array, covariance: Array) -> float:
 
 
 def moved_lidars(fleet: FleetModel) -> list[str]:
-    """Vehicles whose LiDAR moved: all cameras deviate, and the poses between them do not."""
-    of, found = fleet.observations, []
-    for name, model in fleet.models.items():
-        rows = (of.model == name) & of.measured & np.isin(of.camera, list(model.mounts))
-        vehicles, index = np.unique(of.vehicle[rows], return_inverse=True)
-        all_of_it, apart = np.bincount(index), np.bincount(index, weights=fleet.apart[rows])
-        whole = (all_of_it > 1) & (apart == all_of_it)
-        turned = {v for pair in model.pairs.values() for v in _moved_in(pair, model.pooled_pairs)}
-        found += [str(vehicle) for vehicle in vehicles[whole] if vehicle not in turned]
-    return found
+    """Vehicles whose LiDAR moved: all cameras deviate, as one motion of the LiDAR explains."""
+    of = fleet.observations
+    known = of.measured & np.isfinite(fleet.moved)
+    apart, counts = (Counter(of.vehicle[rows].tolist()) for rows in (known & fleet.apart, known))
+    return [name for name, count in apart.items() if count == counts[name] > 1
+            and _explains(fleet, np.flatnonzero(known & (of.vehicle == name)))]  # fmt: skip
 
 
-def _moved_in(mount: Mount, pooled: Pooled) -> list[str]:
-    """Vehicles in which a pair of cameras is rather moved than not."""
-    return [*mount.seen.vehicle[mount.weigh(pooled).share[1] > 0.5].tolist()]  # noqa: PLR2004
+def _explains(fleet: FleetModel, rows: NDArray[np.intp]) -> bool:
+    """Whether a motion of the LiDAR explains how the cameras of one vehicle deviate."""
+    of, model = fleet.observations, fleet.models[str(fleet.observations.model[rows[0]])]
+    spreads = [model.mounts[str(of.camera[row])].spread for row in rows]
+    found = find_lidar_motion(
+        fleet.deviation[rows].ravel(),
+        block_diag(*(of.covariance[rows] + spreads)),
+        [*of.T_camera_lidar[rows]],
+        moved=range(len(rows)),
+        quantile=0.0,
+    )
+    return found is not None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.model.geometry import adjoints, relative_transform
 
 Words = NDArray[np.str_]
 
 NAMES = ("vehicle", "camera", "model", "batch")
-_COLUMNS = (*NAMES, "status", "verdict", "T_camera_lidar", "covariance", "seconds", "date")
+_NO_COVARIATES = (*NAMES, "seconds", "probability_off", "date")
 _UNKNOWN = 1e6
 """Variance [rad^2, m^2] of a camera without a usable result: it leaves the prior as it is."""
 
@@ -71,7 +70,7 @@ def observe(rows: pa.Table) -> Observations:
             f"the fleet's table has no column {missing[0]!r}, found "
             f"{', '.join(rows.column_names)}; give the folder that calibgraph fleet wrote"
         )
-    require_one_quantity(rows)
+    _require_one_quantity(rows)
     T, placed = _fixed_size(rows, "T_camera_lidar", 16)
     covariance, bounded = _fixed_size(rows, "covariance", 36)
     done = (words(rows, "status") == "done") & (words(rows, "verdict") != "FAIL")
@@ -87,70 +86,24 @@ def observe(rows: pa.Table) -> Observations:
     )
 
 
-def require_one_quantity(*tables: pa.Table) -> None:
-    """Check that the poses of all rows are alignments, or all mounts.
-
-    Raises:
-        CalibrationError: naming a vehicle of each.
-    """
-    found: dict[str, str] = {}
-    for rows in tables:
-        done = words(rows, "status") == "done"
-        of, first = np.unique(words(rows, "of")[done] == "mount", return_index=True)
-        names = words(rows, "vehicle")[done][first].tolist()
-        found |= zip(np.where(of, "mount", "alignment").tolist(), names, strict=True)
-    if len(found) > 1:
+def _require_one_quantity(rows: pa.Table) -> None:
+    """Check that the poses of all rows are alignments, or all mounts."""
+    done = words(rows, "status") == "done"
+    of, first = np.unique(words(rows, "of")[done] == "mount", return_index=True)
+    if len(of) > 1:
+        alignment, mount = words(rows, "vehicle")[done][first].tolist()
         raise CalibrationError(
-            f"the rows of vehicle {found['mount']!r} are of mounts, those of "
-            f"{found['alignment']!r} of alignments, which are different quantities; calibrate all "
-            "with one `of` in their settings"
+            f"the rows of vehicle {mount!r} are of mounts, those of {alignment!r} of alignments, "
+            "which are different quantities; calibrate all with one `of` in their settings"
         )
 
 
-def newest_rows(rows: pa.Table, *, days_ago: float = 0.0) -> pa.Table:
-    """The newest row of each vehicle and camera, among those with a date by then.
-
-    Args:
-        rows: the fleet's; rows of one date, or of none, are taken in their order.
-        days_ago: before the newest date of all; with 0 rows without a date count too.
-    """
-    day = days(rows)
-    old = np.full(len(rows), True)
-    if days_ago:
-        old = day <= np.nanmax(day, initial=-np.inf) - days_ago
-    index = np.flatnonzero(old)
-    index = index[np.argsort(np.nan_to_num(day[index], nan=-np.inf), kind="stable")]
+def newest_rows(rows: pa.Table) -> pa.Table:
+    """The newest row of each vehicle and camera; of one date, or of none, the last."""
+    index = np.argsort(np.nan_to_num(days(rows), nan=-np.inf), kind="stable")
     names = np.char.add(np.char.add(words(rows, "vehicle"), "\n"), words(rows, "camera"))[index]
     last = len(index) - 1 - np.unique(names[::-1], return_index=True)[1]
     return rows.take(pa.array(index[np.sort(last)]))
-
-
-def concatenate(parts: Sequence[Observations]) -> Observations:
-    """Observations of one model under each other, at least one."""
-    arrays = {
-        field.name: np.concatenate([getattr(part, field.name) for part in parts])
-        for field in fields(Observations)
-        if field.name != "covariates"
-    }
-    covariates = {name: np.concatenate([part.covariates[name] for part in parts])
-                  for name in parts[0].covariates}  # fmt: skip
-    return Observations(**arrays, covariates=covariates)
-
-
-def relative_observations(of: Observations, camera: str, reference: str) -> Observations:
-    """The poses between two cameras, of the vehicles that have both.
-
-    Returns:
-        With T_b_a in place of T_camera_lidar, and its covariance in the axes of b. The errors of
-        both cameras are taken as independent: a row holds no covariance between cameras.
-    """
-    a, b = (np.flatnonzero((of.camera == name) & of.measured) for name in (reference, camera))
-    _, in_a, in_b = np.intersect1d(of.vehicle[a], of.vehicle[b], return_indices=True)
-    a, b = a[in_a], b[in_b]
-    T_b_a = relative_transform(of.T_camera_lidar[b], of.T_camera_lidar[a])
-    Ad = adjoints(T_b_a)
-    covariance = of.covariance[b] + Ad @ of.covariance[a] @ Ad.transpose(0, 2, 1)
-    return replace(of.select(b), T_camera_lidar=T_b_a, covariance=covariance)
 
 
 def words(rows: pa.Table, name: str) -> Words:
@@ -188,7 +141,7 @@ def _fixed_size(rows: pa.Table, name: str, size: int) -> tuple[Array, NDArray[np
 def _covariates(rows: pa.Table) -> dict[str, Array]:
     """The columns of numbers that are not the fleet's own."""
     plain = (pa.types.is_floating, pa.types.is_integer)
-    others = [field for field in rows.schema if field.name not in _COLUMNS]
+    others = [field for field in rows.schema if field.name not in _NO_COVARIATES]
     numbers = [field.name for field in others if any(test(field.type) for test in plain)]
     return {
         name: rows.column(name).cast(pa.float64()).fill_null(np.nan).to_numpy() for name in numbers

@@ -8,27 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.fleet.fit import Mount, Pooled, fit_mounts
-from calibgraph.fleet.observations import Observations, concatenate, relative_observations
+from calibgraph.audit.mounts import Mount, Pooled, fit_mounts
+from calibgraph.audit.observations import Observations
 
 
 @dataclass(frozen=True, eq=False)
 class ModelFit:
-    """One model of vehicle.
-
-    Attributes:
-        mounts: per camera that enough vehicles measured.
-        pooled: what they share.
-        pairs: per further camera b, its pose from the first camera a, T_b_a, as a mount.
-        pooled_pairs: what the pairs share.
-        reference: the first camera, a.
-    """
+    """One model of vehicle: the mounts that enough vehicles measured, and what they share."""
 
     mounts: Mapping[str, Mount]
     pooled: Pooled
-    pairs: Mapping[str, Mount]
-    pooled_pairs: Pooled
-    reference: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +71,10 @@ def fit_fleet(observations: Observations) -> FleetModel:
     Args:
         observations: one row per vehicle and camera.
     """
-    models = {str(name): fit_model(observations.select(observations.model == name))
-              for name in np.unique(observations.model)}  # fmt: skip
-    models = {name: model for name, model in models.items() if model.mounts}
+    fits = {str(name): fit_mounts(observations.select(observations.model == name))
+            for name in np.unique(observations.model)}  # fmt: skip
+    models = {name: ModelFit({mount.camera: mount for mount in mounts}, pooled)
+              for name, (mounts, pooled) in fits.items() if mounts}  # fmt: skip
     n = len(observations.vehicle)
     T, covariance = observations.T_camera_lidar.copy(), observations.covariance.copy()
     deviation, moved = np.full((n, 6), np.nan), np.full(n, np.nan)
@@ -92,21 +82,18 @@ def fit_fleet(observations: Observations) -> FleetModel:
         for camera, mount in model.mounts.items():
             rows = np.flatnonzero((observations.model == name) & (observations.camera == camera))
             everyone = mount.of_all(observations.select(rows), model.pooled)
-            deviation[rows], moved[rows] = (
-                everyone.deviations(),
-                everyone.weigh(model.pooled).share[1],
-            )
+            deviation[rows] = everyone.deviations()
+            moved[rows] = everyone.weigh(model.pooled).share[1]
             T[rows], covariance[rows] = everyone.shrink(model.pooled)
     return FleetModel(observations, models, T, covariance, deviation, moved)
 
 
-def fit_model(of: Observations) -> ModelFit:
-    """The cameras of one model of vehicle, and the poses between them."""
-    mounts, pooled = fit_mounts(of)
-    cameras = [mount.camera for mount in mounts]
-    pairs = [relative_observations(of, camera, cameras[0]) for camera in cameras[1:]]
-    pair_mounts, pooled_pairs = fit_mounts(concatenate(pairs)) if pairs else ([], Pooled())
-    return ModelFit(
-        {mount.camera: mount for mount in mounts}, pooled,
-        {mount.camera: mount for mount in pair_mounts}, pooled_pairs, (cameras or [""])[0],
-    )  # fmt: skip
+def expected_pose(mount: Mount, pooled: Pooled) -> tuple[Array, Array]:
+    """Where a further vehicle's camera is, unless it is moved in its mount.
+
+    Returns:
+        (4, 4) T_camera_lidar; (6, 6) covariance of xi in T_camera_lidar = exp(xi) that, which
+        holds the spread of vehicles and batches and the uncertainty of the nominal pose.
+    """
+    between = mount.centers.nominal_covariance + pooled.batch * mount.spread
+    return mount.centers.nominal, mount.spread + between

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.fleet.deviations import Centers, Posterior, measured_batches, solve_centers, weigh
-from calibgraph.fleet.observations import Observations
+from calibgraph.audit.model import Posterior, weigh, weighted_mean
+from calibgraph.audit.observations import Observations
 from calibgraph.model.geometry import retract_all, twists_between
 
 MIN_VEHICLES = 8
@@ -62,6 +62,44 @@ def shapes(spread: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
+class Centers:
+    """Where a camera sits in a model of vehicle and in each of its batches.
+
+    Attributes:
+        nominal: (4, 4) T_camera_lidar of the model.
+        nominal_covariance: (6, 6) of xi in T_camera_lidar = exp(xi) estimate.
+        batches: (b, 4, 4).
+        batch_covariance: (b, 6, 6).
+    """
+
+    nominal: Array
+    nominal_covariance: Array
+    batches: Array
+    batch_covariance: Array
+
+
+Batches = tuple[NDArray[np.intp], Array, Array]
+"""What the vehicles alone measure: (m,) batches, (m, 4, 4) their poses, (m, 6, 6) covariances."""
+
+
+def solve_centers(start: Centers, measured: Batches, spread: Array) -> Centers:
+    """Nominal pose and batches: a batch scatters about the nominal pose by (b, 6, 6) ``spread``."""
+    some, T, noise = measured
+    y = twists_between(T, start.nominal)
+    total: Array = np.asarray(np.linalg.inv(spread[some] + noise), np.float64)
+    center, of_center = weighted_mean(y, total)
+    gain, rest = np.zeros_like(spread), np.tile(np.eye(6), (len(spread), 1, 1))
+    gain[some] = spread[some] @ total
+    rest -= gain
+    steps = np.tile(center, (len(spread), 1))
+    steps[some] += np.einsum("bij,bj->bi", gain[some], y - center)
+    starts = np.tile(start.nominal, (len(spread) + 1, 1, 1))
+    poses = retract_all(starts, -np.vstack([center, steps]))
+    bars = rest @ spread + rest @ of_center @ rest.swapaxes(1, 2)
+    return Centers(poses[0], of_center, poses[1:], (bars + bars.swapaxes(1, 2)) / 2)
+
+
+@dataclass(frozen=True, eq=False)
 class Mount:
     """One camera in all vehicles of a model.
 
@@ -87,14 +125,18 @@ class Mount:
         y = twists_between(self.seen.T_camera_lidar, self.centers.batches[self.batch])
         return np.where(self.seen.measured[:, None], y, 0.0)
 
-    def measured_batches(self, vehicles: Posterior) -> tuple[NDArray[np.intp], Array, Array]:
+    def measured_batches(self, vehicles: Posterior) -> Batches:
         """What the vehicles alone measure of the batches' centres, by sums over vehicles."""
         information = np.zeros((len(self.batches), 6, 6))
         weighted = np.zeros((len(self.batches), 6))
         each = np.einsum("nij,nj->ni", vehicles.information, self.deviations())
         np.add.at(information, self.batch, vehicles.information)
         np.add.at(weighted, self.batch, each)
-        return measured_batches(self.centers.batches, information, weighted)
+        some = np.flatnonzero(np.trace(information, axis1=1, axis2=2) > 0)
+        covariance = np.linalg.inv(information[some])
+        covariance = (covariance + covariance.swapaxes(1, 2)) / 2
+        steps = np.einsum("bij,bj->bi", covariance, weighted[some])
+        return some, retract_all(self.centers.batches[some], -steps), covariance
 
     def of_all(self, rows: Observations, pooled: Pooled) -> Mount:
         """The same mount with other rows; unmeasured batches have the model's nominal pose."""
@@ -125,18 +167,12 @@ class Moments:
     """Sums over vehicles, or over batches, of both cases: regular first.
 
     Attributes:
-        counts: expected number of each case.
-        squares: expected sums of squared deviations over the spread of :func:`shapes`.
-        of: how many there are.
+        counts: (2,) expected number of each case.
+        squares: (2,) expected sums of squared deviations over the spread of :func:`shapes`.
     """
 
-    counts: Array = field(default_factory=lambda: np.zeros(2))
-    squares: Array = field(default_factory=lambda: np.zeros(2))
-    of: int = 0
-
-    def __add__(self, other: Moments) -> Moments:
-        """Of both."""
-        return Moments(self.counts + other.counts, self.squares + other.squares, self.of + other.of)
+    counts: Array
+    squares: Array
 
     def variances(self, defaults: Sequence[float]) -> Array:
         """(2,) variances of both cases, their defaults with the weight of one."""
@@ -145,14 +181,14 @@ class Moments:
 
     def share(self, default: float) -> float:
         """The share of the second case, its default with the weight of 50."""
-        return float((50 * default + self.counts[1]) / (50 + self.of))
+        return float((50 * default + self.counts[1]) / (50 + self.counts.sum()))
 
 
 def moments_of(posterior: Posterior, moments: Array, spread: Array) -> Moments:
     """The sums of deviations with (2, n, 6, 6) second moments."""
     squares = np.einsum("kij,knji->kn", np.linalg.inv(shapes(spread)), moments)
     share = posterior.share
-    return Moments(share.sum(axis=1), (share * squares).sum(axis=1), share.shape[1])
+    return Moments(share.sum(axis=1), (share * squares).sum(axis=1))
 
 
 def fit_mounts(observations: Observations) -> tuple[list[Mount], Pooled]:
@@ -225,7 +261,12 @@ def _between(mount: Mount, pooled: Pooled, some: NDArray[np.intp], batches: Post
 
 def pool(vehicles: Sequence[Moments], batches: Sequence[Moments]) -> Pooled:
     """What the cameras of a model share, from the sums of each."""
-    start, of_vehicles, of_batches = Pooled(), sum(vehicles, Moments()), sum(batches, Moments())
+    start = Pooled()
+    of_vehicles, of_batches = (
+        Moments(np.sum([each.counts for each in all_], axis=0),
+                np.sum([each.squares for each in all_], axis=0))
+        for all_ in (vehicles, batches)
+    )  # fmt: skip
     batch, batch_moved = of_batches.variances([start.batch, start.batch_moved])
     return Pooled(
         moved=max(9.0, of_vehicles.variances([1.0, start.moved])[1]),

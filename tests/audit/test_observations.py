@@ -6,10 +6,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from calibgraph.audit.fleet_model import fit_fleet
+from calibgraph.audit.observations import observe
 from calibgraph.errors import CalibrationError
-from calibgraph.fleet.model import fit_fleet
-from calibgraph.fleet.observations import observe
-from calibgraph.fleet.page import STATES, assess_status, payload
+from calibgraph.fleet.page import STATES, FleetReport, assess_status, payload
 from calibgraph.fleet.rows import SCHEMA
 
 
@@ -34,11 +34,11 @@ def test_rows_without_a_result_measure_nothing() -> None:
     assert of.measured.tolist() == [True, False, False]
     assert np.isnan(of.day).all()
     assert of.covariates == {}
-    fleet = fit_fleet(of)
-    standing = assess_status(rows, fleet)
+    report = FleetReport(fit_fleet(of), [], [])
+    standing = assess_status(rows, report)
     assert [STATES[s] for s in standing.state] == ["PASS", "WARN", "NO RESULT"]
     assert standing.reasons == ["", "no error bar; few frames", "no images"]
-    assert payload(fleet, standing, "")["vehicles"] == ["a", "b"]
+    assert payload(report, standing)["vehicles"] == ["a", "b"]
 
 
 def test_columns_of_the_manifest_are_understood() -> None:
@@ -46,6 +46,7 @@ def test_columns_of_the_manifest_are_understood() -> None:
         rows_of(
             model=[2024, 2024, None], date=["2026-03-01", "2026-03-02T12:00:00", None],
             mileage_km=[10, None, 30], seconds=[1.0, 2.0, 3.0],
+            probability_off=[0.1, 0.2, None],
         )
     )  # fmt: skip
     assert of.model.tolist() == ["2024", "2024", ""]
@@ -67,10 +68,7 @@ def test_wrong_tables_are_one_line(rows: pa.Table, message: str) -> None:
 
 
 def test_mounts_are_not_mixed_with_alignments() -> None:
-    """Rows of earlier versions, without the column, are alignments; a failed row is neither."""
-    mounts, alignments = rows_of(of=["mount", "mount", None]), rows_of()
-    assert observe(mounts).measured.any()
+    """Rows without the column are alignments; a failed row is neither."""
+    assert observe(rows_of(of=["mount", "mount", None])).measured.any()
     with pytest.raises(CalibrationError, match="vehicle 'a' are of mounts, those of 'a' of align"):
-        assess_status(mounts, fit_fleet(observe(mounts)), before=alignments)
-    with pytest.raises(CalibrationError, match="one `of` in their settings"):
         observe(rows_of(of=["mount", None, None]))
