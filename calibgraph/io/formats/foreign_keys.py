@@ -138,6 +138,8 @@ def _one_map_per_camera(content: dict[str, Any], path: Path, name: str | None) -
             pose = {"T_lidar_camera": given[0]} if given else {}
             values = camera["intrinsics"]
             if stated_model(camera, path) == "equirectangular":
+                if len(values) != 2:  # noqa: PLR2004
+                    raise FileError(path, f"has the intrinsics {values}, expected width and height")
                 width, height = values
                 focal = {"fx": width / (2 * math.pi), "fy": height / math.pi}
                 lens = {**focal, "cx": width / 2, "cy": height / 2, "model": "equirectangular"}

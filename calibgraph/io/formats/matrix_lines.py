@@ -15,7 +15,7 @@ perspective.txt          P_rect_0k, R_rect_0k,       lenses of the rectified ima
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -53,9 +53,10 @@ def read_lines(path: Path, name: str | None) -> Part | None:
         if array.dtype.kind not in "fiu" or array.size not in (12, 16):
             raise FileError(path, f"holds {array.shape} of {array.dtype}, expected 3 x 4 or 4 x 4")
         return _matrices({"": array.astype(np.float64).ravel().tolist()}, path, name)
-    lines = [line for line in read_text(path).splitlines() if line.strip()]
-    cameras = [words for line in lines if (words := line.split()) and words[0][0] != "#"]
-    first = cameras[0] if cameras else [""]
+    numbered = enumerate(read_text(path).splitlines(), start=1)
+    lines = {number: line for number, line in numbered if line.strip()}
+    cameras = {k: line.split() for k, line in lines.items() if not line.lstrip().startswith("#")}
+    first = next(iter(cameras.values()), [""])
     if path.name == "cameras.txt" or (
         first[0].isdecimal() and len(first) > 1 and first[1][0].isalpha()
     ):
@@ -63,15 +64,17 @@ def read_lines(path: Path, name: str | None) -> Part | None:
             raise FileError(
                 path, "holds no camera; expected lines CAMERA_ID MODEL WIDTH HEIGHT ..."
             )
-        return Part(path, lenses=dict(_colmap_lens(words, path) for words in cameras))
-    if lines and (":" in lines[0] or len(_row(lines[0])) in (4, 12, 16)):
-        return _matrices(dict(_keyed(lines)), path, name)
+        return Part(path, lenses=dict(_colmap_lens(each, path) for each in cameras.items()))
+    head = next(iter(lines.values()), "")
+    if ":" in head or len(_row(head)) in (4, 12, 16):
+        return _matrices(dict(_keyed(lines.values())), path, name)
     return None
 
 
-def _colmap_lens(words: list[str], path: Path) -> tuple[str, CameraLens]:
+def _colmap_lens(numbered: tuple[int, list[str]], path: Path) -> tuple[str, CameraLens]:
     """The name camera_ID and the lens of a line."""
-    where = f"line {' '.join(words)[:40]!r}"
+    number, words = numbered
+    where = f"line {number}"
     try:
         identity, name, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
         values = [float(word) for word in words[_COLMAP_FIELDS:]]
@@ -147,7 +150,7 @@ def _T_camera_lidar(lines: dict[str, list[float]], path: Path) -> Array:
     return invert(T) if to_lidar else T
 
 
-def _keyed(lines: list[str]) -> Iterator[tuple[str, list[float]]]:
+def _keyed(lines: Iterable[str]) -> Iterator[tuple[str, list[float]]]:
     """The numbers of each key; those without a key together. KITTI's calib_time is a date."""
     bare: list[float] = []
     for line in lines:
