@@ -56,7 +56,7 @@ def _rows(path: Path, data: bytes, columns: int) -> NDArray[np.float32]:
 
 
 def _count_columns(path: Path, values: NDArray[np.float32]) -> int | None:
-    """The smallest number of columns that explains as much as any; None of few numbers."""
+    """The smallest number of columns that explains as much as any; None of few or alike ones."""
     if len(values) < _FEW:
         return None
     ranks = rankdata(np.abs(np.nan_to_num(values[:_MOST]))) / min(len(values), _MOST)
@@ -68,11 +68,14 @@ def _count_columns(path: Path, values: NDArray[np.float32]) -> int | None:
     thinned = np.abs(np.nan_to_num(values[:: 1 + len(values) // _MOST]))
     parts = np.array_split(rankdata(thinned) / len(thinned), 4)
     between = float(np.var([part.mean() for part in parts]))
-    best = next(c for c in explained if explained[c] >= _ENOUGH * max(explained.values()))
-    if between > _CLEARLY * explained[best]:
+    most = max(*explained.values(), 1 / len(ranks))
+    if between > _CLEARLY * most:
         raise FileError(
             path, "has all x first, then all y, by its content; write it point by point"
         )
+    best = next((c for c in explained if explained[c] >= _ENOUGH * most), None)
+    if best is None:
+        return None
     rows = values[: len(values) // best * best].reshape(-1, best)[:, :3]
     with np.errstate(invalid="ignore"):
         implausible = bool((np.abs(rows) > MAX_COORDINATE).any())
