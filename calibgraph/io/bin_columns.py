@@ -16,14 +16,12 @@ from calibgraph.io.point_fields import RawCloud, make_cloud, raw_cloud
 from calibgraph.model.correspondences import MAX_COORDINATE
 
 _NAMES = ("x", "y", "z", "intensity", "column 5", "column 6")
-_FEW, _MOST = (
-    3_000,
-    60_000,
-)  # numbers: with fewer, columns are as the name says; so many are looked at
-_ENOUGH = 0.95  # of the largest variance: twice as many columns have as much, a half at most 0.91
-_CLEARLY = (
-    10.0  # times the variance between parts: 130 and more in transposed clouds, 1.1 in others
-)
+_FEW, _MOST = 840, 60_000
+"""Of numbers: with fewer, columns are as the name says; so many are looked at."""
+_ENOUGH = 0.95
+"""Of the largest variance: twice as many columns explain as much, half as many at most 0.91."""
+_CLEARLY = 10.0
+"""Times the variance between parts of a file: 130 and more if transposed, 1.1 in others."""
 _ASK = "write `cloud_columns: [x, y, z, intensity, ring]` into rig.yaml, a name per float32 column"
 
 
