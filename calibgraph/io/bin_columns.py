@@ -71,7 +71,7 @@ def _count_columns(path: Path, values: NDArray[np.float32]) -> int | None:
         raise FileError(
             path, "has all x first, then all y, by its content; write it point by point"
         )
-    best = next((c for c in explained if explained[c] >= _ENOUGH * most), None)
+    best = next((c for c in explained if explained[c] >= _ENOUGH * most - 4 / len(ranks)), None)
     if best is None:
         return None
     rows = values[: len(values) // best * best].reshape(-1, best)[:, :3]
