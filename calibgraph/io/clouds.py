@@ -4,7 +4,7 @@ import threading
 import tokenize
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,9 @@ _XYZ, _XYZI = 3, 4
 _MOST_COLUMNS = 64
 
 
-def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np.float32]:
+def load_cloud(
+    path: Path | str, motion: ScanMotion | None = None, columns: Sequence[str] | None = None
+) -> NDArray[np.float32]:
     """Read a cloud.
 
     Args:
@@ -50,6 +52,7 @@ def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np
             nuScenes), .pcd, .ply, or a .feather of Argoverse 2; or the address of a message in a
             bag.
         motion: for which points of a bag's message are corrected; None for none.
+        columns: names of those of a .bin; told by its content if None.
 
     Returns:
         (n, 4) x y z [m] in the LiDAR frame and the intensity as the file has it, NaN where it has
@@ -62,7 +65,7 @@ def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np
     path = Path(path)
     if path.suffix == MESSAGE_SUFFIX:
         return with_intensity(load_bag_cloud(path, motion))
-    return with_intensity(check_points(read_cloud(path).points, path))
+    return with_intensity(check_points(read_cloud(path, columns).points, path))
 
 
 def thin_cloud(cloud: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -84,12 +87,14 @@ def describe_thinned(sizes: Iterable[int]) -> list[str]:
     ]
 
 
-def read_cloud(path: Path) -> RawCloud:
+def read_cloud(path: Path, columns: Sequence[str] | None = None) -> RawCloud:
     """All points of a file, and the names of its fields."""
     if require_file(path).stat().st_size > MAX_CLOUD_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for one cloud")
     if path.suffix.lower() not in _READERS:
         raise FileError(path, f"unknown cloud format; known are {', '.join(CLOUD_SUFFIXES)}")
+    if path.suffix.lower() == ".bin":
+        return read_bin(path, columns)
     return _READERS[path.suffix.lower()](path)
 
 
@@ -219,14 +224,14 @@ _COST = "the error bars become about twice as wide without; record it, or name i
 """Measured on data/sample: 1.8 to 2.8 times the error bars without it, with half of the matches."""
 
 
-def read_cloud_notes(path: Path) -> list[str]:
+def read_cloud_notes(path: Path, columns: Sequence[str] | None = None) -> list[str]:
     """Notes about a file, or about a message in a bag; none if it cannot be read."""
     try:
         if path.suffix == MESSAGE_SUFFIX:
             fields = tuple(each.name for each in read_message(path)[1].fields)
             cloud = RawCloud(load_bag_cloud(path), fields)
         else:
-            cloud = read_cloud(path)
+            cloud = read_cloud(path, columns)
             cloud = cloud._replace(points=check_points(cloud.points, path))
     except (CalibrationError, OSError):  # which is named where the frame is read
         return []

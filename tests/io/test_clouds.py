@@ -168,7 +168,7 @@ def test_random_bytes_are_refused_without_a_warning(tmp_path: Path) -> None:
     """Warnings are errors here; signalling NaNs are numbers that cause some."""
     data = np.random.default_rng(0).integers(0, 256, 16 * 50_000, np.uint8)
     (tmp_path / "random.bin").write_bytes(data.tobytes())
-    with pytest.raises(FileError, match=r"random.bin: (point \d+ is not finite|holds a coord)"):
+    with pytest.raises(FileError, match="random.bin: its columns cannot be told by its content"):
         load_cloud(tmp_path / "random.bin")
 
 

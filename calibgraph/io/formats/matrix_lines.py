@@ -1,4 +1,6 @@
-"""Text files of matrices as KITTI, KITTI-360 and data sets like them write: ``KEY: numbers``.
+"""Text files of lines: lenses of COLMAP's cameras.txt, and matrices as KITTI and others write them.
+
+COLMAP's pixel (0.5, 0.5) is the centre of the first one. Matrices are lines ``KEY: numbers``:
 
 =======================  ==========================  ==============================================
 file                     lines                       direction
@@ -11,8 +13,9 @@ perspective.txt          P_rect_0k, R_rect_0k,       lenses of the rectified ima
 =======================  ==========================  ==============================================
 """
 
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,15 +24,20 @@ from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
 from calibgraph.io.clouds import read_npy
+from calibgraph.io.formats.foreign_keys import foreign_keys
 from calibgraph.io.formats.part import ONLY_CAMERA, FrameLink, Part
 from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.io.kitti import matrix_of_line
-from calibgraph.io.lenses import CameraLens, intrinsics_of_matrix
+from calibgraph.io.lenses import (
+    CameraLens,
+    fitted_coefficients,
+    intrinsics_of_matrix,
+    listed_intrinsics,
+)
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import rigid_transform
 
-_LIDAR, _POSE = "velodyne", "pose"
-_KITTI_360, _FIRST = "calib_cam_to_velo", "image_00"
+_COLMAP_FIELDS = 4  # before the parameters: id, model, width, height
 _TO_LIDAR = re.compile(r"cam[a-z]*_?(to|2)_?(velo|lidar)", re.IGNORECASE)
 _TO_CAMERA = re.compile(r"(velo[a-z]*|lidar)_?(to|2)_?cam", re.IGNORECASE)
 _EXPECTED = (
@@ -38,25 +46,65 @@ _EXPECTED = (
 )
 
 
-def is_kitti_lines(text: str) -> bool:
-    """Whether the first line of a text is ``KEY: ...``, or a matrix or its first row."""
-    first = next((line for line in text.splitlines() if line.strip()), "")
-    return ":" in first or len(_row(first)) in (4, 12, 16)
+def read_lines(path: Path, name: str | None) -> Part | None:
+    """The lenses and transforms of a file of lines, or of an array; None if it is no such file."""
+    if path.suffix.lower() == ".npy":
+        array = read_npy(path)
+        if array.dtype.kind not in "fiu" or array.size not in (12, 16):
+            raise FileError(path, f"holds {array.shape} of {array.dtype}, expected 3 x 4 or 4 x 4")
+        return _matrices({"": array.astype(np.float64).ravel().tolist()}, path, name)
+    numbered = enumerate(read_text(path).splitlines(), start=1)
+    lines = {number: line for number, line in numbered if line.strip()}
+    cameras = {k: line.split() for k, line in lines.items() if not line.lstrip().startswith("#")}
+    first = next(iter(cameras.values()), [""])
+    if path.name == "cameras.txt" or (
+        first[0].isdecimal() and len(first) > 1 and first[1][0].isalpha()
+    ):
+        if not cameras:
+            raise FileError(
+                path, "holds no camera; expected lines CAMERA_ID MODEL WIDTH HEIGHT ..."
+            )
+        return Part(path, lenses=dict(_colmap_lens(each, path) for each in cameras.items()))
+    head = next(iter(lines.values()), "")
+    if ":" in head or len(_row(head)) in (4, 12, 16):
+        return _matrices(dict(_keyed(lines.values())), path, name)
+    return None
 
 
-def read_kitti_lines(path: Path, name: str | None) -> Part:
-    """The lenses and transforms of a file."""
-    lines = _matrix_of_npy(path) if path.suffix == ".npy" else dict(_lines(path))
-    transforms = {key: row for key, row in lines.items() if re.fullmatch(r"image_\d+", key)}
+def _colmap_lens(numbered: tuple[int, list[str]], path: Path) -> tuple[str, CameraLens]:
+    """The name camera_ID and the lens of a line."""
+    number, words = numbered
+    where = f"line {number}"
+    try:
+        identity, name, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+        values = [float(word) for word in words[_COLMAP_FIELDS:]]
+    except (IndexError, ValueError) as error:
+        raise FileError(path, f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from error
+    models = foreign_keys().colmap
+    if name not in models:
+        raise FileError(path, f"{where}: lens model {name!r} is none of calibgraph's; of COLMAP's "
+                        f"there are {', '.join(models)}")  # fmt: skip
+    model, focals, distorted = models[name]
+    count = focals + 2 + distorted
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise FileError(path, f"{where}: {name} has {count} parameters, found {len(values)}")
+    cx, cy = (centre - 0.5 for centre in values[focals : focals + 2])
+    K = listed_intrinsics((values[0], values[focals - 1], cx, cy), f"{path}: {where}")
+    distortion = fitted_coefficients(values[focals + 2 :], model, path)
+    return f"camera_{identity}", CameraLens(model, (width, height), K, distortion)
+
+
+def _matrices(lines: dict[str, list[float]], path: Path, name: str | None) -> Part:
+    """The lenses and transforms of matrices by key."""
+    poses = {key: row for key, row in lines.items() if re.fullmatch(r"image_\d+", key)}
     rectified = sorted(key[-2:] for key in lines if re.fullmatch(r"P_rect_\d\d", key))
-    if transforms:
-        links = [FrameLink(_POSE, f"{key}_optical", _rigid(row, path, key))
-                 for key, row in transforms.items()]  # fmt: skip
-        return Part(path, links=tuple(links))
+    if poses:
+        return Part(path, links=tuple(FrameLink("pose", f"{key}_optical", _rigid(row, path, key))
+                                      for key, row in poses.items()))  # fmt: skip
     if rectified:
         return _rectified(lines, rectified, path)
-    camera = name or (_FIRST if path.stem == _KITTI_360 else ONLY_CAMERA)
-    link = FrameLink(f"{frame_id(camera)}_optical", _LIDAR, _T_camera_lidar(lines, path))
+    camera = name or ("image_00" if path.stem == "calib_cam_to_velo" else ONLY_CAMERA)
+    link = FrameLink(f"{frame_id(camera)}_optical", "velodyne", _T_camera_lidar(lines, path))
     return Part(path, links=(link,))
 
 
@@ -102,27 +150,17 @@ def _T_camera_lidar(lines: dict[str, list[float]], path: Path) -> Array:
     return invert(T) if to_lidar else T
 
 
-def _lines(path: Path) -> Iterator[tuple[str, list[float]]]:
-    """The numbers of each key; those without a key together."""
+def _keyed(lines: Iterable[str]) -> Iterator[tuple[str, list[float]]]:
+    """The numbers of each key; those without a key together. KITTI's calib_time is a date."""
     bare: list[float] = []
-    for line in read_text(path).splitlines():
+    for line in lines:
         key, colon, values = line.rpartition(":")
-        if colon and line.split(":")[0].strip().endswith("time"):
-            continue  # KITTI's calib_time, a date
-        if colon:
+        if colon and not line.split(":")[0].strip().endswith("time"):
             yield key.strip(), _row(values)
-        else:
+        elif not colon:
             bare += _row(line)
     if bare:
         yield "", bare
-
-
-def _matrix_of_npy(path: Path) -> dict[str, list[float]]:
-    """The one matrix of an array file."""
-    array = read_npy(path)
-    if array.dtype.kind not in "fiu" or array.size not in (12, 16):
-        raise FileError(path, f"holds {array.shape} of {array.dtype}, expected 3 x 4 or 4 x 4")
-    return {"": array.astype(np.float64).ravel().tolist()}
 
 
 def _row(text: str) -> list[float]:
