@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -14,11 +14,8 @@ from factors import (
     Lens,
     ProjectionBlock,
     block_factor,
-    kernel,
     projection_factor,
-    square_root,
 )
-from factors.block_sums import BlockSums
 from tests.factors.blocks import KEY, LENSES, TRUTH, at, poses, with_loss, world
 
 EACH_LENS_AND_LOSS = [
@@ -108,19 +105,6 @@ def test_sigma_divides_the_whitened_residuals(loss: str) -> None:
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(b).max())
 
 
-def test_selected_correspondences_are_those_of_the_arrays() -> None:
-    block = with_loss(world(LENSES["pinhole"], 300), "cauchy")
-    some = np.random.default_rng(1).random(300) < 0.5
-    part = block.select(some)
-    made = ProjectionBlock(
-        block.lens, block.points_lidar_m[some], block.pixels_px[some], block.sqrt_information[some],
-        block.loss, block.scale,
-    )  # fmt: skip
-    np.testing.assert_array_equal(part.points_lidar_m, made.points_lidar_m)
-    np.testing.assert_array_equal(part.residuals(TRUTH)[0], made.residuals(TRUTH)[0])
-    np.testing.assert_array_equal(part.sums(TRUTH).hessian, made.sums(TRUTH).hessian)
-
-
 @pytest.mark.parametrize("plain", [False, True])
 def test_joined_blocks_are_the_block_of_all_rows(plain: bool) -> None:
     """To the last bit; a block without whitening counts as one with the identity."""
@@ -148,20 +132,6 @@ def test_gradients_at_several_poses_are_those_at_each(count: int) -> None:
         expected = block.sums(pose).gradient
         scale = np.abs(expected).max() or 1.0  # sums in another order: rounding alone
         np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-13 * scale)
-
-
-def test_other_whitening_leaves_the_correspondences_in_their_place() -> None:
-    block = world(LENSES["pinhole"], 40)
-    roots = np.random.default_rng(0).uniform(0.1, 1.0, (40, 3))
-    other = block.rewhiten(roots)
-    assert other.points_lidar_m.base is block.points_lidar_m.base
-    for given in (roots, roots[:, [0, 0, 0]] * [1, 0, 1], None):
-        found, expected = (b.sums(TRUTH) for b in (
-            block.rewhiten(given), replace(block, sqrt_information=given)))  # fmt: skip
-        np.testing.assert_array_equal(found.hessian, expected.hessian)
-        assert found.cost == expected.cost
-    with pytest.raises(ValueError, match=r"sqrt_information\[3\] is not finite"):
-        block.rewhiten(np.where(np.arange(40)[:, None] == 3, np.nan, roots))
 
 
 def test_far_residuals_do_not_leave_the_range_of_a_float() -> None:
@@ -216,28 +186,6 @@ def test_too_few_points_give_a_singular_but_harmless_factor(count: int) -> None:
     np.testing.assert_allclose(error @ error, sums.cost, rtol=1e-9)
 
 
-def test_points_on_one_ray_leave_directions_free() -> None:
-    lens = LENSES["pinhole"]
-    points = np.outer(np.linspace(5, 50, 30), [0.1, 0.05, 1.0])
-    in_lidar = points @ TRUTH.rotation().matrix().T + TRUTH.translation()
-    block = ProjectionBlock(lens, in_lidar, lens.project(points)[0] + 0.5)
-    error, jacobian = block.error_and_jacobian(TRUTH)
-    sums = block.sums(TRUTH)
-    assert np.linalg.matrix_rank(jacobian) < 6
-    np.testing.assert_allclose(jacobian.T @ jacobian, sums.hessian, atol=1e-9 * sums.hessian.max())
-    np.testing.assert_allclose(jacobian.T @ error, sums.gradient, rtol=1e-6, atol=1e-6)
-
-
-def test_blocks_add() -> None:
-    block = with_loss(world(LENSES["radtan"], 5000), "cauchy")
-    whole = block.sums(TRUTH)
-    parts = block.frame_sums(TRUTH, [0, 700, 700, 3000, 5000])
-    assert parts.cost[1] == 0.0
-    np.testing.assert_allclose(parts.hessian.sum(axis=0), whole.hessian, rtol=1e-12)
-    np.testing.assert_allclose(parts.gradient.sum(axis=0), whole.gradient, rtol=1e-9)
-    np.testing.assert_allclose(parts.cost.sum(), whole.cost, rtol=1e-12)
-
-
 def test_every_point_behind_the_camera_is_finite_and_bounded() -> None:
     block = with_loss(world(LENSES["radtan"], 300), "cauchy")
     backwards = TRUTH.compose(gtsam.Pose3(gtsam.Rot3.Ry(np.pi), np.zeros(3)))
@@ -247,12 +195,6 @@ def test_every_point_behind_the_camera_is_finite_and_bounded() -> None:
     found = gtsam.LevenbergMarquardtOptimizer(graph, at(backwards)).optimize()
     assert np.isfinite(found.atPose3(KEY).matrix()).all()
     assert graph.error(found) <= graph.error(at(backwards))
-
-
-def test_square_root_of_nothing_is_zero() -> None:
-    error, jacobian = square_root(BlockSums(np.zeros((6, 6)), np.zeros(6), np.float64(0.0)))
-    assert not error.any()
-    assert not jacobian.any()
 
 
 def test_sums_do_not_depend_on_the_number_of_threads() -> None:
@@ -287,45 +229,6 @@ def test_bad_blocks_are_refused() -> None:
         ProjectionBlock(lens, np.zeros((2, 3)), np.zeros((2, 2)), scale=0.0)
 
 
-def test_a_factor_is_that_of_its_own_block_whatever_was_evaluated_before() -> None:
-    """A factor remembers its last pose; another block's factor, and another pose, do not use it."""
-    block = with_loss(world(LENSES["pinhole"], 40), "cauchy")
-    part = block.select(np.arange(20))
-    factors = {id(b): block_factor(KEY, b) for b in (block, part)}
-    for pose in [*poses(), *poses()]:
-        for b in (block, part):
-            expected = b.sums(pose)
-            A, right = factors[id(b)].linearize(at(pose)).jacobian()
-            hessian, gradient = A.T @ A, -A.T @ right
-            # Of sums of 40 terms, through an eigendecomposition.
-            scale = np.abs(expected.hessian).max()
-            np.testing.assert_allclose(hessian, expected.hessian, rtol=0, atol=1e-12 * scale)
-            largest = np.abs(expected.gradient).max()
-            np.testing.assert_allclose(gradient, expected.gradient, rtol=0, atol=1e-9 * largest)
-            assert 2 * factors[id(b)].error(at(pose)) == pytest.approx(expected.cost, rel=1e-12)
-
-
-def test_a_block_cannot_be_changed() -> None:
-    block = world(LENSES["pinhole"], 10)
-    before = dict(vars(block))
-    with pytest.raises(FrozenInstanceError):
-        block.scale = 1.0
-    for name in ("points_lidar_m", "pixels_px", "sqrt_information", "_columns", "_whitening"):
-        with pytest.raises(ValueError, match="read-only"):
-            getattr(block, name)[0] = 0.0
-    block.residuals(TRUTH), block.sums(TRUTH), block.error_and_jacobian(TRUTH)
-    block.select(np.arange(3)), block.rescale(scale=2.0, sigma=3.0)
-    assert vars(block).keys() == before.keys()
-    assert all(vars(block)[name] is value for name, value in before.items())
-
-
-def test_a_block_does_not_make_the_arrays_of_its_maker_read_only() -> None:
-    points, pixels, roots = np.ones((4, 3)), np.ones((4, 2)), np.ones((4, 3))
-    ProjectionBlock(LENSES["pinhole"], points, pixels, roots)
-    for array in (points, pixels, roots):
-        assert array.flags.writeable
-
-
 def test_threads_get_the_sums_of_their_own_pose() -> None:
     """One factor, evaluated at many poses by several threads at once."""
     factor = block_factor(KEY, with_loss(world(LENSES["pinhole"], 500), "cauchy"))
@@ -334,22 +237,3 @@ def test_threads_get_the_sums_of_their_own_pose() -> None:
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda k: factor.error(at(many[k % 20])), range(400)))
     assert found == [alone[k % 20] for k in range(400)]
-
-
-def test_kernels_are_compiled_once_whether_or_not_their_arrays_can_be_written() -> None:
-    block = world(LENSES["radtan"], 50)
-    T = TRUTH.inverse().matrix()
-    T.flags.writeable = False
-    for pose in (T, T.copy(), np.asfortranarray(T)):
-        runs = np.array([[0, 20], [20, 50]])
-        runs.flags.writeable = pose.flags.writeable
-        block.run_sums(pose[None], runs)
-        block.run_residuals(pose[None], runs)
-        block.run_norms(pose[None], runs)
-        block.costs_at_each(pose[None])
-        block.lens.are_projectable(block.points_lidar_m, pose)
-    for one in (
-        kernel.accumulate(block.lens.kind, shared=False),
-        *(kernel.evaluate(block.lens.kind, norms=norms, shared=False) for norms in (False, True)),
-    ):
-        assert len(one.signatures) == 1, one.signatures

@@ -17,7 +17,6 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.graph.objective import pose_key
-from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import (
     pose_difference,
@@ -26,7 +25,7 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
     twist_between,
 )
-from calibgraph.solver.camera_pairs import MIN_PAIR_MATCHES, PairTerm, pair_graph, pair_terms
+from calibgraph.solver.camera_pairs import PairTerm, pair_graph, pair_terms
 from calibgraph.solver.covariance import cluster_robust_covariance
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.optimizer import optimize
@@ -101,12 +100,6 @@ def test_features_without_a_surface_give_the_direction(pair: Rig) -> None:
     assert directions[0] @ directions[1] > np.cos(np.radians(0.3))
 
 
-def test_pairs_with_too_few_matches_have_no_term(pair: Rig) -> None:
-    table = simulated_pairs(pair)
-    assert pair_terms(pair, table.select(slice(0, MIN_PAIR_MATCHES - 1)), Config()) == ()
-    assert pair_terms(pair, CameraMatches.empty(tuple(pair.cameras)), Config()) == ()
-
-
 def test_sigma_and_gate_fit_the_noise(pair: Rig) -> None:
     """0.3 px in each image; a tenth of outliers, most of them beyond the gate."""
     table = simulated_pairs(pair, outliers=0.1)
@@ -158,22 +151,6 @@ def test_the_joint_optimum_of_a_paper_preset_is_that_of_all_terms(rig: Rig) -> N
     )
     back = objective.minimize(moved.T_camera_lidar, solution.scales)
     assert pair_error(back.T_camera_lidar, rig.moved_to(solution.T_camera_lidar))[1] < 0.05
-
-
-def test_without_common_features_the_solve_is_as_before(rig: Rig) -> None:
-    errors = MatcherErrors(outlier_share=0.1)
-    table = simulate_correspondences(rig, frames=FRAMES, errors=errors, seed=0)
-    before = solve_joint(rig, table)
-    after = solve_joint(rig, table, camera_matches=CameraMatches.empty(tuple(rig.cameras)))
-    for name, T in before.T_camera_lidar.items():
-        np.testing.assert_array_equal(T, after.T_camera_lidar[name])
-
-
-def test_frames_select_their_pairs_too(rig: Rig) -> None:
-    objective = solved(rig, True).inliers
-    even = {n: block.select(block.frame % 2 == 0) for n, block in objective.blocks.items()}
-    pairs = objective.with_blocks(even).pairs
-    assert {frame % 2 for pair in pairs for frame in pair.frame} == {0}
 
 
 def test_frame_gradients_add_up_and_frames_are_clusters(rig: Rig) -> None:

@@ -39,28 +39,6 @@ def test_the_fit_is_exact_without_noise() -> None:
     np.testing.assert_allclose(seen, pixels + jacobian @ twist, atol=1e-3)  # second order: 1e-7 f
 
 
-def test_an_unknown_that_the_pose_compensates_is_not_observable() -> None:
-    points = points_in_front(np.random.default_rng(4), 100)
-    pixels, jacobian = project_with_jacobian(make_camera(), points)
-    field = jacobian[:, :, :1].transpose(2, 1, 0)
-    fit = fit_table(make_camera(), table_of(pixels, points, 4), field)
-    assert fit is not None
-    assert fit.free(0).sigmas[0] > 0.99  # as the prior of the pose: a radian
-
-
-def test_a_few_rows_and_a_single_frame_have_no_fit_and_no_sigma() -> None:
-    rng = np.random.default_rng(8)
-    points = points_in_front(rng, 100)
-    pixels, field = (
-        project_with_jacobian(make_camera(), points)[0],
-        rng.standard_normal((1, 2, 100)),
-    )
-    table = table_of(pixels + rng.standard_normal((100, 2)), points, 1)
-    assert fit_table(make_camera(), table.select(np.arange(20)), field[:, :, :20]) is None
-    fit = fit_table(make_camera(), table, field)
-    assert fit is not None and np.isnan(fit.free(0).sigmas).all()
-
-
 def test_compensating_twist_undoes_what_an_unknown_displaces() -> None:
     rng = np.random.default_rng(5)
     camera, points = make_camera(), points_in_front(rng, 200)
@@ -69,24 +47,6 @@ def test_compensating_twist_undoes_what_an_unknown_displaces() -> None:
     fit = fit_table(camera, table_of(pixels, points, 4), (jacobian @ twist).T[None])
     assert fit is not None
     np.testing.assert_allclose(fit.free(0).compensating[:, 0], -twist, rtol=1e-5)
-
-
-def test_one_fit_gives_those_of_every_choice_of_unknowns() -> None:
-    """Without outliers the weights differ little; those of the other fits are their own."""
-    rng = np.random.default_rng(6)
-    camera, points = make_camera(), points_in_front(rng, 400)
-    fields = rng.standard_normal((3, 2, 400))
-    root = rng.uniform(0.5, 2, (400, 2))
-    information = np.column_stack([root[:, 0], 0.3 * np.ones(400), root[:, 1]])
-    pixels = project_with_jacobian(camera, points)[0] + rng.standard_normal((400, 2))
-    table = table_of(pixels, points, 7, information_px=information)
-    together = fit_table(camera, table, fields)
-    for choice in ([0], [1, 2], [0, 1, 2]):
-        alone = fit_table(camera, table, fields[choice])
-        assert alone is not None and together is not None
-        own, found = alone.free(*range(len(choice))), together.free(*choice)
-        assert np.abs((found.values - own.values) / own.sigmas).max() < 0.1
-        np.testing.assert_allclose(found.sigmas, own.sigmas, rtol=0.1)
 
 
 @pytest.mark.parametrize("outliers", [0, 90])

@@ -5,18 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 import pytest
 
 from calibgraph import (
     Calibration,
-    CalibrationError,
     Config,
     Correspondences,
     DatasetError,
@@ -25,12 +23,11 @@ from calibgraph import (
 )
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.frame import Frame
-from calibgraph.matching.protocol import to_full_matcher
 from calibgraph.tracking import command, dataset_frames
 from calibgraph.tracking.command import Tracking, track
-from calibgraph.tracking.dataset_frames import DatasetDrive, with_places
+from calibgraph.tracking.dataset_frames import with_places
 from calibgraph.tracking.streams import StreamFrame
-from calibgraph.trust.pose_posterior import PosePosterior, no_posteriors
+from calibgraph.trust.pose_posterior import no_posteriors
 from calibgraph.trust.run_evidence import RunEvidence
 from tests.tracking.drives import (
     FRAMES,
@@ -177,43 +174,6 @@ def follow(
     return run
 
 
-@pytest.mark.parametrize("error", [None, np.linalg.LinAlgError, cv2.error, RuntimeError])
-def test_images_that_cannot_be_scored_at_the_end_leave_the_result_without_them(
-    error: type[Exception] | None,
-    follow: Callable[[], tuple[Calibration, list[str]]],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def fail(*_: object, **__: object) -> None:
-        assert error is not None
-        raise error("not positive definite")
-
-    if error is not None:
-        monkeypatch.setattr(dataset_frames, "measure_posteriors", fail)
-    why = "" if error is None else "not positive definite"
-    _, notes = follow()
-    assert any(n.startswith(f"warning: the images could not be checked: {why}") for n in notes)
-
-
-def test_after_a_signal_the_result_is_written_without_the_images(
-    follow: Callable[[], tuple[Calibration, list[str]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given: list[str] = []
-
-    def write(line: str) -> None:
-        given.append(line)
-        if len(given) == FRAMES - 2:
-            signal.raise_signal(signal.SIGTERM)
-
-    def score(*_: object, **__: object) -> None:
-        raise AssertionError("images are scored")
-
-    monkeypatch.setattr(command, "print_line", write)
-    monkeypatch.setattr(dataset_frames, "measure_posteriors", score)
-    _, notes = follow()
-    assert len(given) == FRAMES - 2
-    assert "stopped: the images were not compared with the clouds" in notes
-
-
 def test_a_signal_while_images_are_scored_ends_that(
     follow: Callable[[], tuple[Calibration, list[str]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -224,45 +184,6 @@ def test_a_signal_while_images_are_scored_ends_that(
     monkeypatch.setattr(dataset_frames, "measure_posteriors", score)
     _, notes = follow()
     assert "stopped: the images were not compared with the clouds" in notes
-
-
-def test_a_result_that_cannot_be_solved_for_is_one_error_and_the_updates_stay(
-    follow: Callable[[], tuple[Calibration, list[str]]],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise RuntimeError("\nIndeterminant linear system detected\nwhile working near x0")
-
-    with monkeypatch.context() as patched, pytest.raises(CalibrationError) as caught:
-        patched.setattr(DatasetDrive, "result", fail)
-        follow()
-    assert f"after frame {FRAMES - 1} " in str(caught.value) and "\n" not in str(caught.value)
-    assert (tmp_path / "out" / "state").is_dir()
-    follow()
-
-
-class Numbers(list[int]):
-    """Counts how often all are read."""
-
-    reads = 0
-
-    def __iter__(self) -> Iterator[int]:
-        self.reads += 1
-        return super().__iter__()
-
-
-def test_frames_to_score_are_found_in_linear_time(
-    world: World, recorded: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def measure(data: Dataset, *_: object, seed: int) -> dict[str, PosePosterior]:
-        assert [frame.index for frame in data.frames] == [2, 5]
-        return {"left": flat(1.0, 1.0)}
-
-    monkeypatch.setattr(dataset_frames, "measure_posteriors", measure)
-    given = DatasetDrive(recorded, to_full_matcher(Given(world.tables[0])), Config())
-    numbers = Numbers([5, 2])
-    assert given._measure(recorded.rig, numbers, {}, []) and numbers.reads == 1
 
 
 def test_the_result_names_the_places_of_its_frames(
@@ -313,19 +234,3 @@ def test_frames_of_a_dataset_have_their_places(
     assert names == [str(n // 4 * 4) for n in range(start, FRAMES)]
     assert finder.remembered == [int(name) for name in known if name.isdigit()]
     assert finder.shown == list(range(again, FRAMES))
-
-
-def test_a_restart_looks_again_at_few_frames(
-    world: World, recorded: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(dataset_frames, "MOST_AGAIN", 2)
-    stated = replace(world.tables[8], metadata={"place_variance": 8.0})
-    finder = Odometer()
-    list(with_places([StreamFrame(8, stated)], recorded, finder, ("0",)))  # type: ignore[arg-type]
-    assert finder.shown == [6, 7, 8]
-
-
-def test_without_an_error_of_places_no_image_is_looked_at(world: World, recorded: Dataset) -> None:
-    finder, items = Odometer(), [StreamFrame(0, world.tables[0])]
-    assert list(with_places(items, recorded, finder, ())) == items  # type: ignore[arg-type]
-    assert not finder.shown

@@ -90,29 +90,6 @@ def test_cameras_are_scored_on_frames_that_show_them(
         assert "flat_evidence" in {check.kind for check in verdict.checks}
 
 
-@pytest.mark.parametrize("tied", [True, False])
-def test_a_camera_that_no_frame_shows_is_not_compared(tied: bool) -> None:
-    scorer = Scorer()
-    result = result_of(scorer, 22, tied=tied, right=range(6, 22))
-    assert scorer.asked == {tuple(range(12, 22)): [LEFT]}
-    assert result.covariance["right"] is not None
-    found = {
-        name: [check for check in verdict.checks if check.name == "image evidence"]
-        for name, verdict in result.camera_verdicts.items()
-    }
-    (check,) = found["right"]
-    assert check.status == "WARN" and "were not compared" in check.text
-    assert not found["left"]
-
-
-def test_without_images_no_check_speaks_of_them() -> None:
-    tracker = IncrementalCalibrator(rig_of(tied=False), SHORT)
-    for table in drive(pair_of()):
-        tracker.update(table)
-    checks = tracker.calibration().verdict.checks
-    assert checks and not {"image evidence", "flat_evidence"} & {check.kind for check in checks}
-
-
 def test_of_a_drift_the_last_frames_are_scored() -> None:
     """Those of another camera, which does not drift, all the same."""
     frames = [SimpleNamespace(number=n, raw={0: None, 1: None}) for n in range(30)]

@@ -22,10 +22,8 @@ from tests.tracking.state_data import (
     crashed,
     filled,
     held,
-    opened,
     recovered,
     require_refused,
-    require_usable,
     restored,
 )
 
@@ -93,23 +91,6 @@ def test_a_log_that_is_damaged_or_cut_short_costs_the_inputs_from_there_on_at_mo
     assert lengths == {*range(0, len(truth), INPUT_BYTES)}
 
 
-def test_a_log_that_is_missing_is_reported(tmp_path: Path) -> None:
-    files, _ = crashed(tmp_path / "state", 8)
-    del files[LOG]
-    folder = restored(tmp_path / "copy", files)
-    (line,) = recovered(folder).damages
-    assert line.startswith(f"{folder / LOG}: is missing, updates may be lost")
-    with opened(folder) as database:
-        database.append(b"abc")
-    assert recovered(folder).damages == ()
-
-
-def test_a_database_that_is_missing_beside_its_log_is_refused(tmp_path: Path) -> None:
-    files, _ = crashed(tmp_path / "state", 8)
-    del files[DATABASE]
-    require_refused(restored(tmp_path / "copy", files), "is missing, and its log is there")
-
-
 def edited(folder: Path, statement: str) -> None:
     with closing(sqlite3.connect(folder / DATABASE, isolation_level=None)) as database:
         database.execute(statement)
@@ -166,29 +147,6 @@ def test_a_database_of_another_layout_or_program_is_refused(
     require_refused(tmp_path, match)
 
 
-ENDLESS = "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r) SELECT max(n)"
-
-
-@pytest.mark.parametrize(
-    "statements",
-    [
-        "DROP TABLE journal",
-        f"DROP TABLE status; CREATE VIEW status AS {ENDLESS} AS number, 0 AS is_open FROM r",
-        f"CREATE VIEW more AS {ENDLESS} FROM r",
-        "CREATE TRIGGER t AFTER UPDATE ON status BEGIN DELETE FROM journal; END",
-        "CREATE INDEX i ON status (number)",
-        "ALTER TABLE status ADD COLUMN more INTEGER CHECK (length(zeroblob(900000000)) > 0)",
-    ],
-)
-def test_a_database_with_other_tables_is_refused_before_a_query(
-    tmp_path: Path, statements: str
-) -> None:
-    filled(tmp_path, 5)
-    with closing(sqlite3.connect(tmp_path / DATABASE)) as database:
-        database.executescript(statements)
-    require_refused(tmp_path, "holds other tables than a tracker's; choose another folder")
-
-
 def test_pages_that_refer_to_each_other_end_the_reading(tmp_path: Path) -> None:
     """A tree of 16 levels, each of a page with 3000 references to the next one: 10^55 rows."""
     filled(tmp_path, 5)
@@ -208,26 +166,6 @@ def test_pages_that_refer_to_each_other_end_the_reading(tmp_path: Path) -> None:
     data[28:32] = struct.pack(">I", len(data) // size)
     restored(tmp_path, {DATABASE: bytes(data)})
     require_refused(tmp_path, "is damaged")
-
-
-def test_a_link_in_the_place_of_the_lock_is_not_followed(tmp_path: Path) -> None:
-    (folder := tmp_path / "state").mkdir()
-    (folder / "lock").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(FileError, match="lock: is a link or a folder, expected a file; remove it"):
-        StateDatabase(folder)
-    assert not (tmp_path / "elsewhere").exists()
-
-
-@pytest.mark.parametrize("data", [b"", b"half", b"no database at all" * 1000])
-def test_a_file_that_is_no_database_is_refused(tmp_path: Path, data: bytes) -> None:
-    restored(tmp_path, {DATABASE: data})
-    require_refused(tmp_path, "is damaged .*; .*another folder")
-
-
-@pytest.mark.parametrize("name", ["snapshot-000001.state", "journal-000002.log"])
-def test_a_folder_of_the_earliest_layout_is_refused(tmp_path: Path, name: str) -> None:
-    restored(tmp_path, {name: b"calibgraph-tracker/1\nwhatever"})
-    require_refused(tmp_path, f"{name}: is state of the earliest layout; choose another folder, or")
 
 
 @pytest.mark.parametrize("log", [b"", b"theirs"])
@@ -263,18 +201,3 @@ def test_two_processes_cannot_have_one_folder(tmp_path: Path) -> None:
         other.send_signal(signal.SIGKILL)
         other.wait()
     filled(tmp_path, 1)
-
-
-def test_a_second_writer_is_refused_until_the_first_is_closed(tmp_path: Path) -> None:
-    with opened(tmp_path), pytest.raises(FileError, match="is in use"):
-        StateDatabase(tmp_path)
-    filled(tmp_path, 1)
-
-
-def test_a_database_that_another_program_has_locked_is_left_alone(tmp_path: Path) -> None:
-    truth = filled(tmp_path, 5)
-    with closing(sqlite3.connect(tmp_path / DATABASE, isolation_level=None)) as other:
-        other.execute("BEGIN EXCLUSIVE")
-        with opened(tmp_path) as database, pytest.raises(OSError, match="database is locked"):
-            database.append(b"abc")
-    require_usable(tmp_path, truth)

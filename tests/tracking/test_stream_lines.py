@@ -55,11 +55,6 @@ def test_a_line_of_metadata_alone_holds_for_the_frames_after_it() -> None:
     assert third.table.metadata == {"systematic_rotation_rad": 0.001, "matcher": "other"}
 
 
-@pytest.mark.parametrize("wrong", [3, {"systematic_rotation_rad": "much"}])
-def test_a_wrong_header_is_refused_at_its_line(wrong: object) -> None:
-    assert "metadata" in refusal(json.dumps({"metadata": wrong}).encode())
-
-
 @pytest.mark.parametrize("cameras", [{}, {"left": camera(0)}])
 def test_a_frame_without_rows_is_a_frame(cameras: dict[str, Any]) -> None:
     (item,) = of_bytes(line(9, cameras=cameras, stamp_ns=5, metadata={"k": 1}))
@@ -67,15 +62,6 @@ def test_a_frame_without_rows_is_a_frame(cameras: dict[str, Any]) -> None:
     assert (item.frame, len(item.table)) == (9, 0)
     assert item.table.cameras == tuple(cameras)
     assert item.table.metadata == {"k": 1}
-
-
-def test_empty_lines_are_skipped_but_counted() -> None:
-    assert outcomes(of_bytes(b"\n \r\n" + line(1) + b"{\n" + line(2).rstrip())) == [
-        1,
-        "standard input, line 4: is not JSON (EOF while parsing an object at line 1 "
-        "column 1); send one frame a line, as JSON",
-        2,
-    ]
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,6 @@ from tests.io.bags.motion_messages import messages as messages_of_a_drive
 from tests.io.bags.writing import (
     PERIOD_NS,
     START_NS,
-    STORES,
     Messages,
     Stamped,
     sample_messages,
@@ -91,19 +90,14 @@ def test_a_sensor_that_hangs_by_a_transform_that_is_none_is_named_with_frame_and
     require_guess(write_bag(tmp_path / "mended", "mcap", [good, bad, *others]))
 
 
-def halves(make: Messages, part_of: Callable[[Stamped], int]) -> list[list[Stamped]]:
-    """The sample's messages in two."""
-    written = sample_messages(make)
-    return [[each for each in written if part_of(each) == part] for part in (0, 1)]
-
-
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
 @pytest.mark.parametrize("backwards", [False, True])
 def test_any_bag_of_a_drive_may_have_the_transforms_and_lenses(
     tmp_path: Path, kind: str, backwards: bool
 ) -> None:
     middle = START_NS + int(2.5 * PERIOD_NS)
-    parts = halves(Messages(kind), lambda each: int(each.record_ns > middle))
+    written = sample_messages(Messages(kind))
+    parts = ([m for m in written if (m.record_ns > middle) == later] for later in (False, True))
     bags = [write_bag(tmp_path / str(n), kind, part) for n, part in enumerate(parts)]
     given = bags[::-1] if backwards else bags
     notes = require_guess(given)
@@ -113,21 +107,6 @@ def test_any_bag_of_a_drive_may_have_the_transforms_and_lenses(
     ] * 3
     assert any("/tf_static of" in note and str(bags[1]) in note for note in notes)
     assert f"{bags[1]}: /left/camera_info is that of {bags[0]}" in notes
-
-
-@pytest.mark.parametrize("kind", ["ros1", "mcap"])
-def test_a_bag_of_transforms_or_lenses_alone_serves_the_others(tmp_path: Path, kind: str) -> None:
-    written = sample_messages(Messages(kind))
-    ends = ("tf_static", "camera_info")
-    tree, infos = ([e for e in written if e.topic.endswith(end)] for end in ends)
-    rest = [each for each in written if not each.topic.endswith(ends)]
-    parts = {"tree": tree, "infos": infos, "rest": rest}
-    bags = [write_bag(tmp_path / name, kind, part) for name, part in parts.items()]
-    notes = require_guess(bags)
-    assert len(load_dataset(bags).frames) == 6
-    assert f"{bags[0]}: has no clouds; it serves the other bags" in notes
-    with pytest.raises(DatasetError, match="it has neither images nor PointCloud2, but "):
-        load_dataset(bags[:2])
 
 
 def test_transforms_of_the_own_bag_count_first(tmp_path: Path) -> None:
@@ -143,12 +122,6 @@ def test_transforms_of_the_own_bag_count_first(tmp_path: Path) -> None:
     for name, T in rig_of_bag(one, options).T_camera_lidar.items():
         np.testing.assert_allclose(T, RIG.T_camera_lidar[name], atol=1e-12)
     assert read_bag_rig(one, options).notes == ()
-
-
-def test_the_second_bag_alone_names_what_to_do(tmp_path: Path) -> None:
-    bare = write_bag(tmp_path, "mcap", without(sample_messages(MAKE), "/tf_static"))
-    with pytest.raises(DatasetError, match="its frames are none. If another bag of the drive has"):
-        load_rig(bare)
 
 
 def repeated(tree: Any, type_: str = TREE) -> list[Stamped]:
@@ -169,21 +142,6 @@ def test_transforms_on_tf_that_never_change_are_static(tmp_path: Path, kind: str
     bag = write_bag(tmp_path / "some", kind, both)
     (note,) = [note for note in require_guess(bag) if "never change" in note]
     assert "the transforms of velodyne are from /tf of" in note
-
-
-def test_transforms_of_tf_before_tf2_are_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TREE))
-    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", OLD_TREE))
-    monkeypatch.setitem(STORES, True, store)
-    make = Messages("ros1")
-    tree = store.types[OLD_TREE](transforms=make.transforms(tree_of(RIG)).transforms)
-    others = without(sample_messages(make), "/tf_static")
-    require_guess(write_bag(tmp_path, "ros1", [*others, *repeated(tree, OLD_TREE)]))
 
 
 def test_transforms_that_move_are_not_static_and_are_named(tmp_path: Path) -> None:
@@ -300,27 +258,6 @@ def test_a_baseline_along_any_axis_parts_the_cameras_as_recorded_and_rectified(
     expected[:3, 3] = shift
     found = relative_transform(T["front_right"], T["front_left"])
     np.testing.assert_allclose(found, expected, atol=1e-9)
-
-
-def test_a_baseline_that_the_frames_have_is_not_added(tmp_path: Path) -> None:
-    T_right_own = np.eye(4)  # R turns the own frame into the axes of the image
-    T_right_own[:3, :3] = T_RIGHT_LEFT[:3, :3]
-    T_own_lidar = invert(T_right_own) @ T_RIGHT_LIDAR
-    own = [*SHARED, ("velodyne", "right", invert(T_own_lidar))]
-    bag = pair(tmp_path, ("stereo", "right"), own)
-    np.testing.assert_allclose(
-        rig_of_bag(bag).T_camera_lidar["front_right"], T_RIGHT_LIDAR, atol=1e-9
-    )
-    notes = read_bag_rig(bag).notes
-    assert notes[0].endswith("; frame 'right' is its own, so it is not added")
-
-
-def test_a_baseline_is_added_to_another_frame_at_the_same_place(tmp_path: Path) -> None:
-    twice = [*SHARED, ("stereo", "stereo_again", np.eye(4))]
-    bag = pair(tmp_path, ("stereo", "stereo_again"), twice)
-    np.testing.assert_allclose(
-        rig_of_bag(bag).T_camera_lidar["front_right"], T_RIGHT_LIDAR, atol=1e-9
-    )
 
 
 @pytest.mark.parametrize("rectified", [False, True])

@@ -9,19 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from calibgraph import DatasetError
 from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.inputs import (
     LidarImage,
     View,
     encode_depth,
     halve_lidar,
-    lidar_channels,
     network_size,
-    rgb_tensor,
 )
 from tests.conftest import KANNALA, RADTAN5, make_camera
-from tests.matching.cmrnext.builders import cloud_before
 
 
 def test_the_nearest_point_of_a_pixel_is_rendered() -> None:
@@ -35,13 +31,6 @@ def test_the_nearest_point_of_a_pixel_is_rendered() -> None:
     np.testing.assert_allclose(lidar.pixels_px, [[100.25, 50.75]], atol=1e-4)
     assert lidar.rasterize(lidar.depth_m)[50, 100] == pytest.approx(10.0)
     assert np.count_nonzero(lidar.rasterize(lidar.depth_m)) == 1
-
-
-def test_points_behind_and_beside_are_not_rendered() -> None:
-    camera = make_camera()
-    in_camera = np.array([[0, 0, -5, 1], [50, 0, 5, 1], [0, 0, 2000, 1], [0, 0, 5, 1.0]])
-    cloud = (in_camera @ np.linalg.inv(camera.T_camera_lidar).T).astype(np.float32)
-    assert LidarImage.render(cloud, camera.T_camera_lidar, View(camera)).point_index.tolist() == [3]
 
 
 def test_halving_takes_the_mean_of_pixels_with_points() -> None:
@@ -75,15 +64,6 @@ def test_published_inputs_are_reproduced(reference_folder: Path) -> None:
     np.testing.assert_allclose(found, vectors["lidar_input"], atol=1e-3, rtol=0)
 
 
-def test_padding_has_the_mean_colour() -> None:
-    image = np.full((100, 150, 3), 255, np.uint8)
-    tensor = rgb_tensor(image, normalize=True)
-    assert tensor.shape == (3, 128, 192)
-    assert not tensor[:, 100:].any() and not tensor[:, :, 150:].any()
-    np.testing.assert_allclose(tensor[:, 0, 0], (1 - np.array([0.485, 0.456, 0.406])) / np.array(
-        [0.229, 0.224, 0.225]), rtol=1e-6)  # fmt: skip
-
-
 @pytest.mark.parametrize(("model", "distortion"), [("pinhole", RADTAN5), ("fisheye", KANNALA)])
 def test_distortion_is_removed_and_added_again(model: str, distortion: tuple[float, ...]) -> None:
     """A dot moves to the pinhole's pixel, and back to its own."""
@@ -99,22 +79,3 @@ def test_distortion_is_removed_and_added_again(model: str, distortion: tuple[flo
     assert on_image.all()
     assert np.linalg.norm(centre - dot) > 1  # it was distorted
     np.testing.assert_allclose(back[0], dot, atol=0.1)  # a disc's centre moves by curvature
-
-
-def test_clouds_without_intensity_are_refused_where_it_is_needed() -> None:
-    camera = make_camera()
-    cloud = cloud_before(camera, 100)
-    cloud[:, 3] = np.nan
-    lidar = LidarImage.render(cloud, camera.T_camera_lidar, View(camera))
-    with pytest.raises(DatasetError, match="intensity"):
-        lidar_channels(lidar, Architecture(reflectance=True), 160.0)
-    assert lidar_channels(lidar, Architecture(), 160.0).shape[0] == 1
-
-
-def test_intensities_of_bytes_become_unit() -> None:
-    camera = make_camera()
-    cloud = cloud_before(camera, 100)
-    unit = LidarImage.render(cloud, camera.T_camera_lidar, View(camera))
-    cloud[:, 3] *= 255
-    same = LidarImage.render(cloud, camera.T_camera_lidar, View(camera))
-    np.testing.assert_allclose(same.intensity, unit.intensity, rtol=1e-5)

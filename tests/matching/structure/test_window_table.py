@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-import gc
-import weakref
-
 import numpy as np
 import pytest
 
@@ -36,24 +33,6 @@ def test_a_small_motion_of_the_camera_keeps_most_windows(cloud: PreparedCloud, t
     assert len(one & two) > 0.9 * max(len(one), len(two)) > 100
 
 
-def test_windows_are_cut_once(
-    cloud: PreparedCloud, truth: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cut: list[int] = []
-    original = window_table.cut_windows
-
-    def counted(*arguments: object, **options: object) -> object:
-        cut.append(len(arguments[1]))  # type: ignore[arg-type]
-        return original(*arguments, **options)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(window_table, "cut_windows", counted)
-    camera = truth.cameras["front_left"]
-    first = select_windows(cloud, camera, LEVELS[3], max_windows=2_000)
-    second = select_windows(cloud, camera, LEVELS[4], max_windows=2_000)  # of the same spacing
-    assert len(cut) == 1 and cut[0] <= 2_000
-    np.testing.assert_array_equal(first.basis, second.basis)
-
-
 def test_a_table_that_was_dropped_is_made_again_alike(
     cloud: PreparedCloud, truth: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -78,17 +57,3 @@ def test_a_table_that_was_dropped_is_made_again_alike(
     )  # fmt: skip
     assert len(made) == 2
     np.testing.assert_array_equal(first.grids, again.grids)
-
-
-def test_a_cloud_and_its_windows_go_without_the_garbage_collector(truth: Rig) -> None:
-    """Else a program that calibrates again and again holds the clouds of the last dozen calls."""
-    data = calibgraph.load_dataset(SAMPLE)
-    gc.disable()
-    try:
-        cloud = PreparedCloud.from_points(data.frames[0].load_cloud())
-        select_windows(cloud, truth.cameras["front_left"], LEVELS[3], max_windows=100)
-        gone = weakref.ref(cloud)
-        del cloud
-        assert gone() is None
-    finally:
-        gc.enable()
