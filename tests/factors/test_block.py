@@ -134,6 +134,20 @@ def test_gradients_at_several_poses_are_those_at_each(count: int) -> None:
         np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-13 * scale)
 
 
+def test_other_whitening_leaves_the_correspondences_in_their_place() -> None:
+    block = world(LENSES["pinhole"], 40)
+    roots = np.random.default_rng(0).uniform(0.1, 1.0, (40, 3))
+    other = block.rewhiten(roots)
+    assert other.points_lidar_m.base is block.points_lidar_m.base
+    for given in (roots, roots[:, [0, 0, 0]] * [1, 0, 1], None):
+        found, expected = (b.sums(TRUTH) for b in (
+            block.rewhiten(given), replace(block, sqrt_information=given)))  # fmt: skip
+        np.testing.assert_array_equal(found.hessian, expected.hessian)
+        assert found.cost == expected.cost
+    with pytest.raises(ValueError, match=r"sqrt_information\[3\] is not finite"):
+        block.rewhiten(np.where(np.arange(40)[:, None] == 3, np.nan, roots))
+
+
 def test_far_residuals_do_not_leave_the_range_of_a_float() -> None:
     """The sum of logarithms is taken as that of a product, of weights down to 1e-20 each here."""
     points = np.tile([0.0, 0.0, 1.0], (1001, 1))
@@ -186,6 +200,16 @@ def test_too_few_points_give_a_singular_but_harmless_factor(count: int) -> None:
     np.testing.assert_allclose(error @ error, sums.cost, rtol=1e-9)
 
 
+def test_blocks_add() -> None:
+    block = with_loss(world(LENSES["radtan"], 5000), "cauchy")
+    whole = block.sums(TRUTH)
+    parts = block.frame_sums(TRUTH, [0, 700, 700, 3000, 5000])
+    assert parts.cost[1] == 0.0
+    np.testing.assert_allclose(parts.hessian.sum(axis=0), whole.hessian, rtol=1e-12)
+    np.testing.assert_allclose(parts.gradient.sum(axis=0), whole.gradient, rtol=1e-9)
+    np.testing.assert_allclose(parts.cost.sum(), whole.cost, rtol=1e-12)
+
+
 def test_every_point_behind_the_camera_is_finite_and_bounded() -> None:
     block = with_loss(world(LENSES["radtan"], 300), "cauchy")
     backwards = TRUTH.compose(gtsam.Pose3(gtsam.Rot3.Ry(np.pi), np.zeros(3)))
@@ -227,6 +251,24 @@ def test_bad_blocks_are_refused() -> None:
         ProjectionBlock(lens, np.zeros((2, 3)), np.zeros((2, 2)), loss="welsch")
     with pytest.raises(ValueError, match="scale"):
         ProjectionBlock(lens, np.zeros((2, 3)), np.zeros((2, 2)), scale=0.0)
+
+
+def test_a_factor_is_that_of_its_own_block_whatever_was_evaluated_before() -> None:
+    """A factor remembers its last pose; another block's factor, and another pose, do not use it."""
+    block = with_loss(world(LENSES["pinhole"], 40), "cauchy")
+    part = block.select(np.arange(20))
+    factors = {id(b): block_factor(KEY, b) for b in (block, part)}
+    for pose in [*poses(), *poses()]:
+        for b in (block, part):
+            expected = b.sums(pose)
+            A, right = factors[id(b)].linearize(at(pose)).jacobian()
+            hessian, gradient = A.T @ A, -A.T @ right
+            # Of sums of 40 terms, through an eigendecomposition.
+            scale = np.abs(expected.hessian).max()
+            np.testing.assert_allclose(hessian, expected.hessian, rtol=0, atol=1e-12 * scale)
+            largest = np.abs(expected.gradient).max()
+            np.testing.assert_allclose(gradient, expected.gradient, rtol=0, atol=1e-9 * largest)
+            assert 2 * factors[id(b)].error(at(pose)) == pytest.approx(expected.cost, rel=1e-12)
 
 
 def test_threads_get_the_sums_of_their_own_pose() -> None:

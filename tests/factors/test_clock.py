@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import Clock, FreeLens, FreeLensBlock, ProjectionBlock, free_lens_factor
+from factors import Clock, FreeLens, FreeLensBlock, ProjectionBlock, displace, free_lens_factor
 from tests.factors.blocks import KEY, LENSES, TRUTH, K, at, world
 from tests.factors.test_free_lens import KEY_LENS, with_lens
 
@@ -81,6 +81,28 @@ def test_equals_factors_of_gtsam_on_a_camera_that_moves_on() -> None:
     np.testing.assert_allclose(found[1], pulled, atol=1e-9 * np.abs(pulled).max())
 
 
+def test_points_that_have_been_moved_are_moved_on() -> None:
+    """A block at one clock has the residuals of the recorded points at that clock."""
+    free = FreeLens(LENSES["radtan"], ("offset", "readout"), (0.1, 0.1), Clock(0, 0, HEIGHT_PX))
+    block, values, T = moving("radtan", 40), np.array([0.4, -0.3]), TRUTH.inverse().matrix()
+    times_s = free.clock_at(values).times_s(block.pixels_px[:, 1])
+    assert block.motion is not None
+    points = displace(block.points_lidar_m, block.motion[:, :6], -times_s)
+    motion = np.column_stack([block.motion[:, :6], times_s])
+    moved = replace(block, points_lidar_m=points, motion=motion)
+    recorded, there = (FreeLensBlock(one, free).columns(T, values) for one in (block, moved))
+    np.testing.assert_allclose(there, recorded, atol=1e-9 * np.abs(recorded).max())
+
+
+def test_displacement_is_that_of_the_exponential() -> None:
+    points = np.random.default_rng(3).normal(0, 20, (30, 3))
+    for rate in (1.0, 1e-4, 0.0):
+        twist = TWIST * [rate, rate, rate, 1, 1, 1]
+        T = gtsam.Pose3.Expmap(0.3 * twist).matrix()
+        expected = points @ T[:3, :3].T + T[:3, 3]
+        np.testing.assert_allclose(displace(points, twist, 0.3), expected, atol=1e-9)
+
+
 def test_without_motion_or_at_rest_the_clock_is_not_observable() -> None:
     free = FreeLens(LENSES["pinhole"], ("offset", "readout"), (0.02, 0.02))
     still = world(LENSES["pinhole"], 20)
@@ -88,3 +110,13 @@ def test_without_motion_or_at_rest_the_clock_is_not_observable() -> None:
     for block in (still, parked):
         columns = FreeLensBlock(block, free).columns(TRUTH.inverse().matrix(), np.ones(2))
         assert not columns[6:8].any()
+
+
+def test_the_motion_stays_with_its_correspondences() -> None:
+    block, rows = moving("pinhole", 12), np.array([7, 2, 5])
+    assert block.motion is not None
+    parts = [block.select(rows), block.select(np.arange(3)).rewhiten(None)]
+    expected = block.motion[[*rows, 0, 1, 2]]
+    joined = ProjectionBlock.join(parts)
+    np.testing.assert_array_equal(joined.motion, expected)
+    assert ProjectionBlock.join([world(LENSES["pinhole"], 4)] * 2).motion is None

@@ -146,3 +146,10 @@ def displace(values: gtsam.Values, key: int, step: np.ndarray) -> gtsam.Values:
     else:
         moved.update(key, values.atPose3(key).retract(step))
     return moved
+
+
+def test_refuses_parameters_that_a_lens_does_not_have() -> None:
+    with pytest.raises(ValueError, match="no free k4"):
+        FreeLens(LENSES["radtan"], ("k4",), (1.0,))
+    with pytest.raises(ValueError, match="no free focal"):
+        FreeLens(LENSES["equirectangular"], ("focal",), (1.0,))

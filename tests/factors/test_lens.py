@@ -67,6 +67,11 @@ def test_jacobian_agrees_with_finite_differences(name: str) -> None:
         np.testing.assert_allclose(jacobian, numeric, atol=2e-16 * 1e4 / step + 1e-6 * 720)
 
 
+def test_points_behind_a_pinhole_are_invalid() -> None:
+    _, valid = LENSES["radtan5"].project([[0.1, 0.1, -5.0], [0.1, 0.1, 0.0], [0.1, 0.1, 5.0]])
+    assert valid.tolist() == [False, False, True]
+
+
 def test_where_the_distortion_folds_back_a_point_is_invalid() -> None:
     # r (1 - 0.3 r^2) grows until r^2 = 1 / 0.9: OpenCV maps r = 1.5 back into the image.
     lens = Lens.pinhole(**K, distortion=(-0.3, 0.0, 0.0, 0.0))
@@ -100,3 +105,16 @@ def test_projection_is_continuous_and_finite_outside_its_domain(name: str) -> No
         jumps.append(np.abs(np.diff(pixels, axis=0)).max())
     assert jumps[1] < 0.6 * jumps[0]  # a step half as long: a jump would stay as it is
     assert np.isfinite(lens.project([[0.0, 0.0, -3.0], [0.0, 0.0, 0.0]])[0]).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6, 12])
+def test_other_numbers_of_coefficients_are_refused(count: int) -> None:
+    with pytest.raises(ValueError, match="distortion coefficients"):
+        Lens.pinhole(**K, distortion=(0.1,) * count)
+    with pytest.raises(ValueError, match="expected 4"):
+        Lens.fisheye(**K, distortion=(0.1,) * count)
+
+
+def test_a_focal_length_must_be_positive() -> None:
+    with pytest.raises(ValueError, match="focal"):
+        Lens.pinhole(fx=0.0, fy=1.0, cx=0.0, cy=0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import gtsam
@@ -206,3 +207,19 @@ def test_a_ray_that_leaves_its_plane_gives_finite_numbers() -> None:
         sums = block.sums(T_LIDAR_A.retract(np.array([0, angle, 0, 0, 0, 0])), T_LIDAR_B)
         assert np.isfinite(sums.hessian).all() and np.isfinite(sums.gradient).all()
         assert np.isfinite(sums.cost)
+
+
+BAD: dict[str, Callable[[Features], object]] = {
+    "shape": lambda f: SurfaceBlock(f.lenses[1], f.rays_a, f.planes[:3], f.pixels_b),
+    "nan": lambda f: SurfaceBlock(f.lenses[1], f.rays_a, f.planes * np.nan, f.pixels_b),
+    "loss": lambda f: EpipolarBlock(*f.lenses, f.pixels_a, f.pixels_b, "welsch"),
+    "sigma": lambda f: EpipolarBlock(*f.lenses, f.pixels_a, f.pixels_b, sigma=0.0),
+    "ray": lambda f: EpipolarBlock(*f.lenses, f.pixels_a * np.nan, f.pixels_b),
+    "pixels": lambda f: EpipolarBlock(*f.lenses, f.pixels_a, f.pixels_b[:2]),
+}
+
+
+@pytest.mark.parametrize("make", BAD.values(), ids=BAD)
+def test_wrong_blocks_are_refused(make: Callable[[Features], object]) -> None:
+    with pytest.raises(ValueError, match=r"expected|unknown|positive|no ray"):
+        make(Features(LENSES["pinhole"], 10))

@@ -107,9 +107,22 @@ def test_residuals_cross_the_seam_of_a_panorama_the_short_way() -> None:
     assert one.error(values) < 4.0
 
 
+def test_the_poles_of_a_panorama_are_not_seen() -> None:
+    pixels, valid = PANORAMA.project([[0.0, 3.0, 0.0], [0.0, -3.0, 0.0], [1e-3, 3.0, 0.0]])
+    assert valid.tolist() == [False, False, True]
+    assert np.isfinite(pixels).all()
+    assert np.isfinite(PANORAMA.project_with_jacobian([[0.0, 3.0, 0.0]])[1]).all()
+
+
 def test_the_field_of_a_unified_lens_ends_where_it_folds() -> None:
     """Without distortion sin t / (cos t + xi) grows up to arccos(-1 / xi)."""
     lens = Lens.omnidirectional(**K, distortion=(2.0, 0.0, 0.0, 0.0, 0.0))
     angle = np.radians([119.0, 121.0])
     _, valid = lens.project(np.column_stack([np.sin(angle), np.zeros(2), np.cos(angle)]))
     assert valid.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("xi", [-0.1, 101.0, np.nan])
+def test_an_impossible_mirror_is_refused(xi: float) -> None:
+    with pytest.raises(ValueError, match="xi of the unified model"):
+        Lens.omnidirectional(**K, distortion=(xi, 0.0, 0.0, 0.0, 0.0))

@@ -91,6 +91,11 @@ def test_twice_the_error_of_the_graph_is_eq_5(triple: Rig, terms: str, pairs: st
     assert 2 * graph.error(to_values(names, T)) == pytest.approx(expected, rel=1e-10)
 
 
+def test_weights_of_zero_give_no_factor(pair: Rig) -> None:
+    config = CONFIG.changed(prior_weight=0.0, relative_prior_weight=0.0)
+    assert objective_graph(pair, {}, pair.T_camera_lidar, config, terms="full").size() == 0
+
+
 def test_the_optimum_of_the_priors_is_stage_1(pair: Rig) -> None:
     graph = objective_graph(pair, {}, pair.T_camera_lidar, CONFIG, terms="priors")
     start = perturb(pair, rotation_deg=3, translation_m=0.3).T_camera_lidar

@@ -9,6 +9,7 @@ import pytest
 from calibgraph.model.geometry import (
     angle_deg,
     invert,
+    invert_each,
     local_coordinates,
     point_in_lidar,
     pose_difference,
@@ -93,6 +94,11 @@ def test_the_covariance_of_a_pair_follows_from_finite_differences() -> None:
     np.testing.assert_allclose(
         relative_covariance(joint, 0, 1, T_b_a), expected, rtol=0, atol=tolerance
     )
+
+
+def test_many_rigid_transforms_are_inverted_as_any_matrix() -> None:
+    T = np.array([[random_transform(seed) for seed in range(row, row + 3)] for row in range(2)])
+    np.testing.assert_allclose(invert_each(T), np.linalg.inv(T), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-7, 9e-3, 1.1e-2, 0.5, 1.8])

@@ -17,6 +17,7 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.graph.objective import pose_key
+from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import (
     pose_difference,
@@ -25,7 +26,7 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
     twist_between,
 )
-from calibgraph.solver.camera_pairs import PairTerm, pair_graph, pair_terms
+from calibgraph.solver.camera_pairs import MIN_PAIR_MATCHES, PairTerm, pair_graph, pair_terms
 from calibgraph.solver.covariance import cluster_robust_covariance
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.optimizer import optimize
@@ -98,6 +99,12 @@ def test_features_without_a_surface_give_the_direction(pair: Rig) -> None:
     assert pose_difference(found, true)[0] < 0.05
     directions = [each[:3, 3] / np.linalg.norm(each[:3, 3]) for each in (found, true)]
     assert directions[0] @ directions[1] > np.cos(np.radians(0.3))
+
+
+def test_pairs_with_too_few_matches_have_no_term(pair: Rig) -> None:
+    table = simulated_pairs(pair)
+    assert pair_terms(pair, table.select(slice(0, MIN_PAIR_MATCHES - 1)), Config()) == ()
+    assert pair_terms(pair, CameraMatches.empty(tuple(pair.cameras)), Config()) == ()
 
 
 def test_sigma_and_gate_fit_the_noise(pair: Rig) -> None:

@@ -81,6 +81,17 @@ def test_an_offset_beyond_what_the_rig_allows_is_no_pass(sigma_s: float, status:
         assert reason.cause == "time" and "correct the named time in the rig" in reason.action
 
 
+def test_a_known_clock_is_as_good_as_none() -> None:
+    """Points at the times of the pixels, and points of late images with the times in the rig."""
+    truth, table = late(0.04, 0.02)
+    _, same = late(0.0, 0.0)
+    known = with_times(truth, time_offset_s=0.04, readout_s=0.02)
+    expected, found = (solve_joint(rig, t) for rig, t in ((truth, same), (known, table)))
+    for name, T in expected.T_camera_lidar.items():
+        twist = twist_between(found.T_camera_lidar[name], T)
+        assert np.abs(twist).max() < 1e-6  # exact but for the digits of the displacement
+
+
 def test_a_stated_error_of_the_clock_is_one_of_the_pose() -> None:
     """10 ms at 10 m/s, which is 10 cm along the drive; at an unknown motion it is not."""
     truth, table = late(0.0, 0.0, twists=np.tile(STRAIGHT, (30, 1)))

@@ -17,6 +17,13 @@ def test_pseudo_frames_add_the_scatter_without_its_correlations() -> None:
     np.testing.assert_allclose(found, scatter + 6 / 9 * np.diag(np.diag(scatter)))
 
 
+def test_of_one_frame_the_scatter_is_what_is_usual() -> None:
+    """Its own gradient is zero at the solution; along the axes of the Hessian, usual remains."""
+    hessian, usual = np.diag([4.0, 3.0, 2.0, 1.0]), np.diag([9.0, 8.0, 7.0, 6.0])
+    found = with_pseudo_frames(np.zeros((4, 4)), hessian, np.ones(4), usual)
+    np.testing.assert_allclose(found, usual)
+
+
 def test_of_many_frames_their_own_scatter_remains() -> None:
     rng = np.random.default_rng(0)
     gradients = rng.standard_normal((4000, 4))

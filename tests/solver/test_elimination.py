@@ -184,6 +184,20 @@ def with_correlations(model: LatentPoseModel) -> LatentPoseModel:
     return replace(model, components=components)
 
 
+def test_a_pair_of_which_the_gate_has_left_nothing_takes_no_part(pair: Rig) -> None:
+    table, matches = table_of(pair, 6, False, []), simulated_pairs(pair, count=40)
+    solution = solve_joint(pair, table, Config(learnt_weights=False), camera_matches=matches)
+    term = pair_terms(pair, matches, Config())[0].with_sigma(1.0)
+    empty = term.select(np.zeros(len(term.frame), np.bool_))
+    more = replace(solution.inliers, pairs=(*solution.inliers.pairs, empty))
+    found, expected = (
+        fit_errors(replace(solution.fitted, objective=inliers), table.findings, table.places)
+        for inliers in (more, solution.inliers)
+    )
+    assert found is not None and expected is not None
+    np.testing.assert_array_equal(found.fit.covariance, expected.fit.covariance)
+
+
 def test_the_factor_of_a_pair_and_its_cloud_is_that_of_the_moved_cameras(pair: Rig) -> None:
     """Its error is that of the pair seen from the cloud, its Jacobian that by differences."""
     term = pair_terms(pair, simulated_pairs(pair), Config())[0]
@@ -206,6 +220,33 @@ def test_the_factor_of_a_pair_and_its_cloud_is_that_of_the_moved_cameras(pair: R
             moved.update(key, values.atPose3(key).retract(sign * step))
             costs.append(factor.error(moved))
         assert gradient[column] == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-4, abs=1e-2)
+
+
+def test_matches_of_one_place_decide_by_themselves(pair: Rig) -> None:
+    """Nothing contradicts them: the solve has no model, and the model the same minimum."""
+    table = table_of(pair, 8, False, [])
+    bends = ("elevation_rad", "elevation_stretch", "scan_motion_m")
+    table = replace(table, metadata={k: v for k, v in table.metadata.items() if k not in bends})
+    config = Config(learnt_weights=False, prior_weight=0.0, relative_prior_weight=0.0)
+    solution = solve_joint(pair, table, config)
+    assert solution.errors is None
+    errors = fit_errors(solution.fitted, table.findings, table.places)
+    assert errors is not None
+    for name, T in errors.T_camera_lidar.items():
+        np.testing.assert_allclose(T, solution.T_camera_lidar[name], rtol=0, atol=1e-7)
+
+
+def test_a_continued_fit_is_that_of_its_start(pair: Rig) -> None:
+    """The data that it has linearized hold for other components and another pose graph."""
+    errors = solve_model(tie(pair), table_of(pair, 8, False, PLACES["four"]), pairs=True)
+    other = replace(with_correlations(errors.model), pose_graph=gtsam.NonlinearFactorGraph())
+    for model in (errors.model, other):
+        starts = errors.fit, errors.fit.linear.values
+        found, expected = (fit_latent_poses(model, start) for start in starts)
+        assert found is not None and expected is not None
+        for name, T in found.T_camera_lidar.items():
+            np.testing.assert_allclose(T, expected.T_camera_lidar[name], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-9, atol=1e-15)
 
 
 def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Rig) -> None:

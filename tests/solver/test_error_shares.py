@@ -11,8 +11,8 @@ import pytest
 from calibgraph import Correspondences, MatcherErrors, Rig, simulate_correspondences
 from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.graph.variables import DISTORTION
-from calibgraph.model.config import Config
-from calibgraph.model.error_sources import COMMON, MOST_TIMES
+from calibgraph.model.config import Config, preset
+from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES
 from calibgraph.solver.elimination import join_linear
 from calibgraph.solver.error_model import ErrorFit
 from calibgraph.solver.error_shares import variances_by_source
@@ -45,6 +45,16 @@ def table(rig: Rig, places: int, stated: dict[str, Any]) -> Correspondences:
 
 def evidence(rig: Rig, found: Correspondences, config: Config | None = None) -> Evidence:
     return Evidence(solve_joint(rig, found, config or Config()), rig)
+
+
+@pytest.mark.parametrize("config", [Config(), preset("kitti")])
+def test_what_all_frames_share_is_the_share_that_its_size_has(pair: Rig, config: Config) -> None:
+    found = evidence(pair, table(pair, 2, STATED), config).error_sources["left"]
+    assert sum(found.rotation.values()) == pytest.approx(1.0)
+    # The cloud turns about the LiDAR, as far as the camera.
+    expected = (np.degrees(SHARED_RAD) / found.rotation_deg) ** 2
+    assert found.rotation[COMMON] == pytest.approx(expected, rel=0.01)
+    assert found.rotation[COMMON] > 0.5 > found.rotation[MATCHES] > 0
 
 
 def test_the_shares_are_those_of_independent_errors_and_add_up(pair: Rig) -> None:

@@ -28,6 +28,7 @@ STUCK = MatcherErrors(
     stuck_share=0.6,
     stuck_pose=PoseSpread((0.5, 0.5, 0.5), (0.3, 0.3, 0.6)),
 )
+GOOD = replace(STUCK, stuck_share=0.0)
 
 
 def errors_of(rig: Rig, errors: MatcherErrors, *, learnt: bool, seed: int) -> list[float]:
@@ -47,6 +48,14 @@ def test_a_majority_of_frames_that_are_stuck_elsewhere_seldom_decides(pair: Rig)
         for learnt in (True, False)
     ]
     assert wrong[0] <= 3 < wrong[1]
+
+
+def test_good_frames_all_count(pair: Rig) -> None:
+    table = simulate_correspondences(pair, frames=20, matches=300, errors=GOOD)
+    found = solve_joint(pair, table)
+    for counts in found.counts.values():
+        assert counts["outlier_frames"] <= 2
+        assert counts["frames"] == 20
 
 
 def test_frames_with_few_matches_neither_rule_nor_are_called_apart(pair: Rig) -> None:

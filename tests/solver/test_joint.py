@@ -86,6 +86,15 @@ def test_every_configuration_and_preset_calibrates(pair: Rig, terms: str, name: 
     assert (result.joint_covariance is None) == (terms in ("stage1", "priors"))
 
 
+def test_the_gate_drops_what_exceeds_it(pair: Rig) -> None:
+    table = simulate_correspondences(pair, errors=NOISY, frames=8, matches=300)
+    result = solve(perturb(pair, rotation_deg=1, translation_m=0.1), table, preset("kitti"))
+    for name, counts in result.counts.items():
+        assert counts["used"] < counts["capped"]
+        # Inside 3 px: most of the 85 % with noise of 1.1 px, and few of the others.
+        assert 0.75 < result.residuals[name].inlier_share < 0.9
+
+
 def test_a_camera_without_correspondences_is_solved_through_a_relative_pose(pair: Rig) -> None:
     table = simulate_correspondences(pair, errors=CLEAN, frames=6).of_camera("left")
     rig = pair.model_copy(update={"relative_poses": (stereo_relative_pose(pair),)})
@@ -226,6 +235,15 @@ def test_random_correspondences_fail(pair: Rig) -> None:
     assert result.verdict.status == "FAIL"
 
 
+def test_the_same_call_gives_the_same_numbers(pair: Rig) -> None:
+    table = simulate_correspondences(pair, errors=NOISY, frames=6)
+    start = perturb(pair, rotation_deg=2, translation_m=0.2)
+    one, two = solve(start, table), solve(start, table)
+    for name in pair.cameras:
+        assert (one.T_camera_lidar[name] == two.T_camera_lidar[name]).all()
+    assert (one.joint_covariance == two.joint_covariance).all()
+
+
 def test_an_error_that_all_frames_share_is_in_the_error_bar(pair: Rig) -> None:
     table = simulate_correspondences(pair, errors=NOISY, frames=8)
     metadata = {"systematic_rotation_rad": 1e-3, "systematic_translation_m": 0.02}
@@ -266,6 +284,13 @@ def test_without_pnp_a_narrowing_loss_leads_to_where_matches_are_densest(
     monkeypatch.setattr(objective, "_NARROWINGS", 0)
     stuck, _ = worst(solve_joint(start, table, Config(stage1="rig")).solved_rig, pair)
     assert stuck > 1
+
+
+def test_few_frames_are_told(pair: Rig) -> None:
+    table = simulate_correspondences(pair, errors=NOISY, frames=3)
+    result = solve(pair, table)
+    assert result.verdict.status != "PASS"
+    assert any("mostly a default" in reason for reason in result.verdict.reasons)
 
 
 def test_information_along_an_edge_is_used_and_across_it_is_not(pair: Rig) -> None:

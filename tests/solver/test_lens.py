@@ -18,7 +18,7 @@ from calibgraph import (
 )
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.graph.lens import LensVariable
-from calibgraph.graph.variables import aligned_key, lens_key
+from calibgraph.graph.variables import aligned_key, body_key, lens_key
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import twist_between
 from calibgraph.model.lens_estimate import LensEstimate
@@ -151,6 +151,20 @@ def test_the_lens_is_part_of_an_alignment_and_an_error_of_a_mount(
         assert shares["uncertain lenses and clocks"] > 0.9
 
 
+def test_the_covariance_of_a_mount_is_that_of_its_graph(
+    drawn: tuple[Rig, Correspondences],
+) -> None:
+    truth, table = drawn
+    found = solve_joint(truth, table, Config(of="mount"))
+    assert found.marginals.errors is not None
+    fit = found.marginals.errors.fit
+    marginals = gtsam.Marginals(found.graph(), fit.linear.values)
+    for number in range(len(truth.cameras)):
+        own = found.covariance[6 * number : 6 * number + 6, 6 * number : 6 * number + 6]
+        sigmas = np.sqrt(np.diag(marginals.marginalCovariance(body_key(number))))
+        np.testing.assert_allclose(np.sqrt(np.diag(own)), sigmas, rtol=1e-3)
+
+
 def test_estimate_and_sigma_are_those_of_the_whole_graph(
     drawn: tuple[Rig, Correspondences],
 ) -> None:
@@ -183,6 +197,22 @@ def test_estimate_and_sigma_are_those_of_the_whole_graph(
             np.sqrt(np.diag(fit.covariance[rows, rows])), np.sqrt(np.diag(pose)), rtol=0.01
         )
         assert name in truth.cameras
+
+
+def test_the_rig_gets_the_lens_and_without_the_flag_keeps_its_own(
+    drawn: tuple[Rig, Correspondences],
+) -> None:
+    truth, table = drawn
+    wrong = put_lens_error(truth, "focal", 0.02)
+    plain, found = solve(wrong, table), solve(wrong, table, Config(estimate=("focal",)))
+    assert plain.lens == {}
+    assert plain.rig.with_lenses_of(wrong) is plain.rig
+    assert plain.not_included.startswith("intrinsics, ")
+    assert found.not_included.startswith("other intrinsics, ")
+    for name, camera in found.rig.cameras.items():
+        assert camera.intrinsics_px.fx == pytest.approx(found.lens[name][0].value, rel=1e-9)
+        assert found.initial_rig.cameras[name] == wrong.cameras[name]
+        assert "estimated lenses and clocks" in found.error_sources[name].translation
 
 
 @pytest.mark.parametrize("name", ["fisheye", "omni"])

@@ -39,6 +39,28 @@ def test_the_fit_is_exact_without_noise() -> None:
     np.testing.assert_allclose(seen, pixels + jacobian @ twist, atol=1e-3)  # second order: 1e-7 f
 
 
+def test_an_unknown_that_the_pose_compensates_is_not_observable() -> None:
+    points = points_in_front(np.random.default_rng(4), 100)
+    pixels, jacobian = project_with_jacobian(make_camera(), points)
+    field = jacobian[:, :, :1].transpose(2, 1, 0)
+    fit = fit_table(make_camera(), table_of(pixels, points, 4), field)
+    assert fit is not None
+    assert fit.free(0).sigmas[0] > 0.99  # as the prior of the pose: a radian
+
+
+def test_a_few_rows_and_a_single_frame_have_no_fit_and_no_sigma() -> None:
+    rng = np.random.default_rng(8)
+    points = points_in_front(rng, 100)
+    pixels, field = (
+        project_with_jacobian(make_camera(), points)[0],
+        rng.standard_normal((1, 2, 100)),
+    )
+    table = table_of(pixels + rng.standard_normal((100, 2)), points, 1)
+    assert fit_table(make_camera(), table.select(np.arange(20)), field[:, :, :20]) is None
+    fit = fit_table(make_camera(), table, field)
+    assert fit is not None and np.isnan(fit.free(0).sigmas).all()
+
+
 def test_compensating_twist_undoes_what_an_unknown_displaces() -> None:
     rng = np.random.default_rng(5)
     camera, points = make_camera(), points_in_front(rng, 200)

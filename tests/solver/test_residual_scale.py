@@ -7,7 +7,10 @@ import pytest
 
 from calibgraph.solver.residual_scale import (
     iterate_spread,
+    quantile,
+    quantiles,
     robust_spread,
+    robust_spreads,
 )
 
 
@@ -43,3 +46,23 @@ def test_the_spread_is_that_of_sorted_values(count: int) -> None:
         values[count // 2 :: 7] *= 1e4
         # Interpolation between two values is rounded in another order.
         assert robust_spread(values) == pytest.approx(sorted_spread(values), rel=1e-12)
+
+
+def test_runs_have_the_spread_of_their_finite_values() -> None:
+    values = np.abs(np.random.default_rng(1).standard_normal(1000))
+    values[100:110] = np.inf
+    runs = np.array([[0, 400], [400, 1000], [100, 110]])
+    found = robust_spreads(values, runs)
+    finite = values[:400][np.isfinite(values[:400])]
+    assert found.tolist() == [robust_spread(finite), robust_spread(values[400:]), np.inf]
+
+
+@pytest.mark.parametrize("count", [1, 2, 30, 3000, 20_000])
+def test_quantiles_are_those_of_numpy(count: int) -> None:
+    values = np.random.default_rng(count).exponential(5.0, count)
+    for share in (0.0, 0.02, 0.5, 0.98, 1.0):
+        # Interpolation between two values is rounded in another order.
+        assert quantile(values, share) == pytest.approx(np.quantile(values, share), rel=1e-14)
+    runs = np.array([[0, count], [count // 2, count]])
+    expected = [np.median(values[slice(*run)]) for run in runs]
+    np.testing.assert_allclose(quantiles(values, runs, 0.5), expected, rtol=1e-14)

@@ -14,9 +14,11 @@ from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.scan_distortion import (
     distortion_evidence,
+    distortion_fields_px,
     distortions_at,
     pair_jacobians,
 )
+from tests.conftest import make_camera, points_in_front
 
 STEP = np.array([2e-4, 2e-3, 4e-3])  # far below the scale of the loss
 
@@ -28,6 +30,19 @@ def test_elevation_turns_each_line_of_sight_and_motion_grows_with_the_heading() 
     np.testing.assert_allclose(elevation, [[1.0, 0, 10], [0, 0, 10], [2, 0, 10]], atol=1e-12)
     np.testing.assert_allclose(stretch, elevation * slopes[:, None], atol=1e-12)
     np.testing.assert_allclose(motion, [[0, 0, 0], [0.25, 0, 0], [0.5, 0, 0]], atol=1e-12)
+
+
+def test_the_fields_are_derivatives_of_pixels() -> None:
+    camera, points = make_camera(), points_in_front(np.random.default_rng(0), 50)
+    T = camera.T_camera_lidar
+    for field, bend in zip(
+        distortion_fields_px(camera, points), distortions_at(points), strict=True
+    ):
+        before, after = (
+            camera.lens.project((points + step * bend) @ T[:3, :3].T + T[:3, 3])[0]
+            for step in (-1e-6, 1e-6)
+        )
+        np.testing.assert_allclose(field.T, (after - before) / 2e-6, rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("bend", [0, 1, 2])

@@ -102,6 +102,15 @@ def fits_of(rig: Rig) -> list[PairFit]:
     return fit_pairs(rig, simulated_pairs(rig), Config(), held)
 
 
+def test_it_is_never_taken_for_less_than_usual(pair: Rig) -> None:
+    covariance = np.diag(np.tile(EACH, 2))
+    assert shared_variance_ratio(pair.T_camera_lidar, covariance, fits_of(pair)) == 1.0
+
+
+def test_without_tied_cameras_it_is_as_usual(pair: Rig) -> None:
+    assert shared_variance_ratio(pair.T_camera_lidar, np.eye(12), ()) == 1.0
+
+
 def test_a_displaced_camera_widens_the_error_bars(pair: Rig) -> None:
     """The matches of one camera are displaced by 12 cm, which images of both show."""
     table = simulate_correspondences(

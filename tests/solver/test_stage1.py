@@ -17,6 +17,7 @@ from calibgraph import (
 from calibgraph.model.geometry import pose_difference
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver import stage1
+from calibgraph.solver.geodesic_median import geodesic_median
 from calibgraph.solver.pnp import frame_pose, view_plane
 from calibgraph.solver.stage1 import (
     T_hat,
@@ -100,6 +101,14 @@ def test_outliers_do_not_spoil_a_frame(pair: Rig) -> None:
         assert error.translation_error_cm < 2
 
 
+def test_failed_frames_are_counted_and_dropped(pair: Rig) -> None:
+    good = simulate_correspondences(pair, frames=5, matches=100)
+    few = good.select((good.frame < 4) | (np.arange(len(good)) % 40 == 0))
+    found = estimate_stage1(pair, few, Config())
+    assert {name: camera.failed_frames for name, camera in found.items()} == {"left": 1, "right": 1}
+    assert len(found["left"].per_frame) == 4
+
+
 def test_matches_that_leave_a_direction_free_give_no_pose(pair: Rig) -> None:
     table = simulate_correspondences(pair, frames=1, matches=50, errors=MatcherErrors(noise_px=0.0))
     right = table.of_camera("right")
@@ -134,6 +143,12 @@ def test_median_and_mode_ignore_what_the_mean_does_not() -> None:
     mean = aggregate(scattered, "mean")
     assert mean[0, 3] == pytest.approx(1 + 5 * 0.3, abs=0.01)
     assert Rotation.from_matrix(mean[:3, :3]).magnitude() == pytest.approx(0.15, abs=0.02)
+
+
+def test_the_geodesic_median_of_rotations_about_one_axis_is_the_median_angle() -> None:
+    angles = np.array([-0.3, -0.1, 0.05, 0.4, 1.2])
+    rotations = Rotation.from_rotvec(np.outer(angles, [0, 0, 1]))
+    np.testing.assert_allclose(geodesic_median(rotations).as_rotvec(), [0, 0, 0.05], atol=1e-6)
 
 
 def test_the_half_sample_mode_is_where_samples_are_densest() -> None:

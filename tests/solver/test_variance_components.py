@@ -55,3 +55,8 @@ def test_the_size_of_places_is_found_from_many_of_them(pair: Rig, size: float) -
 
 def test_few_places_are_never_taken_for_better_than_usual(pair: Rig) -> None:
     assert errors_of(pair, table_of(pair, 4, 0.0, 0)).ratios == VarianceRatios()
+
+
+def test_one_place_has_the_usual_size(pair: Rig) -> None:
+    """Nothing is measured twice, so nothing is learnt, whatever the error."""
+    assert errors_of(pair, table_of(pair, 1, 25.0, 0)).ratios == VarianceRatios()

@@ -21,6 +21,14 @@ def test_weights_are_the_papers() -> None:
     assert not roots[:, 1].any()
 
 
+def test_whitening_is_a_root_of_the_information() -> None:
+    information = np.array([[4.0, 1.0, 2.0], [1, 1, 1], [0, 0, 9], [9, 0, 0]])
+    roots = sqrt_information(table(information_px=information), Config())
+    for (uu, uv, vv), (a, b, c) in zip(information, roots, strict=True):
+        S = np.array([[a, b], [0, c]])
+        np.testing.assert_allclose(S.T @ S, [[uu, uv], [uv, vv]], atol=1e-12)
+
+
 def test_the_error_of_an_edge_is_the_distance_from_it() -> None:
     residuals = np.array([[3.0, 4.0], [3.0, 4.0], [3.0, 4.0]])
     information = np.array([[1.0, 0, 1], [7.0, 0, 0], [0.5, 0.5, 0.5]])
