@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph import Dataset, Rig
-from calibgraph.errors import DatasetError
 from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching import places
@@ -124,23 +122,6 @@ def test_a_frame_stays_after_an_unknown_motion_if_it_follows_closely(
     frames = [replace(f, name=name) for f, name in zip(data.frames, names, strict=False)]
     walk = PlaceWalk(in_sequence=True)
     assert [walk.first_of_place(frame, None) for frame in frames] == places_found
-
-
-@pytest.mark.parametrize("what", ["find_motion", "find_twist"])
-def test_a_frame_whose_motion_cannot_be_found_is_of_the_place_before(what: str) -> None:
-    """Its scan does not fit its neighbours'; frame by frame and in a batch."""
-
-    def misfit() -> Any:
-        raise DatasetError("the scans do not fit")
-
-    data, name = sample()
-    stamps = [str(10**15 + 10**5 * frame.index) for frame in data.frames[:3]]  # 0.1 s apart
-    frames = [replace(f, name=s) for f, s in zip(data.frames, stamps, strict=False)]
-    frames[1] = replace(frames[1], **{what: misfit})
-    finder = PlaceFinder(data.rig)
-    assert [finder.first_of_place(frame) for frame in frames] == [0, 0, 0]
-    found = find_places(replace(data, frames=tuple(frames)), data.rig, name)
-    assert 1 in found[0]
 
 
 # Places that were visited before

@@ -41,18 +41,6 @@ def of_z_score(value: float) -> Verdict:
     return Verdict((threshold("z_score").check(value),))
 
 
-def test_every_camera_has_its_own_reason_and_action() -> None:
-    """A wrong centre is shown though causes of other cameras come before it."""
-    wrong = {"left": ("search", "z_score"), "rear": ("guess_rotation", "time_offset"),
-             "right": ("principal_point", "frames")}  # fmt: skip
-    summary = summarize({name: of_kinds(*kinds) for name, kinds in wrong.items()})
-    assert [(r.cameras, r.cause) for r in summary.reasons] == [
-        (("left",), "guess"), (("rear",), "guess"), (("right",), "lens")
-    ]  # fmt: skip
-    assert [action.partition(":")[0] for action in summary.actions] == ["left", "rear", "right"]
-    assert [r.cause for r in summary.others] == ["time", "agreement", "data"]
-
-
 def test_a_fail_comes_before_what_explains_it_if_that_only_warns() -> None:
     verdict = of_kinds("competing_solution", "frames", "lens", "own_clouds", "guess_rotation")
     summary = summarize({"left": Verdict((*verdict.checks, FAILED))}, {"left": ("loose height",)})
@@ -88,20 +76,6 @@ WIDE = ErrorSources(
     translation={COMMON: 0.9, MATCHES: 0.1},
     forecast={2: (0.29, 1.9), MOST_TIMES: (0.285, 1.8)},
 )
-
-
-def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
-    unsure = {
-        "left": Verdict((threshold("sigma_rotation").check(0.3),), ErrorProbability(0.001, 0.1))
-    }
-    summary = summarize(unsure, sources={"left": WIDE})
-    assert summary.error_bar == (
-        "Least certain: left, 0.3 deg (1 sigma). Measured relative_poses or priors would help most."
-    )
-    (action,) = summary.actions
-    assert "0.28 deg of common error remain" in action or "0.29 deg of common error" in action
-    few = replace(WIDE, forecast={2: (0.2, 1.5), 3: (0.14, 1.0), MOST_TIMES: (0.01, 0.1)})
-    assert summarize(unsure, sources={"left": few}).actions == ("Record 3 times as many frames.",)
 
 
 @pytest.mark.parametrize(

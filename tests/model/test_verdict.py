@@ -31,6 +31,11 @@ def test_the_worst_check_decides_and_its_reason_comes_first() -> None:
     assert rig_verdict({"front": verdict}).reasons[0] == "front: c: 0, below the limit 1"
 
 
+@pytest.mark.parametrize("direction", ["at most", "at least"])
+def test_nan_fails(direction: Direction) -> None:
+    assert check_of("a", float("nan"), direction, 1, 2, unit="m").status == "FAIL"
+
+
 def test_a_number_next_to_its_limit_is_told_from_it_in_three_digits() -> None:
     assert (
         check_of("kept", 0.59999, "at least", 0.6, 0.3, unit="share").text

@@ -21,7 +21,6 @@ from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.variables import aligned_key, body_key, lens_key
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import twist_between
-from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.lens_knowledge import LensSigmas
 from calibgraph.model.rig import IntrinsicsSigma
 from calibgraph.simulation.rigs import rig_of
@@ -235,23 +234,6 @@ def test_lenses_that_see_all_round_are_estimated(name: str) -> None:
         assert estimates[0].is_determined and estimates[1].is_determined
         if name == "omni":
             assert found.distortion[0] == right.distortion[0]
-
-
-@pytest.mark.parametrize(
-    ("name", "needed"),
-    [
-        ("focal", "record several distances, towards the corners, too"),
-        ("aspect", "record near things at the sides, above and below"),
-        ("centre_y", "record near and far things over the whole image"),
-        ("k1", "record matches near the corners of the image"),
-        ("p2", "record matches near the corners of the image"),
-        ("readout", "record turns and changes of speed"),
-    ],
-)
-def test_what_is_not_determined_names_what_to_record(name: str, needed: str) -> None:
-    one = LensEstimate(name, "", 1.0, 0.1, 1.0, 0.1, "z", 0.5)
-    assert one.describe() == f"not determined by these data; {needed}; with z 0.50"
-    assert replace(one, sigma=0.01).describe() == "with z 0.50"
 
 
 def test_the_rig_states_how_well_its_new_lens_is_known(

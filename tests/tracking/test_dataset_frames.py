@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -22,11 +20,8 @@ from calibgraph import (
     concatenate,
 )
 from calibgraph.io.dataset import Dataset, load_dataset
-from calibgraph.io.frame import Frame
 from calibgraph.tracking import command, dataset_frames
 from calibgraph.tracking.command import Tracking, track
-from calibgraph.tracking.dataset_frames import with_places
-from calibgraph.tracking.streams import StreamFrame
 from calibgraph.trust.pose_posterior import no_posteriors
 from calibgraph.trust.run_evidence import RunEvidence
 from tests.tracking.drives import (
@@ -152,85 +147,3 @@ def test_flat_images_widen_the_result_at_the_end_and_its_verdict(
     assert wide.camera_verdicts["left"].cannot_tell
     assert "beyond_tolerance" not in {c.kind for c in narrow.camera_verdicts["left"].checks}
     assert "no images" in narrow.verdict.images_note and not wide.verdict.images_note
-
-
-@pytest.fixture
-def follow(
-    world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[], tuple[Calibration, list[str]]]:
-    """Tracks the dataset, whose files hold no images, with a matcher whose images count."""
-    monkeypatch.setattr(RunEvidence, "_measure_posteriors", no_posteriors)
-    monkeypatch.setattr(Given, "image_checks_can_fail", True, raising=False)
-
-    def run() -> tuple[Calibration, list[str]]:
-        notes: list[str] = []
-        matcher = Given(concatenate(world.tables))
-        wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
-        result, (saved, *_) = track(wanted, recorded.folders, notify=notes.append)
-        assert saved.is_file() and result.covariance["left"] is not None
-        assert result.verdict.images_note
-        return result, notes
-
-    return run
-
-
-def test_a_signal_while_images_are_scored_ends_that(
-    follow: Callable[[], tuple[Calibration, list[str]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def score(*_: object, **__: object) -> None:
-        signal.raise_signal(signal.SIGINT)
-        raise AssertionError("it went on")
-
-    monkeypatch.setattr(dataset_frames, "measure_posteriors", score)
-    _, notes = follow()
-    assert "stopped: the images were not compared with the clouds" in notes
-
-
-def test_the_result_names_the_places_of_its_frames(
-    world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As that of ``calibrate``."""
-    monkeypatch.setattr(dataset_frames, "PlaceFinder", lambda *_, **__: Odometer())
-    stated = [replace(t, metadata={"place_variance": 8.0}) for t in world.tables]
-    matcher = Given(concatenate(stated))
-    wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
-    result, _ = track(wanted, recorded.folders, notify=lambda _: None)
-    assert result.places == ((0, 1, 2, 3), (4, 5, 6, 7), (8, 9, 10, 11), (12, 13))
-    for name, found in result.error_sources.items():
-        assert sum(found.translation.values()) == pytest.approx(1.0)
-        assert found.translation["errors that a place shares"] > 0.01
-        assert found.translation_cm == pytest.approx(float(result.sigmas(name)[1].max()), rel=0.01)
-    assert result.error_sources.keys() == result.rig.cameras.keys()
-
-
-class Odometer:
-    """Finds a new place every four frames; notes what it is shown."""
-
-    def __init__(self) -> None:
-        self.shown: list[int] = []
-        self.remembered: list[int] = []
-
-    def first_of_place(self, frame: Frame) -> int:
-        self.shown.append(frame.index)
-        return frame.index // 4 * 4
-
-    def remember(self, frame: Frame) -> None:
-        self.remembered.append(frame.index)
-
-
-@pytest.mark.parametrize(
-    ("known", "start", "again"),
-    [((), 0, 0), (("", "gate"), 2, 2), (("0", "4"), 7, 4), (("4", "0"), 9, 4)],
-)
-def test_frames_of_a_dataset_have_their_places(
-    known: tuple[str, ...], start: int, again: int, world: World, recorded: Dataset
-) -> None:
-    """A restart looks again at the first frames of all places, and at those since the newest."""
-    stated = [replace(t, metadata={"place_variance": 8.0}) for t in world.tables]
-    items = [StreamFrame(n, stated[n]) for n in range(start, FRAMES)]
-    finder = Odometer()
-    found = list(with_places(items, recorded, finder, known))  # type: ignore[arg-type]
-    names = [item.table.metadata["place"] for item in found if isinstance(item, StreamFrame)]
-    assert names == [str(n // 4 * 4) for n in range(start, FRAMES)]
-    assert finder.remembered == [int(name) for name in known if name.isdigit()]
-    assert finder.shown == list(range(again, FRAMES))

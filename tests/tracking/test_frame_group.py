@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -14,7 +13,6 @@ from calibgraph import (
     Calibration,
     CorrespondenceError,
     Correspondences,
-    DurableCalibrator,
     IncrementalCalibrator,
     Rig,
     perturb,
@@ -23,7 +21,7 @@ from calibgraph import (
 from calibgraph.model.correspondences import concatenate
 from calibgraph.tracking.frame_group import update_all
 from calibgraph.tracking.stream_tables import Refused, StreamFrame
-from calibgraph.tracking.update import Update, json_line
+from calibgraph.tracking.update import Update
 from tests.draws.drives import simulate_drive
 from tests.tracking.drives import ERRORS, drive, pair_of
 
@@ -149,80 +147,3 @@ def test_frames_that_stand_out_are_taken_in_by_themselves() -> None:
         (u.frame, u.left_out, {*u.used}) for u in expected
     ]
     assert found[23].left_out == ("left", "right") and not found[31].used and not found[33].used
-
-
-@pytest.fixture(scope="module")
-def started() -> bytes:
-    """After 16 frames."""
-    rig = pair_of()
-    tracker = IncrementalCalibrator(guess_of(rig))
-    together(tracker, frames_of(drive(rig, 16)))
-    return tracker.to_bytes()
-
-
-def hostile_frames(seed: int, first: int, last: int) -> list[StreamFrame]:
-    """Frames most of which lack a camera or matches, repeat an earlier one, or are wrong."""
-    rng, tables = np.random.default_rng(seed), drive(pair_of(), last)
-    for number in range(first, last):
-        table, earlier = tables[number], tables[number - int(rng.integers(1, 5))]
-        size = table.points_lidar_m.shape
-        kinds = [
-            table.of_camera("left"),
-            table.of_camera("right"),
-            table.select(slice(0, int(rng.integers(0, 12)))),
-            replace(earlier, frame=np.full(len(earlier), number)),
-            replace(table, stamp_ns=np.full(len(table), 10**9 * number)),
-            replace(table, points_lidar_m=table.points_lidar_m + 3 * rng.normal(size=size)),
-            replace(table, metadata={**table.metadata, "place": str(rng.integers(0, 3))}),
-        ]
-        kind = int(rng.integers(0, 2 * len(kinds)))
-        tables[number] = kinds[kind] if kind < len(kinds) else table
-    return [StreamFrame(number, tables[number]) for number in range(first, last)]
-
-
-@pytest.mark.parametrize(
-    "seed", [*range(3), *(pytest.param(n, marks=pytest.mark.slow) for n in range(3, 40))]
-)
-def test_whatever_comes_the_same_is_absorbed_as_one_by_one(seed: int, started: bytes) -> None:
-    """Also a camera's last cloud that comes again after frames without the camera."""
-    frames = hostile_frames(seed, 16, 32)
-    expected, _ = one_by_one(IncrementalCalibrator.from_bytes(started), frames)
-    found, _ = together(IncrementalCalibrator.from_bytes(started), frames)
-    assert [(u.frame, u.left_out, {*u.used}, [*map(str, u.events)]) for u in found] == [
-        (u.frame, u.left_out, {*u.used}, [*map(str, u.events)]) for u in expected
-    ]
-
-
-def test_an_error_in_a_group_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = pair_of()
-    frames = frames_of(drive(rig, 28))
-    tracker = IncrementalCalibrator(guess_of(rig))
-    together(tracker, frames[:25])
-    before = tracker.to_bytes()
-
-    def singular(*_: object) -> None:
-        patch.undo()  # what had been taken in is taken in again
-        raise np.linalg.LinAlgError("Singular matrix")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("calibgraph.tracking.tracker.make_updates", singular)
-        assert tracker.update_together(frames[25:]) == []
-    assert tracker.to_bytes() == before
-
-
-def test_a_restart_goes_on_with_the_same_numbers(tmp_path: Path) -> None:
-    """In the middle of an epoch, from bytes and from disk."""
-    rig = pair_of()
-    frames = frames_of(drive(rig, 40))
-    tracker = IncrementalCalibrator(guess_of(rig))
-    together(tracker, frames[:27])
-    copy = IncrementalCalibrator.from_bytes(tracker.to_bytes())
-    expected, _ = together(tracker, frames[27:])
-    assert [*map(json_line, together(copy, frames[27:])[0])] == [*map(json_line, expected)]
-    calibrator = DurableCalibrator(tmp_path, guess_of(rig))
-    together(calibrator, frames[:27])
-    calibrator.abandon()  # as a kill leaves it
-    with DurableCalibrator(tmp_path, guess_of(rig)) as resumed:
-        assert resumed.repeated[-1].frame == 26 and len(resumed.last_repeated) == 7
-        again, _ = together(resumed, frames[27:])
-    assert [*map(json_line, again)] == [*map(json_line, expected)]

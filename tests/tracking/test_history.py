@@ -49,28 +49,6 @@ def drive(history: History, frames: int, first: int = 0) -> History:
     return history
 
 
-def kept_frames(history: History) -> list[int]:
-    curve = history.curves()["left"]
-    assert curve is not None
-    return [int(frame) for frame in curve.frames]
-
-
-@pytest.mark.parametrize("most", [2, 3, 10, 11])
-def test_after_every_update_the_entries_are_evenly_spaced_and_end_with_the_newest(most: int):
-    history = History(most)
-    for frame in range(200):
-        drive(history, 1, first=frame)
-        frames = kept_frames(history)
-        assert len(frames) == len(history) <= most
-        assert frames[0] == 0
-        assert frames[-1] == frame
-        steps = np.diff(frames)
-        assert len(set(steps[:-1])) <= 1
-        if len(steps) > 1:
-            assert steps[-1] <= steps[0]
-            assert np.log2(steps[0]) % 1 == 0
-
-
 def test_curves_end_at_zero_and_bring_the_newest_estimate_to_the_older_ones():
     rng = np.random.default_rng(0)
     xis = 0.1 * rng.standard_normal((5, 6))
@@ -101,15 +79,6 @@ def test_memory_does_not_grow_with_the_drive():
     assert len(history.events) == 1000
 
 
-def test_events_outlive_the_entries_of_their_frames():
-    history = History(4)
-    expected = [Event("moved", "left", 31, 33), Event("blind", "left", 41, 60)]
-    for frame in range(1000):
-        history.add(update(frame, events=[e for e in expected if e.detected_frame == frame]))
-    assert history.events == tuple(expected)
-    assert 33 not in kept_frames(history)
-
-
 def test_lines_are_in_degrees_and_centimetres_and_bands_are_three_sigma():
     xi = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.3])
     history = History()
@@ -126,24 +95,6 @@ def test_lines_are_in_degrees_and_centimetres_and_bands_are_three_sigma():
         low_and_high = unit * (xi[rows, None] + SIGMA[rows, None] * [-3.0, 3.0])
         np.testing.assert_allclose(drawn[:6].reshape(3, 2), low_and_high, atol=1e-9)
         np.testing.assert_allclose(drawn[6:], unit * xi[rows], atol=1e-9)
-
-
-def test_no_band_is_drawn_without_a_covariance():
-    history = History()
-    for frame in range(6):
-        began = [Event("started", "left", 0, 0)] if frame == 0 else []
-        history.add(update(frame, unsure=["left"] if frame < 3 else [], events=began))
-    edge = np.asarray(history.figure().axes[0].lines[0].get_ydata())
-    np.testing.assert_array_equal(np.isnan(edge), [True, True, True, False, False, False])
-
-
-def test_timestamps_as_frame_numbers_are_drawn_to_the_frame():
-    first = 1_700_000_000_000_000_000  # ns: a double holds such numbers to 256 only
-    history = drive(History(), 10, first=first)
-    panel = history.figure().axes[0]
-    assert panel.get_xlim() == (0, 9)
-    np.testing.assert_array_equal(panel.lines[0].get_xdata(), np.arange(10))
-    assert str(first) in panel.get_xlabel()
 
 
 def test_names_with_dollars_or_foreign_letters_and_long_ones_can_be_drawn(tmp_path: Path):

@@ -76,40 +76,21 @@ def test_a_frame_without_rows_is_a_frame(cameras: dict[str, Any]) -> None:
         (b'{"frame": 7}', "key 'cameras' is missing"),
         (line(weather="rain"), "unknown key 'weather'; remove it"),
         (line(1.0), "frame: Input should be a valid integer, found 1.0"),
-        (line(True), "frame: Input should be a valid integer, found True"),
         (line(2**63), "frame: Input should be less than 9223372036854775808, found"),
-        (line("7"), "frame: Input should be a valid integer, found '7'"),
-        (line(stamp_ns=None), "stamp_ns: Input should be a valid integer, found None"),
-        (line(cameras=[]), "cameras: expected keys with values, as in {key: value}, found []"),
-        (
-            line(cameras={"left": None}),
-            "cameras.left: expected keys with values, as in {key: value}, found None",
-        ),
         (line(cameras={"left": {}}), "key 'cameras.left.u_px' is missing"),
         (line(cameras={"left": camera(depth=[1])}), "unknown key 'cameras.left.depth'"),
-        (line(cameras={"left": camera(u_px=5)}), "u_px: Input should be a valid list, found 5"),
         (
             line(cameras={"left": camera(u_px=[True])}),
             "u_px.0: Input should be a valid number, found True",
-        ),
-        (
-            line(cameras={"left": camera(u_px=[[1]])}),
-            "u_px.0: Input should be a valid number, found [1]",
-        ),
-        (
-            line(cameras={"left": camera(u_px=[None])}),
-            "u_px.0: Input should be a valid number, found None",
         ),
         (
             line(cameras={"left": camera(u_px=[10**400])}),
             "u_px.0: Input should be a valid number, found 1000",
         ),
         (line(cameras={"left": camera(u_px=[float("nan")])}), "is not JSON"),
-        (line(cameras={"left": camera(u_px=[-float("inf")])}), "is not JSON"),
         (line().replace(b"[1.5]", b"[1e999]"), "pixel must be finite"),
         (line(cameras={"left": camera(u_px=[1, 2])}), "differ in length: {'u_px': 2, 'v_px': 1"),
         (line(cameras={"left": camera(confidence=[2])}), "confidence must lie in (0, 1]"),
-        (line(cameras={"left": camera(confidence=[1e300])}), "confidence must lie in (0, 1]"),
         (
             line(cameras={"left": camera(point_index=[0.5])}),
             "point_index.0: Input should be a valid integer, found 0.5",
@@ -123,14 +104,9 @@ def test_a_frame_without_rows_is_a_frame(cameras: dict[str, Any]) -> None:
             line(cameras={str(i): camera(0) for i in range(1001)}),
             "cameras: Dictionary should have at most 1000 items",
         ),
-        (line(metadata=[]), "metadata: expected keys with values, as in {key: value}, found []"),
         (
             line(metadata={"systematic_rotation_rad": "x"}),
             "systematic_rotation_rad: expected a number from 0 to 3.14, found 'x'; correct it, or",
-        ),
-        (
-            line(metadata={"systematic_rotation_rad": 10**400}),
-            "systematic_rotation_rad: expected a number from 0 to 3.14, found 1000",
         ),
     ],
 )

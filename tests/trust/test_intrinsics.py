@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -65,6 +66,14 @@ def test_a_skew_is_no_pass_and_is_measured(pair: Rig) -> None:
 def test_images_undistorted_twice_fail(pair: Rig) -> None:
     result = solve(with_lens(pair, distortion=(-0.2, 0.0, 0.0, 0.0)), simulated(pair))
     assert named(result, "left", "a k1 ")[0].status == "FAIL"
+
+
+def test_a_shifted_principal_point_fails_and_is_measured(pair: Rig) -> None:
+    result = solve(with_lens(pair, cx=20.0), simulated(pair))
+    (check,) = named(result, "left", "principal point")
+    assert check.status == "FAIL"  # it turns the camera by a degree
+    (found,) = re.findall(r"off by \((-[0-9.]+) ", check.text)
+    assert abs(float(found) + 20) < 1
 
 
 def test_a_wall_hides_a_wrong_focal_length_which_is_a_warning(pair: Rig) -> None:

@@ -91,6 +91,12 @@ def test_tied_cameras_move_by_one_motion_of_the_cloud() -> None:
         assert np.linalg.norm((mean - back)[3:]) < 0.04
 
 
+def test_a_narrower_posterior_leaves_the_covariance_as_it_is() -> None:
+    joint = random_covariance(12, seed=0)
+    found = widen(joint, {0: joint[:6, :6] / 2, 1: joint[6:, 6:] / 3})
+    np.testing.assert_allclose(found, joint, rtol=1e-9)
+
+
 def test_no_direction_is_narrower_than_by_the_matches_or_by_the_images() -> None:
     joint, moments = random_covariance(12, seed=0), 2 * random_covariance(6, seed=1)
     found = widen(joint, {1: moments})

@@ -9,12 +9,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from calibgraph import BagOptions, DatasetError, calibrate, evaluate, load_dataset, load_rig
+from calibgraph import BagOptions, calibrate, evaluate, load_dataset, load_rig
 from calibgraph.io.bags.point_clouds import timed_points_of
 from calibgraph.io.frame import load_entry_cloud
 from calibgraph.io.motion import ScanMotion
 from calibgraph.matching import places
-from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.model.geometry import invert
 from tests.conftest import SAMPLE
 from tests.io.bags.motion_messages import (
@@ -67,19 +66,6 @@ def test_poses_correct_them(bag: tuple[Path, list[np.ndarray]], motion: str) -> 
     assert max(errors_m(bag, motion)) < 2e-4  # on the bend: 10 m/s 0.3 /s (20 ms)^2 / 8
 
 
-def test_a_cache_tells_corrected_clouds_from_those_as_recorded(
-    bag: tuple[Path, list[np.ndarray]],
-) -> None:
-    cache = FrameCache()
-    options = (BagOptions(), BagOptions(motion="tf"))
-    frames = [load_dataset(bag[0], bag=each).frames[1] for each in options]
-    one, two = (cache.cloud(frame) for frame in frames)
-    assert one is not two
-    assert cache.cloud(frames[1]) is two
-    cache.keep_only(frames[:1])
-    assert cache.cloud(frames[0]) is one
-
-
 @pytest.mark.parametrize(("motion", "limit_m"), [("odometry", 2e-4), ("scans", 0.1)])
 def test_poses_or_twists_give_the_motion_between_frames(
     bag: tuple[Path, list[np.ndarray]],
@@ -120,25 +106,6 @@ def test_times_of_all_drivers_are_read(kind: str, values: list[float]) -> None:
     rows["timestamp"] = values
     _, times = timed_points_of(MAKE.cloud(rows, START_NS), "here")
     np.testing.assert_allclose(times, [0.0, 0.05], atol=1e-6)  # float64 stamps: 0.2 us
-
-
-def test_what_is_missing_is_named(bag: tuple[Path, list[np.ndarray]], tmp_path: Path) -> None:
-    written, _ = messages()
-    still = [each for each in written if each.topic not in ("/odom", "/tf")]
-    parked = write_bag(tmp_path / "still", "mcap", still)
-    with pytest.raises(DatasetError, match="has 0 topics of Odometry"):
-        load_dataset(parked, bag=BagOptions(motion="odometry"))
-    with pytest.raises(DatasetError, match="has 0 poses of the LiDAR"):
-        load_dataset(parked, bag=BagOptions(motion="tf"))
-    few = [e for e in written if e.topic != "/odom" or e.record_ns < START_NS + PERIOD_NS]
-    short = write_bag(tmp_path / "short", "mcap", few)
-    last = load_dataset(short, bag=BagOptions(motion="odometry")).frames[-1]
-    with pytest.raises(DatasetError, match="no poses of the LiDAR within 0.5 s at"):
-        last.load_cloud()
-    with pytest.raises(ValueError, match="motion 'wheels': known are none, odometry, tf, scans"):
-        BagOptions(motion="wheels")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="by the stamps of the headers"):
-        BagOptions(motion="tf", stamps="record")
 
 
 def driven_sample(folder: Path) -> Path:

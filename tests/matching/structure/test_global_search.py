@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from calibgraph import RelativePose, Rig
-from calibgraph.matching.structure import acceptance, global_search, pose_search
+from calibgraph.matching.structure import acceptance, global_search
 from calibgraph.matching.structure.acceptance import (
     Chance,
     least_z_score,
@@ -22,8 +20,6 @@ from calibgraph.matching.structure.bodies import Body, lead, place
 from calibgraph.matching.structure.global_search import TRIES, Located, Locator
 from calibgraph.matching.structure.pose_refinement import Candidate
 from calibgraph.matching.structure.pose_search import (
-    CONFIDENT,
-    PROMISING,
     PoseSearch,
     SearchRange,
 )
@@ -122,52 +118,6 @@ def test_a_lower_z_score_is_accepted_at_the_guess_if_a_search_found_no_better(
         np.testing.assert_allclose(found.camera.T_camera_lidar, T, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("z_score", "stands_out", "looks"),
-    [(CONFIDENT + 1, True, 0), (CONFIDENT + 1, False, 1), (PROMISING - 1, False, 0)],
-)
-def test_near_the_guess_a_pose_that_does_not_stand_out_is_looked_around(
-    one: Rig, monkeypatch: pytest.MonkeyPatch, z_score: float, stands_out: bool, looks: int
-) -> None:
-    """In a laboratory, poses 3 to 7 degrees off had z-scores of 20 to 32: the right one 72."""
-    looked: list[Candidate] = []
-
-    class Around(PoseSearch):
-        def from_afar(self, body: Body) -> Candidate:
-            return Candidate(body, 1.0)
-
-        def _best_around(self, candidate: Candidate) -> Candidate:
-            looked.append(candidate)
-            return Candidate(candidate.body, 72.0, stands_out=True)
-
-    monkeypatch.setattr(
-        pose_search, "refine", lambda _, body: Candidate(body, z_score, stands_out=stands_out)
-    )
-    found = Around(one, {}, SearchRange(0.3, 1.5), seed=0, out_of_time=never).near(
-        dict(one.cameras)
-    )
-    assert (len(looked), found.z_score) == (looks, 72.0 if looks else z_score)
-
-
-@pytest.mark.parametrize(
-    ("by_roll", "rolls"), [((CONFIDENT + 1, 40.0, 50.0), 1), ((MANY + 0.1, 30.0, 50.0), 2)]
-)
-def test_of_the_rolls_those_are_tried_until_a_pose_is_beyond_doubt(
-    one: Rig, by_roll: tuple[float, ...], rolls: int
-) -> None:
-    """A local optimum may be accepted, but is not taken while better places may be left."""
-    tried: list[float] = []
-
-    class Rolled(PoseSearch):
-        def with_roll(self, body: Body, roll_rad: float, *, effort: int) -> Candidate:
-            tried.append(roll_rad)
-            return Candidate(body, by_roll[len(tried) - 1])
-
-    search = Rolled(one, {}, SearchRange(0.3, 1.5), seed=0, out_of_time=never)
-    found = search.everywhere(dict(one.cameras), 1)
-    assert (len(tried), found.z_score) == (rolls, max(by_roll[:rolls]))
-
-
 def test_one_camera_is_searched_and_the_other_placed_where_it_is_seen(two: Rig) -> None:
     """The camera that is more promising at its guess is searched first."""
     first, second = (two.T_camera_lidar[name] for name in NAMES)
@@ -185,24 +135,6 @@ def test_one_camera_is_searched_and_the_other_placed_where_it_is_seen(two: Rig) 
         np.testing.assert_allclose(found[name].camera.T_camera_lidar, T, atol=1e-9)
 
 
-class NeverAgreeing(MadeUp):
-    """Each camera always sees the other one metre from where that is."""
-
-    def seen_by(self, other: Body, body: Body) -> Body | None:
-        return place(body, off(lead(body).T_camera_lidar))
-
-    def at(self, body: Body) -> Candidate:
-        return Candidate(body, 30.0)
-
-
-def test_cameras_that_never_agree_are_moved_once_each_and_the_search_ends(two: Rig) -> None:
-    first, second = (two.T_camera_lidar[name] for name in NAMES)
-    search = NeverAgreeing(two, [(first, 34.0), (second, 33.0)])
-    search.guess = {NAMES[0]: first, NAMES[1]: second}
-    found = locate(search)
-    assert [found[name].accepted for name in NAMES].count(True) == 1
-
-
 def test_a_body_is_tried_at_the_guesses_of_all_its_cameras(two: Rig) -> None:
     """The lead's guess is far off, the other camera's is right, and the relative pose is known."""
     first, second = (two.T_camera_lidar[name] for name in NAMES)
@@ -218,60 +150,6 @@ def test_a_body_is_tried_at_the_guesses_of_all_its_cameras(two: Rig) -> None:
     for name, T in zip(NAMES, (first, second), strict=True):
         assert found[name].accepted
         np.testing.assert_allclose(found[name].camera.T_camera_lidar, T, atol=1e-9)
-
-
-class FewFrames(MadeUp):
-    """One to three frames, with that evidence in mirrored images."""
-
-    _mirrored_evidence = 12.0
-
-
-@pytest.mark.parametrize(
-    ("few", "above", "accepted"), [(True, 0.1, True), (True, -0.1, False), (False, 0.1, False)]
-)
-def test_in_few_frames_the_fine_levels_can_accept_a_pose(
-    one: Rig, monkeypatch: pytest.MonkeyPatch, few: bool, above: float, accepted: bool
-) -> None:
-    """The camera is then where they put it, and the probability by chance is known."""
-    elsewhere = off(one.T_camera_lidar["left"])
-    search = FewFrames(one, [(elsewhere, MANY - 4)], {"left": [elsewhere]})
-    search._few = few
-    at_fine = least_z_score(TRIES[1], second_look_chance(12.0, 3)) + above - (MANY - 4)
-
-    def look_again(_: Any, body: Body) -> Candidate:
-        return Candidate(place(body, off(lead(body).T_camera_lidar, 0.1)), at_fine)
-
-    monkeypatch.setattr(pose_search, "look_again", look_again)
-    found = locate(search)["left"]
-    assert found.accepted == accepted
-    if few:
-        assert found.chance is not None
-        assert (found.chance <= acceptance.FALSE_ACCEPTANCE) == accepted
-    else:
-        assert found.chance is None
-    if accepted:
-        np.testing.assert_allclose(found.camera.T_camera_lidar, off(elsewhere, 0.1), atol=1e-9)
-
-
-@pytest.mark.parametrize(("frames", "approached", "refined"), [(1, 5, 10), (3, 5, 10), (4, 5, 2)])
-def test_in_few_frames_all_candidates_are_refined(
-    one: Rig, monkeypatch: pytest.MonkeyPatch, frames: int, approached: int, refined: int
-) -> None:
-    """An approach may lead away from the right pose, and its z-score ranks poses badly."""
-    tried: list[str] = []
-    for name in ("approach", "refine"):
-
-        def improve(_: Any, body: Body, name: str = name) -> Candidate:
-            tried.append(name)
-            return Candidate(body, 1.0)
-
-        monkeypatch.setattr(pose_search, name, improve)
-    monkeypatch.setattr(pose_search, "search_box", lambda *_, **__: [np.eye(4)] * 5)
-    monkeypatch.setattr(PoseSearch, "_correlate", lambda *_: SimpleNamespace(maps=["some"]))
-    seen: Any = {"left": SimpleNamespace(frames=[None] * frames, cores=None)}
-    search = PoseSearch(one, seen, SearchRange(0.3, 1.5), seed=0, out_of_time=never)
-    search.with_roll(dict(one.cameras), 0.0, effort=1)
-    assert (tried.count("approach"), tried.count("refine")) == (approached, refined)
 
 
 @pytest.mark.parametrize("chance", [acceptance.SEARCH, second_look_chance(12.0, 3)])
