@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from calibgraph import Camera, Intrinsics, Rig
+from calibgraph import Camera, Intrinsics, Rig, load_rig
 from calibgraph.model.geometry import T_OPTICAL_LINK
 from calibgraph.model.plausibility import find_implausible
+from calibgraph.model.rig import RelativePose
 from factors import LensModel
+from tests.conftest import SAMPLE
 
 HD = {"size": (1280, 720), "centre": (640, 360)}
 
@@ -89,3 +92,21 @@ def test_a_value_that_cannot_be_right_is_named_once_with_its_numbers(
 )
 def test_usual_lenses_are_left_alone(usual: dict[str, Any]) -> None:
     assert lines(**usual) == []
+
+
+def test_cameras_that_are_too_far_apart_are_named() -> None:
+    rig = load_rig(SAMPLE)
+    T = np.eye(4)
+    T[0, 3] = 54.0
+    pair = RelativePose(
+        a="left", b="front_left", T_a_b=T, rotation_sigma_rad=0.1, translation_sigma_m=0.1
+    )
+    assert find_implausible(rig) == []
+    (line,) = find_implausible(rig.model_copy(update={"relative_poses": (pair,)}))
+    assert line.startswith("front_left is 54 m from left: lengths in millimetres or centimetres?")
+
+
+def test_no_camera_of_real_rigs_is_named(realdata: Path) -> None:
+    rigs = [*realdata.glob("*/rig.yaml"), *realdata.glob("kitti_odometry/sequences/*")]
+    assert len(rigs) > 10
+    assert {path: found for path in rigs if (found := find_implausible(load_rig(path)))} == {}

@@ -79,6 +79,21 @@ def test_every_source_gives_the_same_lines(
     assert text.splitlines() == (world.lines if kind == "lines" else world.file_lines)
 
 
+def test_every_nth_frame_is_taken_also_after_a_restart(
+    world: World, call: Call, tmp_path: Path
+) -> None:
+    half = tmp_path / "half.parquet"
+    concatenate(world.tables[:8]).save(half)
+    every = ("--every", 3, "--out", tmp_path / "out")
+    _, first, _ = call("track", world.rig, half, *every)
+    _, second, err = call("track", world.rig, world.source, *every)
+    assert frames_in(first) == [0, 3, 6] and frames_in(second) == [9, 12]
+    assert "going on after frame 6" in err and "3 known from before" in err
+    assert (first + second).splitlines() == file_lines(
+        world.guess, world.tables[:8:3], world.tables[9::3]
+    )
+
+
 @pytest.mark.parametrize("numbers", [(10**18, 10**8), (-(2**63), 1), (-5, 1), (2**63 - 15, 1)])
 def test_frame_numbers_may_be_any_of_64_bits(
     numbers: tuple[int, int], world: World, piped: Callable[..., Any], tmp_path: Path

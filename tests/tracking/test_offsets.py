@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 
 from calibgraph import (
+    CorrespondenceError,
+    IncrementalCalibrator,
     concatenate,
     solve,
 )
@@ -14,10 +18,13 @@ from calibgraph.graph.by_place import QuadraticByPlace
 from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, seen_lens_key
 from calibgraph.model.geometry import twist_between
+from calibgraph.simulation.rigs import rig_of
 from calibgraph.tracking.offset_sums import with_offset
 from calibgraph.tracking.sums import Sums
+from tests.tracking.drives import moved_later
 from tests.tracking.late_drives import (
     CONSTANT,
+    OFFSET,
     RATE,
     STRAIGHT,
     late,
@@ -68,6 +75,15 @@ def test_the_first_turn_after_a_way_straight_ahead_is_no_move() -> None:
         assert np.linalg.norm(twist_between(updates[-1].T_camera_lidar[name], T)[3:]) < 0.02
 
 
+def test_a_move_is_found_while_the_offset_drifts() -> None:
+    truth, tables = late(
+        town(150, 2), 0.005 + RATE * np.arange(150), rig_at=moved_later(rig_of("kitti"), 120)
+    )
+    updates = track(truth, tables)
+    (event,) = [e for update in updates for e in update.events if e.kind != "started"]
+    assert (event.kind, event.camera, event.frame) == ("moved", "image_2", 120)
+
+
 def test_a_constant_offset_is_that_of_a_batch() -> None:
     """Without a walk. As near as poses are with a known clock: 0.15 sigma."""
     truth, tables = late(town(120, 4), np.full(120, 0.02), seed=4)
@@ -81,6 +97,14 @@ def test_a_constant_offset_is_that_of_a_batch() -> None:
         (batch,), (one,) = found.lens[name], last.lens[name]
         assert abs(one.value - batch.value) < 0.15 * batch.sigma
         assert one.sigma == pytest.approx(batch.sigma, rel=0.05)
+
+
+def test_frames_without_a_motion_are_refused_and_nothing_has_changed() -> None:
+    truth, tables = late(town(6, 0), np.zeros(6))
+    tracker = IncrementalCalibrator(truth, OFFSET)
+    with pytest.raises(CorrespondenceError, match="the motion of the LiDAR must be known"):
+        tracker.update(replace(tables[0], twist_per_s=None))
+    assert tracker.frame is None
 
 
 # Parts

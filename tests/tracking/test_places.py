@@ -255,6 +255,30 @@ def test_an_update_is_the_optimum_of_the_graph_with_all_places() -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(joint.joint_covariance)), sigmas.ravel(), rtol=0.01)
 
 
+def test_a_camera_that_is_blind_at_new_places_stops_nothing() -> None:
+    """Its error bar stays that of the places where it saw something."""
+    tracker = IncrementalCalibrator(pair_of())
+    for frame, table in enumerate(drive(pair_of(), 40)):
+        seen = states(table if frame < 25 else table.of_camera("left"))
+        update = tracker.update(seen, place=str(frame // 6))
+        sigmas = {name: np.sqrt(np.diag(own)) for name, own in update.covariance.items()
+                  if own is not None}  # fmt: skip
+        if frame == 24:
+            before = sigmas
+    np.testing.assert_allclose(sigmas["right"], before["right"], rtol=0.2)
+    assert (sigmas["left"][:3] < before["left"][:3]).all()
+
+
+def test_a_camera_that_sees_a_place_later_than_another_is_taken_in() -> None:
+    """Its variable at a place that the open epoch has already begins another window."""
+    tracker = IncrementalCalibrator(pair_of())
+    for frame, table in enumerate(drive(pair_of(), 40)):
+        seen = table.of_camera("left") if frame in (24, 25) else table
+        tracker.update(states(seen), place="here" if frame < 24 else "there")
+    counts = tracker.calibration().counts
+    assert [counts[name]["frames_used"] for name in ("left", "right")] == [40, 38]
+
+
 # Where the place of a frame comes from
 
 

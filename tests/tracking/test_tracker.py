@@ -95,6 +95,29 @@ def test_a_step_of_the_lidar_is_not_blamed_on_a_camera(mixed_rig: Rig) -> None:
         assert np.degrees(np.linalg.norm(xi[:3])) < 0.1
 
 
+def test_a_camera_that_was_blind_when_the_lidar_moved_is_carried_along(mixed_rig: Rig) -> None:
+    by = gtsam.Pose3.Expmap(step_of(1.0, 5)).matrix()
+    after = mixed_rig.moved_to({name: T @ by for name, T in mixed_rig.T_camera_lidar.items()})
+    tables = drive(
+        lambda frame: after if frame >= 42 else mixed_rig, 52, blind={"side": range(20, 200)}
+    )
+    _, updates = tracked(mixed_rig, tables)
+    assert [(e.kind, e.camera) for e in events_of(updates)] == [("blind", "side"), ("moved", None)]
+    xi = difference(updates[-1].T_camera_lidar["side"], after.T_camera_lidar["side"])
+    assert np.degrees(np.linalg.norm(xi[:3])) < 0.2
+    assert updates[-1].covariance["side"] is None
+
+
+def test_a_large_knock_is_found_too(pair: Rig) -> None:
+    after = moved(pair, "left", np.array([0.02, 0.12, -0.05, 0.2, 0.1, 0]))  # 7.5 deg, 22 cm
+    tables = drive(lambda frame: after if frame >= 20 else pair, 30)
+    _, updates = tracked(pair, tables)
+    (event,) = events_of(updates)
+    assert (event.camera, event.frame) == ("left", 20)
+    xi = difference(updates[-1].T_camera_lidar["left"], after.T_camera_lidar["left"])
+    assert np.degrees(np.linalg.norm(xi[:3])) < 0.1
+
+
 def test_failed_matches_are_left_out_and_counted(pair: Rig) -> None:
     tables = drive(lambda frame: pair, 40, failed_share=0.3)
     tracker, updates = tracked(pair, tables)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -48,3 +50,9 @@ def test_a_scan_twice_with_a_shift_is_seen() -> None:
 )
 def test_parts_that_agree_are_left_alone(cloud: np.ndarray) -> None:
     assert displacement_of_parts(cloud) is None
+
+
+def test_no_real_cloud_is_named(realdata: Path) -> None:
+    clouds = [*realdata.glob("*/lidar/*"), *realdata.glob("kitti_odometry/sequences/*/velodyne/*")]
+    assert len(clouds) > 30
+    assert [path for path in clouds[::3] if displacement_of_parts(load_cloud(path))] == []

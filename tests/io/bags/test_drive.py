@@ -25,6 +25,7 @@ from tests.io.bags.motion_messages import messages as messages_of_a_drive
 from tests.io.bags.writing import (
     PERIOD_NS,
     START_NS,
+    STORES,
     Messages,
     Stamped,
     sample_messages,
@@ -144,6 +145,21 @@ def test_transforms_on_tf_that_never_change_are_static(tmp_path: Path, kind: str
     assert "the transforms of velodyne are from /tf of" in note
 
 
+def test_transforms_of_tf_before_tf2_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TREE))
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", OLD_TREE))
+    monkeypatch.setitem(STORES, True, store)
+    make = Messages("ros1")
+    tree = store.types[OLD_TREE](transforms=make.transforms(tree_of(RIG)).transforms)
+    others = without(sample_messages(make), "/tf_static")
+    require_guess(write_bag(tmp_path, "ros1", [*others, *repeated(tree, OLD_TREE)]))
+
+
 def test_transforms_that_move_are_not_static_and_are_named(tmp_path: Path) -> None:
     written = without(sample_messages(MAKE), "/tf_static")
     for number in range(6):
@@ -258,6 +274,27 @@ def test_a_baseline_along_any_axis_parts_the_cameras_as_recorded_and_rectified(
     expected[:3, 3] = shift
     found = relative_transform(T["front_right"], T["front_left"])
     np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_baseline_that_the_frames_have_is_not_added(tmp_path: Path) -> None:
+    T_right_own = np.eye(4)  # R turns the own frame into the axes of the image
+    T_right_own[:3, :3] = T_RIGHT_LEFT[:3, :3]
+    T_own_lidar = invert(T_right_own) @ T_RIGHT_LIDAR
+    own = [*SHARED, ("velodyne", "right", invert(T_own_lidar))]
+    bag = pair(tmp_path, ("stereo", "right"), own)
+    np.testing.assert_allclose(
+        rig_of_bag(bag).T_camera_lidar["front_right"], T_RIGHT_LIDAR, atol=1e-9
+    )
+    notes = read_bag_rig(bag).notes
+    assert notes[0].endswith("; frame 'right' is its own, so it is not added")
+
+
+def test_a_baseline_is_added_to_another_frame_at_the_same_place(tmp_path: Path) -> None:
+    twice = [*SHARED, ("stereo", "stereo_again", np.eye(4))]
+    bag = pair(tmp_path, ("stereo", "stereo_again"), twice)
+    np.testing.assert_allclose(
+        rig_of_bag(bag).T_camera_lidar["front_right"], T_RIGHT_LIDAR, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("rectified", [False, True])

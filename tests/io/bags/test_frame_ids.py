@@ -18,6 +18,7 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
+from calibgraph.io.mounts import find_mounts
 from calibgraph.model.geometry import invert
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
@@ -113,3 +114,30 @@ def test_the_exported_transforms_are_read_back_over_the_robots_description(
         for camera, T in estimate.items():
             np.testing.assert_allclose(found.T_camera_lidar[camera], T, atol=1e-9)
             assert found.cameras[camera].mount is not None
+
+
+MOUNTED = {  # parents by child, and what is expected to be moved
+    "a drivers frames below one link": (
+        {"velodyne": "base", "cam_link": "base", "rgb": "cam_link", "rgb_optical": "rgb"},
+        {"rgb_optical": ("base", "cam_link")},
+    ),
+    "two cameras on one bar": (
+        {"velodyne": "base", "bar": "base", "l": "bar", "l_opt": "l", "r": "bar", "r_opt": "r"},
+        {"l_opt": ("bar", "l"), "r_opt": ("bar", "r")},
+    ),
+    "below the LiDAR": (
+        {"link": "velodyne", "opt": "link", "direct": "velodyne"},
+        {"opt": ("velodyne", "link"), "direct": None},
+    ),
+    "the LiDAR below the camera": ({"velodyne": "opt"}, {"opt": None}),
+    "one frame for two": ({"velodyne": "base", "opt": "base"}, {"opt": None, "opt ": None}),
+}
+
+
+@pytest.mark.parametrize("name", MOUNTED)
+def test_the_link_that_moves_is_the_uppermost_of_the_camera_alone(name: str) -> None:
+    parents, expected = MOUNTED[name]
+    cameras = {camera: (camera.strip(), np.eye(4)) for camera in expected}
+    found = find_mounts(cameras, "velodyne", parents, lambda *_: np.eye(4))
+    moved = {n: (found[n].parent, found[n].child) if n in found else None for n in expected}
+    assert moved == expected

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibgraph import BagOptions, Dataset, calibrate, load_dataset, load_rig
+from calibgraph import BagOptions, Dataset, DatasetError, calibrate, load_dataset, load_rig
 from calibgraph.io.frame import hash_source
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
@@ -49,6 +49,21 @@ def test_frames_of_a_bag_equal_those_of_the_folder(tmp_path: Path, kind: str, ra
             )
     paths = [frame.cloud_path for frame in data.frames]
     assert len({hash_source(path) for path in paths}) == len(paths)
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("kind", KINDS)
+def test_recorded_frames_are_the_same_from_a_bag(tmp_path: Path, realdata: Path, kind: str) -> None:
+    folder = load_dataset(realdata / "kitti_odometry" / "sequences" / "05", frames="0:3")
+    for raw in (False, True):
+        bag = sample_bag(tmp_path / str(raw), kind, data=folder, raw=raw)
+        data = load_dataset(bag)
+        for found, expected in zip(data.frames, folder.frames, strict=True):
+            np.testing.assert_array_equal(found.load_cloud(), expected.load_cloud())
+            for name, camera in data.rig.cameras.items():
+                np.testing.assert_array_equal(
+                    found.load_image(name, camera), expected.load_image(name, camera)
+                )
 
 
 @pytest.mark.slow
@@ -148,6 +163,16 @@ def test_after_a_clock_is_set_back_only_messages_of_one_time_pair(
         )
 
 
+def test_clocks_that_differ_are_named_and_the_time_of_recording_serves(tmp_path: Path) -> None:
+    def since_start(_: int, each: Stamped) -> Stamped:
+        return restamped(each, stamp_of(each) - START_NS) if each.topic == LEFT else each
+
+    bag = changed(tmp_path, since_start)
+    with pytest.raises(DatasetError, match=r"/left.* 0.003 to 0.503 s do not meet; give --stamps"):
+        load_dataset(bag)
+    assert numbers(load_dataset(bag, bag=BagOptions(stamps="record"))) == [0, 1, 2, 3, 4, 5]
+
+
 def long_bag(folder: Path, kind: str, frames: int) -> Path:
     """A bag of the sample's frames, again and again, 0.1 s apart."""
     data = load_dataset(SAMPLE)
@@ -176,6 +201,13 @@ def test_a_frame_in_each_period_is_picked_and_keeps_its_neighbours(
         last = data.neighbour(last, 1)
     few = load_dataset(bag, frames="1:3", bag=BagOptions(every_s=1.0))
     assert [frame.name for frame in few.frames] == [frame.name for frame in data.frames[1:3]]
+
+
+def test_bags_and_folders_form_one_problem(tmp_path: Path) -> None:
+    data = load_dataset([SAMPLE, sample_bag(tmp_path, "ros1")], load_rig(SAMPLE))
+    assert numbers(data) == list(range(12))
+    assert data.frames[6].name == f"drive.bag/{START_NS}"
+    assert data.neighbour(data.frames[5], 1) is None
 
 
 def test_times_of_points_are_noticed(tmp_path: Path) -> None:

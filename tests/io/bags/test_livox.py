@@ -98,3 +98,12 @@ def test_any_alignment_of_the_points_is_read(frame: str, ros1: bool, little: boo
         assert found.header.stamp.nanosec == 12
         np.testing.assert_array_equal(points_of(found, "here")[:, :3], cloud[:count, :3])
         assert time_fields(each.name for each in found.fields) == ["offset_time"]
+
+
+def test_a_truncated_cloud_is_refused() -> None:
+    make = Messages("mcap")
+    message = custom_msg(make, np.ones((9, 4), np.float32), 0, LIVOX_CLOUDS[0])
+    data = bytes(STORES[False].serialize_cdr(message, LIVOX_CLOUDS[0]))
+    for length in (len(data) - 30, 40, 10, 3):
+        with pytest.raises((ValueError, IndexError)):
+            read_custom_msg(data[:length], STORES[False].types, ros1=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,12 @@ def require_the_sample(path: Path) -> None:
             np.testing.assert_array_equal(image, frame.load_image(name, camera))
 
 
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_file_is_read_by_its_index(tmp_path: Path, name: str) -> None:
+    messages = sample_messages(Messages("mcap"))
+    require_the_sample(write_mcap(tmp_path / "drive.mcap", messages, **WHOLE[name]))
+
+
 @pytest.mark.parametrize("name", NOT_WHOLE)
 def test_a_file_whose_index_is_not_whole_is_named_with_the_repair(
     tmp_path: Path, name: str
@@ -138,6 +145,14 @@ def test_channels_of_other_encodings_are_left_alone(
     path = write_mcap(tmp_path / "drive.mcap", messages, beside=encoding or "none", **WHOLE[name])
     require_the_sample(path)
     assert "/notes" in Bag(path).topics
+
+
+def test_an_unknown_compression_is_named(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "drive.mcap", sample_messages(Messages("mcap")), enable_crcs=False)
+    text = struct.pack("<I", 4)
+    path.write_bytes(path.read_bytes().replace(text + b"zstd", text + b"bzip"))
+    with pytest.raises(FileError, match="is compressed by 'bzip'; known are bz2, lz4 and zstd"):
+        Bag(path).first("/points")
 
 
 def test_a_damaged_chunk_is_noticed_by_its_sum(tmp_path: Path) -> None:

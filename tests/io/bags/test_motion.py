@@ -9,12 +9,13 @@ import gtsam
 import numpy as np
 import pytest
 
-from calibgraph import BagOptions, calibrate, evaluate, load_dataset, load_rig
+from calibgraph import BagOptions, DatasetError, calibrate, evaluate, load_dataset, load_rig
 from calibgraph.io.bags.point_clouds import timed_points_of
 from calibgraph.io.frame import load_entry_cloud
 from calibgraph.io.motion import ScanMotion
 from calibgraph.matching import places
 from calibgraph.model.geometry import invert
+from calibgraph.trust.inputs import find_doubts
 from tests.conftest import SAMPLE
 from tests.io.bags.motion_messages import (
     IMAGE_S,
@@ -66,6 +67,10 @@ def test_poses_correct_them(bag: tuple[Path, list[np.ndarray]], motion: str) -> 
     assert max(errors_m(bag, motion)) < 2e-4  # on the bend: 10 m/s 0.3 /s (20 ms)^2 / 8
 
 
+def test_registration_of_neighbours_corrects_them(bag: tuple[Path, list[np.ndarray]]) -> None:
+    assert max(errors_m(bag, "scans")) < 0.01  # surfaces without noise, in voxels of 0.25 m
+
+
 @pytest.mark.parametrize(("motion", "limit_m"), [("odometry", 2e-4), ("scans", 0.1)])
 def test_poses_or_twists_give_the_motion_between_frames(
     bag: tuple[Path, list[np.ndarray]],
@@ -92,6 +97,17 @@ def test_poses_or_twists_give_the_motion_between_frames(
     assert [step is None for step in found] == [motion == "scans"] * len(found)
 
 
+def test_times_that_are_all_equal_are_named_if_motion_is_to_be_corrected(
+    bag: tuple[Path, list[np.ndarray]], tmp_path: Path
+) -> None:
+    equal = write_bag(tmp_path / "equal", "mcap", messages(timed=False)[0])
+    for path, motion, expected in ((equal, "tf", 1), (equal, "none", 0), (bag[0], "tf", 0)):
+        frame = load_dataset(path, bag=BagOptions(motion=motion)).frames[1]  # type: ignore[arg-type]
+        found = [text for text in find_doubts(RIG, frame, frame.load_cloud()) if "time" in text]
+        assert len(found) == expected
+        assert all("so that --motion moves it as a whole" in text for text in found)
+
+
 @pytest.mark.parametrize(
     ("kind", "values"),
     [
@@ -106,6 +122,13 @@ def test_times_of_all_drivers_are_read(kind: str, values: list[float]) -> None:
     rows["timestamp"] = values
     _, times = timed_points_of(MAKE.cloud(rows, START_NS), "here")
     np.testing.assert_allclose(times, [0.0, 0.05], atol=1e-6)  # float64 stamps: 0.2 us
+
+
+def test_times_that_are_none_are_refused() -> None:
+    rows = np.ones(2, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")])
+    rows["time"] = 7.0, np.nan
+    with pytest.raises(DatasetError, match="time: times from .* are not those of one scan"):
+        timed_points_of(MAKE.cloud(rows, START_NS), "here")
 
 
 def driven_sample(folder: Path) -> Path:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from calibgraph import BagOptions, DatasetError, FileError, load_dataset, load_rig
+from calibgraph import BagOptions, CalibrationError, DatasetError, FileError, load_dataset, load_rig
 from calibgraph.io.bags.rig import read_bag_rig, rig_of_bag
 from calibgraph.io.ros_messages import image_from_message
 from tests.conftest import SAMPLE
@@ -173,6 +173,11 @@ def test_a_camera_info_that_changes_is_noted_and_its_frames_left_out(
     assert note in found and ("camera_info" in found) == bool(note)
 
 
+def test_without_any_lens_the_first_camera_info_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"/left/camera_info: K: .*not calibrated"):
+        load_dataset(recording(tmp_path, infos(lambda _: {"K": np.zeros(9)})))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     ("topic", "record_ns"),
@@ -201,6 +206,17 @@ def test_a_time_of_recording_that_is_wrong_costs_nothing(
     lost = topic in ("/left/image_raw/compressed", "/points")
     assert len(data.frames) == len(whole.frames) == (5 if lost else 6)
     assert max(frame.index for frame in data.frames) < 20
+
+
+def test_clouds_of_another_frame_are_left_out_and_counted(tmp_path: Path) -> None:
+    def change(each: Stamped) -> Stamped:
+        if each.topic == "/points" and (each.record_ns - START_NS) // 100_000_000 in (2, 5):
+            each.content.header.frame_id = "rear"
+        return each
+
+    data = load_dataset(recording(tmp_path, change))
+    assert len(data.frames) == 4
+    assert "/points: 2 name another frame than the first (rear, not velodyne)" in data.notes[-1]
 
 
 def turned(orientation: int, form: str) -> bytes:

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calibgraph import DatasetError
-from calibgraph.io.bags.pictures import picture_of
+from calibgraph.io.bags.pictures import is_depth, picture_of
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import START_NS, Messages
 
@@ -78,6 +78,15 @@ def test_mosaics_give_their_colours_back(
     np.testing.assert_array_equal(found[2:-2, inner], colours[2:-2, inner])
 
 
+def test_yuv_is_read() -> None:
+    gray = np.full((40, 60), 117, np.uint8)
+    neutral = np.full_like(gray, 128)
+    for encoding, layers in (("yuv422", (neutral, gray)), ("yuv422_yuy2", (gray, neutral))):
+        found = read(np.dstack(layers), encoding).astype(int)
+        assert np.ptp(found) == 0  # one gray, by the scale of video
+        assert abs(found[0, 0, 0] - (117 - 16) * 255 / 219) <= 1
+
+
 @pytest.mark.parametrize("counts_both", [False, True])
 @pytest.mark.parametrize("encoding", ["nv12", "nv21", "nv24", "nv42", "NV12"])
 @pytest.mark.parametrize("padding", [0, 64])
@@ -128,6 +137,19 @@ def test_jpeg_is_read(form: str) -> None:
     np.testing.assert_array_equal(picture_of(MAKE.compressed(data, form, START_NS), "here"), BGR)
 
 
+def png(image: NDArray[Any], form: str) -> NDArray[np.uint8]:
+    data = cv2.imencode(".png", image)[1].tobytes()
+    return picture_of(MAKE.compressed(data, form, START_NS), "here")
+
+
+def test_png_is_read_in_the_order_in_which_it_was_stored() -> None:
+    np.testing.assert_array_equal(png(BGR, "png"), BGR)
+    np.testing.assert_array_equal(png(BGR[..., ::-1], "rgb8; png compressed rgb8"), BGR)
+    wide = GRAY.astype(np.uint16) << 4
+    wide[0, 0] = 0xFFF
+    np.testing.assert_array_equal(png(wide, "mono16; png compressed ")[1:, :, 0], GRAY[1:])
+
+
 def test_images_that_cannot_be_read_are_named() -> None:
     cut = MAKE.image(BGR, "bgr8", START_NS)
     cut.data = cut.data[:-1]
@@ -140,3 +162,10 @@ def test_images_that_cannot_be_read_are_named() -> None:
         picture_of(MAKE.compressed(data[:-100], "jpeg", START_NS), "here")
     with pytest.raises(DatasetError, match="its format 'h264' is neither JPEG nor PNG"):
         picture_of(MAKE.compressed(b"\0\0\0\1g", "h264", START_NS), "here")
+
+
+def test_depth_is_no_image() -> None:
+    assert is_depth(MAKE.image(GRAY.astype(np.uint16), "16UC1", START_NS))
+    assert is_depth(MAKE.compressed(b"", "16UC1; compressedDepth png", START_NS))
+    assert not is_depth(MAKE.image(GRAY.astype(np.uint16), "mono16", START_NS))
+    assert not is_depth(MAKE.compressed(b"", "bgr8; jpeg compressed bgr8", START_NS))

@@ -21,6 +21,12 @@ def test_fields_of_any_order_and_byte_order_are_read(order: str, names: str, gap
     np.testing.assert_array_equal(points_of(message, "here"), CLOUD)
 
 
+def test_organised_clouds_with_padded_rows_are_read() -> None:
+    message = MAKE.cloud(structured(CLOUD), START_NS, height=6, padding=5)
+    assert (message.height, message.width, message.row_step) == (6, 20, 20 * 16 + 5)
+    np.testing.assert_array_equal(points_of(message, "here"), CLOUD)
+
+
 def test_points_without_a_return_are_left_out() -> None:
     cloud = CLOUD.copy()
     cloud[3, :3] = np.nan
@@ -41,6 +47,19 @@ def test_doubles_and_whole_numbers_are_read() -> None:
     found = points_of(MAKE.cloud(points, START_NS), "here")
     np.testing.assert_array_equal(found[:, :3], CLOUD[:, :3])
     np.testing.assert_array_equal(found[:, 3], np.arange(len(CLOUD)))
+
+
+def test_intensity_is_known_by_the_names_that_files_have_for_it() -> None:
+    kind = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("scalar_Intensity", "f4")]
+    points = np.zeros(len(CLOUD), kind)
+    for column, (name, _) in enumerate(kind):
+        points[name] = CLOUD[:, column]
+    np.testing.assert_array_equal(points_of(MAKE.cloud(points, START_NS), "here"), CLOUD)
+
+
+def test_a_cloud_without_intensity_has_none() -> None:
+    found = points_of(MAKE.cloud(structured(CLOUD, "xyz"), START_NS), "here")
+    assert np.isnan(found[:, 3]).all()
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan])

@@ -13,6 +13,7 @@ from calibgraph import (
     CalibrationError,
     DatasetError,
     FileError,
+    camera_from_message,
     import_rig,
     load_dataset,
     load_rig,
@@ -159,3 +160,17 @@ def test_rectified_images_have_the_rectified_matrix_and_axes() -> None:
     assert found == {"fx": 700.0, "fy": 700.0, "cx": 600.0, "cy": 180.0}
     assert stated.lens.distortion == ()
     np.testing.assert_array_equal(stated.R_image_frame, R)
+
+
+def test_a_message_of_a_pairs_second_camera_counts_its_baseline_on_request() -> None:
+    P = np.array([700.0, 0, 600, -70, 0, 700, 180, 14, 0, 0, 1, 0])
+    info = MAKE.camera_info(make_camera(), "first", P=P)
+    T = camera_from_message(info, np.eye(4), rectified=True, frame_of_first=True).T_camera_lidar
+    np.testing.assert_allclose(T[:3, 3], [-0.1, 0.02, 0.0], atol=1e-12)
+    assert not camera_from_message(info, np.eye(4), rectified=True).T_camera_lidar[:3, 3].any()
+
+
+def test_an_uncalibrated_camera_is_named() -> None:
+    info = MAKE.camera_info(make_camera(), "eye", K=np.zeros(9))
+    with pytest.raises(FileError, match="here: K: .* holds no focal length"):
+        lens_of(info, "here", rectified=False)

@@ -59,6 +59,11 @@ def test_matches_are_right_where_the_lidar_knows(
         assert np.mean(errors < 4) > 0.85
 
 
+def test_matching_is_repeatable(found: CameraMatches, data: Dataset, truth: Rig) -> None:
+    again = match_cameras(data, truth)
+    np.testing.assert_array_equal(found.pixels_px, again.pixels_px)
+
+
 def test_features_have_no_bias(data: Dataset, truth: Rig) -> None:
     """A mirrored image has the mirrored features."""
     camera = truth.cameras["front_left"]

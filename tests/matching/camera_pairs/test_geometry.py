@@ -7,7 +7,9 @@ import pytest
 
 from calibgraph import Camera, Intrinsics
 from calibgraph.matching.camera_pairs.geometry import (
+    MAX_LOG10_FALSE_ALARMS,
     agree_on_epipolar_geometry,
+    log10_false_alarms,
 )
 from calibgraph.simulation.rigs import rig_of
 from factors import unproject
@@ -80,3 +82,12 @@ def test_random_matches_agree_on_nothing(cameras: tuple[Camera, Camera], count: 
         fit = agree_on_epipolar_geometry(*cameras, *rays, seed=seed)
         assert not fit.inlier.any()
         assert len(fit.inlier) == count
+
+
+def test_the_number_of_false_alarms_is_an_upper_bound() -> None:
+    """Of residuals that are uniform over the image height, none of 2000 draws is accepted."""
+    rng = np.random.default_rng(0)
+    alarms = [
+        log10_false_alarms(rng.uniform(0, 376, 100), (NARROW, NARROW))[0] for _ in range(2000)
+    ]
+    assert min(alarms) > MAX_LOG10_FALSE_ALARMS

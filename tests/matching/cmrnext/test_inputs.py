@@ -18,6 +18,7 @@ from calibgraph.matching.cmrnext.inputs import (
     network_size,
 )
 from tests.conftest import KANNALA, RADTAN5, make_camera
+from tests.matching.cmrnext.builders import cloud_before
 
 
 def test_the_nearest_point_of_a_pixel_is_rendered() -> None:
@@ -31,6 +32,13 @@ def test_the_nearest_point_of_a_pixel_is_rendered() -> None:
     np.testing.assert_allclose(lidar.pixels_px, [[100.25, 50.75]], atol=1e-4)
     assert lidar.rasterize(lidar.depth_m)[50, 100] == pytest.approx(10.0)
     assert np.count_nonzero(lidar.rasterize(lidar.depth_m)) == 1
+
+
+def test_points_behind_and_beside_are_not_rendered() -> None:
+    camera = make_camera()
+    in_camera = np.array([[0, 0, -5, 1], [50, 0, 5, 1], [0, 0, 2000, 1], [0, 0, 5, 1.0]])
+    cloud = (in_camera @ np.linalg.inv(camera.T_camera_lidar).T).astype(np.float32)
+    assert LidarImage.render(cloud, camera.T_camera_lidar, View(camera)).point_index.tolist() == [3]
 
 
 def test_halving_takes_the_mean_of_pixels_with_points() -> None:
@@ -79,3 +87,12 @@ def test_distortion_is_removed_and_added_again(model: str, distortion: tuple[flo
     assert on_image.all()
     assert np.linalg.norm(centre - dot) > 1  # it was distorted
     np.testing.assert_allclose(back[0], dot, atol=0.1)  # a disc's centre moves by curvature
+
+
+def test_intensities_of_bytes_become_unit() -> None:
+    camera = make_camera()
+    cloud = cloud_before(camera, 100)
+    unit = LidarImage.render(cloud, camera.T_camera_lidar, View(camera))
+    cloud[:, 3] *= 255
+    same = LidarImage.render(cloud, camera.T_camera_lidar, View(camera))
+    np.testing.assert_allclose(same.intensity, unit.intensity, rtol=1e-5)

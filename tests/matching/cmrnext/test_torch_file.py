@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from calibgraph import FileError
-from calibgraph.matching.cmrnext import load_checkpoint
+from calibgraph.matching.cmrnext import load_checkpoint, torch_file
 from tests.matching.cmrnext.builders import CONFIG, good_content, saved
 
 STORAGE_0 = 8 * 3 * 7 * 7
@@ -39,6 +39,14 @@ def test_wrapped_half_and_strided_weights_are_read(tmp_path: Path) -> None:
     checkpoint = load_checkpoint(saved(tmp_path / "a.tar", content | {"state_dict": state}))
     assert torch.equal(checkpoint.state["fnet_img.conv2.weight"], expected)
     assert torch.equal(checkpoint.state["fnet_img.conv1.bias"], backwards)
+
+
+def test_sizes_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path / "a.tar", good_content())
+    for limit, message in (("MAX_BYTES", "bytes, expected at most"),):
+        monkeypatch.setattr(torch_file, limit, 50)
+        with pytest.raises(FileError, match=message):
+            load_checkpoint(path)
 
 
 class Command:

@@ -27,3 +27,8 @@ def test_an_edge_constrains_only_its_normal() -> None:
     assert values[0] == pytest.approx(0.0, abs=1e-9)
     assert abs(vectors[:, 1] @ [0.6, 0.8]) == pytest.approx(1.0, abs=1e-3)
     assert shift[0] @ [0.6, 0.8] == pytest.approx(1.0, abs=0.1)
+
+
+def test_peaks_at_the_rim_are_dropped() -> None:
+    _, _, peak = find_local_peaks(make_grids(np.array([[11.0, 0.0]])), np.array([[11.0, 0.0]]))
+    assert peak[0] == -np.inf

@@ -18,7 +18,7 @@ from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.shift_scores import score_frame
 from calibgraph.matching.structure.window_kernels import FEATURES, ROOM, fill_features
-from calibgraph.matching.structure.window_weights import WindowNetwork
+from calibgraph.matching.structure.window_weights import WindowNetwork, window_network
 from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows
 from tests.conftest import make_camera
 from tools.scenes.surroundings import build_meadow
@@ -101,6 +101,22 @@ def test_a_weight_lessens_the_share_that_a_window_explains() -> None:
     # Single precision, and a product of factors near 1: some 1e-6 of a logarithm.
     np.testing.assert_allclose(weighed, -np.log(1 - 0.3 * (1 - np.exp(-whole))), atol=1e-5)
     assert np.ptp(whole) > 0.1
+
+
+def test_the_network_is_two_hidden_layers_as_torch_computes_them() -> None:
+    torch = pytest.importorskip("torch")
+    network = window_network()
+    values = np.random.default_rng(3).normal(0, 2, (50, len(FEATURES)))
+    layers = []
+    for matrix, bias in network.layers:
+        layer = torch.nn.Linear(*matrix.shape).double()
+        layer.weight.data, layer.bias.data = torch.tensor(matrix.T), torch.tensor(bias)
+        layers += [layer, torch.nn.GELU(approximate="tanh")]
+    expected = torch.sigmoid(torch.nn.Sequential(*layers[:-1])(torch.tensor(values)))[:, 0]
+    raw = values * network.spread + network.mean
+    # Weights are kept in single precision.
+    np.testing.assert_allclose(network.weights(raw), expected.detach().numpy(), atol=1e-6)
+    assert sum(matrix.size + bias.size for matrix, bias in network.layers) == 529
 
 
 @pytest.mark.usefixtures("open3d")

@@ -5,13 +5,13 @@ import itertools
 import numpy as np
 
 import calibgraph
-from calibgraph import Rig
+from calibgraph import Camera, Intrinsics, Rig
 from calibgraph.matching.structure.directions import sphere_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.shift_scores import select_windows
 from calibgraph.matching.structure.window_table import WindowTable
-from tests.conftest import SAMPLE
+from tests.conftest import KANNALA, SAMPLE, make_camera
 
 
 def test_windows_come_from_clouds_with_and_without_intensity(truth: Rig) -> None:
@@ -32,6 +32,24 @@ def test_windows_come_from_clouds_with_and_without_intensity(truth: Rig) -> None
         np.testing.assert_allclose(basis.sum(axis=0), 0, atol=1e-4)
         gram = basis.T @ basis
         np.testing.assert_allclose(gram - np.diag(np.diag(gram)), 0, atol=1e-4)
+
+
+def test_fisheyes_and_views_past_90_degrees_give_windows() -> None:
+    raw = calibgraph.load_dataset(SAMPLE).frames[0].load_cloud()
+    camera = Camera(
+        model="fisheye",
+        width_px=2600,
+        height_px=2600,
+        intrinsics_px=Intrinsics(fx=700.0, fy=700.0, cx=1300.0, cy=1300.0),
+        distortion=KANNALA,
+        T_camera_lidar=make_camera().T_camera_lidar,
+    )
+    cloud = PreparedCloud.from_points(raw)
+    windows = select_windows(cloud, camera, LEVELS[2], max_windows=10_000)
+    T = camera.T_camera_lidar
+    z = (windows.rays_m.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3])[:, 2]
+    assert z.min() < 0 < z.max()
+    assert len(windows.counts) > 100
 
 
 def test_members_behind_a_silhouette_are_moved_to_it() -> None:
