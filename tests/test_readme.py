@@ -21,7 +21,7 @@ def example(page: str) -> str:
 
 FIRST = example("README.md")
 ARRAYS = example("docs/library.md")
-OWN_MATCHER = example("docs/your_matcher.md")
+OWN_MATCHER = example("docs/matchers.md")
 TRACKER = example("docs/tracking.md")
 TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")
 
@@ -101,7 +101,7 @@ def test_a_matcher_and_a_tracker_as_in_the_examples(
 ) -> None:
     monkeypatch.chdir(folder)
     names: dict[str, object] = {"calibgraph": calibgraph, "your_matches": true_matches}
-    exec(compile(OWN_MATCHER, "your_matcher.md", "exec"), names)
+    exec(compile(OWN_MATCHER, "matchers.md", "exec"), names)
     table = calibgraph.load_correspondences(folder / "matches.parquet")
     assert table.point_index is not None and len(np.unique(table.frame)) == 6
     result = names["result"]

@@ -4,7 +4,7 @@ import threading
 import tokenize
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,9 @@ from calibgraph.io.point_fields import RawCloud, choose_fields, make_cloud, raw_
 from calibgraph.model.correspondences import MAX_COORDINATE
 
 MAX_CLOUD_BYTES = 2 * 2**30
+MOST_POINTS = 400_000
+"""Of a cloud that is used: larger ones, which join many scans, take minutes and gigabytes more and
+are no more accurate."""
 
 _PARSER = threading.Lock()
 """numpy reads headers by Python's parser, which in 3.11 raises SystemError if another thread parses
@@ -60,6 +63,25 @@ def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np
     if path.suffix == MESSAGE_SUFFIX:
         return with_intensity(load_bag_cloud(path, motion))
     return with_intensity(check_points(read_cloud(path).points, path))
+
+
+def thin_cloud(cloud: NDArray[np.float32]) -> NDArray[np.float32]:
+    """At most ``MOST_POINTS`` of a cloud's points, drawn at random, the same each time."""
+    if len(cloud) <= MOST_POINTS:
+        return cloud
+    drawn = np.random.default_rng(0).choice(len(cloud), MOST_POINTS, replace=False)
+    return cloud[np.sort(drawn)]
+
+
+def describe_thinned(sizes: Iterable[int]) -> list[str]:
+    """A line if clouds of these sizes have been thinned."""
+    full = [size >= MOST_POINTS for size in sizes]
+    if not any(full):
+        return []
+    return [
+        f"{sum(full)} of {len(full)} clouds have {MOST_POINTS:,} points or more: "
+        f"{MOST_POINTS:,} of each, drawn at random, are used"
+    ]
 
 
 def read_cloud(path: Path) -> RawCloud:

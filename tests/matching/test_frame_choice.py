@@ -37,7 +37,9 @@ def drive(
     images: dict[str, list[np.ndarray]] = {"front": [], "rear": []}
     for number, place in enumerate(at_px):
         view = np.ascontiguousarray(WALL[:HEIGHT, place : place + WIDTH])
-        images["rear"].append(view)
+        images["rear"].append(
+            np.ascontiguousarray(WALL[HEIGHT : 2 * HEIGHT, place : place + WIDTH])
+        )
         how = (spoilt or {}).get(number, "")
         if how == "blurred":
             view = cv2.blur(view, (41, 1))

@@ -69,7 +69,6 @@ def test_a_frame_without_rows_is_a_frame(cameras: dict[str, Any]) -> None:
     [
         (line()[:-9], "is not JSON"),
         (b"\xfe\xfe", "is not JSON"),
-        (line()[:-1].decode().encode("utf-16"), "is not JSON"),
         (b"[" * 100_000, "is not JSON (recursion limit exceeded"),
         (b"[1]", "expected keys with values, as in {key: value}, found [1]"),
         (b'{"frame": ' + b"9" * 5000 + b', "cameras": {}}', "is not JSON (number out of range"),

@@ -44,6 +44,18 @@ def test_findings_decide_the_verdict_of_their_camera(
     assert verdicts["right"].status == "PASS"
 
 
+def test_a_camera_that_features_place_elsewhere_is_no_pass_with_both_statements(
+    pair: Rig, table: Correspondences
+) -> None:
+    findings = {"found": {"left": 25.0, "right": 30.0}, "contradicted": {"left": "right"}}
+    verdicts = calibgraph.solve(pair, replace(table, metadata=STATED | findings)).camera_verdicts
+    assert [verdicts[name].status for name in ("left", "right")] == ["WARN", "PASS"]
+    found = verdicts["left"].error_probability
+    assert found is not None and found.probability < 0.05
+    (text,) = (check.text for check in verdicts["left"].checks if check.kind == "contradiction")
+    assert "image and cloud agree" in text and "in common with right" in text
+
+
 @pytest.mark.parametrize("nonsense", [{"left": "high"}, {"left": True}, 3, [1]])
 def test_malformed_findings_are_refused(
     pair: Rig, table: Correspondences, nonsense: object

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Calibration, MatcherErrors, Rig, perturb, simulate_correspondences
+from calibgraph import (
+    Calibration,
+    MatcherErrors,
+    RelativePose,
+    Rig,
+    perturb,
+    simulate_correspondences,
+)
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.solver.pair_refinement import fit_pairs
@@ -116,3 +123,26 @@ def test_of_two_cameras_either_may_be_wrong() -> None:
     assert [check_agreement(found[0], name, found).status for name in "ab"] == ["FAIL", "FAIL"]
     nearly = [*found, disagreement("b", "c", 1.5)]  # a neighbour of b agrees
     assert check_agreement(nearly[0], "a", nearly).status == "FAIL"
+
+
+@pytest.mark.parametrize(("tied", "metres"), [(False, 0.0), (False, 0.02), (True, 0.0)])
+def test_cameras_that_end_at_one_pose_are_no_pass_unless_the_rig_ties_them(
+    pair: Rig, tied: bool, metres: float
+) -> None:
+    T = pair.T_camera_lidar["left"].copy()
+    T[0, 3] += metres
+    rig = pair.moved_to({"right": T})
+    table = simulate_correspondences(rig, frames=8, matches=200)
+    if tied:
+        tie = RelativePose(
+            a="left", b="right", T_a_b=np.eye(4),
+            rotation_sigma_rad=0.001, translation_sigma_m=0.001,
+        )  # fmt: skip
+        rig = rig.model_copy(update={"relative_poses": (tie,)})
+    verdicts = calibgraph.solve(rig, table).camera_verdicts
+    asked = not tied and metres == 0
+    for verdict in verdicts.values():
+        assert [check.kind for check in verdict.checks if check.kind == "one_pose"] == (
+            ["one_pose"] if asked else []
+        )
+        assert not (asked and verdict.status != "WARN")

@@ -8,6 +8,7 @@ import calibgraph
 from calibgraph import Rig
 from calibgraph.matching.structure.consensus import z_score
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import (
     CHANCE_DEPTH,
@@ -116,7 +117,7 @@ def test_scores_of_a_frame_agree_at_the_true_pose(truth: Rig) -> None:
     frame = calibgraph.load_dataset(SAMPLE).frames[0]
     camera = truth.cameras["front_left"]
     gray, cloud = (
-        frame.load_gray("front_left", camera),
+        PreparedImage(frame.load_gray("front_left", camera)),
         PreparedCloud.from_points(frame.load_cloud()),
     )
     scores = score_frame(gray, cloud, camera, LEVELS[1], frame=7, max_windows=2_000)

@@ -14,6 +14,7 @@ import calibgraph
 from calibgraph import Rig
 from calibgraph.matching.structure.consensus import z_score
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.shift_scores import score_frame
@@ -127,7 +128,7 @@ def test_weights_make_the_truth_stand_out_more_among_leaves(tmp_path: Path) -> N
         tmp_path / "meadow", rig, frames=1, seed=5, vary_layout=True, build_scene=build_meadow
     )
     frame, camera = calibgraph.load_dataset(tmp_path / "meadow", rig).frames[0], rig.cameras["left"]
-    gray = frame.load_gray("left", camera)
+    gray = PreparedImage(frame.load_gray("left", camera))
     cloud = PreparedCloud.from_points(frame.load_cloud())
     plain, weighed = (
         z_score(score_frame(gray, cloud, camera, level, frame=0, max_windows=2000), np.zeros(6))
