@@ -5,8 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from calibgraph import Camera
 from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.network import CmrNext
 
@@ -30,6 +33,24 @@ def good_content(architecture: Architecture | None = None, **config: Any) -> dic
     return {"config": CONFIG | config, "epoch": 150, "state_dict": state, "train_loss": 0.5}
 
 
+def nll_content() -> dict[str, Any]:
+    """The content of a checkpoint with an uncertainty head."""
+    return good_content(Architecture(width=8, uncertainty="nll"), uncertainty=True)
+
+
 def saved(path: Path, content: Any) -> Path:
     torch.save(content, path)
     return path
+
+
+def cloud_before(camera: Camera, count: int, *, seed: int = 0) -> NDArray[np.float32]:
+    """(n, 4) points in front of a camera, in the LiDAR frame."""
+    rng = np.random.default_rng(seed)
+    pixels = rng.uniform([5, 5], [camera.width_px - 5, camera.height_px - 5], (count, 2))
+    depth = rng.uniform(4, 60, (count, 1))
+    k = camera.intrinsics_px
+    plane = (pixels - [k.cx, k.cy]) / [k.fx, k.fy]
+    points = np.column_stack([plane * depth, depth])
+    T = np.linalg.inv(camera.T_camera_lidar)
+    lidar = points @ T[:3, :3].T + T[:3, 3]
+    return np.column_stack([lidar, rng.uniform(0, 1, count)]).astype(np.float32)
