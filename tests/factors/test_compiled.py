@@ -103,11 +103,18 @@ BY_ANOTHER = "import os; os.geteuid = lambda: 4242\n"
     ("spoil", "code", "why"),
     [
         (lambda index: index.parents[1].chmod(0o777), LOSS, ": others may write it"),
-        (lambda index: index.parents[2].chmod(0o777), LOSS, ": others may write it"),
-        (lambda index: index.chmod(0o666), LOSS, ": others may write it"),
+        pytest.param(
+            lambda index: index.parents[2].chmod(0o777),
+            LOSS,
+            ": others may write it",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            lambda index: index.chmod(0o666), LOSS, ": others may write it", marks=pytest.mark.slow
+        ),
         (lambda index: index.symlink_to(index.rename(index.with_name("x"))), LOSS, ": others may"),
         (lambda index: None, BY_ANOTHER + LOSS, ": belongs to another user)"),
-    ],
+    ],  # fmt: skip
     ids=["folder", "folder above", "file", "link", "another user's"],
 )
 def test_code_that_another_user_may_have_written_is_not_loaded(
@@ -124,6 +131,8 @@ def test_code_that_another_user_may_have_written_is_not_loaded(
     assert err.startswith(NOT_KEPT) and err.count("\n") == 1 and why in err
 
 
+@pytest.mark.ci
+@pytest.mark.slow
 def test_a_change_of_a_callee_or_a_constant_is_noticed_and_one_elsewhere_is_not(
     tmp_path: Path,
 ) -> None:

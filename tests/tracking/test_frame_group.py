@@ -88,7 +88,7 @@ def test_along_places_estimates_are_those_of_a_batch() -> None:
         assert sigmas_apart(found[-1], batch, camera) < 0.2 * np.sqrt(6)
 
 
-@pytest.mark.parametrize("size", [1.0, 0.15])
+@pytest.mark.parametrize("size", [pytest.param(1.0, marks=pytest.mark.slow), 0.15])
 def test_a_move_is_found_at_the_same_frame_as_one_by_one(size: float) -> None:
     """Frames that disagree are taken in one by one; a small step shows at the end of an epoch."""
     rig = pair_of()

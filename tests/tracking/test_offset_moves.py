@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.simulation.rigs import rig_of
@@ -15,6 +16,7 @@ from tests.tracking.late_drives import OFFSET, late, town, track
 from tests.tracking.steps import moved, step_of
 
 
+@pytest.mark.slow
 def test_a_small_move_is_found_although_the_offset_is_estimated() -> None:
     """Of two sigmas of a frame: no frame disagrees, and the later ones scatter as the earlier."""
     rig = rig_of("kitti")

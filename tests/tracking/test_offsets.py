@@ -63,6 +63,7 @@ def test_straight_ahead_the_offset_is_not_determined() -> None:
     assert max(squared_errors(updates[-1], truth)) < 3.0
 
 
+@pytest.mark.slow
 def test_the_first_turn_after_a_way_straight_ahead_is_no_move() -> None:
     """All of 50 ms and 50 cm is found in it."""
     twists = np.vstack([np.tile(STRAIGHT, (60, 1)), town(140, 1)])
@@ -84,6 +85,7 @@ def test_a_move_is_found_while_the_offset_drifts() -> None:
     assert (event.kind, event.camera, event.frame) == ("moved", "image_2", 120)
 
 
+@pytest.mark.slow
 def test_a_constant_offset_is_that_of_a_batch() -> None:
     """Without a walk. As near as poses are with a known clock: 0.15 sigma."""
     truth, tables = late(town(120, 4), np.full(120, 0.02), seed=4)
