@@ -28,7 +28,7 @@ from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
 from calibgraph.cli.learned import weights
 from calibgraph.cli.outputs import keep_files
 from calibgraph.cli.pick import pick
-from calibgraph.cli.serve import serve, token
+from calibgraph.cli.serve import serve
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
 
@@ -77,7 +77,7 @@ def _options(
 COMMANDS: tuple[Callable[..., None], ...] = (
     calibrate, check, drift, match, solve, report, view, evaluate, perturb, bag, doctor, init,
     guess, export, import_, simulate, weights, track, pick, fleet,
-    serve, token,
+    serve,
 )  # fmt: skip
 """In the order of the help."""
 for _command in COMMANDS:

@@ -9,6 +9,12 @@ from pathlib import Path
 from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_folder, sync_folder, write_text
 
+INPUT, SCRATCH, WORK, RESULT, LOG = "input", "scratch", "work", "result", "log.txt"
+"""In a job's folder: its input, its working folder, its result as it is written, then; its log."""
+
+FILES, ARCHIVE, SUMMARY = "files", "files.zip", "summary.json"
+"""In the result: the files that the command writes, all of them, the summary that it prints."""
+
 
 class DataFolder:
     """The data folder of a server, locked against a second one.
@@ -27,24 +33,25 @@ class DataFolder:
         shutil.rmtree(self.arriving, ignore_errors=True)
         for folder in (self.jobs, self.trackers, self.arriving):
             folder.mkdir(exist_ok=True, mode=0o700)
-        self.owner = _owner(self.path / "owner")
+        owner = self.path / "owner"
+        if not owner.exists():
+            write_text(owner, secrets.token_hex(16))
+        self.owner = owner.read_text().strip()
 
     def of_job(self, id: str) -> Path:
         """The folder of a job."""
         return self.jobs / id
 
-    def of_tracker(self, id: str) -> Path:
-        """The folder of a tracker."""
-        return self.trackers / id
-
-    def keep(self, arrived: Path, target: Path) -> None:
-        """Give an upload that is whole and on disk its place, durably."""
-        arrived.rename(target)
-        sync_folder(target.parent)
-
-    def free_bytes(self) -> int:
-        """Of the disk."""
-        return shutil.disk_usage(self.path).free
+    def keep(self, arrived: Path) -> None:
+        """Put an upload on disk, and give it its place among the jobs."""
+        for path in (*arrived.rglob("*"), arrived):
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        arrived.rename(self.of_job(arrived.name))
+        sync_folder(self.jobs)
 
     def close(self) -> None:
         """Release the folder."""
@@ -52,34 +59,13 @@ class DataFolder:
 
 
 def _lock(folder: Path) -> int:
-    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
     try:
+        descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
-        raise FileError(
-            folder, "is in use by another server; stop that one, or give another --data"
-        ) from None
+        why = "is in use by another server; stop that one, or give another --data"
+        raise FileError(folder, why) from None
+    except OSError as error:
+        raise FileError(folder, f"cannot be locked ({error.strerror})") from error
     return descriptor
-
-
-def _owner(path: Path) -> str:
-    if not path.exists():
-        write_text(path, secrets.token_hex(16))
-    return path.read_text().strip()
-
-
-def sync_tree(folder: Path) -> None:
-    """Put the files of a folder, and their names, on disk."""
-    for path in folder.rglob("*"):
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-    sync_folder(folder)
-
-
-def remove_folder(folder: Path) -> None:
-    """Remove a folder and all that is in it."""
-    shutil.rmtree(folder, ignore_errors=True)
