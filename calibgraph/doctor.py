@@ -10,15 +10,21 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.bags import BagOptions, is_bag
+from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.dataset_folders import frames_of_folder
 from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import Frame, hash_source
 from calibgraph.io.rigs import load_rig
+from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.camera_pairs import overlapping_pairs
+from calibgraph.matching.cloud_similarity import find_up
 from calibgraph.matching.frame_choice import choose_frames
+from calibgraph.matching.places import UNKNOWN_UP, find_places
+from calibgraph.matching.same_images import find_same_images
 from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.matching.structure.matcher import MOST_FRAMES
+from calibgraph.model.places import as_groups, describe_places
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores
 from calibgraph.report.point_overlay import write_guess_overlays
@@ -94,17 +100,20 @@ def diagnose(
     if data is None:
         return Diagnosis(tuple(findings))
     findings += _describe(data)
+    findings += [Finding("error", line) for line in find_same_images(data, data.rig)]
+    data = hide_burnt_in(data, data.rig)
+    findings += [Finding("warning", line) for line in describe_burnt_in(data)]
     choice = choose_frames(data, data.rig, MOST_FRAMES)
     examined = choice.dataset
     findings += [Finding("note", choice.text)] if choice.text else []
     readable = _examine_frames(examined.frames, data.rig, findings)
-    findings += _examine_places(examined)
     seen: dict[str, int] = {}
     written: list[Path] = []
     if readable:
         frame = readable[len(readable) // 2]
         cloud = frame.load_cloud()
         seen = count_points_in_view(data.rig, cloud)
+        findings += _examine_places(examined, max(seen, key=seen.__getitem__), cloud)
         findings += _examine_guess(examined, (frame, cloud), seen)
         if pictures is not None and not any(finding.level == "error" for finding in findings):
             written = write_guess_overlays(frame, data.rig, pictures)
@@ -167,6 +176,7 @@ def _examine_frames(frames: Sequence[Frame], rig: Rig, findings: list[Finding]) 
     for name in rig.cameras:
         text = describe_brightness(name, [e.brightness[name] for e in read if name in e.brightness])
         findings += [Finding("warning", text)] if text else []
+    findings += [Finding("note", line) for line in describe_thinned(e.points for e in read)]
     readable = [f for f, each in zip(frames, read, strict=True) if "" not in each.problems]
     findings += _repeats("cloud", [(f.name, f.cloud_path) for f in readable])
     for name in rig.cameras:
@@ -177,16 +187,17 @@ def _examine_frames(frames: Sequence[Frame], rig: Rig, findings: list[Finding]) 
 
 @dataclass
 class _Examined:
-    """A frame: problems of its cloud ("") and of images, and the mean levels of these."""
+    """A frame: problems of its cloud ("") and of images, its points, and mean levels of images."""
 
     problems: dict[str, str] = field(default_factory=dict)
+    points: int = 0
     brightness: dict[str, float] = field(default_factory=dict)
 
 
 def _examine_frame(frame: Frame, rig: Rig) -> _Examined:
     found = _Examined()
     try:
-        frame.load_cloud()
+        found.points = len(frame.load_cloud())
     except (CalibrationError, OSError) as error:
         found.problems[""] = str(error)
     for name, camera in rig.cameras.items():
@@ -208,21 +219,25 @@ def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> list[Finding]:
     return [Finding("warning", text)] if text else []
 
 
-def _examine_places(data: Dataset) -> Iterator[Finding]:
-    """How many places the frames are of, if the vehicle stands in some."""
+def _examine_places(data: Dataset, camera: str, cloud: NDArray[np.float32]) -> Iterator[Finding]:
+    """How many places the frames are of, as a calibration counts them; and whether some repeat."""
     try:
-        places = find_stationary_frames(data, data.rig)
+        places = find_places(data, data.rig, camera)
+        stops = find_stationary_frames(data, data.rig)
     except (CalibrationError, OSError):  # which is a finding already
         return
-    if places:
+    yield Finding("note", describe_places(as_groups(places)))
+    if find_up(cloud, data.rig.T_camera_lidar.values()) is None:
+        yield Finding("note", UNKNOWN_UP)
+    if stops:
         names = {frame.index: frame.name for frame in data.frames}
-        most = max(places, key=len)
-        count = len(data.frames) - sum(len(place) - 1 for place in places)
+        most = max(stops, key=len)
+        count = len(data.frames) - sum(len(stop) - 1 for stop in stops)
         yield Finding(
             "warning",
-            f"{len(data.frames)} frames are of {count} places: the vehicle stands, as in "
-            f"{len(most)} frames from {names[most[0]]} to {names[most[-1]]}; frames of one place "
-            f"count as one, and {ENOUGH_FRAMES} are needed for an error bar of their own",
+            f"{len(data.frames)} frames count as {count}: the vehicle stands, as in {len(most)} "
+            f"frames from {names[most[0]]} to {names[most[-1]]}; {ENOUGH_FRAMES} are needed for an "
+            "error bar of their own",
         )
 
 
@@ -233,7 +248,7 @@ def _examine_guess(
     frame, cloud = cloud_of
     doubts = find_doubts(data.rig, frame, cloud)
     intended = explain_guess(data, data.rig, cloud)
-    yield from [Finding("error", f"{intended}: correct it")] if intended else []
+    yield from [Finding("error", intended)] if intended else []
     yield from (Finding("error", text) for text in describe_out_of_view(seen))
     yield from (Finding("warning", text) for text in doubts)
     for name, count in seen.items():

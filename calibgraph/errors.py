@@ -40,7 +40,20 @@ def _one_line(message: str) -> str:
     text = " ".join(message.split())
     if len(text) > MAX_MESSAGE:
         text = f"{text[:MAX_MESSAGE]}..."
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    return printable(text)
+
+
+def printable(text: str) -> str:
+    """A text of others, for a terminal or a page; its lines stay.
+
+    Characters that are not seen but do something (of control, of direction) are escaped.
+    """
+    lines = text.split("\n")
+    return "\n".join(line if line.isprintable() else "".join(map(_visible, line)) for line in lines)
+
+
+def _visible(character: str) -> str:
+    return character if character.isprintable() or character == "\t" else ascii(character)[1:-1]
 
 
 def in_words(error: BaseException) -> str:

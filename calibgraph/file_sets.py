@@ -4,6 +4,7 @@ import fcntl
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 from calibgraph.files import cannot_write, require_place_for_folder, sync_folder
 
 _PREFIX = ".writing-"
+_NEW_S = 60.0
 
 
 @contextmanager
@@ -19,7 +21,8 @@ def written_together(folder: Path, *, last: str) -> Iterator[Path]:
 
     After an error, as of a full disk, none of them is there, and older ones are as they were. The
     file named ``last`` is moved last: if the process is killed, it is not there before the others.
-    What a killed process has left is removed by the next one.
+    What a killed process has left is removed by the next one. Of two processes that write into one
+    folder, the files of the later one are there.
 
     Raises:
         FileError: if there is no place for them.
@@ -34,7 +37,11 @@ def written_together(folder: Path, *, last: str) -> Iterator[Path]:
             if path.is_relative_to(new):
                 error.filename = str(folder / path.relative_to(new))
             raise
-        _move_all(new, folder, last)
+        if folder.name.startswith(_PREFIX):  # of another set, and locked by it
+            _move_all(new, folder, last)
+        else:
+            with _locked(folder):
+                _move_all(new, folder, last)
 
 
 @contextmanager
@@ -46,14 +53,20 @@ def _temporary_folder(parent: Path) -> Iterator[Path]:
             with suppress(OSError):  # in use, a file, or of another user
                 _remove_leftover(left)
         made = tempfile.TemporaryDirectory(dir=parent, prefix=_PREFIX)
-        lock = os.open(made.name, os.O_RDONLY)
     except OSError as error:
         raise cannot_write(parent, error) from error
+    with _locked(Path(made.name)), made as name:
+        yield Path(name)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder; where there are no locks, no leftover is removed either."""
+    lock = os.open(folder, os.O_RDONLY)
     try:
-        with made as name:
-            with suppress(OSError):  # where there are no locks, no leftover is removed either
-                fcntl.flock(lock, fcntl.LOCK_EX)
-            yield Path(name)
+        with suppress(OSError):
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
     finally:
         os.close(lock)
 
@@ -62,7 +75,8 @@ def _remove_leftover(folder: Path) -> None:
     lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if any(folder.iterdir()):  # an empty one may be new, and not locked yet
+        age_s = time.time() - folder.stat().st_mtime
+        if any(folder.iterdir()) or age_s > _NEW_S:  # a new one may not be locked yet
             shutil.rmtree(folder)
     finally:
         os.close(lock)

@@ -15,10 +15,12 @@ from pathlib import Path
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.kept_frames import keep_frames
+from calibgraph.matching.burnt_in import hide_burnt_in
 from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
+from calibgraph.matching.cloud_similarity import find_up
 from calibgraph.matching.frame_choice import FrameChoice, choose_frames, without_copies
 from calibgraph.matching.named import find_matcher
-from calibgraph.matching.places import find_places
+from calibgraph.matching.places import UNKNOWN_UP, find_places
 from calibgraph.matching.protocol import Matcher
 from calibgraph.matching.run import (
     MatchingRun,
@@ -28,6 +30,7 @@ from calibgraph.matching.run import (
     summarize_round,
     with_motion,
 )
+from calibgraph.matching.same_images import require_different_images
 from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
@@ -71,7 +74,7 @@ def match_in_rounds(
     full = find_matcher(matcher, seed=config.seed).with_estimate(config.estimate)
     with watch("choose_frames"):
         choice, guess = _open(dataset, rig, full.most_frames)
-    data = keep_frames(choice.dataset)
+    data = choice.dataset
     _log.info("%d frames, cameras %s", len(data.frames), ", ".join(guess.cameras))
     with watch("inputs"):
         require_known_motion(data, full, config.estimate)
@@ -128,7 +131,8 @@ def assign_places(run: MatchingRun) -> MatchingRun:
         return run
     camera, config = max(found, key=lambda name: found[name]), run.solution.config
     try:
-        groups = find_places(run.dataset, camera, rig.cameras[camera], seed=config.seed)
+        groups = find_places(run.dataset, rig, camera, seed=config.seed)
+        up = find_up(run.dataset.frames[0].load_cloud(), rig.T_camera_lidar.values())
     except (CalibrationError, OSError):  # the checks on images report it
         return run
     places = replace(run.correspondences.places, places=as_groups(groups))
@@ -140,13 +144,17 @@ def assign_places(run: MatchingRun) -> MatchingRun:
         run.solution.terms,
         camera_matches=run.solution.camera_matches,
     )
-    return replace(run, correspondences=table, solution=solution)
+    warnings = run.warnings if up is not None else (*run.warnings, UNKNOWN_UP)
+    return replace(run, correspondences=table, solution=solution, warnings=warnings)
 
 
 def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[FrameChoice, Rig]:
     """The frames that the matcher is given, and the initial guess."""
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     guess = rig if rig is not None else data.rig
+    data = keep_frames(data)
+    require_different_images(data, guess)
+    data = keep_frames(hide_burnt_in(data, guess))
     if most_frames is None:
         choice = without_copies(data)
     else:

@@ -1,8 +1,9 @@
 """The decorator of all kernels: compiled by numba on first use, and kept for later processes.
 
 The machine code is kept in ``NUMBA_CACHE_DIR`` if that is set, else in the user's cache folder,
-else beside the source. Where nothing can be written, kernels are compiled in memory, and one line
-on standard error (by ``logging``) reports it once.
+else beside the source. Who can write it can run code as the user, since numba reads pickles. So a
+folder is used only if it is the user's alone. Where there is none, kernels are compiled in memory,
+and one line on standard error (by ``logging``) reports it once.
 
 numba compares the source file of a kernel alone, and not what the file imports. So the cache is one
 of this file and of the files with kernels that it imports, of the options below, and of the
@@ -12,15 +13,18 @@ use. A kernel uses kernels and constants of these files alone. It may enclose nu
 kernel: numba would not find its code again.
 """
 
+import errno
 import hashlib
 import logging
 import os
 import re
 import shutil
+import stat
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -122,7 +126,7 @@ def _files(module: str) -> tuple[Path, ...]:
 
 @cache
 def _folder(module: str) -> Path | None:
-    """Where the code of the kernels of a module is kept; None if nothing can be written."""
+    """Where the code of the kernels of a module is kept; None if there is no safe place."""
     versions = f"{numba.__version__} {np.__version__} {sys.version} {sorted(_COMMON.items())}"
     digest = hashlib.sha256(versions.encode())
     for file in _files(module):
@@ -132,17 +136,28 @@ def _folder(module: str) -> Path | None:
     reasons = []
     for place in [Path(chosen)] if chosen else [user, beside]:
         try:
-            return _prepare(place / name)
+            return _prepare(place.resolve() / name)
         except OSError as error:
-            reasons.append(f"{place}: {error.strerror}")
+            reasons.append(f"{error.filename}: {error.strerror}")
     _report_once(reasons[0])
     return None
 
 
 def _prepare(folder: Path) -> Path:
-    """Make a folder that can be written, and remove those beside it that nobody uses."""
-    if not folder.exists():
-        folder.mkdir(parents=True)
+    """Make a folder that the user alone can write, and remove those beside it that nobody uses.
+
+    Raises:
+        OSError: if that is not possible.
+    """
+    is_new = not folder.exists()
+    for part in reversed((folder, *folder.parents)):
+        if not part.exists():
+            part.mkdir(mode=0o700, exist_ok=True)
+        _require_own(part, above=part != folder)
+    for part in folder.rglob("*"):
+        with suppress(FileNotFoundError):  # what another process writes is renamed
+            _require_own(part)
+    if is_new:
         kind, oldest = folder.name.rsplit("-", 1)[0], time.time() - _UNUSED_S
         for other in folder.parent.glob(f"{kind}-*"):
             if other.stat().st_mtime < oldest:
@@ -151,11 +166,24 @@ def _prepare(folder: Path) -> Path:
     return folder
 
 
+def _require_own(path: Path, *, above: bool = False) -> None:
+    """Refuse what others own or may write. A folder above may be root's, and shared as /tmp is.
+
+    A group with the number of the user is taken for the user's own.
+    """
+    user, found = os.geteuid(), path.lstat()
+    by_group = 0 if found.st_gid in (user, 0) else stat.S_IWGRP
+    if found.st_uid != user and not (above and found.st_uid == 0):
+        raise PermissionError(errno.EPERM, "belongs to another user", str(path))
+    if found.st_mode & (stat.S_IWOTH | by_group) and not (above and found.st_mode & stat.S_ISVTX):
+        raise PermissionError(errno.EPERM, "others may write it", str(path))
+
+
 @cache
 def _report_once(why: str) -> None:
     if _report_once.cache_info().currsize == 0:
         _log.warning(
-            "calibgraph: compiled code cannot be kept (%s), so every start compiles it anew; "
-            "set NUMBA_CACHE_DIR to a folder that can be written",
+            "calibgraph: compiled code is not kept (%s), so every start compiles it anew; "
+            "set NUMBA_CACHE_DIR to a folder that you alone can write",
             why,
         )

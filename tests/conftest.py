@@ -8,9 +8,11 @@ import os
 import pickle
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,6 +62,14 @@ def pytest_collection_finish() -> None:
     """Let no later collection of garbage look at what has been imported and collected."""
     gc.freeze()
     gc.enable()
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print one line for each reason why tests were skipped: what to install."""
+    reports = terminalreporter.stats.get("skipped", [])
+    reasons = Counter(report.longrepr[2].removeprefix("Skipped: ") for report in reports)
+    for reason, tests in sorted(reasons.items()):
+        terminalreporter.line(f"{tests} skipped: {reason}")
 
 
 def make_camera(
@@ -227,6 +237,16 @@ def mixed_rig() -> Rig:
 
 
 @pytest.fixture(scope="session")
+def open3d() -> Any:
+    """Open3D, which simulates sensors, and loads libraries of the system."""
+    return pytest.importorskip(
+        "open3d",
+        reason="no libraries of Open3D: apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6",
+        exc_type=ImportError,
+    )
+
+
+@pytest.fixture(scope="session")
 def realdata() -> Path:
     """The real sensor data: $CALIBGRAPH_REALDATA, or a folder beside the checkout."""
     path = Path(os.environ.get("CALIBGRAPH_REALDATA", ROOT.parent / "shared" / "realdata"))
@@ -241,5 +261,5 @@ def reference_folder() -> Path:
     default = ROOT.parent / "shared" / "reference"
     folder = Path(os.environ.get("CALIBGRAPH_REFERENCE", default))
     if not (folder / "cmrnext_golden.npz").is_file():
-        pytest.skip("the original network's test vectors are not here ($CALIBGRAPH_REFERENCE)")
+        pytest.skip(f"no real data at {folder}; set CALIBGRAPH_REFERENCE to run this")
     return folder

@@ -25,21 +25,6 @@ def texts(found: Diagnosis, level: str) -> list[str]:
     return [finding.text for finding in found.findings if finding.level == level]
 
 
-def test_the_sample_has_nothing_to_fix(tmp_path: Path) -> None:
-    found = diagnose([SAMPLE], pictures=tmp_path)
-    assert found.healthy
-    assert not texts(found, "warning")
-    assert found.frames == 6
-    assert all(count > 1000 for count in found.points_in_image.values())
-    assert sorted(path.name for path in found.pictures) == [
-        "guess_front_left.png", "guess_front_right.png", "guess_left.png",
-    ]  # fmt: skip
-    assert (
-        "cameras that see the same by the guess: front_left and front_right, front_left and "
-        in (texts(found, "note")[-1])
-    )
-
-
 @pytest.mark.usefixtures("no_image_checks")
 def test_damaged_sources_are_listed_with_the_frames_that_do_not_pair(folder: Path) -> None:
     (folder / "cameras/left/000002.jpg").unlink()
@@ -89,7 +74,7 @@ def test_a_vehicle_that_stands_is_named(folder: Path) -> None:
             shutil.copy(camera / "000002.jpg", camera / f"{name}.jpg")
     warnings = texts(diagnose([folder]), "warning")
     assert warnings[-1].startswith(
-        "6 frames are of 4 places: the vehicle stands, as in 3 frames from 000002 to 000004;"
+        "6 frames count as 4: the vehicle stands, as in 3 frames from 000002 to 000004;"
     )
 
 
@@ -100,8 +85,8 @@ def test_a_guess_in_millimetres_is_named_by_what_the_images_show_first() -> None
     found = diagnose([SAMPLE], rig.moved_to({"left": T}))
     assert found.points_in_image["left"] == 0
     assert texts(found, "error") == [
-        "the images of left fit clearly better if the guess has a translation in millimetres: "
-        "correct it",
+        "the images of left fit clearly better if the guess has a translation in millimetres; undo "
+        "it with calibgraph import RIG --correct left=millimetres --out FILE.yaml",
         "left: by the guess, no point of the cloud lies in the image",
     ]
     assert texts(found, "warning") == [
@@ -112,16 +97,6 @@ def test_a_guess_in_millimetres_is_named_by_what_the_images_show_first() -> None
 def change_clouds(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     for path in (folder / "lidar").iterdir():
         np.save(path, change(np.load(path)))
-
-
-def test_axes_of_the_lidar_turned_about_z_are_the_only_hint(folder: Path) -> None:
-    change_clouds(folder, lambda cloud: cloud * np.float32([-1, -1, 1, 1][: cloud.shape[1]]))
-    errors = texts(diagnose([folder], frames="0"), "error")
-    assert errors[0] == (
-        "the images fit clearly better if the LiDAR's axes are turned by 180 deg about z (its x "
-        "points backward): correct it"
-    )
-    assert all("no point of the cloud lies in the image" in error for error in errors[1:])
 
 
 @pytest.mark.parametrize(
@@ -139,19 +114,6 @@ def test_clouds_in_other_units_are_named_with_their_distance(
 
 
 @pytest.mark.usefixtures("no_image_checks")
-def test_clouds_joined_with_a_wrong_extrinsic_are_named_with_how_far_apart(folder: Path) -> None:
-    def join(cloud: np.ndarray) -> np.ndarray:
-        moved = cloud.copy()
-        moved[:, 0] += 0.3
-        return np.concatenate([cloud, moved])
-
-    change_clouds(folder, join)
-    (warning,) = texts(diagnose([folder]), "warning")
-    assert "holds the same surfaces twice, 0.0" in warning
-    assert "deg and 0.3 m apart: clouds joined with a wrong extrinsic" in warning
-
-
-@pytest.mark.usefixtures("no_image_checks")
 def test_the_command_prints_it_and_exits_with_one_if_anything_is_to_be_fixed(
     call: Call, folder: Path
 ) -> None:
@@ -165,18 +127,6 @@ def test_the_command_prints_it_and_exits_with_one_if_anything_is_to_be_fixed(
     code, _, err = call("doctor", folder / "missing")
     assert code == 1
     assert "no such folder or ROS bag" in err
-
-
-@pytest.mark.usefixtures("no_image_checks")
-def test_doctor_replaces_its_own_pictures_and_no_others(tmp_path: Path, call: Call) -> None:
-    """Mend, run again: also with another rig; a picture of the user's stays."""
-    given = ("doctor", SAMPLE, "--out", tmp_path / "pictures")
-    assert call(*given)[0] == call(*given)[0] == 0
-    picture = tmp_path / "pictures" / "guess_front_left.png"
-    assert cv2.imread(str(picture)) is not None
-    cv2.imwrite(str(picture), np.zeros((4, 4, 3), np.uint8))
-    code, _, err = call(*given)
-    assert code == 2 and "was not written by calibgraph doctor" in err
 
 
 @pytest.mark.parametrize(("scale", "lift", "word"), [(0.12, 0, "dark"), (0.2, 215, "bright")])

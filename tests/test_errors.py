@@ -7,11 +7,21 @@ import zipfile
 
 import pytest
 
-from calibgraph.errors import CalibrationError, in_words
+from calibgraph.errors import in_words, printable
 
 
-def test_errors_are_one_line() -> None:
-    assert str(CalibrationError("a\n  b")) == "a b"
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("\x1b[2J", "\\x1b[2J"),
+        ("a\x7fb\x9b2J", "a\\x7fb\\x9b2J"),
+        ("rig\u202elmay.gir", "rig\\u202elmay.gir"),
+        ("a\rb\u2028c\ud800", "a\\rb\\u2028c\\ud800"),
+        ("Kamera größer\n\tü 前 שלום", "Kamera größer\n\tü 前 שלום"),
+    ],
+)
+def test_characters_that_are_not_seen_are_escaped(text: str, shown: str) -> None:
+    assert printable(text) == shown
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from calibgraph.files import write_text
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
-from calibgraph.matching.structure.shift_scores import downscale_log_gray, select_windows
+from calibgraph.matching.structure.shift_scores import select_windows
 from calibgraph.matching.structure.visibility import find_places
 from calibgraph.matching.structure.window_kernels import FEATURES
 from calibgraph.matching.structure.window_weights import (
@@ -116,10 +116,9 @@ def sample_of(dataset: Dataset, rig: Rig, of: str, frames: int = 4) -> Sample:
         cloud = cache.cloud(frame)
         for name in rig.cameras.keys() & frame.image_paths.keys():
             camera = rig.cameras[name]
-            image, scale = downscale_log_gray(
-                cache.image(frame, name=name, camera=camera), camera, LEVEL.step_rad,
-                LEVEL.blur_steps,
-            )  # fmt: skip
+            image, scale = cache.image(frame, name=name, camera=camera).log_gray(
+                camera, LEVEL.step_rad, LEVEL.blur_steps
+            )
             windows = select_windows(cloud, camera, LEVEL, max_windows=MOST[of])
             viewpoint_m = cloud.viewpoint_lidar_m(camera)
             reach = min(REACH, round(LEVEL.reach_rad * camera.lens.pixels_per_rad * scale.max()))

@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from benchmarks.tables import Table, add_record_option, publish
-from calibgraph.fleet.findings import Finding, find_changes
-from calibgraph.fleet.model import FleetModel, fit_fleet
-from calibgraph.fleet.observations import observe
+from calibgraph.audit.findings import Finding, find_changes
+from calibgraph.audit.fleet_model import FleetModel, fit_fleet
+from calibgraph.audit.observations import observe
 from calibgraph.model.geometry import twists_between
 from tests.draws.fleets import Fleet, errors_of, simulate_fleet
 

@@ -22,7 +22,7 @@ from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.declaration import declare, help_of
 from calibgraph.cli.exchange import export, import_
-from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
+from calibgraph.cli.fleet import fleet
 from calibgraph.cli.guess import bag, guess, init
 from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
 from calibgraph.cli.learned import weights
@@ -77,7 +77,7 @@ def _options(
 COMMANDS: tuple[Callable[..., None], ...] = (
     calibrate, check, drift, match, solve, report, view, evaluate, perturb, bag, doctor, init,
     guess, export, import_, simulate, weights, track, pick, fleet,
-    fleet_model, fleet_report, serve,
+    serve,
 )  # fmt: skip
 """In the order of the help."""
 for _command in COMMANDS:
@@ -175,10 +175,12 @@ def _repeat_weights_option(arguments: Iterable[str]) -> Iterator[str]:
 
 
 def _one_line(error: Exception) -> str:
+    from calibgraph.errors import printable
+
     if isinstance(error, OSError) and error.filename:
-        return f"{error.filename}: {error.strerror}"
+        return printable(f"{error.filename}: {error.strerror}")
     text = error.format_message() if hasattr(error, "format_message") else str(error)
-    return " ".join(text.split()).removesuffix(".") + _help_hint(error)
+    return printable(" ".join(text.split())).removesuffix(".") + _help_hint(error)
 
 
 def _crash(error: Exception) -> str:

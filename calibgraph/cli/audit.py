@@ -76,7 +76,6 @@ def drift(
     tolerance_deg: float = 0.5,
     tolerance_cm: float = 10.0,
     own_lenses: bool = False,
-    plot: Annotated[Path | None, outputs.PLOT_OF_DRIFT] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Which of several results of one rig deviates? Exit 0: none, 1: one CHANGED, 3: cannot tell.
@@ -89,7 +88,6 @@ def drift(
         days (DAY,DAY,...): When each was recorded, for the trend: dates like 2026-03-01, or numbers
             of days. (default: the order given)
         own_lenses: Lenses may differ: several vehicles, each with its own.
-        plot (FILE.png): Draw the deviations, per camera.
     """
     from calibgraph.audit import drift
 
@@ -101,10 +99,6 @@ def drift(
             tolerance_cm=tolerance_cm,
             own_lenses=own_lenses,
         )
-    if plot is not None:
-        from calibgraph.audit.drift_plot import draw_drift
-
-        draw_drift(found, plot)
     if as_json:
         from calibgraph.audit import drift_summary
 
@@ -113,7 +107,7 @@ def drift(
         from calibgraph.cli.audit_tables import print_drift
 
         print_drift(terminal(), found)
-        print_plain(terminal(), f"{plot}: written" if plot is not None else "nothing was written")
+        print_plain(terminal(), "nothing was written")
     raise typer.Exit(_EXIT_CODES[found.status])
 
 

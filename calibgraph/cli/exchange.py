@@ -170,6 +170,7 @@ def import_(
     out: Annotated[Path, typer.Option(), outputs.rig_of("import")],
     tie_deg: Annotated[float, typer.Option(min=0.001)] = 0.1,
     tie_m: Annotated[float, typer.Option(min=1e-5)] = 0.005,
+    correct: list[str] | None = None,
 ) -> None:
     """Build a rig file from files of others, and print where each camera looks and sits.
 
@@ -179,7 +180,9 @@ def import_(
         tie_m (M): The sigma in translation, per axis.
     """
     from calibgraph.io.formats.describe import describe_rig
+    from calibgraph.model.lens_knowledge import state_calibrated
     from calibgraph.outputs import yaml_mark
+    from calibgraph.trust.conventions import correct_guess
 
     with checked_arguments():
         parts = files.read()
@@ -188,6 +191,7 @@ def import_(
             relative_sigma_deg=tie_deg,
             relative_sigma_cm=100.0 * tie_m,
         )
+        rig = state_calibrated(correct_guess(rig, correct or ()))
     rig.save(out, first_line=yaml_mark("import"))
     print_doubts(rig, parts.notes)
     for sentence in describe_rig(rig):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -36,6 +38,7 @@ def guess(
         search (NAME): Search for this camera although a file has an extrinsic.
     """
     from calibgraph.guessing.guess import guess_rig
+    from calibgraph.model.lens_knowledge import state_calibrated
     from calibgraph.outputs import yaml_mark
 
     with checked_arguments(), progress_bar("reading") as progress:
@@ -50,6 +53,7 @@ def guess(
             seed=seed,
             progress=progress,
         )
+    found = replace(found, rig=state_calibrated(found.rig))
     found.save(out, first_line=yaml_mark("guess"))
     if as_json:
         print_json(found.to_mapping())
@@ -63,6 +67,7 @@ def init(
     dataset: Path,
     out: Path | None = None,
     mount: list[str] | None = None,
+    lens: list[str] | None = None,
     forward: str = "+x",
     force: bool = False,
 ) -> None:
@@ -71,18 +76,53 @@ def init(
     Args:
         dataset (DATASET): Folder with lidar/ and cameras/NAME/.
         out (FILE.yaml): Rig file to write. (default: DATASET/rig.yaml)
+        lens ([NAME=]HOW): How the lens of a camera, or of all, is known: calibration; a horizontal
+            field of view, as '90 deg'; or focal length and size of a pixel, as '4 mm 3 um'. May be
+            repeated. (default: asked in a terminal, else calibration)
         force: Replace the file, and the values in it.
     """
-    from calibgraph.guessing.template import write_rig_template
+    from calibgraph.guessing.lens_words import CALIBRATION
+    from calibgraph.guessing.template import cameras_of_folder, write_rig_template
     from calibgraph.io.dataset_folders import describe_pairing
 
     with checked_arguments():
         words = parse_names("--mount", mount)
-        path = write_rig_template(dataset, out, mountings=words, forward=forward, replace=force)
+        known = _lenses(lens, [*cameras_of_folder(dataset)])
+        path = write_rig_template(
+            dataset, out, mountings=words, lenses=known, forward=forward, replace=force
+        )
         pairing = describe_pairing(dataset)
     if pairing:
         print_plain(terminal(), pairing)
-    print_plain(terminal(), f"{path}: written; replace every FILL_IN, then run calibgraph doctor")
+    left = "FILL_IN" in path.read_text(encoding="utf-8").partition("\nformat:")[2]
+    where = f"{dataset}" if out is None else f"{dataset} --rig {out}"
+    first = "replace every FILL_IN; then" if left else "next"
+    print_plain(terminal(), f"{path}: written; {first}: calibgraph doctor {where}")
+    if any(how != CALIBRATION for how in known.values()):
+        print_plain(
+            terminal(),
+            "a lens from a spec sheet or a field of view is known to 2 %, so estimate it: "
+            f"calibgraph calibrate {where} --estimate lens",
+        )
+
+
+def _lenses(given: list[str] | None, cameras: list[str]) -> dict[str, str]:
+    """How the lens of each camera is known, as given for all or one, or asked for."""
+    from calibgraph.guessing.lens_words import CALIBRATION, LENS_GRAMMAR
+
+    for_all = [how for how in given or () if "=" not in how]
+    if not given and _is_terminal():
+        answers = [CALIBRATION]
+        for name in cameras:
+            question = f"{name}: how is its lens known? {LENS_GRAMMAR}"
+            answers.append(typer.prompt(question, default=answers[-1], err=True))
+        return dict(zip(cameras, answers[1:], strict=True))
+    named = parse_names("--lens", [how for how in given or () if "=" in how])
+    return dict.fromkeys(cameras, for_all[-1] if for_all else CALIBRATION) | named
+
+
+def _is_terminal() -> bool:
+    return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def bag(
@@ -91,6 +131,7 @@ def bag(
     topic: TopicOption = None,
     tie_deg: Annotated[float | None, typer.Option(min=0.001)] = None,
     tie_m: Annotated[float | None, typer.Option(min=1e-5)] = None,
+    correct: list[str] | None = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the topics of a ROS bag, and write its rig: camera_info and /tf_static.
@@ -104,8 +145,10 @@ def bag(
     """
     from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
     from calibgraph.io.formats.describe import describe_rig
+    from calibgraph.model.lens_knowledge import state_calibrated
     from calibgraph.model.plausibility import find_implausible
     from calibgraph.outputs import yaml_mark
+    from calibgraph.trust.conventions import correct_guess
 
     with checked_arguments():
         sigmas = _sigmas(tie_deg, tie_m)
@@ -115,7 +158,7 @@ def bag(
         for name, kind, count in topics:
             print_plain(terminal(), f"{name}  {kind}  {count}")
     read = read_bag_rig(path, options)
-    rig = read.to_rig(sigmas)
+    rig = state_calibrated(correct_guess(read.to_rig(sigmas), correct or ()))
     if out is not None:
         rig.save(out, first_line=yaml_mark("bag"))
     notes = [*doubtful_axes(rig), *read.notes]

@@ -3,6 +3,8 @@
 Args:
     as_json: Print JSON on stdout.
     config (FILE): Settings of the solve, YAML.
+    correct ([CAMERA=]MISTAKE): Undo a mistake of the guess, by the name that doctor gives it, as
+        inverse or camera-flu; of all cameras or of one. May be repeated.
     dataset (DATASET...): Dataset folder (rig.yaml, lidar/, cameras/NAME/), KITTI odometry sequence
         or raw drive, nuScenes folder or scene, or ROS bag; several of one rig are calibrated
         together.
@@ -19,12 +21,11 @@ Args:
     preset (auto|kitti|walkley): Settings of the solve by name.
     result (DIR): Result: its folder, or its calibration.yaml.
     rig (RIG): Initial guess, instead of the dataset's own.
-    rows (URI): What calibgraph fleet wrote: a folder or a URI.
     seed: Seed of everything random.
     tolerance_cm (CM): Largest deviation along an axis that is OK.
     tolerance_deg (DEG): Largest deviation about an axis that is OK.
-    topic (NAME=/TOPIC): Topic of a camera's images, of the clouds as lidar=/TOPIC, or of
-        odometry=/TOPIC; may be repeated. (default: found by the messages' types)
+    topic (NAME=/TOPIC[,/INFO]): Topic of a camera's images, of the clouds as lidar=/TOPIC, or of
+        odometry=/TOPIC; INFO: of the camera_info. May be repeated. (default: found by types)
     weights (FILE...): Weights of the networks, .tar or .safetensors, in the order in which they
         run; a file may be repeated: --weights iter1.tar iter5.tar iter5.tar iter6.tar.
 """

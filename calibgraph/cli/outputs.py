@@ -44,9 +44,7 @@ def rig_of(command: str) -> Writes:
 
 TABLE = _named("match", table_mark(MATCH), *TABLE_SUFFIXES)
 """A table of correspondences; a CSV file has no place for a mark."""
-PLOT_OF_DRIFT = _named("drift", png_mark("drift"), ".png")
 PAGE_OF_AUDIT = _named("check", AUDIT_PAGE_MARK, *PAGE_SUFFIXES)
-FLEET_PAGE = _named("fleet-report", PAGE_MARK, *PAGE_SUFFIXES)
 WEIGHTS = _named("weights", WEIGHTS_MARK, ".safetensors")
 GRAPH = _named("solve --graph", DOT_MARK, ".dot")
 RERUN, MCAP = (_named("view", VIEW_MARK, suffix) for suffix in (".rrd", ".mcap"))
@@ -57,12 +55,6 @@ def _page(path: Path | None, given: Given) -> list[Output]:
     """The page of a report, in the folder of the result if it is not named."""
     folder = given["result"] if given["result"].is_dir() else given["result"].parent
     return [Output(path or folder / REPORT_FILE, "report", (PAGE_MARK,), PAGE_SUFFIXES)]
-
-
-def _fleet_model(folder: Path, _: Given) -> list[Output]:
-    from calibgraph.fleet.model_files import outputs_of_fleet_model
-
-    return outputs_of_fleet_model(folder)
 
 
 def _exported(path: Path, given: Given) -> list[Output]:
@@ -83,7 +75,7 @@ def _picked(folder: Path, _: Given) -> list[Output]:
     return outputs_of_pick(folder)
 
 
-PAGE, FLEET_MODEL, EXPORTED = Writes(_page), Writes(_fleet_model), Writes(_exported)
+PAGE, EXPORTED = Writes(_page), Writes(_exported)
 PICTURES, PICKED = Writes(_pictures), Writes(_picked)
 
 

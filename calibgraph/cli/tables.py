@@ -49,6 +49,8 @@ def print_result(console: Console, result: Calibration, written: list[Path]) -> 
         + " A FAIL has no error bar."
         * unknown
     )
+    if result.unstated_lenses:
+        print_plain(console, result.unstated_lenses)
     if result.lens:
         console.print(lens_table(result))
     print_plain(console, f"{elapsed_s():.1f} s; {FRAMES_SENTENCE}; written:")

@@ -6,7 +6,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +21,20 @@ LINE_EVERY_S = 5.0
 
 
 def terminal() -> Console:
-    """A console on stderr, on which a reader that has gone is no error; stdout is for JSON."""
+    """A console on stderr, on which a reader that has gone is no error; stdout is for JSON.
+
+    What is printed can do no more than be seen: names of files and fields are those of others.
+    """
     from rich.console import Console
+    from rich.segment import Segment
+
+    from calibgraph.errors import printable
 
     class Stderr(Console):
+        def render(self, *arguments: Any, **options: Any) -> Iterable[Segment]:
+            for segment in super().render(*arguments, **options):
+                yield segment if segment.control else segment._replace(text=printable(segment.text))
+
         def on_broken_pipe(self) -> None:
             """Go on without output: the files and the exit code are what counts."""
             self.quiet = True

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -26,6 +25,7 @@ from calibgraph.graph.clock import clock_sigmas, put_clock_into
 from calibgraph.graph.variables import DISTORTION, lens_key, seen_lens_key
 from calibgraph.model.clock import clock_of
 from calibgraph.model.config import LensPart
+from calibgraph.model.lens_knowledge import IN_DOUBT, LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from factors import (
     BlockSums,
@@ -38,31 +38,7 @@ from factors import (
 from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
 from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
 
-
-class LensSigmas(NamedTuple):
-    """Prior standard deviations where the rig states none.
-
-    Of the logarithms of both focal lengths and of fx / fy, of each coordinate of the centre [px],
-    and of radial coefficients; tangential ones have ``TANGENTIAL_SHARE`` of these.
-    """
-
-    focal: float
-    aspect: float
-    centre_px: float
-    radial: float
-
-    @staticmethod
-    def calibrated(camera: Camera) -> LensSigmas:
-        """Of a lens that was calibrated with a target: 0.2 %; of 1000 px, a centre to 2 px."""
-        share = _CALIBRATED
-        return LensSigmas(share, share, share * camera.intrinsics_px.fx, share)
-
-
-IN_DOUBT = LensSigmas(0.02, 0.002, 5.0, 0.05)
-"""Of a lens that is estimated."""
-
 TANGENTIAL_SHARE = 0.1
-_CALIBRATED = 0.002
 _TAIL_SIGMAS = 2.0  # where the Cauchy loss of a prior bends
 _PLAIN = 2  # radial coefficients that are set free in a rig without distortion
 _STILL = 1e-4  # of a walk in no time: two places that were left together

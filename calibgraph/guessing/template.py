@@ -8,6 +8,7 @@ import numpy as np
 
 from calibgraph.errors import FileError
 from calibgraph.files import write_text
+from calibgraph.guessing.lens_words import parse_lens
 from calibgraph.guessing.mounting import check_forward, parse_mounting
 from calibgraph.io.bags import is_bag
 from calibgraph.io.clouds import CLOUD_SUFFIXES
@@ -26,6 +27,7 @@ def write_rig_template(
     out: Path | str | None = None,
     *,
     mountings: Mapping[str, str] | None = None,
+    lenses: Mapping[str, str] | None = None,
     forward: str = "+x",
     replace: bool = False,
 ) -> Path:
@@ -36,6 +38,8 @@ def write_rig_template(
         out: the file; ``rig.yaml`` in the folder if None.
         mountings: per camera, how it is mounted, in the words of :func:`calibgraph.guess_rig`; its
             guess is then no placeholder.
+        lenses: per camera, how its lens is known: ``LENS_GRAMMAR``; a lens of a spec sheet or a
+            field of view is computed, with sigmas of a lens in doubt.
         forward: the axis of the LiDAR frame that points ahead, for the words.
         replace: whether a file that is there is replaced.
 
@@ -51,12 +55,12 @@ def write_rig_template(
     path = Path(out) if out is not None else folder / RIG_FILE
     if path.exists() and not replace:
         raise FileError(path, "is there already; --force replaces it")
-    write_text(path, rig_template(folder, mountings=mountings or {}, forward=forward))
+    write_text(path, rig_template(folder, mountings or {}, lenses or {}, forward=forward))
     return path
 
 
-def rig_template(folder: Path, *, mountings: Mapping[str, str], forward: str = "+x") -> str:
-    """The text of :func:`write_rig_template`."""
+def cameras_of_folder(folder: Path) -> dict[str, Path]:
+    """The images of each camera; arguments and errors as of :func:`write_rig_template`."""
     _require_plain_folder(folder)
     sources = folder_layout(folder).images
     if not sources:
@@ -65,11 +69,24 @@ def rig_template(folder: Path, *, mountings: Mapping[str, str], forward: str = "
             folder / "cameras", "no images; put those of each camera into cameras/NAME, named as "
             f"the clouds in lidar, found are the folders {beside}"
         )  # fmt: skip
+    return dict(sources)
+
+
+def rig_template(
+    folder: Path,
+    mountings: Mapping[str, str],
+    lenses: Mapping[str, str],
+    *,
+    forward: str = "+x",
+) -> str:
+    """The text of :func:`write_rig_template`."""
+    sources = cameras_of_folder(folder)
     clouds = len(files_by_stem(folder / "lidar", CLOUD_SUFFIXES))
-    for name in mountings.keys() - sources.keys():
-        raise ValueError(f"--mount {name}=...: no such camera; found are {', '.join(sources)}")
+    for option, words in (("--mount", mountings), ("--lens", lenses)):
+        for name in words.keys() - sources.keys():
+            raise ValueError(f"{option} {name}=...: no such camera; found are {', '.join(sources)}")
     cameras = {
-        name: _camera(name, _size(source), mountings.get(name), forward)
+        name: _camera(name, _size(source), (mountings.get(name), lenses.get(name)), forward)
         for name, source in sources.items()
     }
     head = (files("calibgraph.guessing") / "rig_head.txt").read_text(encoding="utf-8")
@@ -98,10 +115,16 @@ def _size(source: Path) -> tuple[int, int]:
 
 
 def _camera(
-    name: str, size_px: tuple[int, int], words: str | None, forward: str
+    name: str, size_px: tuple[int, int], said: tuple[str | None, str | None], forward: str
 ) -> dict[str, object]:
-    """A camera of the file."""
+    """A camera of the file, by what is said of its mounting and its lens."""
     guess: object = FILL_IN
+    words, lens = said
+    known = None if lens is None else parse_lens(lens, name, size_px)
+    unknown = {
+        "intrinsics_px": dict.fromkeys(("fx", "fy", "cx", "cy"), FILL_IN),
+        "distortion": FILL_IN,
+    }
     if words is not None:
         T = parse_mounting(words, name).T_camera_lidar(check_forward(forward))
         guess = (np.round(T, 6) + 0.0).tolist()
@@ -109,7 +132,6 @@ def _camera(
         "model": "pinhole",
         "width_px": size_px[0],
         "height_px": size_px[1],
-        "intrinsics_px": dict.fromkeys(("fx", "fy", "cx", "cy"), FILL_IN),
-        "distortion": FILL_IN,
+        **(known or unknown),
         "T_camera_lidar": guess,
     }

@@ -148,7 +148,9 @@ def load_dataset(
     if data.recorded == data.frames:
         data = replace(data, recorded=())
     data = data if frames is None else _complete(data.select(frames))
-    of_clouds = (note for each in data.frames[:1] for note in read_cloud_notes(each.cloud_path))
+    of_clouds = (
+        note for each in data.frames[:1] for note in read_cloud_notes(each.cloud_path, each.columns)
+    )
     return replace(data, notes=(*of_clouds, *data.notes))
 
 
@@ -182,7 +184,13 @@ def _with_folder(
     """The dataset with the frames of a folder; of complete ones where names are stamps."""
     start, cameras = _next_index(data), data.rig.cameras.keys()
     found = tuple(
-        Frame(start + number, prefix + files.stem, files.cloud, files.images)
+        Frame(
+            start + number,
+            prefix + files.stem,
+            files.cloud,
+            files.images,
+            columns=data.rig.cloud_columns,
+        )
         for number, files in enumerate(of_folder.files)
         if not of_folder.pairing or cameras <= files.images.keys()
     )
@@ -218,7 +226,7 @@ def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
 def _with_bag(data: Dataset, path: Path, prefix: str, options: BagOptions) -> Dataset:
     """The dataset with the frames of a bag."""
     start = _next_index(data)
-    found = frames_of_bag(path, list(data.rig.cameras), options)
+    found = frames_of_bag(path, data.rig.cameras, options)
     find = None if options.motion == "none" else motion_finder(path, found.recorded, options)
     recorded = tuple(_bag_frame(each, start, prefix, find) for each in found.recorded)
     data = replace(data, notes=(*data.notes, f"{path}: {found.summary}"))
@@ -303,7 +311,7 @@ def _require_same_lenses(first: Path, rig: Rig, path: Path, other: Rig) -> None:
     """Check that two rigs differ in their extrinsics at most."""
     lenses = [
         {
-            name: camera.model_dump(exclude={"T_camera_lidar", "covariance", "frame_id"})
+            name: camera.model_dump(exclude={"T_camera_lidar", "covariance", "frame_id", "mount"})
             for name, camera in r.cameras.items()
         }
         for r in (rig, other)

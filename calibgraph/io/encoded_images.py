@@ -8,10 +8,13 @@ import cv2
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
+from PIL.ExifTags import Base
+from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
 _PNG_MARK = b"\x89PNG\r\n\x1a\n"
 _END = b"\0\0\0\0IEND\xaeB`\x82"
+_UPRIGHT = (0, 1)  # orientations; 0 is not one, but some cameras write it
 _AROUND_CHUNK = 12  # bytes of a chunk's length, name and checksum
 
 _FEW_PIXELS, _MOST_PER_BYTE = 2**25, 40
@@ -55,6 +58,27 @@ def _require_plausible_size(data: bytes) -> None:
         raise ValueError(
             f"it states {width}x{height} px in {len(data) / 1e3:.0f} kB: no picture packs so"
         )
+
+
+def describe_turn(data: bytes) -> str:
+    """What is wrong with an orientation in PNG or JPEG data; empty if the image is upright.
+
+    It is unknown which pixels the intrinsics count, turned or stored.
+
+    Raises:
+        ValueError: if the header is damaged.
+    """
+    if is_png(data) and b"eXIf" not in data:  # Pillow decodes a PNG whole to look for it
+        return ""
+    try:
+        header = (PngImageFile if is_png(data) else JpegImageFile)(io.BytesIO(data))
+        found = header.getexif().get(Base.Orientation, 1)
+    except (SyntaxError, OSError) as error:
+        raise ValueError(str(error)) from error
+    return "" if found in _UPRIGHT else (
+        f"has the EXIF orientation {found}, by which some programs turn it and others do not; "
+        "write the images without it, and the intrinsics for the pixels as they are stored"
+    )  # fmt: skip
 
 
 def _pixels_alone(png: bytes) -> bytes:

@@ -6,20 +6,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL.ExifTags import Base
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
 from calibgraph.errors import FileError
 from calibgraph.io.bags import MESSAGE_SUFFIX, load_bag_image
-from calibgraph.io.encoded_images import decode_image, is_png
+from calibgraph.io.encoded_images import decode_image, describe_turn, is_png
 from calibgraph.model.rig import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 _AS_IT_IS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH  # without a reduction to 8 bits
-_UPRIGHT = (0, 1)  # orientations; 0 is not one, but some cameras write it
 
 
 def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
@@ -38,8 +36,7 @@ def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
         return image
     data, header = _read(path)
     _require_size(path, header.size, camera)
-    if not is_png(data) or b"eXIf" in data:  # Pillow decodes a PNG whole to look for it
-        _require_upright(path, header)
+    _require_upright(path, data)
     try:
         image = np.asarray(decode_image(data), np.uint8)
     except ValueError as error:
@@ -76,18 +73,13 @@ def _read(path: Path) -> tuple[bytes, ImageFile]:
         raise _damaged(path, error) from error
 
 
-def _require_upright(path: Path, header: ImageFile) -> None:
-    """Refuse an orientation: it is unknown which pixels the intrinsics count, turned or stored."""
+def _require_upright(path: Path, data: bytes) -> None:
     try:
-        found = header.getexif().get(Base.Orientation, 1)
-    except (SyntaxError, OSError, ValueError) as error:
+        turned = describe_turn(data)
+    except ValueError as error:
         raise _damaged(path, error) from error
-    if found not in _UPRIGHT:
-        raise FileError(
-            path,
-            f"has the EXIF orientation {found}, by which some programs turn it and others do not; "
-            "write the images without it, and the intrinsics for the pixels as they are stored",
-        )
+    if turned:
+        raise FileError(path, turned)
 
 
 def _damaged(path: Path, why: object) -> FileError:

@@ -1,7 +1,7 @@
 """Lenses as others write them: their model by any of its names, K, and lists of coefficients."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ class CameraLens:
         intrinsics_px: (0, 0) is the centre of the top-left pixel.
         distortion: in OpenCV's order.
         time_offset_s: of its images to the clouds, if the file has it.
+        stated: further fields of :class:`calibgraph.Camera`: sigmas, and the read-out.
     """
 
     model: LensModel
@@ -51,6 +52,7 @@ class CameraLens:
     intrinsics_px: Intrinsics
     distortion: tuple[float, ...]
     time_offset_s: float | None = None
+    stated: Mapping[str, Any] = field(default_factory=dict)
 
     def fields(self) -> dict[str, Any]:
         """The fields of :class:`calibgraph.Camera` without the extrinsic."""
@@ -62,6 +64,7 @@ class CameraLens:
             "intrinsics_px": self.intrinsics_px,
             "distortion": self.distortion,
             "time_offset_s": self.time_offset_s,
+            **self.stated,
         }
 
 

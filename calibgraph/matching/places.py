@@ -3,11 +3,12 @@
 The motion from one frame to the next follows from poses of the LiDAR, if they are given, or from
 its twists over a short time; else from features of a camera's images that both see, with depths
 from the cloud: robust PnP, in metres; or from the two clouds. Who returns to a place, in any
-direction, is recognised by the cloud of the place's first frame.
+direction, is recognised by the cloud of the place's first frame. Clouds are compared upright.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -23,8 +24,14 @@ from calibgraph.io.frame import Frame, seconds_between
 from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
 from calibgraph.matching.camera_pairs.relative_pose import relative_pose
 from calibgraph.matching.camera_pairs.surfaces import planes_at
-from calibgraph.matching.cloud_similarity import LEAST_UPRIGHT, UprightCloud, align_with_any
-from calibgraph.model.geometry import invert
+from calibgraph.matching.cloud_similarity import (
+    LEAST_UPRIGHT,
+    Z_UP,
+    UprightCloud,
+    align_with_any,
+    find_up,
+)
+from calibgraph.model.geometry import invert, transform
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 
@@ -44,8 +51,20 @@ Motion = NDArray[np.float64] | None
 """(4, 4) T_later_earlier of the LiDAR; None where the two frames have too little in common."""
 
 
-def find_places(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -> list[list[int]]:
+UNKNOWN_UP = (
+    "which way is up in the clouds is unknown, so that they are not compared: all frames are taken "
+    "to be of one place"
+)
+
+
+def find_places(dataset: Dataset, rig: Rig, camera: str, *, seed: int = 0) -> list[list[int]]:
     """The numbers of the frames of each place, in the order of the frames.
+
+    Args:
+        dataset: the frames.
+        rig: cameras at their extrinsics.
+        camera: whose images show the motion.
+        seed: of the robust fits.
 
     Without poses and twists, features show the motion up to some 5 m, and clouds beyond. A frame
     farther than PLACE_M from the first of its place, of another recording, or after an unknown
@@ -57,7 +76,8 @@ def find_places(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -
         FileError: if an image or a cloud cannot be read.
     """
     places: dict[int, list[int]] = {}
-    walk, steps = PlaceWalk(), [None, *motions(dataset, camera, lens, seed=seed)]
+    steps = [None, *motions(dataset, camera, rig.cameras[camera], seed=seed)]
+    walk = PlaceWalk(rig=rig)
     for frame, step in zip(dataset.frames, steps, strict=True):
         places.setdefault(walk.first_of_place(frame, step), []).append(frame.index)
     return list(places.values())
@@ -70,13 +90,17 @@ class PlaceWalk:
         most_places: that are remembered, those visited last; None: all.
         in_sequence: whether the frames are of a drive: then a frame that follows the one before
             closely stays at its place after an unknown motion, however unlike the clouds are.
+        rig: whose cameras show which way is up in the clouds; None where z is.
     """
 
-    def __init__(self, most_places: int | None = None, *, in_sequence: bool = False) -> None:
+    def __init__(
+        self, most_places: int | None = None, *, in_sequence: bool = False, rig: Rig | None = None
+    ) -> None:
         self._T_now_first, self._first = np.eye(4), -1
         self._before: Frame | None = None
         self._known: dict[int, UprightCloud] = {}  # by their first frames, the last visited last
-        self._most, self._in_sequence = most_places, in_sequence
+        self._most, self._in_sequence, self._rig = most_places, in_sequence, rig
+        self._R_up_lidar: Array | None = Z_UP  # once the rig is None
 
     def first_of_place(self, frame: Frame, step: Motion) -> int:
         """The number of the first frame of this frame's place."""
@@ -84,10 +108,10 @@ class PlaceWalk:
         if before is None or before.cloud_path.parent != frame.cloud_path.parent:
             self._find_place(frame)
             return self._first
-        step = _motion_by_clouds(before, frame) if step is None else step
+        step = self._motion_by_clouds(before, frame) if step is None else step
         if step is None:
             follows = self._in_sequence and _follows(before, frame)
-            self._find_place(frame, may_stay=follows or not _are_comparable(before, frame))
+            self._find_place(frame, may_stay=follows or not self._are_comparable(before, frame))
             return self._first
         self._T_now_first = step @ self._T_now_first
         if _distance_m(self._T_now_first) > PLACE_M:
@@ -96,17 +120,17 @@ class PlaceWalk:
 
     def remember(self, frame: Frame) -> None:
         """Register a place by its first frame."""
-        self._visit(frame.index, _upright_cloud(frame))
+        self._visit(frame.index, self._upright_cloud(frame))
 
     def _find_place(self, frame: Frame, *, left: int | None = None, may_stay: bool = False) -> None:
         """The most similar known place but for one that was left, else the present or a new one."""
-        cloud = _upright_cloud(frame)
+        cloud = self._upright_cloud(frame)
         known = [first for first in self._known if first != left]
-        found = cloud and align_with_any(cloud, [self._known[first] for first in known])
+        found = cloud and self._align(cloud, [self._known[first] for first in known])
         if found and _distance_m(found[1]) <= PLACE_M:
             self._first, self._T_now_first = known[found[0]], found[1]
             self._visit(self._first, self._known[self._first])
-        elif found or not may_stay:
+        elif self._first < 0 or not (may_stay or self._R_up_lidar is None) or found:
             self._first, self._T_now_first = frame.index, np.eye(4)
             self._visit(frame.index, cloud)
 
@@ -116,6 +140,41 @@ class PlaceWalk:
             self._known[first] = cloud
         while self._most is not None and len(self._known) > self._most:
             del self._known[next(iter(self._known))]
+
+    def _motion_by_clouds(self, before: Frame, now: Frame) -> Motion:
+        earlier, later = self._upright_cloud(before), self._upright_cloud(now)
+        found = earlier and later and self._align(later, [earlier])
+        return found[1] if found else None
+
+    def _align(self, now: UprightCloud, known: Sequence[UprightCloud]) -> tuple[int, Array] | None:
+        """As of :func:`align_with_any`, in the axes of the LiDAR."""
+        found = align_with_any(now, known)
+        if found is None or self._R_up_lidar is None:
+            return None
+        T_up_lidar = transform(self._R_up_lidar)
+        return found[0], invert(T_up_lidar) @ found[1] @ T_up_lidar
+
+    def _are_comparable(self, before: Frame, now: Frame) -> bool:
+        """Whether enough stands upright in both clouds that they were alike at one place."""
+        clouds = self._upright_cloud(before), self._upright_cloud(now)
+        return all(cloud is not None and len(cloud.points_m) >= LEAST_UPRIGHT for cloud in clouds)
+
+    def _upright_cloud(self, frame: Frame) -> UprightCloud | None:
+        """The upright structure of a frame's cloud; None where up is unknown, or if unreadable.
+
+        The matcher reports clouds that cannot be read.
+        """
+        try:
+            if self._rig is not None:
+                self._R_up_lidar = find_up(frame.load_cloud(), self._rig.T_camera_lidar.values())
+                self._rig = None
+            R = self._R_up_lidar
+            if R is None:
+                return None
+            key = ("upright", R.tobytes())
+            return frame.derive(key, lambda: UprightCloud.from_cloud(frame.load_cloud(), R))
+        except (CalibrationError, OSError):
+            return None
 
 
 def _given_motion(before: Frame, now: Frame) -> Motion:
@@ -151,26 +210,6 @@ def _follows(before: Frame, now: Frame) -> bool:
     return abs(int(numbers[1]) - int(numbers[0])) <= FOLLOWS_NUMBERS
 
 
-def _motion_by_clouds(before: Frame, now: Frame) -> Motion:
-    earlier, later = _upright_cloud(before), _upright_cloud(now)
-    found = earlier and later and align_with_any(later, [earlier])
-    return found[1] if found else None
-
-
-def _are_comparable(before: Frame, now: Frame) -> bool:
-    """Whether enough stands upright in both clouds that they were alike at one place."""
-    clouds = _upright_cloud(before), _upright_cloud(now)
-    return all(cloud is not None and len(cloud.points_m) >= LEAST_UPRIGHT for cloud in clouds)
-
-
-def _upright_cloud(frame: Frame) -> UprightCloud | None:
-    """The upright structure of a frame's cloud; None if unreadable, which the matcher reports."""
-    try:
-        return frame.derive("upright", lambda: UprightCloud.from_cloud(frame.load_cloud()))
-    except (CalibrationError, OSError):
-        return None
-
-
 def _distance_m(T: Array) -> float:
     return float(np.linalg.norm(T[:3, 3]))
 
@@ -187,7 +226,8 @@ class PlaceFinder:
     """
 
     def __init__(self, rig: Rig, *, most_places: int | None = None, seed: int = 0) -> None:
-        self._rig, self._seed, self._walk = rig, seed, PlaceWalk(most_places, in_sequence=True)
+        self._rig, self._seed = rig, seed
+        self._walk = PlaceWalk(most_places, in_sequence=True, rig=rig)
         self._before: _SeenFrame | None = None
 
     def remember(self, frame: Frame) -> None:

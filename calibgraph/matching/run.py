@@ -5,13 +5,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from calibgraph.errors import MotionError
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.protocol import FullMatcher
-from calibgraph.model.clock import require_motion
+from calibgraph.model.clock import OF_IMAGES, require_motion
 from calibgraph.model.config import LensPart
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Rig
+from calibgraph.model.table_columns import TWIST_RULE, beyond_vehicles
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.solution import Solution
@@ -89,12 +91,24 @@ def require_known_motion(data: Dataset, matcher: FullMatcher, parts: Sequence[Le
         return
     with core_pool() as cores:  # registrations, which frames keep
         twists = [*cores.map(lambda frame: frame.twist_per_s, data.frames)]
-    require_motion(parts, is_known=all(twist is not None for twist in twists))
+    known = all(twist is not None for twist in twists)
+    require_motion(parts, is_known=known, how=OF_IMAGES)
 
 
 def with_motion(table: Correspondences, data: Dataset) -> Correspondences:
-    """The table with the motion of the LiDAR in each frame, where it is known of all of them."""
+    """The table with the motion of the LiDAR in each frame, where it is known of all of them.
+
+    Raises:
+        MotionError: if no vehicle has it.
+    """
     twists = {frame.index: frame.twist_per_s for frame in data.frames}
+    for frame in data.frames:
+        twist = twists[frame.index]
+        if twist is not None and beyond_vehicles(twist[None])[0]:
+            raise MotionError(
+                f"frame {frame.name}: the motion of the LiDAR must {TWIST_RULE}, found "
+                f"{np.round(twist, 3).tolist()}; correct the odometry, or the time between clouds"
+            )
     known = {number: twist for number, twist in twists.items() if twist is not None}
     if table.twist_per_s is not None or not {*table.frame.tolist()} <= known.keys():
         return table

@@ -21,6 +21,7 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.error_sources import ErrorSources, left_out
 from calibgraph.model.lens_estimate import LensEstimate, joint_parameters
+from calibgraph.model.lens_knowledge import describe_unstated
 from calibgraph.model.places import Groups
 from calibgraph.model.rig import Rig
 from calibgraph.model.summary import Summary, summarize
@@ -186,6 +187,12 @@ class Calibration:
         """
         covariance = self.covariance.get(name, self.pair_covariance.get(name))
         return None if covariance is None else geometry.degrees_and_centimetres(covariance)
+
+    @property
+    def unstated_lenses(self) -> str:
+        """The cameras whose lenses count as calibrated, in a clause; empty if none does."""
+        is_estimated = bool({*self.config.estimate} - {"offset", "readout"})
+        return "" if is_estimated else describe_unstated(self.rig)
 
     @property
     def not_included(self) -> str:

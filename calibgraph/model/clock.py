@@ -23,10 +23,9 @@ from factors.free_lens import CLOCK
 
 _log = logging.getLogger(__name__)
 
-_HOW = (
-    "--interval-s with folders, --motion with bags, twists_per_s with arrays, twist_per_s with "
-    "every line of JSON, or the columns wx_rad_s to vz_m_s of a table"
-)
+OF_IMAGES = "--interval-s with folders, --motion with bags, or twists_per_s with arrays"
+OF_TABLES = "the columns wx_rad_s to vz_m_s of a table, or twist_per_s with every line of JSON"
+"""How a user of images, or of tables, gives the motion of the LiDAR."""
 _ALONG = 0.9  # mean cosine of turns and ways; of noise it is a half
 _ROW_STEPS = 2  # a point 20 rows further is seen 2 ms later, and moves by 2 rows in these at most
 
@@ -36,23 +35,23 @@ def clock_of(camera: Camera) -> Clock:
     return Clock(camera.time_offset_s or 0.0, camera.readout_s or 0.0, camera.height_px)
 
 
-def require_motion(parts: Sequence[LensPart], *, is_known: bool) -> None:
+def require_motion(parts: Sequence[LensPart], *, is_known: bool, how: str = OF_TABLES) -> None:
     """Raise a CorrespondenceError if parts of a clock are to be estimated without a motion."""
     clock = [part for part in CLOCK if part in parts]
     if clock and not is_known:
         raise CorrespondenceError(
-            f"to estimate {', '.join(clock)}, the motion of the LiDAR must be known: give {_HOW}"
+            f"to estimate {', '.join(clock)}, the motion of the LiDAR must be known: give {how}"
         )
 
 
-def unused_times(rig: Rig, *, is_known: bool) -> list[str]:
+def unused_times(rig: Rig, *, is_known: bool, how: str = OF_TABLES) -> list[str]:
     """A warning, which is logged, if the motion is unknown that the times of a rig need."""
     stated = [n for n, c in rig.cameras.items() if c.time_offset_s or c.readout_s]
     if is_known or not stated:
         return []
     text = (
         f"{', '.join(stated)}: time_offset_s and readout_s are not used, since the motion of the "
-        f"LiDAR is unknown; give {_HOW}"
+        f"LiDAR is unknown; give {how}"
     )
     _log.warning(text)
     return [text]

@@ -111,10 +111,17 @@ PoseCovariance = Annotated[
 
 def _checked_name(name: str) -> str:
     """A camera's name is part of file names and messages."""
-    if not re.fullmatch(r"[^/\\\x00-\x1f\x7f]{1,100}", name) or name in (".", ".."):
+    if not re.fullmatch(r"[^/\\]{1,100}", name) or not name.isprintable() or name in (".", ".."):
         raise ValueError(
-            f"camera name {name!r}: expected 1 to 100 characters without slashes, and not a dot"
+            f"camera name {name!r}: expected 1 to 100 printable characters without slashes, "
+            "and not a dot"
         )
+    return name
+
+
+def _require_printable(name: str) -> str:
+    if not name.isprintable():
+        raise ValueError(f"{name!r} holds characters that are not seen; rename it")
     return name
 
 
@@ -127,7 +134,7 @@ def _checked_model(name: Any) -> Any:
 
 
 CameraName = Annotated[str, AfterValidator(_checked_name)]
-FrameId = Annotated[str, Field(pattern=r"^\S{1,200}$")]
+FrameId = Annotated[str, Field(pattern=r"^\S{1,200}$"), AfterValidator(_require_printable)]
 Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # below, LM stalls
 Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -139,7 +146,9 @@ class _Model(StrictNumbers):
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
 
-_LEFT_OUT = "covariance", "frame_id", "intrinsics_sigma_px", "distortion_sigma", *IMAGE_TIMES
+KNOWLEDGE = "intrinsics_sigma_px", "distortion_sigma", *IMAGE_TIMES
+"""Fields of a camera on its times, and how well these and the lens are known."""
+_LEFT_OUT = "covariance", "frame_id", "mount", *KNOWLEDGE
 """Of a camera, where they are None."""
 
 _LENS = "intrinsics_px", "distortion", "time_offset_s", "readout_s"
@@ -161,14 +170,31 @@ class IntrinsicsSigma(_Model):
     centre: Positive | None = None
 
 
+class Mount(_Model):
+    """The transform of a robot's tree by which a camera hangs, and that its calibration changes.
+
+    ``T_parent_lidar`` and ``T_camera_child`` are those of the tree that the calibration keeps.
+    """
+
+    parent: FrameId
+    child: FrameId
+    T_parent_lidar: Transform
+    T_camera_child: Transform
+
+    def T_parent_child(self, T_lidar_camera: Array) -> Array:
+        """(4, 4) with which the camera is where it was measured."""
+        T: Array = self.T_parent_lidar @ T_lidar_camera @ self.T_camera_child
+        return T
+
+
 class Camera(_Model, ImageTimes):
     """One camera: its lens, its image size, and its extrinsic: a guess, or the reference.
 
     ``intrinsics_sigma_px`` and ``distortion_sigma`` (of radial coefficients) are how well the lens
     is known where it is estimated; ``calibgraph.graph.lens`` has defaults. ``frame_id`` is that of
-    its optical frame in ROS, as its bag names it. ``covariance`` is that of a reference with error
-    bars: (6, 6) of xi = (rotation [rad], translation [m]) in T_camera_lidar = exp(xi) T, in the
-    camera's axes.
+    its optical frame in ROS, as its bag names it, and ``mount`` the link of the robot's tree by
+    which it hangs. ``covariance`` is that of a reference with error bars: (6, 6) of xi = (rotation
+    [rad], translation [m]) in T_camera_lidar = exp(xi) T, in the camera's axes.
     """
 
     model: Annotated[LensModel, BeforeValidator(_checked_model)] = "pinhole"
@@ -179,6 +205,7 @@ class Camera(_Model, ImageTimes):
     intrinsics_sigma_px: IntrinsicsSigma | None = None
     distortion_sigma: Positive | None = None
     frame_id: FrameId | None = None
+    mount: Mount | None = None
     T_camera_lidar: Transform
     covariance: PoseCovariance | None = None
 
@@ -223,7 +250,7 @@ class Camera(_Model, ImageTimes):
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """A copy with some fields changed, not checked; the lens follows the intrinsics."""
         copy = super().model_copy(update=update, deep=deep)
-        if update and update.keys() - {"T_camera_lidar", "covariance", "frame_id"}:
+        if update and update.keys() - {"T_camera_lidar", "covariance", "frame_id", "mount"}:
             copy.__dict__.pop("lens", None)
         return copy
 
@@ -251,6 +278,15 @@ class Rig(_Model):
     lidar: str = "lidar"
     cameras: Annotated[dict[CameraName, Camera], Field(min_length=1)]
     relative_poses: tuple[RelativePose, ...] = ()
+    cloud_columns: tuple[str, ...] | None = None
+    """Names of the float32 columns of .bin clouds, such as x, y, z, intensity, ring."""
+
+    @model_serializer(mode="wrap")
+    def _without_absent_columns(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content: dict[str, Any] = serialize(self)
+        if self.cloud_columns is None:
+            content.pop("cloud_columns", None)
+        return content
 
     @model_validator(mode="after")
     def _relative_poses_name_cameras(self) -> Self:

@@ -18,7 +18,7 @@ LEAST = 3
 
 _OF_DATA = ("error bar", "data", "repeats")  # causes
 _WORST_FIRST: tuple[Status, ...] = ("FAIL", "WARN", "PASS")
-_PARTS = re.compile(r"--estimate [a-z,]+")
+_PARTS = re.compile(r"--estimate [a-z,]+(?: --(?:interval-s [\d.]*\d|motion scans))?")
 _NUMBER = re.compile(r"(-?\d+(?:\.\d+)?)")
 
 

@@ -28,7 +28,7 @@ from calibgraph.files import (
     sync_folder,
     write_atomically,
 )
-from calibgraph.tracking.state_recovery import APPLICATION, LAYOUT, checksum, log_of, read
+from calibgraph.tracking.state_recovery import APPLICATION, LAYOUT, TABLES, checksum, log_of, read
 
 DATABASE = "state.sqlite"
 _PAGE_BYTES = 32768  # a snapshot takes half the time of SQLite's 4096
@@ -36,13 +36,13 @@ _LOG_PAGES = 128  # in the log, before they are copied to the database: 4 MB, as
 _EARLIEST = ("snapshot-*.state", "journal-*.log")
 _TABLES = f"""
     PRAGMA page_size={_PAGE_BYTES};
-    PRAGMA journal_mode=WAL;
+    BEGIN;
     PRAGMA application_id={APPLICATION};
     PRAGMA user_version={LAYOUT};
-    CREATE TABLE snapshot (number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL);
-    CREATE TABLE journal (number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL);
-    CREATE TABLE status (number INTEGER NOT NULL, is_open INTEGER NOT NULL);
+    {"".join(f"CREATE TABLE {name} {columns};" for name, columns in TABLES.items())}
     INSERT INTO status VALUES (0, 0);
+    COMMIT;
+    PRAGMA journal_mode=WAL;
 """
 
 
@@ -154,7 +154,13 @@ def _make_folder(folder: Path) -> None:
 
 def _lock(folder: Path) -> int:
     """A descriptor that holds the folder's lock until it is closed, or the process ends."""
-    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
+    path = folder / "lock"
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    except OSError as error:
+        if path.is_symlink() or path.is_dir():
+            raise FileError(path, "is a link or a folder, expected a file; remove it") from error
+        raise
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BaseException as error:
@@ -167,7 +173,10 @@ def _lock(folder: Path) -> int:
 
 
 def _create(path: Path) -> None:
-    """Put an empty database in place, whole or not at all; not beside another one's parts."""
+    """Put an empty database in place, whole or not at all; not beside another one's parts.
+
+    It is written before it has a log, whose copy at the end would not report a full disk.
+    """
     for pattern in _EARLIEST:
         for found in path.parent.glob(pattern):
             message = "is state of the earliest layout; choose another folder"

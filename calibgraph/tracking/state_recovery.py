@@ -17,6 +17,17 @@ LAYOUT = 2
 APPLICATION = 0x43474254
 """``CGBT``, in the header of the database."""
 
+TABLES = {
+    "snapshot": "(number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL)",
+    "journal": "(number INTEGER PRIMARY KEY, content BLOB NOT NULL, digest BLOB NOT NULL)",
+    "status": "(number INTEGER NOT NULL, is_open INTEGER NOT NULL)",
+}
+"""Their columns. A database with anything else, such as a trigger, is none of a tracker."""
+
+_SCHEMA = [("table", name, name, f"CREATE TABLE {name} {TABLES[name]}") for name in TABLES]
+
+_LEAST_STEPS = 100_000
+_OF_THE_DISK = sqlite3.SQLITE_IOERR, sqlite3.SQLITE_FULL, sqlite3.SQLITE_CANTOPEN
 _HEADER = struct.Struct(">16s44xI4xI28x")  # text, user_version, application_id
 
 
@@ -52,12 +63,23 @@ def read(path: Path) -> tuple[Recovered, int]:
     had_log = log.exists() and log.stat().st_size > 0
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
+            # A query takes less than an instruction per byte of a database of ours; of another
+            # one, whose pages may refer to each other in circles, it might never end.
+            steps = _LEAST_STEPS + path.stat().st_size + (log.stat().st_size if had_log else 0)
+            database.set_progress_handler(lambda: 1, steps)
+            query = "SELECT type, name, tbl_name, sql FROM sqlite_schema"
+            if database.execute(query).fetchmany(len(_SCHEMA) + 1) != _SCHEMA:
+                message = "holds other tables than a tracker's; choose another folder"
+                raise FileError(path, message)
             (state,) = database.execute("PRAGMA integrity_check(1)").fetchone()
             if state != "ok":
                 raise _damaged(path, state)
             number, is_open = database.execute("SELECT number, is_open FROM status").fetchone()
             recovered = _recover(database, path, number)
     except (sqlite3.Error, TypeError, UnicodeError) as error:  # TypeError: a row is missing
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _OF_THE_DISK:
+            message = f"cannot be read ({error}): is the disk full? Free it and start again"
+            raise FileError(path, message) from error
         raise _damaged(path, error) from error
     finally:
         _remove_index(path, had_log=had_log)

@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibgraph.errors import CalibrationError
+from calibgraph.io.bags import is_bag
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import seconds_between
 from calibgraph.io.kept_frames import KeptFrame
@@ -83,11 +84,22 @@ def image_offset_checks(evidence: RunEvidence) -> Checks:
     matcher.release()
     table = with_motion(table, moved).with_places(run.correspondences.places)
     fits = _fit_cameras(rig, table, run.correspondences.findings)
-    checks = {n: [check_offset(fit, IMAGES, config.tolerance)] for n, fit in fits}
+    options = _motion_options(run.dataset) if registered else ""
+    checks = {n: [check_offset(fit, IMAGES, config.tolerance, options)] for n, fit in fits}
     if registered and seconds_between(*moved.frames[:2]) is None:
         taken = f"; successive clouds are taken to be {INTERVAL_S:g} s apart"
         checks = {n: [replace(c, text=c.text + taken) for c in of] for n, of in checks.items()}
     return evidence.grade_by_images(checks)
+
+
+def _motion_options(dataset: Dataset) -> str:
+    """The options with which scans show the motion of all frames."""
+    frame = dataset.frames[0]
+    if any(map(is_bag, dataset.folders)):
+        return " --motion scans"
+    near = dataset.neighbour(frame, 1)
+    seconds = None if near is None else seconds_between(frame, near)
+    return f" --interval-s {abs(seconds or INTERVAL_S):.3g}"
 
 
 def _fit_cameras(
@@ -101,10 +113,10 @@ def _fit_cameras(
 
 
 def check_offset(
-    found: LensParameter, by: str, tolerance: tuple[float, float] = TOLERANCE
+    found: LensParameter, by: str, tolerance: tuple[float, float] = TOLERANCE, options: str = ""
 ) -> Check:
     """The check of an offset; of one that is not determined, it tells how much depends on it."""
-    check, size = check_parameter(found, by, tolerance), float(found.units[0] * found.size)
+    check, size = check_parameter(found, by, tolerance, options), float(found.units[0] * found.size)
     if found.sigmas[0] < limit("lens_wrong"):
         return check
     text = "the time of the images is not determined by these data, and taken for right"

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import permutations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import CalibrationError, RigError
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.acceptance import are_accepted, least_z_score
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of, load_camera_frames
@@ -36,37 +38,110 @@ _REFINED = 2  # of the corrected guesses
 _LEAST_POINTS = 300  # of a cloud in the image, so that windows of it can agree
 
 
+_AHEAD, _LEFT, _UP = np.eye(3)
+_SIDES = {"ahead": _AHEAD, "behind": -_AHEAD, "left": _LEFT, "right": -_LEFT, "up": _UP,
+          "down": -_UP}  # fmt: skip
+
+WORDS: Mapping[str, str] = {
+    "inverse": "the guess is inverted (it is T_lidar_camera)",
+    "camera-flu": "the guess is of camera axes forward, left, up, not right, down, forward",
+    "inverse-camera-flu": "the guess is inverted, and of camera axes forward, left, up",
+    "camera-upside-down": "the camera is turned by 180 deg about its axis (upside down)",
+    "camera-clockwise": "the camera is turned by 90 deg clockwise about its axis",
+    "camera-counterclockwise": "the camera is turned by 90 deg counterclockwise about its axis",
+    "position": "the guess has the camera's position where the LiDAR's in the camera should be",
+    "transposed": "the guess has a transposed rotation",
+    "millimetres": "the guess has a translation in millimetres",
+    "inverse-millimetres": "the guess is inverted, with its translation in millimetres",
+    "wxyz": "the guess has a quaternion w x y z that was read as x y z w",
+    "xyzw": "the guess has a quaternion x y z w that was read as w x y z",
+}
+"""Convention errors by their names for ``--correct``, in words; those of the LiDAR's axes, which
+are named by the sides to which x, y and z point as in ``cloud-right-down-ahead``, are not here."""
+
+
 def undo_convention_errors(guess: Array) -> dict[str, Array]:
-    """Per convention error, in words: the (4, 4) T_camera_lidar of a (4, 4) guess that has it."""
+    """By name, the (4, 4) T_camera_lidar of a (4, 4) guess with each convention error undone.
+
+    The names are those of ``WORDS`` and of the 23 other axes that a cloud may have. Common errors
+    come first.
+    """
     inverse = invert(guess)
     position, transposed = guess.copy(), guess.copy()
     position[:3, 3] = -guess[:3, :3] @ guess[:3, 3]
     transposed[:3, :3] = guess[:3, :3].T
     x, y, z, w = Rotation.from_matrix(guess[:3, :3]).as_quat()
     return {
-        "the guess is inverted (it is T_lidar_camera)": inverse,
-        "the guess is of camera axes forward, left, up, not right, down, forward": (
-            T_OPTICAL_LINK @ guess
-        ),
-        "the guess is inverted, and of camera axes forward, left, up": T_OPTICAL_LINK @ inverse,
-        "the LiDAR's axes are turned by 180 deg about z (its x points backward)": (
-            guess @ _turned(180.0)
-        ),
-        "the LiDAR's axes are turned by 90 deg about z (its x points right)": (
-            guess @ _turned(-90.0)
-        ),
-        "the LiDAR's axes are turned by 90 deg about z (its x points left)": guess @ _turned(90.0),
-        "the guess has the camera's position where the LiDAR's in the camera should be": position,
-        "the guess has a transposed rotation": transposed,
-        "the guess has a translation in millimetres": _in_millimetres(guess),
-        "the guess is inverted, with its translation in millimetres": _in_millimetres(inverse),
-        "the guess has a quaternion w x y z that was read as x y z w": _rotated(guess, y, z, w, x),
-        "the guess has a quaternion x y z w that was read as w x y z": _rotated(guess, w, x, y, z),
+        "inverse": inverse,
+        "camera-flu": T_OPTICAL_LINK @ guess,
+        "inverse-camera-flu": T_OPTICAL_LINK @ inverse,
+        **{name: guess @ transform(R) for name, R in _cloud_axes().items()},
+        "camera-upside-down": _rolled(180.0) @ guess,
+        "camera-clockwise": _rolled(-90.0) @ guess,
+        "camera-counterclockwise": _rolled(90.0) @ guess,
+        "position": position,
+        "transposed": transposed,
+        "millimetres": _in_millimetres(guess),
+        "inverse-millimetres": _in_millimetres(inverse),
+        "wxyz": _rotated(guess, y, z, w, x),
+        "xyzw": _rotated(guess, w, x, y, z),
     }
 
 
-def _turned(degrees: float) -> Array:
-    """(4, 4) a turn about z."""
+def in_words(error: str) -> str:
+    """A convention error, as a clause after "if"."""
+    if error in WORDS:
+        return WORDS[error]
+    x, y, z = error.split("-")[1:]
+    if (x, y, z) == ("right", "down", "ahead"):
+        return "the cloud is in optical axes (x right, y down, z ahead)"
+    turn = Rotation.from_matrix(_cloud_axes()[error]).as_rotvec(degrees=True)
+    about = [f"{abs(angle):.0f} deg about {axis}" for angle, axis in zip(turn, "xyz", strict=True)
+             if abs(angle) > 1.0]  # fmt: skip
+    turned = f"turned by {about[0]}" if len(about) == 1 else "others"
+    return f"the LiDAR's axes are {turned} (its x points {x}, y {y}, z {z})"
+
+
+def correct_guess(rig: Rig, errors: Iterable[str]) -> Rig:
+    """A rig with convention errors of its guess undone.
+
+    Args:
+        rig: with T_camera_lidar as it was read.
+        errors: names as of :func:`undo_convention_errors`, each for all cameras, or for one as
+            CAMERA=NAME.
+
+    Raises:
+        RigError: if there is no such error, or no such camera.
+    """
+    for text in errors:
+        camera, _, error = text.rpartition("=")
+        known = undo_convention_errors(np.eye(4))
+        if error not in known:
+            raise RigError(f"no mistake {error!r} of a guess; known are {', '.join(known)}")
+        names = [camera] if camera else [*rig.cameras]
+        if names[0] not in rig.cameras:
+            raise RigError(f"no camera {camera!r}; the rig has {', '.join(rig.cameras)}")
+        undone = {n: undo_convention_errors(rig.cameras[n].T_camera_lidar)[error] for n in names}
+        rig = rig.moved_to(undone)
+    return rig
+
+
+@cache
+def _cloud_axes() -> dict[str, Array]:
+    """By name, the (3, 3) rotations to x ahead, y left, z up from the other axes of a cloud.
+
+    Those with z up first, then those of a single turn.
+    """
+    named = {
+        f"cloud-{x}-{y}-{z}": np.column_stack([_SIDES[x], _SIDES[y], _SIDES[z]])
+        for x, y, z in permutations(_SIDES, 3)
+    }
+    others = {n: R for n, R in named.items() if np.linalg.det(R) > 0 and (np.eye(3) != R).any()}
+    return dict(sorted(others.items(), key=lambda item: (item[1][2, 2] < 1, np.trace(item[1]))))
+
+
+def _rolled(degrees: float) -> Array:
+    """(4, 4) a turn about the camera's axis."""
     return transform(Rotation.from_euler("z", degrees, degrees=True))
 
 
@@ -84,25 +159,39 @@ def _rotated(guess: Array, *xyzw: float) -> Array:
 
 
 def convention_error_between(guess: Array, result: Array) -> str | None:
-    """The convention error of a guess that, undone, leads near the result; in words.
+    """The convention error of a guess that, undone, leads near the result; its name."""
+    return _error_between({"": guess}, {"": result})
+
+
+def _error_between(guesses: Mapping[str, Array], results: Mapping[str, Array]) -> str | None:
+    """The error that, undone, leads near the results of all cameras, in the mean.
 
     Of errors that lead about as near, the first of the list, the most common one.
     """
-    distances = {
-        error: degrees / limit("convention_rotation") + metres / limit("convention_translation")
-        for error, T in undo_convention_errors(guess).items()
-        for degrees, metres in [_difference(T, result)]
-        if degrees < limit("convention_rotation") and metres < limit("convention_translation")
-    }
+    distances: dict[str, float] = {}
+    for error in undo_convention_errors(np.eye(4)):
+        apart = [
+            _difference(undo_convention_errors(guesses[name])[error], T)
+            for name, T in results.items()
+        ]
+        if all(
+            degrees < limit("convention_rotation") and metres < limit("convention_translation")
+            for degrees, metres in apart
+        ):
+            shares = (
+                degrees / limit("convention_rotation") + metres / limit("convention_translation")
+                for degrees, metres in apart
+            )
+            distances[error] = sum(shares) / len(apart)
     least = min(distances.values(), default=0.0) + _AS_NEAR
     return next((error for error, distance in distances.items() if distance < least), None)
 
 
 def likely_intended_guess(dataset: Dataset, guess: Rig) -> str | None:
-    """The convention error of a guess that, undone, fits the images far better; a sentence.
+    """The mistake that, undone, makes guess and images agree far better, and how to undo it.
 
-    The guess is tried as it is, then with each error undone, as a search would try it: within some
-    degrees and a metre.
+    The guess is tried as it is, then with each convention error undone, as a search would try it:
+    within some degrees and a metre; then with mirrored images.
 
     Returns:
         None if the cameras are near their guesses, if no corrected guess agrees with the images by
@@ -135,22 +224,39 @@ class _Trial:
         tried.sort(key=lambda each: -sum(candidate.z_score for candidate in each.values()))
         for each in tried[:_REFINED]:
             found = {name: self._refine(candidate) for name, candidate in each.items()}
-            better = [one for name, one in found.items() if self._is_better(name, one, given[name])]
-            if are_accepted([one.z_score for one in better], ALONE * len(starts)):
-                best = max(better, key=lambda one: one.z_score)
-                name = next(iter(best.body))
-                error = convention_error_between(lost[name], best.body[name].T_camera_lidar)
-                if error is None:
-                    continue
-                images = "the images" if len(lost) == len(some) else f"the images of {name}"
-                return f"{images} fit clearly better if {error}"
-        return None
+            better = {n: one for n, one in found.items() if self._is_better(n, one, given[n])}
+            if are_accepted([one.z_score for one in better.values()], ALONE * len(starts)):
+                poses = {name: one.body[name].T_camera_lidar for name, one in better.items()}
+                error = _error_between(lost, poses)
+                if error is not None:
+                    return _sentence(error, [] if len(lost) == len(some) else [*better])
+        return self._find_mirrored(lost, given)
+
+    def _find_mirrored(
+        self, lost: Mapping[str, Array], given: Mapping[str, Candidate]
+    ) -> str | None:
+        """The same of mirrored images; tangential distortion, which changes its sign, is kept."""
+        frames, cameras = {}, {}
+        for name in lost:
+            seen, camera = self.frames[name], self.guess.cameras[name]
+            frames[name] = replace(seen, grays=[gray.mirrored() for gray in seen.grays])
+            k = camera.intrinsics_px
+            k = k.model_copy(update={"cx": camera.width_px - 1 - k.cx})
+            cameras[name] = camera.model_copy(update={"intrinsics_px": k})
+        trial = _Trial(frames, self.guess.model_copy(update={"cameras": cameras}))
+        found = {name: trial._refine(trial._approach(name, T)) for name, T in lost.items()}
+        names = [n for n, one in found.items() if _is_accepted(one) and _gains(one, given[n])]
+        if not names:
+            return None
+        return (
+            f"the images of {' and '.join(names)} are mirrored: record them unmirrored, or flip "
+            "the files left to right"
+        )
 
     def _is_better(self, name: str, found: Candidate, given: Candidate) -> bool:
         """Whether a pose agrees better than the guess, which no search from there would reach."""
-        gained = found.z_score >= limit("convention_gain") * given.z_score
         guess = self.guess.T_camera_lidar[name]
-        return gained and not _in_reach(guess, found.body[name].T_camera_lidar)
+        return _gains(found, given) and not _in_reach(guess, found.body[name].T_camera_lidar)
 
     def _refine(self, candidate: Candidate) -> Candidate:
         """The candidate refined, if it is worth it."""
@@ -167,6 +273,22 @@ class _Trial:
         if np.sum(valid & camera.in_image(pixels)) < _LEAST_POINTS:
             return Candidate({name: camera}, 0.0)
         return approach(self.frames, {name: camera})
+
+
+def _sentence(error: str, cameras: Sequence[str]) -> str:
+    """What is wrong with the guess of some cameras, of all if none is named; and what undoes it."""
+    options = " ".join(
+        f"--correct {name}" for name in ([f"{n}={error}" for n in cameras] or [error])
+    )
+    images = f"the images of {' and '.join(cameras)}" if cameras else "the images"
+    return (
+        f"{images} fit clearly better if {in_words(error)}; undo it with "
+        f"calibgraph import RIG {options} --out FILE.yaml"
+    )
+
+
+def _gains(found: Candidate, given: Candidate) -> bool:
+    return found.z_score >= limit("convention_gain") * given.z_score
 
 
 def _is_accepted(candidate: Candidate) -> bool:

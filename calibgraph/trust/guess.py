@@ -12,9 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import angle_deg, relative_transform
+from calibgraph.model.geometry import (
+    angle_deg,
+    invert,
+    pose_difference,
+    relative_transform,
+    transform,
+)
 from calibgraph.model.verdict import Check
-from calibgraph.trust.conventions import convention_error_between
+from calibgraph.trust.conventions import convention_error_between, in_words
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import limit, threshold
@@ -49,7 +55,7 @@ def compare_with_guess(guess: Array, result: Array, findings: MatcherFindings) -
     )
     is_far = any(row.grade(value) != "PASS" for row, value in rows)
     error = convention_error_between(guess, result) if is_far else None
-    advice = "" if error is None else f"it seems that {error}"
+    advice = "" if error is None else f"it seems that {in_words(error)}"
     return [
         *(row.check(value, advice=advice) for row, value in rows),
         threshold("guess_length").check(float(np.linalg.norm(guess[:3, 3]))),
@@ -123,22 +129,60 @@ def _lengths(points: Array) -> Array:
     return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
+_FRAME_M, _ALIKE_DEG, _ALIKE_CM = 1.0, 5.0, 50.0
+"""From how far on a motion of all cameras is that of a frame, and how alike it is, of rough guesses
+(the sample's are 2 deg and 20 cm off)."""
+
+
+def describe_other_frame(guess: Mapping[str, Array], results: Mapping[str, Array]) -> str:
+    """The frame of the guesses, where all cameras are moved alike; empty if they are not.
+
+    A single camera is if it is moved without a turn.
+
+    Args:
+        guess: (4, 4) T_camera_lidar.
+        results: (4, 4) T_camera_lidar of the cameras to compare.
+    """
+    T_frame_lidar = [invert(guess[name]) @ T for name, T in results.items()]
+    if not T_frame_lidar:
+        return ""
+    first = T_frame_lidar[0]
+    others = T_frame_lidar[1:] or [transform(np.eye(3), first[:3, 3])]
+    apart = [pose_difference(first, T) for T in others]
+    if np.linalg.norm(first[:3, 3]) < _FRAME_M or not all(
+        degrees < _ALIKE_DEG and centimetres < _ALIKE_CM for degrees, centimetres in apart
+    ):
+        return ""
+    x, y, z = first[:3, 3]
+    moved = "the camera is" if len(results) == 1 else "all cameras are"
+    return (
+        f"{moved} moved as if the guess were of another frame of the vehicle, as base_link, in "
+        f"which the LiDAR is at x {x:.2f}, y {y:.2f}, z {z:.2f} m: multiply its T_camera_lidar by "
+        "this pose from the right"
+    )
+
+
 def range_checks(evidence: RunEvidence) -> Checks:
     """Whether a result lies within the matcher's range around the guess."""
     findings, guess = evidence.run.correspondences.findings, evidence.run.guess.T_camera_lidar
+    results = evidence.run.solution.T_camera_lidar
+    found = {name: T for name, T in results.items() if name not in findings.missed}
+    frame = describe_other_frame(guess, found)
     return {
-        name: compare_with_range(guess[name], T, findings)
-        for name, T in evidence.run.solution.T_camera_lidar.items()
+        name: compare_with_range(guess[name], T, findings, frame) for name, T in results.items()
     }
 
 
-def compare_with_range(guess: Array, result: Array, findings: MatcherFindings) -> list[Check]:
+def compare_with_range(
+    guess: Array, result: Array, findings: MatcherFindings, frame: str = ""
+) -> list[Check]:
     """The largest component of the step from a guess to its result, over the matcher's range.
 
     Args:
         guess: (4, 4) T_camera_lidar from where the matcher started.
         result: (4, 4) T_camera_lidar.
         findings: of the matcher; without its range there are no checks.
+        frame: as of :func:`describe_other_frame`.
     """
     step = relative_transform(result, guess)
     rotation_deg = np.degrees(Rotation.from_matrix(step[:3, :3]).as_rotvec())
@@ -147,7 +191,7 @@ def compare_with_range(guess: Array, result: Array, findings: MatcherFindings) -
         (threshold("range_translation"), step[:3, 3], findings.range_translation_m),
     )
     return [
-        row.check(float(np.abs(three).max() / max(largest, 1e-9)))
+        row.check(float(np.abs(three).max() / max(largest, 1e-9)), advice=frame)
         for row, three, largest in components
         if largest is not None
     ]

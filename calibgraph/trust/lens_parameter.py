@@ -20,8 +20,9 @@ import numpy as np
 from scipy.special import expit, logit, ndtr, softmax
 
 from calibgraph.arrays import Array
-from calibgraph.graph.lens import LensSigmas, LensVariable
+from calibgraph.graph.lens import LensVariable
 from calibgraph.model.config import LensPart
+from calibgraph.model.lens_knowledge import LensSigmas
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Check, Status
 from calibgraph.solver.linear_fit import Freed
@@ -65,7 +66,7 @@ _PART_OF = {
     for name, kind in kinds.items()
     if (part := _WORDS[name][0]) is not None
 }
-_ESTIMATE = re.compile(r"(run with --estimate )\S+$")
+_ESTIMATE = re.compile(r"(run with --estimate )[a-z,]+((?: --[a-z-]+ [\w.]+)?)")
 
 _NAMES = FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT
 _PARTS: tuple[LensPart, ...] = "focal", "aspect", "centre", "distortion"
@@ -236,7 +237,7 @@ def _with_sigma(value: float, sigma: float) -> str:
 
 
 def check_parameter(
-    found: LensParameter, by: str, tolerance: tuple[float, float] = TOLERANCE
+    found: LensParameter, by: str, tolerance: tuple[float, float] = TOLERANCE, options: str = ""
 ) -> Check:
     """Whether a lens parameter is wrong: the value of the check is the probability.
 
@@ -244,13 +245,14 @@ def check_parameter(
         found: its estimate.
         by: RESIDUALS or IMAGES.
         tolerance: of the user [deg, cm].
+        options: that its estimate needs, as " --interval-s 0.1".
     """
     row, probability, (deg, cm) = threshold("lens"), found.probability(tolerance), found.moved
     status, (part, *_) = row.grade(probability), _WORDS[found.name]
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
     if status != "PASS":
         advice = "correct the time stamps" if found.name == TIME else row.advice
-        text += f": {advice}" + (f"; or run with --estimate {part}" if part else "")
+        text += f": {advice}" + (f"; or run with --estimate {part}{options}" if part else "")
     check = row.describe(probability, status, text, name=f"{found.name} by the {by}: {row.name}")
     return replace(check, kind=KINDS[by][found.name])
 
@@ -266,8 +268,10 @@ def advise_together(checks: Sequence[Check]) -> list[Check]:
     if len(parts) < 2:  # noqa: PLR2004
         return list(checks)
     all_parts = ",".join(["lens", *sorted(parts & {"aspect", "offset"})])
+    found = (_ESTIMATE.search(check.text) for check in checks if check.status != "PASS")
+    options = next((match[2] for match in found if match and match[2]), "")
     return [
-        replace(check, text=_ESTIMATE.sub(rf"\1{all_parts}", check.text))
+        replace(check, text=_ESTIMATE.sub(rf"\1{all_parts}{options}", check.text))
         if check.kind in _PART_OF
         else check
         for check in checks

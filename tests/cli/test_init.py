@@ -105,3 +105,71 @@ def test_words_for_a_camera_that_is_not_there_are_refused(recording: Path, call:
     line = error_line(*call("init", recording, "--mount", "rear=rear"))
     assert "--mount rear=...: no such camera; found are front_left, front_right, left" in line
     assert not (recording / "rig.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("how", "focal_px"), [("90 deg", 320.0), ("53.13°", 640.0), ("4 mm 8 um", 500.0)]
+)
+def test_a_lens_in_words_is_computed_with_what_is_uncertain_of_it(
+    recording: Path, call: Call, how: str, focal_px: float
+) -> None:
+    code, _, err = call("init", recording, "--lens", how, "--mount", "left=left",
+                        "--mount", "front_left=front", "--mount", "front_right=front")  # fmt: skip
+    assert code == 0
+    assert f"next: calibgraph doctor {recording}" in err
+    assert f"calibgraph calibrate {recording} --estimate lens" in err
+    for camera in load_rig(recording).cameras.values():
+        k, sigma = camera.intrinsics_px, camera.intrinsics_sigma_px
+        assert k.fx == k.fy == pytest.approx(focal_px, abs=0.01)
+        assert (k.cx, k.cy, camera.distortion) == (319.5, 179.5, ())
+        assert sigma is not None and sigma.centre == 5.0
+        assert sigma.focal == pytest.approx(0.02 * focal_px, abs=0.01)
+        assert camera.distortion_sigma == 0.05
+
+
+def test_a_lens_of_one_camera_is_named_and_the_others_are_filled_in(
+    recording: Path, call: Call
+) -> None:
+    assert call("init", recording, "--lens", "left=90 deg")[0] == 0
+    cameras = yaml.safe_load((recording / "rig.yaml").read_text())["cameras"]
+    assert {n for n, c in cameras.items() if c["intrinsics_px"]["fx"] == "FILL_IN"} == {
+        "front_left",
+        "front_right",
+    }
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("200 deg", "a field of view of 200 deg; of one over 150 deg the image is curved"),
+        ("wide", "lens 'wide'; expected calibration; a horizontal field of view, as '90 deg'; or"),
+        ("4 mm 0 um", "lens '4 mm 0 um'; expected"),
+        ("rear=90 deg", "--lens rear=...: no such camera; found are front_left"),
+    ],
+)
+def test_a_lens_that_is_not_understood_is_one_line(
+    recording: Path, call: Call, how: str, message: str
+) -> None:
+    assert message in error_line(*call("init", recording, "--lens", how))
+    assert not (recording / "rig.yaml").exists()
+
+
+def test_in_a_terminal_init_asks_for_the_lens_of_each_camera(
+    recording: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The answer of one camera is proposed for the next."""
+    asked, answers = [], iter(("90 deg", "90 deg", "calibration"))
+
+    def prompt(question: str, *, default: str, err: bool) -> str:
+        assert err
+        asked.append((question.partition(":")[0], default))
+        return next(answers)
+
+    monkeypatch.setattr("calibgraph.cli.guess._is_terminal", lambda: True)
+    monkeypatch.setattr("typer.prompt", prompt)
+    assert call("init", recording)[0] == 0
+    assert asked == [
+        ("front_left", "calibration"), ("front_right", "90 deg"), ("left", "90 deg")
+    ]  # fmt: skip
+    cameras = yaml.safe_load((recording / "rig.yaml").read_text())["cameras"]
+    assert [c["intrinsics_px"]["fx"] for c in cameras.values()] == [320.0, 320.0, "FILL_IN"]

@@ -13,9 +13,9 @@ from calibgraph.simulation.scenarios import SCENARIOS, scenario_of
 from tests.conftest import Call, make_camera
 
 
+@pytest.mark.usefixtures("open3d")
 @pytest.mark.slow
 def test_command_writes_a_dataset_and_none_over_it(call: Call, tmp_path: Path) -> None:
-    pytest.importorskip("open3d", reason="open3d is missing", exc_type=ImportError)
     Rig(cameras={"front": make_camera()}).save(tmp_path / "own.yaml")
     options = "--rig", tmp_path / "own.yaml", "--frames", 1, "--beams", 16
     code, _, errors = call("simulate", "street", *options, "--out", tmp_path / "made")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import logging
 import re
 from pathlib import Path
 
 import pytest
 from rich.console import Console
+from rich.table import Table
 
 from calibgraph.cli import terminal
 from calibgraph.cli.terminal import LINE_EVERY_S, progress_lines
@@ -35,6 +37,26 @@ def test_a_terminal_shows_a_bar_with_the_time_that_is_left(
         progress("round 1 of 3: front", 1, 4)
     shown = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", screen.getvalue())
     assert re.search(r"round 1 of 3: front.* 0:00:00 left -:--:--", shown)
+
+
+def test_names_of_others_do_nothing_to_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen, name = io.StringIO(), "a\x1b[2Jb\x7fc\x9b2Jd\u202ee"
+    monkeypatch.setattr("sys.stderr", screen)
+    console = terminal.terminal()
+    terminal.print_plain(console, name)
+    table = Table(name)
+    table.add_row(name)
+    console.print(table)
+    with terminal.progress_bar(name):
+        logging.getLogger("calibgraph").warning(name)
+    shown = screen.getvalue()
+    assert shown.count("a\\x1b[2Jb") == 4
+    assert all(line.isprintable() for line in shown.splitlines())
+
+
+def test_a_file_name_in_an_error_does_nothing_to_a_terminal(call: Call) -> None:
+    code, _, err = call("evaluate", "no\x1b[2J\u202esuch", SAMPLE)
+    assert code == 2 and err.strip().isprintable() and "no\\x1b[2J\\u202esuch" in err
 
 
 def test_short_work_prints_no_progress(call: Call, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import gtsam
 import numpy as np
 import pytest
@@ -53,28 +52,6 @@ def test_the_unified_model_equals_its_formula_wherever_it_sees(xi: float) -> Non
     np.testing.assert_allclose(pixels[valid], expected, rtol=1e-12, atol=1e-9)
     if xi > 0.5:  # it sees behind itself
         assert (points[valid, 2] < 0).sum() > 200
-
-
-def test_the_unified_model_without_a_mirror_is_a_pinhole() -> None:
-    points = points_all_round()
-    pixels, valid = unified_lens(0.0).project(points)
-    expected, _ = cv2.projectPoints(
-        points[valid], np.zeros(3), np.zeros(3),
-        np.array([[K["fx"], 0, K["cx"]], [0, K["fy"], K["cy"]], [0, 0, 1]]), np.array(DISTORTION),
-    )  # fmt: skip
-    np.testing.assert_allclose(pixels[valid], expected[:, 0], rtol=1e-12, atol=1e-9)
-    assert valid.any() and not valid[points[:, 2] < 0].any()
-
-
-@pytest.mark.skipif(not hasattr(cv2, "omnidir"), reason="opencv-contrib is not installed")
-def test_the_unified_model_equals_opencv() -> None:
-    matrix = np.array([[K["fx"], 0, K["cx"]], [0, K["fy"], K["cy"]], [0, 0, 1]])
-    points = points_all_round()
-    pixels, valid = unified_lens(1.6).project(points)
-    expected, _ = cv2.omnidir.projectPoints(
-        points[valid][:, None], np.zeros(3), np.zeros(3), matrix, 1.6, np.array(DISTORTION)
-    )
-    np.testing.assert_allclose(pixels[valid], expected.reshape(-1, 2), rtol=0, atol=1e-9)
 
 
 def test_a_panorama_equals_longitude_and_latitude() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -173,10 +174,7 @@ def test_clouds_are_read_without_open3d(tmp_path: Path, monkeypatch: pytest.Monk
         np.testing.assert_array_equal(load_cloud(tmp_path / name), CLOUD)
 
 
-def test_the_compressed_clouds_of_open3d_are_read(tmp_path: Path) -> None:
-    open3d = pytest.importorskip(
-        "open3d", reason="open3d or a system library of it is missing", exc_type=ImportError
-    )
+def test_the_compressed_clouds_of_open3d_are_read(tmp_path: Path, open3d: Any) -> None:
     points = np.round(CLOUD, 1)  # repeats
     cloud = open3d.t.geometry.PointCloud(open3d.core.Tensor(points[:, :3].copy()))
     cloud.point["intensity"] = open3d.core.Tensor(points[:, 3:].copy())

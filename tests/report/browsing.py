@@ -27,7 +27,7 @@ def browser() -> str:
     names = ("chromium", "chromium-browser", "google-chrome")
     path = next(filter(None, map(shutil.which, names)), None)
     if path is None:
-        pytest.skip("no chromium on the PATH: install Debian's chromium to run this")
+        pytest.skip("no chromium: apt-get install chromium")
     return path
 
 

@@ -61,7 +61,7 @@ class Postgres:
 def postgres(tmp_path: Path) -> Iterator[Postgres]:
     found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
     if not found:
-        pytest.skip("PostgreSQL is not installed")
+        pytest.skip("no PostgreSQL: apt-get install postgresql")
     pytest.importorskip("psycopg")
     folder = tmp_path / "postgres"
     folder.mkdir()

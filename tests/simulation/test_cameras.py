@@ -22,9 +22,7 @@ from calibgraph.simulation.solids import ellipsoid
 from calibgraph.simulation.world import build_world, cast
 from tests.simulation.conftest import LENSES, SCAN, small_camera
 
-pytest.importorskip(
-    "open3d", reason="open3d or a system library of it is missing", exc_type=ImportError
-)
+pytestmark = pytest.mark.usefixtures("open3d")
 
 
 @pytest.mark.parametrize("lens", LENSES)

@@ -18,9 +18,7 @@ from calibgraph.simulation.recording import Drive
 from calibgraph.simulation.world import cast, find_albedos
 from tests.simulation.conftest import SCAN
 
-pytest.importorskip(
-    "open3d", reason="open3d or a system library of it is missing", exc_type=ImportError
-)
+pytestmark = pytest.mark.usefixtures("open3d")
 
 
 def noiseless(drive: Drive, frame: int, directions: np.ndarray) -> np.ndarray:

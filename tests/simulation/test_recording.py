@@ -17,9 +17,7 @@ from calibgraph.simulation.street import Layout, build_street, draw_layout, wind
 from tests.simulation.conftest import SCAN
 from tools.scenes.surroundings import SURROUNDINGS
 
-pytest.importorskip(
-    "open3d", reason="open3d or a system library of it is missing", exc_type=ImportError
-)
+pytestmark = pytest.mark.usefixtures("open3d")
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,7 @@ import pytest
 from calibgraph import load_dataset, load_rig
 from tests.conftest import ROOT, SAMPLE, Call
 
-pytest.importorskip(
-    "open3d", reason="open3d or a system library of it is missing", exc_type=ImportError
-)
+pytestmark = pytest.mark.usefixtures("open3d")
 
 
 @pytest.mark.ci

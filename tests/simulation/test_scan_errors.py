@@ -15,9 +15,7 @@ from calibgraph.simulation.scan_errors import ScanErrors, draw_scan_errors, fore
 from calibgraph.simulation.world import Hits, cast
 from tests.simulation.conftest import SCAN, small_camera
 
-pytest.importorskip(
-    "open3d", reason="open3d or a system library of it is missing", exc_type=ImportError
-)
+pytestmark = pytest.mark.usefixtures("open3d")
 
 EXACT = replace(SCAN, range_noise_m=0.0, dropout=0.0)
 

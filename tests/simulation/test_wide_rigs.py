@@ -10,9 +10,7 @@ import calibgraph
 from calibgraph import evaluate, load_rig, perturb, simulate_correspondences, simulate_street, solve
 from calibgraph.simulation.rigs import rig_of
 
-pytest.importorskip(
-    "open3d", reason="open3d or a system library of it is missing", exc_type=ImportError
-)
+pytestmark = pytest.mark.usefixtures("open3d")
 
 
 @pytest.mark.parametrize("name", ["omni", "panorama"])

@@ -11,6 +11,8 @@ from calibgraph.model.findings import MatcherFindings
 from calibgraph.trust.guess import (
     compare_with_guess,
     compare_with_other_guesses,
+    compare_with_range,
+    describe_other_frame,
 )
 from tests.trust.conftest import named, simulated
 
@@ -49,15 +51,6 @@ def test_swapped_cameras_are_named(pair: Rig) -> None:
     assert compare_with_other_guesses("left", *alone) == []
 
 
-def test_beside_a_lost_camera_the_found_one_is_compared_alone(pair: Rig) -> None:
-    guess = calibgraph.perturb(pair, rotation_deg=1, translation_m=0.1, seed=3).T_camera_lidar
-    right = pair.T_camera_lidar["left"]
-    (check,) = compare_with_other_guesses("left", guess, {"left": right})
-    assert check.status == "PASS"
-    (check,) = compare_with_other_guesses("left", guess, {"left": pair.T_camera_lidar["right"]})
-    assert check.status != "PASS" and "right" in check.name
-
-
 @pytest.mark.parametrize(
     ("degrees", "metres", "false_fails", "named"),
     [(2.0, 0.2, 0.002, 0.9), (10.0, 0.5, 0.01, 0.1), (20.0, 1.5, 0.01, 0.0)],
@@ -84,3 +77,24 @@ def test_points_in_millimetres_fail(pair: Rig) -> None:
     huge = replace(table, points_lidar_m=1000 * table.points_lidar_m)
     result = solve(pair, huge)
     assert named(result, "left", "are the clouds in millimetres?")[0].status == "FAIL"
+
+
+def test_guesses_from_another_frame_of_the_vehicle_are_named(pair: Rig) -> None:
+    """Of rough guesses, of one camera too; not of guesses that differ from each other."""
+    T_lidar_base = np.eye(4)
+    T_lidar_base[:3, 3] = -1.1, 0.0, -1.9
+    rough = calibgraph.perturb(pair, rotation_deg=2, translation_m=0.2, seed=1)
+    from_base = {name: T @ T_lidar_base for name, T in rough.T_camera_lidar.items()}
+    text = describe_other_frame(from_base, pair.T_camera_lidar)
+    assert text.startswith("all cameras are moved as if the guess were of another frame")
+    left = {"left": pair.T_camera_lidar["left"]}
+    assert describe_other_frame(from_base, left).startswith("the camera is moved as if")
+    exact = {name: T @ T_lidar_base for name, T in left.items()}
+    assert "x 1.10, y 0.00, z 1.90 m" in describe_other_frame(exact, left)
+    apart = from_base | {"right": pair.T_camera_lidar["right"]}
+    assert describe_other_frame(apart, pair.T_camera_lidar) == ""
+    assert describe_other_frame(rough.T_camera_lidar, pair.T_camera_lidar) == ""
+    (check,) = compare_with_range(
+        exact["left"], left["left"], MatcherFindings(range_translation_m=0.3), text
+    )
+    assert check.status == "FAIL" and text in check.text

@@ -35,7 +35,7 @@ def load_bag_cloud(path: Path, motion: ScanMotion | None = None) -> NDArray[np.f
 def scan_duration_s(path: Path) -> float | None:
     """Seconds between the first and the last point of a cloud in a message; None without times."""
     content = read_message(path)[1]
-    if not time_fields(content):
+    if not time_fields(each.name for each in content.fields):
         return None
     times_s = timed_points_of(content, str(path))[1]
     return float(np.ptp(times_s)) if len(times_s) else None

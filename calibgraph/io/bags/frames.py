@@ -1,6 +1,6 @@
 """The frames of a bag: each cloud with the image of every camera that is nearest by stamp."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,19 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
+from calibgraph.io.bags.camera_info import LensStates, same_lens
 from calibgraph.io.bags.messages import Bag
 from calibgraph.io.bags.options import BagOptions, Motion
-from calibgraph.io.bags.point_clouds import time_fields
+from calibgraph.io.bags.point_clouds import doubtful_time_fields, time_fields
 from calibgraph.io.bags.stamps import (
     TopicStamps,
     describe_offsets,
     nearest,
     offsets_of,
-    read_stamps,
-    to_every_ns,
-    windows_of,
+    read_messages,
 )
 from calibgraph.io.bags.topics import RigTopics, choose_topics
+from calibgraph.io.lenses import CameraLens
+from calibgraph.model.rig import Camera
 
 _S = 1_000_000_000
 Rows = NDArray[np.int64]
@@ -61,14 +62,12 @@ class BagFrames:
     summary: str
 
 
-def frames_of_bag(path: Path, cameras: Sequence[str], options: BagOptions) -> BagFrames:
+def frames_of_bag(path: Path, cameras: Mapping[str, Camera], options: BagOptions) -> BagFrames:
     """Pair the clouds of a bag with its images, without keeping any of them."""
     bag = Bag(path)
-    topics = choose_topics(bag, options.topics, cameras)
+    topics = choose_topics(bag, options.topics, [*cameras])
     images = {name: each.image for name, each in topics.cameras.items()}
-    read = [topics.lidar, *images.values()]
-    windows = windows_of(bag, read, options.every_s)
-    stamps = read_stamps(bag, read, windows, options.stamps)
+    stamps, lenses = _read(bag, topics, options)
     clouds = stamps[topics.lidar]
     tolerance_ns = round(options.tolerance_s * _S)
     pairs = {n: nearest(clouds, stamps[topic], tolerance_ns) for n, topic in images.items()}
@@ -76,8 +75,11 @@ def frames_of_bag(path: Path, cameras: Sequence[str], options: BagOptions) -> Ba
     summary = _summary(stamps, topics, pairs, complete, options=options)
     if not len(complete):
         raise DatasetError(f"{path}: {summary}; {_advice(stamps, topics, pairs)}")
-    record_ns = np.array(clouds.record_ns)[complete]
-    cells = _cells(record_ns, bag.start_ns, options.every_s)
+    for name, states in lenses.items():
+        record_ns = np.array(stamps[images[name]].record_ns)[pairs[name][complete]]
+        fits, note = _with_lens_of_rig(cameras[name], states, record_ns)
+        complete, summary = complete[fits], summary + (note and f"; {name}: {note}")
+    _, cells = np.unique(np.array(clouds.cells)[complete], return_inverse=True)
     recorded = tuple(
         BagFrame(
             number=int(row + cell),
@@ -96,39 +98,78 @@ def frames_of_bag(path: Path, cameras: Sequence[str], options: BagOptions) -> Ba
         )
         for row, cell in zip(complete, cells, strict=True)
     )
-    picked = _picked(record_ns, cells, windows) if options.every_s else range(len(recorded))
-    return BagFrames(recorded, tuple(picked), summary + _note(bag, topics.lidar, options.motion))
+    of_cells = (np.flatnonzero(cells == cell) for cell in range(len(set(cells))))
+    picked = (int(rows[len(rows) // 2]) for rows in of_cells)  # in the middle: with neighbours
+    chosen = tuple(picked) if options.every_s else tuple(range(len(recorded)))
+    return BagFrames(recorded, chosen, summary + _note(clouds, options.motion))
 
 
-def _note(bag: Bag, topic: str, motion: Motion) -> str:
+def _read(
+    bag: Bag, topics: RigTopics, options: BagOptions
+) -> tuple[dict[str, TopicStamps], dict[str, LensStates]]:
+    """The stamps of clouds and images by topic, and the lenses by camera."""
+    stamps = {t: TopicStamps() for t in (topics.lidar, *(c.image for c in topics.cameras.values()))}
+    infos = {name: c for name, c in topics.cameras.items() if c.info and bag.has(c.info)}
+    lenses = {
+        name: LensStates(f"{bag.path}: {c.info}", rectified=c.rectified)
+        for name, c in infos.items()
+    }
+    of_info = {c.info: lenses[name] for name, c in infos.items()}
+    beside = [info for info in of_info if info]
+    for cell, message in read_messages(bag, [*stamps], options.every_s, beside):
+        if message.topic in stamps:
+            stamps[message.topic].add(message, cell, bag, options.stamps)
+        else:
+            of_info[message.topic].add(message.content, message.record_ns)
+    return stamps, lenses
+
+
+def _with_lens_of_rig(
+    camera: Camera, states: LensStates, record_ns: Rows
+) -> tuple[NDArray[np.bool_], str]:
+    """(n,) which images, by their times of recording, have the lens of the rig; and a note.
+
+    All do if no CameraInfo has it: then the rig's is from elsewhere.
+    """
+    size_px = camera.width_px, camera.height_px
+    own = CameraLens(camera.model, size_px, camera.intrinsics_px, camera.distortion)
+    first = next((each for each in states.lenses if same_lens(each.lens, own)), None)
+    fits = np.ones(len(record_ns), bool)
+    if first is not None:
+        fits = np.array([each.agrees(first) for each in states.lenses])[states.which(record_ns)]
+    notes = [f"{states.without} camera_info have no lens"] * bool(states.without)
+    if states.lenses[1:]:
+        one, two = states.lenses[:2]
+        notes.append(
+            f"its camera_info changes at {states.since_ns[1] / _S:.3f} s (recorded), from "
+            f"{one.in_words()} to {two.in_words()}"
+        )
+    if not fits.all():
+        notes.append(
+            f"{np.sum(~fits)} frames with another lens than the rig's are left out; for them give "
+            "a rig with their lens (--rig)"
+        )
+    return fits, "; ".join(notes)
+
+
+def _note(clouds: TopicStamps, motion: Motion) -> str:
     """How clouds are corrected for motion, or what to do if points have times."""
-    times = time_fields(bag.first(topic))
+    (names, _), *others = clouds.fields.most_common()
+    times, doubtful = time_fields(names), doubtful_time_fields(names)
+    note = f"; {sum(n for _, n in others)} clouds have other fields" if others else ""
+    unread = f"{', '.join(doubtful)} may be times of points, which are read from t, time, timestamp"
     if motion != "none":
-        of = times[0] if times else "stamp of the cloud, as points have no times"
-        return f"; clouds are corrected for motion by {motion}, with the {of}"
-    if not times:
-        return ""
-    return (
-        f"; points have a {times[0]}: unless they are corrected for motion, give --motion "
-        "odometry, tf or scans, or stand still"
-    )
-
-
-def _cells(record_ns: Rows, start_ns: int, every_s: float | None) -> Rows:
-    """(n,) in which ``every_s`` of the bag each message was recorded; 0 without it."""
-    if every_s is None:
-        return np.zeros_like(record_ns)
-    return (record_ns - start_ns) // to_every_ns(every_s)
-
-
-def _picked(record_ns: Rows, cells: Rows, windows: Sequence[tuple[int, int]]) -> tuple[int, ...]:
-    """Positions of the frames nearest to the middles of their windows: they have neighbours."""
-    middles = np.array([(start + stop) // 2 for start, stop in windows])
-    apart = np.abs(record_ns - middles[cells])
-    return tuple(
-        int(rows[np.argmin(apart[rows])])
-        for rows in (np.flatnonzero(cells == cell) for cell in np.unique(cells))
-    )
+        of = times[0] if times else "stamp of the cloud"
+        note += f"; clouds are corrected for motion by {motion}, with the {of}"
+        note += "" if times else f", as {unread}" if doubtful else ", as points have no times"
+    elif times:
+        note += (
+            f"; points have a {times[0]}: unless they are corrected for motion, give --motion "
+            "odometry, tf or scans, or stand still"
+        )
+    elif doubtful:
+        note += f"; {unread}: rename the field if they are"
+    return note
 
 
 def _summary(
@@ -154,13 +195,11 @@ def _summary(
             parts.append(f"{name} {np.median(ahead_ms):+.0f} ms (median), at most {most:.0f}")
         if np.any(rows < 0):
             parts.append(f"{np.sum(rows < 0)} without an image of {name}")
-    for topic, each in stamps.items():
-        counted = (
-            (each.repeated, "repeat a stamp"),
-            (each.empty, "have no point"),
-            (each.back, "have a stamp before the last"),
-        )
-        parts += [f"{topic}: {count} {what}" for count, what in counted if count]
+    parts += [
+        f"{topic}: {count} {what}"
+        for topic, each in stamps.items()
+        for what, count in each.left_out.items()
+    ]
     return "; ".join(parts)
 
 

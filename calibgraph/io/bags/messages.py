@@ -92,6 +92,7 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 TREES = (TRANSFORMS, "tf/msg/tfMessage")  # the latter of tf before tf2, with the same fields
 
 _MOST_OPEN_BAGS = 8
+_LATEST_NS = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,6 @@ class Bag:
             self._recording = open_recording(path)
         weakref.finalize(self, self._recording.close)
         self.topics = self._recording.topics
-        self.start_ns, self.stop_ns = self._recording.start_ns, self._recording.stop_ns
 
     def of_type(self, *types: str) -> list[Topic]:
         """The topics of these types that have messages, sorted by name."""
@@ -130,7 +130,7 @@ class Bag:
         return topic in self.topics and bool(self.topics[topic].count)
 
     def messages(
-        self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
+        self, topics: Collection[str], start_ns: int = 0, stop_ns: int = _LATEST_NS
     ) -> Iterator[Message]:
         """The messages recorded from ``start_ns`` to before ``stop_ns``, in that order, lazily."""
         last: dict[str, tuple[int, int]] = {}
@@ -140,6 +140,12 @@ class Bag:
                 last[topic] = record_ns, number + 1 if before == record_ns else 0
                 content = self._deserialize(topic, record_ns, data)
                 yield Message(topic, record_ns, last[topic][1], content)
+
+    def next_time(self, topics: Collection[str], start_ns: int = 0) -> int | None:
+        """When the first message of some topics was recorded from ``start_ns`` on [ns], if any."""
+        with errors_in_one_line(self.path):
+            found = self._recording.messages(topics, start_ns, _LATEST_NS)
+            return next((record_ns for _, record_ns, _ in found), None)
 
     def first(self, topic: str) -> Any:
         """The content of a topic's first message."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
-from calibgraph.io.encoded_images import decode_image
+from calibgraph.io.encoded_images import decode_image, describe_turn
 
 Image = NDArray[np.uint8]
 
@@ -155,15 +155,21 @@ def _of_compressed(message: Any, where: str) -> Image:
     encoding, _, codec = message.format.partition(";")
     data = np.ascontiguousarray(message.data).tobytes()
     if not data.startswith((b"\xff\xd8", b"\x89PNG")):
-        raise DatasetError(f"{where}: its format {message.format!r} is neither JPEG nor PNG")
+        raise DatasetError(
+            f"{where}: its format {message.format!r} is neither JPEG nor PNG; decode it with "
+            "`ros2 run image_transport republish`, of video through ffmpeg, and give that topic"
+        )
     mosaic = encoding.startswith("bayer_") and "bgr" not in codec and "rgb" not in codec
     kind = cv2.IMREAD_GRAYSCALE if mosaic else cv2.IMREAD_COLOR
     try:
+        turned = describe_turn(data)
         decoded = decode_image(data, kind | cv2.IMREAD_ANYDEPTH)
     except ValueError as error:
         raise DatasetError(
             f"{where}: is truncated or no image of its kind ({error}); record it again"
         ) from error
+    if turned:
+        raise DatasetError(f"{where}: {turned}")
     image = _to_8_bits(decoded)
     if mosaic:
         return _to_bgr(image, _layout(encoding, where)[0])

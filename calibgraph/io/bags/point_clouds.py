@@ -1,6 +1,7 @@
 """PointCloud2 messages: fields in any order, of any type and byte order, organised or not."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,9 @@ from calibgraph.errors import DatasetError
 from calibgraph.io.point_fields import find_intensity, make_cloud
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_TIMES = ("t", "time", "timestamp", "offset_time", "time_offset")  # Ouster, Velodyne, Hesai, Livox
+_TIMES = ("t", "time", "timestamp", "offset_time", "time_offset", "time_stamp")
+"""Of Ouster, Velodyne, Hesai, Livox, and Autoware."""
+_LIKE_A_TIME = re.compile(r"time|stamp|^ts?_|_ts?$|^(ts|dt|sec|nsec|usec|t\d)")
 _STAMPS, _NANOSECOND_STAMPS = 1e6, 1e15  # times since a scan's start are smaller, since 1970 larger
 _LONGEST_S = 1.0
 
@@ -43,7 +46,7 @@ def timed_points_of(message: Any, where: str) -> tuple[NDArray[np.float32], NDAr
     """
     cloud, returned = _all_points(message, where)
     points = np.asarray(cloud[returned], dtype=np.float32)
-    names = time_fields(message)
+    names = time_fields(each.name for each in message.fields)
     if not names:
         return points, np.zeros(len(points))
     times = _structured(message, where, names[:1])[names[0]][returned]
@@ -86,9 +89,14 @@ def has_points(message: Any, where: str) -> bool:
         return bool((np.isfinite(x) & (x != 0)).any())
 
 
-def time_fields(message: Any) -> list[str]:
+def time_fields(names: Iterable[str]) -> list[str]:
     """The fields that give each point a time: such clouds are often as they were scanned."""
-    return [each.name for each in message.fields if each.name in _TIMES]
+    return [name for name in names if name in _TIMES]
+
+
+def doubtful_time_fields(names: Iterable[str]) -> list[str]:
+    """The fields that may be times by their names, and are not read."""
+    return [name for name in names if name not in _TIMES and _LIKE_A_TIME.search(name.lower())]
 
 
 def _structured(message: Any, where: str, chosen: Sequence[str] = ()) -> NDArray[np.void]:

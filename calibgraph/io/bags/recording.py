@@ -19,26 +19,19 @@ class Topic:
 
 
 class Recording(Protocol):
-    """An open bag.
-
-    Attributes:
-        topics: by name.
-        start_ns, stop_ns: when the first message was recorded, and after the last [ns].
-    """
+    """An open bag; ``topics`` are by name."""
 
     topics: dict[str, Topic]
-    start_ns: int
-    stop_ns: int
 
     def messages(
-        self, topics: Collection[str], start_ns: int | None, stop_ns: int | None
+        self, topics: Collection[str], start_ns: int, stop_ns: int
     ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of recording [ns] and bytes of the messages of some topics.
+        """Topic, time of recording [ns] and bytes of the messages of some topics, by time.
 
         Args:
             topics: names.
-            start_ns: when the first was recorded at the earliest [ns]; None for the bag's start.
-            stop_ns: before which the last was recorded [ns]; None for the bag's end.
+            start_ns: when the first was recorded at the earliest [ns].
+            stop_ns: before which the last was recorded [ns].
         """
         ...
 

@@ -3,24 +3,27 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.errors import DatasetError
+from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
 from calibgraph.io.bags.camera_info import StatedLens, lens_of, stated_baseline
 from calibgraph.io.bags.messages import CAMERA_INFO, Bag, Drive
 from calibgraph.io.bags.options import BagOptions
 from calibgraph.io.bags.topics import CameraTopics, choose_topics
 from calibgraph.io.bags.transforms import Transforms
+from calibgraph.io.mounts import find_mounts
 from calibgraph.model.geometry import angle_deg, relative_transform
-from calibgraph.model.rig import Camera, RelativePose, Rig
+from calibgraph.model.rig import Camera, Mount, RelativePose, Rig
 
 _UPWARD = 0.9
 """Vertical part of a camera's axis (64 deg), beyond which it looks up: z is up in body axes."""
+_MOST_WITHOUT_LENS = 100  # messages at the start, each of which may be in a chunk of its own
 _LEAST_BASELINE_M = 1e-3
 _AT_ONE_PLACE = 0.05
 """Of a stated baseline: frames of /tf_static that are nearer to each other leave it out."""
@@ -33,14 +36,23 @@ class BagCamera:
     Attributes:
         stated: the lens in its CameraInfo.
         T_camera_lidar: (4, 4); None if no static transforms connect it with the LiDAR.
+        mount: the link of the tree that a calibration changes; None if there is none but itself.
         frame_id: of its image, if the frame has the image's axes and origin.
+        with_baseline: whether its place is its frame's, and the baseline that its P states.
         where: its CameraInfo, for errors.
     """
 
     stated: StatedLens
     T_camera_lidar: Array | None
     frame_id: str | None
+    with_baseline: bool
     where: str
+    mount: Mount | None = None
+
+    @property
+    def T_camera_frame(self) -> Array:
+        """(4, 4) from the frame in the tree."""
+        return self.stated.T_image_frame(with_baseline=self.with_baseline)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +79,14 @@ class BagRig:
             DatasetError: if an extrinsic is missing.
             FileError: if a value is no camera's.
         """
+        shared = _shared_frames(self.cameras)
+        if relative_sigmas is not None and shared:
+            frame, names = next(iter(shared.items()))
+            raise DatasetError(
+                f"{self.path}: {' and '.join(names)} name one frame, {frame!r}, so their relative "
+                "pose is not known and cannot be taken as measured; leave out --tie-deg and "
+                "--tie-m, or write relative_poses into the rig file"
+            )
         cameras = {
             name: checked_model(Camera, self._content(name), camera.where)
             for name, camera in self.cameras.items()
@@ -92,7 +112,11 @@ class BagRig:
                 "give the rig (--rig)",
                 camera=name,
             )
-        extrinsic = {"frame_id": camera.frame_id, "T_camera_lidar": camera.T_camera_lidar}
+        extrinsic = {
+            "frame_id": camera.frame_id,
+            "mount": camera.mount,
+            "T_camera_lidar": camera.T_camera_lidar,
+        }
         return {**camera.stated.lens.fields(), **extrinsic}
 
 
@@ -110,7 +134,18 @@ def read_bag_rig(path: Path, options: BagOptions | None = None) -> BagRig:
         name: camera if counts[camera.frame_id] == 1 else replace(camera, frame_id=None)
         for name, camera in cameras.items()
     }
-    notes = (*reader.transforms.notes, *reader.notes)
+    hanging = {
+        name: (camera.stated.frame, camera.T_camera_frame)
+        for name, camera in cameras.items()
+        if camera.T_camera_lidar is not None
+    }
+    mounts = find_mounts(hanging, lidar, reader.transforms.parents, reader.transforms.known)
+    cameras = {name: replace(camera, mount=mounts.get(name)) for name, camera in cameras.items()}
+    shared = (
+        f"{path}: {' and '.join(names)} name one frame, {frame!r}: at most one of them is there"
+        for frame, names in _shared_frames(cameras).items()
+    )
+    notes = (*chosen.notes, *reader.transforms.notes, *reader.notes, *shared)
     return BagRig(path, lidar, cameras, reader.transforms, notes)
 
 
@@ -164,15 +199,15 @@ class _CameraReader:
         """
         if topics.info is None:
             raise DatasetError(
-                f"{self._drive.bag.path}: {topics.image} has no camera_info beside it; give a rig "
-                f"with the lens of camera {name!r} (--rig)",
+                f"{self._drive.bag.path}: {_why_no_info(name, topics)}, or give a rig with the "
+                f"lens of camera {name!r} (--rig)",
                 camera=name,
             )
         bag = next(bag for bag in self._drive if bag.has(topics.info))
         if bag is not self._drive.bag:
             self.notes.append(f"{self._drive.bag.path}: {topics.info} is that of {bag.path}")
         where = f"{bag.path}: {topics.info}"
-        lens = lens_of(bag.first(topics.info), where, rectified=topics.rectified)
+        lens = _first_lens(bag, topics, where)
         with_baseline = self._counts_baseline(name, lens, bag, topics.info)
         T_frame_lidar = self.transforms.between(lens.frame, self._lidar)
         T_image_frame = lens.T_image_frame(with_baseline=with_baseline)
@@ -184,7 +219,7 @@ class _CameraReader:
                 "has a frame of their own"
             )
         frame_id = None if lens.is_turned or with_baseline else lens.frame or None
-        return BagCamera(lens, T_camera_lidar, frame_id, where)
+        return BagCamera(lens, T_camera_lidar, frame_id, with_baseline, where)
 
     def _counts_baseline(self, name: str, lens: StatedLens, bag: Bag, info: str) -> bool:
         """Whether the frame of a second camera is at the place of the first, not at its own."""
@@ -211,6 +246,41 @@ class _CameraReader:
             if T is not None and np.linalg.norm(T[:3, 3]) < _AT_ONE_PLACE * length_m:
                 return topic.name
         return None
+
+
+def _why_no_info(name: str, topics: CameraTopics) -> str:
+    """Why no CameraInfo is an image's, and what to do."""
+    if not topics.infos:
+        return f"{topics.image} has no camera_info beside it; record it"
+    also = f", which may be that of {', '.join(topics.rivals)} too" if topics.rivals else ""
+    return (
+        f"which camera_info is that of {topics.image}? There is {', '.join(topics.infos)}{also}; "
+        f"name both: --topic {name}={topics.image},/CAMERA_INFO"
+    )
+
+
+def _first_lens(bag: Bag, topics: CameraTopics, where: str) -> StatedLens:
+    """The lens of the first CameraInfo that has one: some drivers begin with zeros.
+
+    Raises:
+        FileError: why the first has none, if no other has.
+    """
+    error: FileError | None = None
+    for message in islice(bag.messages([topics.infos[0]]), _MOST_WITHOUT_LENS):
+        try:
+            return lens_of(message.content, where, rectified=topics.rectified)
+        except FileError as found:
+            error = error or found
+    raise error or FileError(where, "has no message")
+
+
+def _shared_frames(cameras: Mapping[str, BagCamera]) -> dict[str, list[str]]:
+    """The cameras by the frame that they name, if several name one and no baseline parts them."""
+    named: dict[str, list[str]] = {}
+    for name, camera in cameras.items():
+        if not camera.with_baseline:
+            named.setdefault(camera.stated.frame, []).append(name)
+    return {frame: names for frame, names in named.items() if names[1:]}
 
 
 def _relative_poses(

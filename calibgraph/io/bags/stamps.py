@@ -1,6 +1,7 @@
 """The stamps of a bag's clouds and images: one pass over the messages, none of which is kept."""
 
-from collections.abc import Collection, Iterable
+from collections import Counter
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from calibgraph.io.bags.point_clouds import has_points
 from calibgraph.io.bags.transforms import stamp_ns_of
 
 _S = 1_000_000_000
+_IN_EACH = 4
+"""Messages of each topic at the start of each ``every_s``: one in the middle has neighbours."""
 
 
 @dataclass
@@ -23,67 +26,80 @@ class TopicStamps:
         paths: their addresses.
         record_ns: when they were recorded.
         stamp_ns: when they were taken; the same as ``record_ns`` if so chosen.
-        repeated: number of messages left out because their stamp had been seen.
-        empty: number of clouds left out because they have no point.
-        back: how often a stamp was earlier than the one before.
+        cells: in which ``every_s`` of the bag they were recorded.
+        fields: of clouds, how many have these fields.
+        left_out: how many messages are left out or strange, by the reason.
     """
 
     paths: list[Path] = field(default_factory=list)
     record_ns: list[int] = field(default_factory=list)
     stamp_ns: list[int] = field(default_factory=list)
-    repeated: int = 0
-    empty: int = 0
-    back: int = 0
+    cells: list[int] = field(default_factory=list)
+    fields: Counter[tuple[str, ...]] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
     _seen: set[int] = field(default_factory=set)
+    _frame: str | None = None
 
-    def add(self, message: Message, bag: Bag, stamps: Stamps) -> None:
+    def add(self, message: Message, cell: int, bag: Bag, stamps: Stamps) -> None:
         """Count the message in, or why it is left out."""
         stamp_ns = stamp_ns_of(message.content) if stamps == "header" else message.record_ns
         if stamp_ns in self._seen:
-            self.repeated += 1
+            self.left_out["repeat a stamp"] += 1
             return
         self._seen.add(stamp_ns)
-        path = message.path_in(bag.path)
-        is_cloud = bag.topics[message.topic].type in CLOUDS
-        if is_cloud and not has_points(message.content, str(path)):
-            self.empty += 1
+        path, is_cloud = message.path_in(bag.path), bag.topics[message.topic].type in CLOUDS
+        frame = message.content.header.frame_id.lstrip("/")
+        self._frame = frame if self._frame is None else self._frame
+        if frame != self._frame:
+            self.left_out[f"name another frame than the first ({frame}, not {self._frame})"] += 1
+        if is_cloud and frame != self._frame:
             return
-        self.back += bool(self.stamp_ns) and stamp_ns < self.stamp_ns[-1]
+        if is_cloud and not has_points(message.content, str(path)):
+            self.left_out["have no point"] += 1
+            return
+        if is_cloud:
+            self.fields[tuple(each.name for each in message.content.fields)] += 1
+        if self.stamp_ns and stamp_ns < self.stamp_ns[-1]:
+            self.left_out["have a stamp before the last"] += 1
         self.paths.append(path)
         self.record_ns.append(message.record_ns)
         self.stamp_ns.append(stamp_ns)
+        self.cells.append(cell)
 
 
-def read_stamps(
-    bag: Bag, topics: Collection[str], windows: Iterable[tuple[int, int]], stamps: Stamps
-) -> dict[str, TopicStamps]:
-    """The stamps of some topics within windows of recording time [ns], one after another."""
-    found = {topic: TopicStamps() for topic in topics}
-    for start_ns, stop_ns in windows:
-        for message in bag.messages(topics, start_ns, stop_ns):
-            found[message.topic].add(message, bag, stamps)
-    return found
+def read_messages(
+    bag: Bag, topics: Collection[str], every_s: float | None, beside: Collection[str] = ()
+) -> Iterator[tuple[int, Message]]:
+    """The messages of some topics, and which ``every_s`` since the first they are of.
 
+    With ``every_s`` only so many at its start as give each topic a message with neighbours. Times
+    in which nothing was recorded are passed over, be they years.
 
-def windows_of(bag: Bag, topics: Collection[str], every_s: float | None) -> list[tuple[int, int]]:
-    """From when to when to read messages [ns]: all, or a window at the start of each ``every_s``.
-
-    A window is four periods of the slowest topic long, so that each topic has a message with
-    neighbours in it.
+    Args:
+        bag: the bag.
+        topics: their names.
+        every_s: seconds between frames; all messages are read if None.
+        beside: further topics, which are read with the others.
     """
+    all_topics = {*topics, *beside}
     if every_s is None:
-        return [(bag.start_ns, bag.stop_ns)]
-    every_ns, fewest = to_every_ns(every_s), min(bag.topics[topic].count for topic in topics)
-    length = min(every_ns, 4 * (bag.stop_ns - bag.start_ns) // fewest)
-    return [
-        (start, min(start + length, bag.stop_ns))
-        for start in range(bag.start_ns, bag.stop_ns, every_ns)
-    ]
-
-
-def to_every_ns(every_s: float) -> int:
-    """The seconds between frames in nanoseconds, at least one."""
-    return max(1, round(every_s * _S))
+        yield from ((0, message) for message in bag.messages(all_topics))
+        return
+    every_ns, first_ns, cell = max(1, round(every_s * _S)), bag.next_time(topics), 0
+    next_ns = first_ns
+    while first_ns is not None and next_ns is not None:
+        start_ns = first_ns + cell * every_ns
+        wanted = dict.fromkeys(topics, _IN_EACH)
+        for message in bag.messages(all_topics, start_ns, start_ns + every_ns):
+            yield cell, message
+            if message.topic in wanted:
+                wanted[message.topic] -= 1
+            if max(wanted.values()) <= 0:
+                break
+        cell += 1
+        if min(wanted.values()) == _IN_EACH == max(wanted.values()):
+            next_ns = bag.next_time(topics, start_ns + every_ns)
+            cell = cell if next_ns is None else (next_ns - first_ns) // every_ns
 
 
 _USUAL_M_S = 10.0

@@ -1,28 +1,54 @@
 """Bags by their files: which library reads one, and the folder of a ROS 2 bag as one recording."""
 
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+import heapq
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from operator import itemgetter
 from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
 
 from calibgraph.errors import CalibrationError, FileError, in_words, needs_extra
 from calibgraph.files import read_yaml
 from calibgraph.io.bags.recording import Recording, topics_by_name
+from calibgraph.io.bags.unpacking import unpack, unpack_file
 
 _METADATA, _HEAD_BYTES = "metadata.yaml", 1000
+_SUFFIXES = (".bag", ".mcap", ".db3")
+_UNPACK = {".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz", ".lz4": "unlz4", ".zst": "unzstd",
+           ".zstd": "unzstd", ".zip": "unzip", ".7z": "7z x"}  # fmt: skip
 _REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover"}
 _REPAIR_ROS2 = "ros2 bag reindex"
 
 
 def is_bag(path: Path | str) -> bool:
-    """Whether a path is a ROS 1 bag, a file of a ROS 2 bag or the folder of one."""
+    """Whether a path is a ROS 1 bag, a file of a ROS 2 bag or the folder of one.
+
+    Raises:
+        FileError: if it is the file of a bag that was not closed, or is compressed as a whole.
+    """
     path = Path(path)
-    if path.suffix.lower() in (".bag", ".mcap", ".db3") and path.is_file():
+    if path.suffix.lower() in _SUFFIXES and path.is_file():
         return True
+    if PurePath(path.stem).suffix.lower() in _SUFFIXES and path.is_file():
+        _refuse_as_it_is(path)
     metadata = path / _METADATA
     if not metadata.is_file():
         return False
     with metadata.open("rb") as file:
         return b"rosbag2" in file.read(_HEAD_BYTES)
+
+
+def _refuse_as_it_is(path: Path) -> None:
+    """Refuse a file that would be a bag under its name without the last suffix."""
+    last = path.suffix.lower()
+    if last == ".active":
+        raise FileError(
+            path,
+            "was not closed by the recorder: mend it with `rosbag reindex`, then rename it to "
+            f"{path.stem}",
+        )
+    if last in _UNPACK:
+        raise FileError(path, f"is compressed: unpack it first with `{_UNPACK[last]} {path.name}`")
 
 
 def open_recording(path: Path) -> Recording:
@@ -35,49 +61,51 @@ def open_recording(path: Path) -> Recording:
     """
     _require_closed(path)
     with needs_extra("ros", f"{path}: reading ROS bags needs rosbags and mcap"):
+        from calibgraph.io.bags.db3_files import Db3File
         from calibgraph.io.bags.mcap_files import McapFile
-        from calibgraph.io.bags.rosbags_files import RosbagsFile
+        from calibgraph.io.bags.ros1_files import Ros1File
     if path.is_dir():
-        files = _files_of(path)
-        return BagFolder(files) if files else RosbagsFile(path)
-    return McapFile(path) if path.suffix.lower() == ".mcap" else RosbagsFile(path)
+        return BagFolder(path)
+    kinds: dict[str, Callable[[Path], Recording]] = {".bag": Ros1File, ".mcap": McapFile}
+    return kinds.get(path.suffix.lower(), Db3File)(path)
 
 
 class BagFolder:
-    """The files of a ROS 2 bag one after another, as one recording."""
+    """The files of a ROS 2 bag as one recording, of whichever storage and compression."""
 
-    def __init__(self, files: Collection[Path]) -> None:
-        self._parts: list[Recording] = []
-        try:
-            for file in files:
-                self._parts.append(open_recording(file))
-        except BaseException:
-            self.close()
-            raise
-        self._parts.sort(key=lambda part: part.start_ns)
-        self.topics = topics_by_name(t for part in self._parts for t in part.topics.values())
-        self.start_ns = min(part.start_ns for part in self._parts)
-        self.stop_ns = max(part.stop_ns for part in self._parts)
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        stated = read_yaml(folder / _METADATA)["rosbag2_bagfile_information"]
+        self._mode = (stated.get("compression_mode") or "none").lower()
+        with ExitStack() as opened:
+            self._parts: list[Recording] = []
+            for file in _files_of(folder, stated["relative_file_paths"]):
+                self._parts.append(open_recording(self._unpacked(file, opened)))
+                opened.callback(self._parts[-1].close)
+            self.topics = topics_by_name(t for part in self._parts for t in part.topics.values())
+            self.close = opened.pop_all().close
 
-    def close(self) -> None:
-        """Close all files."""
-        for part in self._parts:
-            part.close()
+    def _unpacked(self, file: Path, opened: ExitStack) -> Path:
+        """The file or, where files are compressed, a copy that is not, until the bag is closed."""
+        if self._mode != "file":
+            return file
+        copy = Path(opened.enter_context(TemporaryDirectory())) / file.stem
+        unpack_file(file, copy)
+        return copy
 
     def messages(
-        self, topics: Collection[str], start_ns: int | None, stop_ns: int | None
+        self, topics: Collection[str], start_ns: int, stop_ns: int
     ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of recording [ns] and bytes of the messages of some topics."""
-        for part in self._parts:
-            yield from part.messages(topics, start_ns, stop_ns)
+        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+        parts = (part.messages(topics, start_ns, stop_ns) for part in self._parts)
+        kind = "zstd" if self._mode == "message" else ""
+        for topic, record_ns, data in heapq.merge(*parts, key=itemgetter(1)):
+            yield topic, record_ns, bytes(unpack(self._folder, kind, data))
 
 
-def _files_of(folder: Path) -> list[Path]:
-    """The files of a folder, of whichever storage; none if they are compressed."""
-    stated = read_yaml(folder / _METADATA)["rosbag2_bagfile_information"]
-    if (stated.get("compression_mode") or "none").lower() != "none":
-        return []
-    files = [folder / PurePath(name).name for name in stated["relative_file_paths"]]
+def _files_of(folder: Path, stated: Iterable[str]) -> list[Path]:
+    """The files of a folder."""
+    files = [folder / PurePath(name).name for name in stated]
     for file in files:
         if not file.is_file():
             raise FileError(

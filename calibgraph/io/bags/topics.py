@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,27 +13,57 @@ from calibgraph.io.bags.options import LIDAR, ODOMETRY
 from calibgraph.io.bags.pictures import is_depth
 
 _BEST_FIRST = ("image_raw", "image", "image_color", "image_mono", "image_rect_color", "image_rect")
+_FORM = re.compile(
+    r"^(image|images|img|raw|rect|rectified|color|colour|mono|gray|grey|compressed|info)(?=\d*$)"
+)
+"""Words of a topic's last part that name a form of an image, not a camera."""
+
+Words = tuple[str, ...]
+
+_VIDEO = "video, which is not read: write images with `ros2 run image_transport republish {} raw`"
+_PACKETS = "a driver's packets, which are not read: record the clouds that the driver makes of them"
+_NOT_READ = {
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": _VIDEO.format("ffmpeg"),
+    "foxglove_msgs/msg/CompressedVideo": _VIDEO.format("foxglove"),
+    "theora_image_transport/msg/Packet": _VIDEO.format("theora"),
+    "point_cloud_interfaces/msg/CompressedPointCloud2": (
+        "a compressed cloud, which is not read: write clouds with `ros2 run point_cloud_transport "
+        "republish --ros-args -p in_transport:=draco -p out_transport:=raw`"
+    ),
+    "velodyne_msgs/msg/VelodyneScan": _PACKETS,
+    "ouster_ros/msg/PacketMsg": _PACKETS,
+    "ouster_sensor_msgs/msg/PacketMsg": _PACKETS,
+    "hesai_ros_driver/msg/UdpFrame": _PACKETS,
+    "nebula_msgs/msg/NebulaPackets": _PACKETS,
+}
 
 
 @dataclass(frozen=True)
 class CameraTopics:
-    """The topics of a camera."""
+    """The topics of a camera: ``infos`` may be its CameraInfo, or that of the images ``rivals``."""
 
     image: str
-    info: str | None
+    infos: tuple[str, ...]
+    rivals: tuple[str, ...] = ()
 
     @property
     def rectified(self) -> bool:
         """Whether the images are, by their name."""
         return "rect" in _base(self.image).rsplit("/", 1)[-1]
 
+    @property
+    def info(self) -> str | None:
+        """The CameraInfo; None if there is none, or it could be another."""
+        return self.infos[0] if len(self.infos) == 1 and not self.rivals else None
+
 
 @dataclass(frozen=True)
 class RigTopics:
-    """The topics of a LiDAR and of cameras, by the cameras' names."""
+    """The topics of a LiDAR and of cameras, by the cameras' names; ``notes`` name others."""
 
     lidar: str
     cameras: Mapping[str, CameraTopics]
+    notes: tuple[str, ...] = ()
 
 
 def choose_topics(
@@ -45,55 +76,103 @@ def choose_topics(
 
     Args:
         bag: the bag.
-        named: the topic of ``lidar`` and those of cameras, where they are not left to be found.
+        named: the topic of ``lidar`` and those of cameras, where they are not left to be found; of
+            a camera with that of its CameraInfo behind a comma, where several could be.
         cameras: names that are wanted; those named, or if none is all that have a CameraInfo.
         drive: the bag, and others whose CameraInfo serve where it has none; the bag alone if None.
 
     Raises:
         DatasetError: if a topic is missing, or there are several to choose from.
     """
-    for name, topic in named.items():
-        if topic not in bag.topics or not bag.topics[topic].count:
-            raise DatasetError(f"{bag.path}: has no messages of {topic} ({name}); {_listed(bag)}")
-    chosen = {name: topic for name, topic in named.items() if name not in (LIDAR, ODOMETRY)}
+    bags = [*(drive or [bag])]
+    parted = {name: topic.split(",") for name, topic in named.items()}
+    for name, (topic, *info) in parted.items():
+        for each, among in ((topic, [bag]), *((one, bags) for one in info)):
+            if not any(one.has(each) for one in among):
+                raise DatasetError(
+                    f"{bag.path}: has no messages of {each} ({name}); {_listed(bag)}"
+                )
+    chosen = {name: parts for name, parts in parted.items() if name not in (LIDAR, ODOMETRY)}
     wanted = list(chosen) if cameras is None else list(cameras)
     for name in set(chosen) - set(wanted):
         raise DatasetError(f"--topic {name}: the rig has no such camera, but {', '.join(wanted)}")
-    infos = _Infos(drive or [bag])
+    infos = _Infos(bag, bags)
     found = _found_cameras(bag, infos)
     names = wanted or list(found)
     if set(names) - set(found):  # the rig has the lenses, the bag need not
         found = {**_found_cameras(bag, None), **found}
     if not names:
         raise DatasetError(f"{bag.path}: {_why_no_camera(bag, infos)}")
-    images = {name: chosen.get(name) or found.get(name) for name in names}
-    return RigTopics(
-        lidar=named.get(LIDAR) or _lidar_topic(bag),
-        cameras={name: _camera(bag, name, topic, infos) for name, topic in images.items()},
-    )
+    topics = {}
+    for name in names:
+        image, *info = chosen.get(name) or [found.get(name, "")]
+        if not image:
+            raise DatasetError(
+                f"{bag.path}: which topic has the images of camera {name!r}? {_listed(bag)}: name "
+                f"it by --topic {name}=/TOPIC",
+                camera=name,
+            )
+        topics[name] = (
+            CameraTopics(image, tuple(info)) if info
+            else CameraTopics(image, infos.of(image), infos.rivals(image))
+        )  # fmt: skip
+    lidar = named.get(LIDAR) or _lidar_topic(bag)
+    return RigTopics(lidar, topics, tuple(_unused(bag, infos, topics.values())))
+
+
+def _unused(bag: Bag, infos: _Infos, used: Iterable[CameraTopics]) -> Iterable[str]:
+    """A line for each image topic with a CameraInfo that no camera has."""
+    taken = {_words(each.image) for each in used}
+    for each in bag.of_type(*_NOT_READ):
+        if _NOT_READ[each.type].startswith("video"):
+            yield f"{bag.path}: {each.name} is {_NOT_READ[each.type]}"
+    for topic in _image_topics(bag):
+        if _words(topic) not in taken and infos.of(topic):
+            depth = _depth(bag, topic)
+            why = f": it is {depth}, which is taken for depth" if depth else ""
+            yield f"{bag.path}: {topic} has a camera_info and is not used{why}"
+
+
+def _depth(bag: Bag, topic: str) -> str:
+    """The encoding of a topic of depth images; empty for others."""
+    message = bag.first(topic)
+    encoding: str = getattr(message, "encoding", None) or message.format
+    return encoding if is_depth(message) else ""
 
 
 def _why_no_camera(bag: Bag, infos: _Infos) -> str:
     """Why no image topic belongs to a camera, and what to do."""
     for topic in _image_topics(bag):
-        if infos.beside(topic):  # so it is depth, by its encoding
-            message = bag.first(topic)
-            encoding = getattr(message, "encoding", None) or message.format
-            name = _short_names([_namespace(topic)])[_namespace(topic)]
+        if infos.of(topic):  # so it is depth, by its encoding
+            name = _short_names([_words(topic)])[_words(topic)]
             return (
-                f"{topic} is {encoding}, which is taken for depth; if it is the image of a camera, "
-                f"name it by --topic {name}={topic}"
+                f"{topic} is {_depth(bag, topic)}, which is taken for depth; if it is the image of "
+                f"a camera, name it by --topic {name}={topic}"
             )
+    if not _image_topics(bag) and (found := _not_read(bag)):
+        return found
     return (
         f"has no image topic with a camera_info beside it; {_listed(bag)}: give a rig with the "
         "lenses (--rig)"
     )
 
 
+def _not_read(bag: Bag, *, clouds: bool = False) -> str:
+    """What the topics are that might have been read; empty if there are none."""
+    found = [
+        f"{each.name} ({each.count}) is {_NOT_READ[each.type]}"
+        for each in bag.of_type(*_NOT_READ)
+        if clouds != _NOT_READ[each.type].startswith("video")
+    ]
+    return found[0] if found else ""
+
+
 def _lidar_topic(bag: Bag) -> str:
     found = bag.of_type(*CLOUDS)
     if len(found) == 1:
         return found[0].name
+    if not found and (what := _not_read(bag, clouds=True)):
+        raise DatasetError(f"{bag.path}: {what}")
     listed = ", ".join(f"{each.name} ({each.count})" for each in found)
     what = f"has {len(found)} topics of clouds: {listed}; name" if found else (
         "has no messages of PointCloud2 or of Livox; convert the driver's packets first, then name"
@@ -101,26 +180,21 @@ def _lidar_topic(bag: Bag) -> str:
     raise DatasetError(f"{bag.path}: {what} the LiDAR's by --topic lidar=/TOPIC")
 
 
-def _camera(bag: Bag, name: str, topic: str | None, infos: _Infos) -> CameraTopics:
-    if topic is None:
-        raise DatasetError(
-            f"{bag.path}: which topic has the images of camera {name!r}? {_listed(bag)}: name it "
-            f"by --topic {name}=/TOPIC",
-            camera=name,
-        )
-    return CameraTopics(topic, infos.beside(topic))
-
-
 def _found_cameras(bag: Bag, infos: _Infos | None) -> dict[str, str]:
     """The best image topic by camera; with ``infos`` only of cameras that have a CameraInfo."""
-    best: dict[str, str] = {}
+    best: dict[Words, str] = {}
     for topic in _image_topics(bag):
-        if _namespace(topic) in best or (infos and infos.beside(topic) is None):
+        if _words(topic) in best or (infos and not infos.of(topic)):
             continue
-        if not is_depth(bag.first(topic)):
-            best[_namespace(topic)] = topic
-    names = _short_names(best)
-    return {names[namespace]: best[namespace] for namespace in sorted(best)}
+        if not _depth(bag, topic):
+            best[_words(topic)] = topic
+    in_space = Counter(map(_space, best.values()))
+    named = {
+        words if in_space[_space(topic)] > 1 else tuple(_space(topic).strip("/").split("/")): topic
+        for words, topic in sorted(best.items())
+    }
+    names = _short_names(named)
+    return {names[words]: topic for words, topic in named.items()}
 
 
 def _image_topics(bag: Bag) -> list[str]:
@@ -129,19 +203,31 @@ def _image_topics(bag: Bag) -> list[str]:
 
 
 class _Infos:
-    """The CameraInfo topics of some bags."""
+    """The CameraInfo topics of a drive, as far as they may be those of a bag's images."""
 
-    def __init__(self, bags: Iterable[Bag]) -> None:
-        self._bags = bags
+    def __init__(self, bag: Bag, drive: Iterable[Bag]) -> None:
+        self._images = [each.name for each in bag.of_type(IMAGE, COMPRESSED_IMAGE)]
+        self._bags = [[each.name for each in one.of_type(CAMERA_INFO)] for one in drive]
 
-    def beside(self, image: str) -> str | None:
-        """That beside an image topic, by ROS's convention in the same namespace."""
-        places = (_namespace(image), _base(image))
-        for bag in self._bags:
-            for info in bag.of_type(CAMERA_INFO):
-                if info.name.rsplit("/", 1)[0] in places:
-                    return info.name
-        return None
+    def of(self, image: str) -> tuple[str, ...]:
+        """Those of an image: with its words; else in its namespace, and of no other image."""
+        for infos in self._bags:
+            same = [info for info in infos if _words(info) == _words(image)]
+            near = [info for info in infos if _space(info) == _space(image)]
+            others = {_words(each) for each in self._images} - {_words(image)}
+            free = [info for info in near if _words(info) not in others]
+            apart = {info: len({*_own(info)} ^ {*_own(image)}) for info in free}
+            sharing = [info for info in free if {*_own(info)} & {*_own(image)}]
+            least = min((apart[info] for info in sharing), default=0)
+            shared = [info for info in sharing if apart[info] == least]
+            if same or shared or free:
+                return tuple(same or shared or free)
+        return ()
+
+    def rivals(self, image: str) -> tuple[str, ...]:
+        """Other images that may have the same CameraInfo."""
+        others = (each for each in self._images if _words(each) != _words(image))
+        return tuple(each for each in others if {*self.of(each)} & {*self.of(image)})
 
 
 def _base(topic: str) -> str:
@@ -149,8 +235,26 @@ def _base(topic: str) -> str:
     return topic.removesuffix("/compressed")
 
 
-def _namespace(topic: str) -> str:
+def _space(topic: str) -> str:
     return _base(topic).rpartition("/")[0]
+
+
+def _own(topic: str) -> list[str]:
+    """The words of a topic's last part that are none of a form: of /cams/image_left, left."""
+    last = _base(topic).rsplit("/", 1)[-1]
+    parts = [part for part in last.split("_") if part]
+    found = [word for part in parts if (word := _FORM.sub("", part, count=1))]
+    forms = len(found) < len(parts)
+    return [word for word in found if not (forms and word in ("camera", "cam"))]
+
+
+def _words(topic: str) -> Words:
+    """What distinguishes a camera: its namespace, and its own words in the topic's last part."""
+    space = _space(topic).strip("/").split("/")
+    own = "_".join(_own(topic))
+    if not own and space[-1].startswith("image"):
+        space.pop()  # of /left/image_raw/camera_info
+    return tuple(word for word in (*space, own) if word)
 
 
 def _rank(topic: str) -> tuple[int, int, str]:
@@ -160,13 +264,13 @@ def _rank(topic: str) -> tuple[int, int, str]:
     return place, int(_base(topic) != topic), topic
 
 
-def _short_names(namespaces: Iterable[str]) -> dict[str, str]:
-    """The last words of each namespace, as many for all as make them differ; joined by _."""
-    words = {namespace: namespace.strip("/").split("/") for namespace in namespaces}
-    for count in range(1, 1 + max(map(len, words.values()), default=0)):
-        names = {namespace: "_".join(parts[-count:]) for namespace, parts in words.items()}
-        if max(Counter(names.values()).values()) == 1:
-            return {namespace: name or "camera" for namespace, name in names.items()}
+def _short_names(cameras: Iterable[Words]) -> dict[Words, str]:
+    """The last words of each camera, as many for all as make them differ; joined by _."""
+    words = list(cameras)
+    for count in range(1, 1 + max((len(each) for each in words), default=0) or 2):
+        names = {each: "_".join(each[-count:]) for each in words}
+        if names and max(Counter(names.values()).values()) == 1:
+            return {each: name or "camera" for each, name in names.items()}
     return {}
 
 

@@ -58,6 +58,7 @@ class Transforms:
         self._drive = drive
         self._static: list[_Tree] = []
         self._used: dict[str, set[str]] = {}
+        self.parents: dict[str, str] = {}  # of the frames, as far as trees were needed
 
     def _trees(self) -> Iterator[_Tree]:
         """Wider and wider trees: of the bag, with another bag, ..., with /tf of all."""
@@ -80,11 +81,19 @@ class Transforms:
         for tree in self._trees():
             T_target_source = _between(tree.links, target, source)
             if T_target_source is not None:
+                self.parents |= {child: link.parent for child, link in tree.links.items()}
                 ways = (_ancestors(tree.links, frame).keys() for frame in (target, source))
                 for frame in set.__xor__(*map(set, ways)):
                     self._used.setdefault(tree.links[frame].source, set()).add(frame)
                 return T_target_source
         return None
+
+    def known(self, target: str, source: str) -> Array:
+        """(4, 4) T_target_source of two frames that are connected."""
+        T_target_source = self.between(target, source)
+        if T_target_source is None:
+            raise ValueError(f"{target} and {source} are not connected")
+        return T_target_source
 
     @property
     def moving(self) -> set[str]:

@@ -13,6 +13,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import T_OPTICAL_LINK, invert
+from calibgraph.model.rig import Mount
 
 ONLY_CAMERA = ""
 """Stands for the camera of a file that names none: the only one of all files."""
@@ -52,6 +53,7 @@ class Part:
         relative_poses: between cameras, measured independently of T_camera_lidar.
         links: frames in their parents.
         frame_ids: of optical frames, by camera.
+        mounts: the links of a tree by which cameras hang, by camera.
         lidar: the LiDAR's frame; None if the file does not name it.
         notes: what was assumed or left out, a line each.
     """
@@ -62,6 +64,7 @@ class Part:
     relative_poses: tuple[RelativeCamera, ...] = ()
     links: tuple[FrameLink, ...] = ()
     frame_ids: Mapping[str, str] = field(default_factory=dict)
+    mounts: Mapping[str, Mount] = field(default_factory=dict)
     lidar: str | None = None
     notes: tuple[str, ...] = ()
 
@@ -94,6 +97,7 @@ class Part:
                 names.get(name, name): frames.get(frame, frame)
                 for name, frame in self.frame_ids.items()
             },
+            mounts={names.get(name, name): mount for name, mount in self.mounts.items()},
         )
 
 
@@ -121,24 +125,24 @@ class FrameTree:
             if link.child in self._links:
                 raise CalibrationError(f"frame {link.child!r} has two parents; give one of them")
             self._links[link.child] = link
-        parents = {link.parent for link in self._links.values()}
-        self.names = tuple(sorted(parents | self._links.keys()))
+        self.parents = {child: link.parent for child, link in self._links.items()}
+        self.names = tuple(sorted({*self.parents.values(), *self.parents}))
 
-    def T_camera_lidar(self, camera_frame: str, lidar_frame: str) -> Array:
-        """(4, 4) from the LiDAR frame to the optical axes of a camera's frame.
+    def T_between(self, target: str, source: str) -> Array:
+        """(4, 4) T_target_source.
 
         Raises:
             CalibrationError: if a frame is unknown, or the two are not connected.
         """
-        camera_root, T_root_frame = self._in_root(camera_frame)
-        lidar_root, T_root_lidar = self._in_root(lidar_frame)
-        if camera_root != lidar_root:
+        target_root, T_root_target = self._in_root(target)
+        source_root, T_root_source = self._in_root(source)
+        if target_root != source_root:
             raise CalibrationError(
-                f"frames {camera_frame!r} and {lidar_frame!r} are not connected: their roots are "
-                f"{camera_root!r} and {lidar_root!r}; add the file with the transform between them"
+                f"frames {target!r} and {source!r} are not connected: their roots are "
+                f"{target_root!r} and {source_root!r}; add the file with the transform between them"
             )
-        T_frame_lidar: Array = invert(T_root_frame) @ T_root_lidar
-        return T_frame_lidar if is_optical(camera_frame) else T_OPTICAL_LINK @ T_frame_lidar
+        T_target_source: Array = invert(T_root_target) @ T_root_source
+        return T_target_source
 
     def notes_between(self, frame: str, other: str) -> list[str]:
         """The notes on the links between two frames."""
@@ -147,21 +151,28 @@ class FrameTree:
 
     def _above(self, frame: str) -> Iterator[str]:
         """A frame and its ancestors but for the root."""
+        passed: set[str] = set()
         while frame in self._links:
+            if frame in passed:
+                raise CalibrationError(f"frame {frame!r} is its own ancestor; correct the file")
+            passed.add(frame)
             yield frame
             frame = self._links[frame].parent
 
     def _in_root(self, frame: str) -> tuple[str, Array]:
+        """The root above a frame, and the (4, 4) pose of the frame in it."""
         if frame not in self.names:
             raise CalibrationError(f"no frame {frame!r}; there are {', '.join(self.names)}")
-        T, passed = np.eye(4), {frame}
-        while frame in self._links:
-            link = self._links[frame]
+        T = np.eye(4)
+        for each in self._above(frame):
+            link = self._links[each]
             T, frame = link.T_parent_child @ T, link.parent
-            if frame in passed:
-                raise CalibrationError(f"frame {frame!r} is its own ancestor; correct the file")
-            passed.add(frame)
         return frame, T
+
+
+def optical_axes(frame: str) -> Array:
+    """(4, 4) from a camera's frame to its optical axes."""
+    return np.eye(4) if is_optical(frame) else T_OPTICAL_LINK
 
 
 def is_optical(frame: str) -> bool:

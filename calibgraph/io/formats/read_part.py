@@ -9,31 +9,33 @@ from calibgraph.files import read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.formats.autoware import is_autoware, read_autoware
-from calibgraph.io.formats.basalt import is_basalt, read_basalt
 from calibgraph.io.formats.camera_info import is_camera_info, read_camera_info
-from calibgraph.io.formats.camera_maps import read_camera_maps
-from calibgraph.io.formats.colmap import is_colmap, read_colmap
 from calibgraph.io.formats.documents import (
     YAML_SUFFIXES,
     content_of_storage,
     read_documents,
     read_xml,
 )
+from calibgraph.io.formats.foreign_keys import read_foreign
 from calibgraph.io.formats.kalibr import is_kalibr, read_kalibr
-from calibgraph.io.formats.kitti_lines import is_kitti_lines, read_kitti_lines
-from calibgraph.io.formats.koide import is_koide, read_koide
+from calibgraph.io.formats.matrix_lines import read_lines
 from calibgraph.io.formats.part import Part, RelativeCamera
-from calibgraph.io.formats.ros_transforms import is_tf2, read_tf2, read_urdf
+from calibgraph.io.formats.ros_transforms import (
+    is_tf2,
+    publisher_lines,
+    read_publishers,
+    read_tf2,
+    read_urdf,
+)
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rigs import is_exported_rig, read_rig
-from calibgraph.model.rig import Camera
+from calibgraph.model.rig import KNOWLEDGE, Camera
 
 _MAX_BYTES, _HEAD_BYTES = 32 * 2**20, 2**16
-_COLMAP_NAME = "cameras.txt"
 
 
-def read_part(path: Path, name: str | None) -> Part:
+def read_part(path: Path, name: str | None) -> Part:  # noqa: PLR0911 - a line for each kind
     """Read a file; ``name`` replaces the file's own name of its camera if it has a single one.
 
     Raises:
@@ -46,11 +48,10 @@ def read_part(path: Path, name: str | None) -> Part:
     suffix = require_file(path).suffix.lower()
     if path.stat().st_size > _MAX_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes are too many for a calibration")
-    if suffix in (".urdf", ".xml", ".xacro"):
-        root = read_xml(path)
-        if root.tag != "opencv_storage":
-            return read_urdf(root, path)
-        return _read_content([content_of_storage(root)], path, name)
+    if suffix in (".urdf", ".xml", ".xacro", ".launch"):
+        return _read_xml(path, name)
+    if suffix in (".sh", ".bash"):
+        return read_publishers(read_text(path).splitlines(), path)
     if suffix in (".txt", ".csv", ".npy"):
         return _read_lines(path, name)
     if suffix in (*YAML_SUFFIXES, ".json"):
@@ -60,15 +61,22 @@ def read_part(path: Path, name: str | None) -> Part:
     raise FileError(path, _unknown(f"a file {suffix or 'without a suffix'} is", head))
 
 
+def _read_xml(path: Path, name: str | None) -> Part:
+    """What a URDF, a launch file or OpenCV's storage holds."""
+    root = read_xml(path)
+    if root.tag == "launch":
+        return read_publishers(publisher_lines(root), path)
+    if root.tag == "opencv_storage":
+        return _read_content([content_of_storage(root)], path, name)
+    return read_urdf(root, path)
+
+
 def _read_lines(path: Path, name: str | None) -> Part:
     """What a text file of lines holds."""
-    if path.suffix.lower() == ".npy":
-        return read_kitti_lines(path, name)
+    found = read_lines(path, name)
+    if found is not None:
+        return found
     text = read_text(path)
-    if is_colmap(text) or path.name == _COLMAP_NAME:
-        return read_colmap(path)
-    if is_kitti_lines(text):
-        return read_kitti_lines(path, name)
     first = next((line for line in text.splitlines() if line.strip()), "")
     raise FileError(path, _unknown(f"its line {first[:40]!r} is", text))
 
@@ -101,7 +109,7 @@ def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None)
     for matches, read in _READERS:
         if matches(content):
             return read(content, path, name)
-    found = read_camera_maps(content, path, name)
+    found = read_foreign(content, path, name)
     if found is None:
         keys = ", ".join(str(key) for key in list(content)[:5])
         raise FileError(path, _unknown(f"its keys ({keys}) are"))
@@ -121,8 +129,6 @@ _READERS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[..., Part]], ..
     (is_camera_info, read_camera_info),
     (_is_rig, lambda _, path, __: _part_of_rig(path)),
     (is_kalibr, lambda content, path, _: read_kalibr(content, path)),
-    (is_koide, read_koide),
-    (is_basalt, lambda content, path, _: read_basalt(content, path)),
     (is_autoware, lambda content, path, _: read_autoware(content, path)),
 )
 
@@ -137,6 +143,7 @@ def _part_of_bag(path: Path) -> Part:
         lenses={name: camera.stated.lens for name, camera in cameras.items()},
         T_camera_lidar={name: T for name, T in found.items() if T is not None},
         frame_ids={name: each.frame_id for name, each in cameras.items() if each.frame_id},
+        mounts={name: each.mount for name, each in cameras.items() if each.mount},
         lidar=read.lidar,
         notes=tuple(read.notes),
     )
@@ -153,6 +160,7 @@ def _part_of_rig(path: Path) -> Part:
             for p in rig.relative_poses
         ),
         frame_ids={name: each.frame_id for name, each in rig.cameras.items() if each.frame_id},
+        mounts={name: each.mount for name, each in rig.cameras.items() if each.mount},
         lidar=rig.lidar,
         notes=notes,
     )
@@ -160,4 +168,5 @@ def _part_of_rig(path: Path) -> Part:
 
 def _lens(camera: Camera) -> CameraLens:
     size = (camera.width_px, camera.height_px)
-    return CameraLens(camera.model, size, camera.intrinsics_px, camera.distortion)
+    stated = {name: getattr(camera, name) for name in KNOWLEDGE}
+    return CameraLens(camera.model, size, camera.intrinsics_px, camera.distortion, stated=stated)

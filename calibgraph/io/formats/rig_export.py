@@ -13,7 +13,7 @@ from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.geometry import invert, point_in_lidar, ros_pose_covariance
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Camera, Mount, Rig
 from calibgraph.model.verdict import rig_verdict
 
 EXPORT_MARK = "calibgraph export"
@@ -36,6 +36,7 @@ class RigExport:
         verdict: PASS, WARN or FAIL; empty for a rig file.
         lidar_frame: the LiDAR's frame id.
         optical_frames: per camera, the id of its optical frame.
+        in_tree: whether the frames are those of the rig, and of the robot's tree that it knows.
         T_base_lidar: (4, 4) where the LiDAR is mounted on the vehicle or sensor kit, if given.
     """
 
@@ -45,6 +46,18 @@ class RigExport:
     lidar_frame: str
     optical_frames: Mapping[str, str]
     T_base_lidar: Array | None = None
+    in_tree: bool = True
+
+    def link(self, name: str) -> tuple[str, str, Array]:
+        """Parent, child and (4, 4) T_parent_child of the transform that a calibration changes."""
+        mount, T_lidar_camera = self.mount(name), self.T_lidar_camera(name)
+        if mount is None:
+            return self.lidar_frame, self.optical_frames[name], T_lidar_camera
+        return mount.parent, mount.child, mount.T_parent_child(T_lidar_camera)
+
+    def mount(self, name: str) -> Mount | None:
+        """The link of the robot's tree by which a camera hangs, if frames are the tree's."""
+        return self.cameras[name].mount if self.in_tree else None
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -135,6 +148,7 @@ def prepare_export(
         lidar_frame=lidar,
         optical_frames=frames,
         T_base_lidar=T_base_lidar,
+        in_tree=lidar_frame is None and camera_frame is None,
     )
 
 

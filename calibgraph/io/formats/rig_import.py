@@ -14,17 +14,20 @@ from calibgraph.files import checked_model
 from calibgraph.io.formats.part import (
     NO_LIDAR_IN_IMU,
     ONLY_CAMERA,
+    FrameLink,
     FrameTree,
     Part,
     RelativeCamera,
     find_camera_frame,
     find_lidar_frame,
+    optical_axes,
     tied_links,
 )
 from calibgraph.io.formats.read_part import read_part
 from calibgraph.io.lenses import CameraLens
+from calibgraph.io.mounts import find_mounts
 from calibgraph.model.geometry import invert
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import Mount, Rig
 
 Value = TypeVar("Value")
 
@@ -82,6 +85,7 @@ class RigParts:
         pairs: relative poses.
         frames: names of the frames.
         frame_ids: of optical frames, by camera.
+        mounts: the links of a tree by which cameras hang, by camera.
         notes: what was assumed or left out in the files, a line each.
     """
 
@@ -92,6 +96,7 @@ class RigParts:
     pairs: Sequence[RelativeCamera]
     frames: Sequence[str]
     frame_ids: Mapping[str, str]
+    mounts: Mapping[str, Mount]
     notes: Sequence[str]
 
     def tied_to(self, camera: str, T_camera_lidar: Array) -> dict[str, Array]:
@@ -115,6 +120,7 @@ class RigParts:
                 name: {
                     **_camera(name, lens, T.get(name), size_px, parts=self),
                     "frame_id": self.frame_ids.get(name),
+                    "mount": self.mounts.get(name),
                 }
                 for name, lens in self.lenses.items()
             },
@@ -140,7 +146,7 @@ def read_rig_parts(
     lenses = _merged(parts, lambda part: part.lenses, "lens", lambda one, other: one == other)
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
     missing = sorted(lenses.keys() - T_camera_lidar.keys())
-    links = [link for part in parts for link in part.links]
+    links, notes = _later_first(parts)
     tied = tied_links(links, lidar_frame)
     tree = FrameTree(tied)
     frame_ids = {name: frame for part in parts for name, frame in part.frame_ids.items()}
@@ -148,12 +154,13 @@ def read_rig_parts(
     in_tree = {name: frame for name, frame in frame_ids.items() if frame in tree.names}
     chosen = {**in_tree, **(camera_frames or {})}
     of_tree = lidar if lidar_frame or lidar in tree.names else None
-    notes = [note for part in parts for note in part.notes]
+    notes += [note for part in parts for note in part.notes]
     notes += [NO_LIDAR_IN_IMU] if missing and len(tied) < len(links) else []
     try:
-        T_camera_lidar |= _by_frames(tree, missing, of_tree, chosen, notes=notes)
+        by_frames, mounts = _by_frames(tree, missing, of_tree, chosen, notes=notes)
     except CalibrationError as error:
         raise CalibrationError("; ".join([str(error), *notes])) from error
+    T_camera_lidar |= by_frames
     pairs = [pair for part in parts for pair in part.relative_poses]
     T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
     return RigParts(
@@ -164,6 +171,7 @@ def read_rig_parts(
         pairs=pairs,
         frames=tree.names,
         frame_ids=frame_ids,
+        mounts={n: m for part in parts for n, m in part.mounts.items()} | mounts,
         notes=notes,
     )
 
@@ -219,6 +227,18 @@ def _is_same(one: Array, other: Array) -> bool:
     return bool(np.abs(one - other).max() <= _SAME)
 
 
+def _later_first(parts: Sequence[Part]) -> tuple[list[FrameLink], list[str]]:
+    """The links, of which a later file's replace those between the same frames; and notes."""
+    links: list[FrameLink] = []
+    notes: list[str] = []
+    for part in parts:
+        own = {(each.parent, each.child) for each in part.links}
+        replaced = [each for each in links if (each.parent, each.child) in own]
+        notes += [f"{part.path}: {e.child} in {e.parent} is that of this file" for e in replaced]
+        links = [each for each in links if each not in replaced] + [*part.links]
+    return links, notes
+
+
 def _by_frames(
     tree: FrameTree,
     cameras: Iterable[str],
@@ -226,16 +246,17 @@ def _by_frames(
     chosen: Mapping[str, str],
     *,
     notes: list[str],
-) -> dict[str, Array]:
-    """T_camera_lidar of the cameras that have a frame in the tree; with notes on their links."""
+) -> tuple[dict[str, Array], dict[str, Mount]]:
+    """T_camera_lidar and mounts of the cameras that have a frame in the tree; notes on links."""
     frames = {name: find_camera_frame(tree, name, chosen) for name in cameras}
-    found = {name: frame for name, frame in frames.items() if frame is not None}
+    found = {n: (frame, optical_axes(frame)) for n, frame in frames.items() if frame is not None}
     if not found:
-        return {}
+        return {}, {}
     lidar = lidar_frame or find_lidar_frame(tree)
-    for frame in found.values():
+    for frame, _ in found.values():
         notes += [note for note in tree.notes_between(frame, lidar) if note not in notes]
-    return {name: tree.T_camera_lidar(frame, lidar) for name, frame in found.items()}
+    T = {name: axes @ tree.T_between(frame, lidar) for name, (frame, axes) in found.items()}
+    return T, find_mounts(found, lidar, tree.parents, tree.T_between)
 
 
 def _by_pairs(known: Mapping[str, Array], pairs: Iterable[RelativeCamera]) -> dict[str, Array]:

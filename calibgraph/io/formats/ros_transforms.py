@@ -1,6 +1,7 @@
 """Static transforms of ROS: publisher lines, a launch file, tf2's message, URDF."""
 
 import shlex
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -8,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.documents import commented, commented_xml, commented_yaml
@@ -19,23 +21,37 @@ from calibgraph.io.rotations import (
     quaternion_xyzw,
     roll_pitch_yaw,
 )
+from calibgraph.model.geometry import invert
 
-_DIRECTION = (
-    "each transform is the pose of the optical frame (child) in the LiDAR frame (parent): "
-    "p_lidar = T * p_camera, the inverse of T_camera_lidar; a frame has one parent: take other "
-    "transforms to these optical frames out of the robot's description"
+_DIRECTION = "each transform is the pose of the child frame in its parent: p_parent = T * p_child"
+_OF_LIDAR = (
+    "{camera}: the optical frame (child) in the LiDAR frame (parent): p_lidar = T * p_camera, the "
+    "inverse of T_camera_lidar; a frame has one parent: take other transforms to {child} out of "
+    "the robot's description"
 )
+_OF_TREE = (
+    "{camera}: {child} in {parent}, so that the camera, which hangs from {child}, is where it was "
+    "measured; it replaces this transform of the robot's description, whose others stay"
+)
+
+
+def _statement(export: RigExport, *more: str) -> list[str]:
+    """The lines of a comment: direction, and of each camera which transform is written."""
+    lines = []
+    for name in export.cameras:
+        parent, child, _ = export.link(name)
+        text = _OF_LIDAR if export.mount(name) is None else _OF_TREE
+        lines.append(text.format(camera=name, parent=parent, child=child))
+    return export.statement(_DIRECTION, *lines, *more)
 
 
 def write_ros1(export: RigExport) -> str:
     """Lines ``static_transform_publisher x y z qx qy qz qw frame_id child_frame_id`` of tf2_ros."""
     publisher = ["rosrun", "tf2_ros", "static_transform_publisher"]
-    lines = [
-        shlex.join([*publisher, *_numbers(export, name), export.lidar_frame, frame])
-        for name, frame in export.optical_frames.items()
-    ]
+    links = (export.link(name) for name in export.cameras)
+    lines = [shlex.join([*publisher, *_numbers(T), *frames]) for *frames, T in links]
     order = "numbers: x y z qx qy qz qw, then parent and child frame"
-    return _script(export.statement(_DIRECTION, order), lines)
+    return _script(_statement(export, order), lines)
 
 
 def write_ros2(export: RigExport) -> str:
@@ -44,7 +60,7 @@ def write_ros2(export: RigExport) -> str:
         shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *arguments])
         for arguments in _arguments(export)
     ]
-    return _script(export.statement(_DIRECTION), lines)
+    return _script(_statement(export), lines)
 
 
 def _script(statement: list[str], lines: list[str]) -> str:
@@ -56,31 +72,92 @@ def write_ros2_launch(export: RigExport) -> str:
     """An XML launch file with one publisher per camera."""
     root = ElementTree.Element("launch")
     for arguments in _arguments(export):
-        attributes = {
-            "pkg": "tf2_ros",
-            "exec": "static_transform_publisher",
-            "args": " ".join(arguments),
-        }
+        attributes = {"pkg": "tf2_ros", "exec": _PUBLISHER, "args": " ".join(arguments)}
         ElementTree.SubElement(root, "node", attributes)
-    return commented_xml(export.statement(_DIRECTION), root)
+    return commented_xml(_statement(export), root)
+
+
+_PUBLISHER = "static_transform_publisher"
+_KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def _arguments(export: RigExport) -> list[list[str]]:
     """The arguments of each ROS 2 publisher."""
-    keys = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
-    return [
-        [
-            *(part for pair in zip(keys, _numbers(export, name), strict=True) for part in pair),
-            *("--frame-id", export.lidar_frame, "--child-frame-id", frame),
-        ]
-        for name, frame in export.optical_frames.items()
-    ]
+    found = []
+    for name in export.cameras:
+        parent, child, T = export.link(name)
+        pairs = zip(_KEYS, _numbers(T), strict=True)
+        numbers = (part for key, number in pairs for part in (f"--{key}", number))
+        found.append([*numbers, "--frame-id", parent, "--child-frame-id", child])
+    return found
 
 
-def _numbers(export: RigExport, name: str) -> list[str]:
-    """The seven numbers x y z qx qy qz qw of a camera's pose in the LiDAR frame."""
-    T = export.T_lidar_camera(name)
+def _numbers(T: Array) -> list[str]:
+    """The seven numbers x y z qx qy qz qw of a pose."""
     return [repr(float(value)) for value in (*T[:3, 3], *quaternion_xyzw(T))]
+
+
+def publisher_lines(launch: ElementTree.Element) -> list[str]:
+    """The publishers of a launch file, as lines of a script."""
+    nodes = (each for each in launch.iter("node") if _PUBLISHER in each.attrib.values())
+    return [f"{_PUBLISHER} {each.get('args', '')}" for each in nodes]
+
+
+def read_publishers(lines: Iterable[str], path: Path) -> Part:
+    """The frames of lines ``... static_transform_publisher ARGUMENTS``, of ROS 1 or 2."""
+    links = [
+        _published(line.partition(_PUBLISHER)[2].partition(" &")[0], path)
+        for line in lines
+        if _PUBLISHER in line and not line.lstrip().startswith("#")
+    ]
+    if not links:
+        raise FileError(
+            path,
+            f"has no {_PUBLISHER}; write the transforms to a file: `ros2 topic echo --once "
+            "/tf_static > tf_static.yaml`",
+        )
+    return Part(path, links=tuple(links))
+
+
+def _published(text: str, path: Path) -> FrameLink:
+    """The frame of a publisher: with names, or x y z, yaw pitch roll or a quaternion, frames."""
+    wrong = FileError(
+        path, f"{_PUBLISHER}{text[:80]}: expected numbers and two frames, without $()"
+    )
+    try:
+        words = shlex.split(text)
+        given = dict(zip(words[::2], words[1::2], strict=False))
+        if text.lstrip().startswith("--"):
+            frames = given["--frame-id"], given["--child-frame-id"]
+            x, y, z, roll, pitch, yaw, *turn = (
+                float(given.get(f"--{key}", "0"))
+                for key in ("x", "y", "z", "roll", "pitch", "yaw", *_KEYS[3:6])
+            )
+            by_quaternion = "--qw" in given
+            turn.append(float(given.get("--qw", "1")))
+        else:
+            places = [n for n, word in enumerate(words) if not _is_number(word)][:2]
+            frames = words[places[0]], words[places[1]]
+            x, y, z, *turn = map(float, words[: places[0]])
+            by_quaternion = len(turn) == len("xyzw")
+            yaw, pitch, roll = turn[:3]
+        T = (
+            pose_of_quaternion((x, y, z), turn) if by_quaternion
+            else pose_of_angles((x, y, z), (roll, pitch, yaw))
+        )  # fmt: skip
+    except (KeyError, IndexError, ValueError) as error:
+        raise wrong from error
+    if not np.isfinite(T).all():
+        raise wrong
+    return FrameLink(frames[0].lstrip("/"), frames[1].lstrip("/"), T)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def write_tf2(export: RigExport) -> str:
@@ -90,14 +167,14 @@ def write_tf2(export: RigExport) -> str:
         "publish: ros2 topic pub --once --qos-durability transient_local /tf_static "
         'tf2_msgs/msg/TFMessage "$(cat FILE)"'
     )
-    return commented_yaml(export.statement(_DIRECTION, publish), content)
+    return commented_yaml(_statement(export, publish), content)
 
 
 def _stamped(export: RigExport, name: str) -> dict[str, Any]:
-    T = export.T_lidar_camera(name)
+    parent, child, T = export.link(name)
     return {
-        "header": {"frame_id": export.lidar_frame},
-        "child_frame_id": export.optical_frames[name],
+        "header": {"frame_id": parent},
+        "child_frame_id": child,
         "transform": {
             "translation": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
             "rotation": dict(zip("xyzw", quaternion_xyzw(T), strict=True)),
@@ -167,25 +244,30 @@ def _link(stamped: _Stamped) -> FrameLink:
     return FrameLink(parent, child, T)
 
 
-_URDF_DIRECTION = (
-    "each joint's origin is the pose of the optical frame (child) in the LiDAR frame (parent): "
-    "p_lidar = T * p_camera, the inverse of T_camera_lidar; rpy about fixed x, y, z; a frame has "
-    "one parent: take other joints to these optical frames out of the robot's description"
-)
-
-
 def write_urdf(export: RigExport) -> str:
-    """A robot of the LiDAR's link and one link and fixed joint per camera."""
+    """A robot of the LiDAR's link and, for each camera, links and fixed joints to it."""
+    joints: dict[str, tuple[str, Array]] = {}
+    for name, optical in export.optical_frames.items():
+        parent, child, T_parent_child = export.link(name)
+        joints[child] = parent, T_parent_child
+        mount = export.mount(name)
+        if mount is not None and child != optical:
+            joints[optical] = child, invert(mount.T_camera_child)
+        if mount is None or parent == export.lidar_frame:
+            continue
+        if export.lidar_frame not in joints:
+            joints[export.lidar_frame] = parent, mount.T_parent_lidar
+        elif joints[export.lidar_frame][0] != parent:
+            joints[parent] = export.lidar_frame, invert(mount.T_parent_lidar)
     root = ElementTree.Element("robot", name="calibgraph")
-    ElementTree.SubElement(root, "link", name=export.lidar_frame)
-    for name, frame in export.optical_frames.items():
-        T = export.T_lidar_camera(name)
-        ElementTree.SubElement(root, "link", name=frame)
-        joint = ElementTree.SubElement(root, "joint", name=f"{frame}_joint", type="fixed")
-        ElementTree.SubElement(joint, "parent", link=export.lidar_frame)
-        ElementTree.SubElement(joint, "child", link=frame)
+    for link in dict.fromkeys([export.lidar_frame, *(p for p, _ in joints.values()), *joints]):
+        ElementTree.SubElement(root, "link", name=link)
+    for child, (parent, T) in joints.items():
+        joint = ElementTree.SubElement(root, "joint", name=f"{child}_joint", type="fixed")
+        ElementTree.SubElement(joint, "parent", link=parent)
+        ElementTree.SubElement(joint, "child", link=child)
         ElementTree.SubElement(joint, "origin", xyz=_text(T[:3, 3]), rpy=_text(roll_pitch_yaw(T)))
-    return commented_xml(export.statement(_URDF_DIRECTION), root)
+    return commented_xml(_statement(export, "rpy about fixed x, y, z"), root)
 
 
 def _text(values: list[float] | NDArray[np.float64]) -> str:

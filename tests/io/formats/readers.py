@@ -18,6 +18,7 @@ import yaml
 from urdf_parser_py.urdf import URDF
 
 Poses = dict[str, np.ndarray]
+PARENTS = ("lidar", "base")  # base: of a tree in which a calibration replaces a transform
 
 # ROS's camera_link is x forward, y left, z up; REP 103.
 OPTICAL_OF_LINK = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
@@ -72,7 +73,7 @@ def ros1(path: Path) -> Poses:
             words = shlex.split(line.removesuffix(" &"))
             assert words[:3] == ["rosrun", "tf2_ros", "static_transform_publisher"]
             x, y, z, *quaternion = map(float, words[3:10])
-            assert words[10] == "lidar" and len(words) == 12
+            assert words[10] in PARENTS and len(words) == 12
             poses[camera_of(words[11])] = inverse(quaternion_pose([x, y, z], *quaternion))
     return poses
 
@@ -80,7 +81,7 @@ def ros1(path: Path) -> Poses:
 def ros2_arguments(words: list[str]) -> tuple[str, np.ndarray]:
     """The child, and T_child_parent, of a ROS 2 static_transform_publisher."""
     flags = dict(zip(words[::2], words[1::2], strict=True))
-    assert flags["--frame-id"] == "lidar"
+    assert flags["--frame-id"] in PARENTS
     xyz = [float(flags[f"--{axis}"]) for axis in "xyz"]
     T = quaternion_pose(xyz, *(float(flags[f"--q{axis}"]) for axis in "xyzw"))
     return camera_of(flags["--child-frame-id"]), inverse(T)
@@ -106,7 +107,7 @@ def tf2(path: Path) -> Poses:
     """A TransformStamped holds the pose of the child in the frame of its header."""
     poses = {}
     for stamped in yaml.safe_load(path.read_text())["transforms"]:
-        assert stamped["header"] == {"frame_id": "lidar"}
+        assert stamped["header"]["frame_id"] in PARENTS
         t, q = stamped["transform"]["translation"], stamped["transform"]["rotation"]
         T = quaternion_pose([t["x"], t["y"], t["z"]], **q)
         poses[camera_of(stamped["child_frame_id"])] = inverse(T)
