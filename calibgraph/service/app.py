@@ -18,11 +18,7 @@ STATIC_FOLDER = Path(__file__).parent / "static"
 
 
 def create_app(settings: Settings) -> FastAPI:
-    """The application of a server; its parts are in ``app.state.service``.
-
-    Raises:
-        CalibrationError: see :class:`Service`.
-    """
+    """The application of a server; its parts are ``app.state.service``, see :class:`Service`."""
     app = FastAPI(
         title="calibgraph",
         description="Joint extrinsic calibration of cameras and a LiDAR.",

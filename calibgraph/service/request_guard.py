@@ -40,6 +40,9 @@ UPLOADS = "/v1/jobs/"
 BODY_S, BODY_BYTES_PER_S = 20.0, 500.0
 """A body has so many seconds, and one more for so many bytes that have arrived."""
 
+UNREAD_S = 1.0
+"""For the rest of a body that was answered before its end; then the connection ends."""
+
 _SAFE = ("GET", "HEAD", "OPTIONS")
 
 
@@ -64,25 +67,32 @@ class RequestGuard:
             await self._app(scope, receive, send)
             return
 
+        path = scope["path"]
+        settings, is_upload = self._settings, path.startswith(UPLOADS)
+        body = _Body(receive, settings.recording_bytes if is_upload else settings.body_bytes)
+        rest: asyncio.Task[None] | None = None
+
         async def send_with_headers(message: Message) -> None:
+            nonlocal rest
             if message["type"] == "http.response.start":
+                rest = asyncio.create_task(body.drop())  # who still sends can read the answer
+                await asyncio.wait([rest], timeout=UNREAD_S)
                 self._answers[message["status"]] += 1
                 headers = MutableHeaders(scope=message)
-                if scope["path"] == "/docs":
-                    headers["Content-Security-Policy"] = DOCS_POLICY
-                for name, value in STRICT_HEADERS.items():
+                own = {"Connection": "close"} if not rest.done() else {}
+                own |= {"Content-Security-Policy": DOCS_POLICY} if path == "/docs" else {}
+                for name, value in (STRICT_HEADERS | own).items():
                     headers.setdefault(name, value)
             await send(message)
 
-        most = self._settings.body_bytes
-        if scope["path"].startswith(UPLOADS):
-            most = self._settings.recording_bytes
         try:
-            self._require_ours(scope, most)
+            self._require_ours(scope, body.most_bytes)
+            await self._app(scope, body.receive, send_with_headers)
         except Problem as problem:
             await problem_response(problem)(scope, receive, send_with_headers)
-            return
-        await self._app(scope, _Body(receive, most).receive, send_with_headers)
+        finally:
+            if rest is not None:
+                rest.cancel()
 
     def _require_ours(self, scope: Scope, most_bytes: int) -> None:
         headers = Headers(scope=scope)
@@ -104,7 +114,7 @@ class _Body:
     """A body as it arrives, which ends in a problem if it is too large or too slow."""
 
     def __init__(self, receive: Receive, most_bytes: int) -> None:
-        self._receive, self._most_bytes = receive, most_bytes
+        self._receive, self.most_bytes = receive, most_bytes
         self._start_s, self._bytes, self._is_whole = time.monotonic(), 0, False
 
     async def receive(self) -> Message:
@@ -118,9 +128,15 @@ class _Body:
             raise Problem(408, f"the body stopped after {self._bytes} bytes") from None
         self._bytes += len(message.get("body", b""))
         self._is_whole = not message.get("more_body", False)
-        if self._bytes > self._most_bytes:
-            raise _too_large(self._most_bytes)
+        if self._bytes > self.most_bytes:
+            raise _too_large(self.most_bytes)
         return message
+
+    async def drop(self) -> None:
+        """Take what is left, unread: hypercorn waits for ever for room in its queue."""
+        while not self._is_whole:
+            message = await self._receive()
+            self._is_whole = not message.get("more_body", False)
 
 
 def _too_large(most_bytes: int) -> Problem:

@@ -54,11 +54,7 @@ class Service:
         self.folder.close()
 
     def require_room(self, size: int) -> None:
-        """Check that a body of so many bytes can be taken in: it is on the disk twice for a while.
-
-        Raises:
-            Problem: if the server stops, its disk would be full, or its queue is.
-        """
+        """Refuse a body of so many bytes if there is no room: it is on the disk twice at first."""
         if self.is_stopping:
             raise Problem(503, "the server is being stopped; try again soon")
         if shutil.disk_usage(self.folder.path).free - 2 * size < self.settings.free_bytes:

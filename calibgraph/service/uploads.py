@@ -41,14 +41,7 @@ class _Form(MultiPartParser):
 async def receive_job(
     request: Request, kind: JobKind, folder: DataFolder, roots: tuple[Root, ...]
 ) -> tuple[str, Job]:
-    """Read the form of a job; its files are on disk then.
-
-    Returns:
-        The job and its id, which names its folder.
-
-    Raises:
-        Problem: if the form is malformed, lacks a part, or has one that is not expected.
-    """
+    """Read the form of a job, which is on disk then; its id, which names its folder, and the job."""
     if not request.headers.get("content-type", "").startswith("multipart/form-data"):
         raise Problem(415, "send a form: multipart/form-data")
 

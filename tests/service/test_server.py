@@ -148,6 +148,27 @@ def test_who_sends_a_byte_now_and_then_is_cut_off_too(server: Server) -> None:
 
 
 @pytest.mark.slow
+def test_a_body_that_is_answered_before_its_end_holds_nothing(server: Server) -> None:
+    """A queue that nobody reads must not hold the connection, nor the requests after it."""
+    before = server.memory_mb()
+    for _ in range(30):
+        answer = server.http.post("/v1/jobs/nothing", content=bytes(3_000_000))
+        assert answer.status_code == 422
+    assert server.memory_mb() < before + 50
+    with server.connect() as connection:
+        connection.sendall(
+            b"POST /v1/jobs/nothing HTTP/1.1\r\nHost: localhost\r\n"
+            b"Content-Length: 10000000000\r\n\r\n"
+        )
+        start = time.monotonic()
+        with suppress(ConnectionResetError, BrokenPipeError):
+            while time.monotonic() - start < 30:
+                connection.sendall(b"x" * 65536)
+            pytest.fail("the connection stayed open")
+    assert seconds_of_a_request(server) < 5
+
+
+@pytest.mark.slow
 def test_a_kill_in_the_middle_of_a_job_and_of_frames_loses_nothing(
     server: Server, small: Problem
 ) -> None:
