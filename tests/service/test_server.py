@@ -159,6 +159,7 @@ def test_a_body_that_is_answered_before_its_end_holds_nothing(server: Server) ->
         connection.sendall(
             b"POST /v1/jobs/nothing HTTP/1.1\r\nHost: localhost\r\n"
             b"Content-Length: 10000000000\r\n\r\n"
+            b"Content-Length: 10000000000\r\n\r\n"
         )
         start = time.monotonic()
         with suppress(ConnectionResetError, BrokenPipeError):
