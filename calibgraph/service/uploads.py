@@ -41,7 +41,7 @@ class _Form(MultiPartParser):
 async def receive_job(
     request: Request, kind: JobKind, folder: DataFolder, roots: tuple[Root, ...]
 ) -> tuple[str, Job]:
-    """Read the form of a job, which is on disk then; its id, which names its folder, and the job."""
+    """Read the form of a job, which is on disk then; its id, which names its folder, and it."""
     if not request.headers.get("content-type", "").startswith("multipart/form-data"):
         raise Problem(415, "send a form: multipart/form-data")
 
