@@ -17,7 +17,6 @@ A kind of check that no case had makes a FAIL by itself from its limit of WARN o
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,7 +27,7 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.special import expit, logit
 
 from benchmarks.accuracy import ledger
-from benchmarks.tables import ROOT, add_record_option
+from benchmarks.tables import ROOT, parser_of
 from calibgraph.model.verdict import FAIL_ABOVE
 from calibgraph.trust.probability import STRUCTURE, TABLES, WORST, steps
 from tools.probability_tables import judged
@@ -137,16 +136,13 @@ def with_intercept(model: dict[str, Any], samples: Sequence[Sample]) -> dict[str
 
 def main() -> None:
     """Fit, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--tune", type=Path, nargs="+", default=[], help="files of verdicts")
     parser.add_argument("--count", type=Path, nargs="+", required=True, help="files of verdicts")
     parser.add_argument("--weights", type=Path, default=FILE, help="judged without --tune")
     parser.add_argument("--without", default="", help="kinds of checks, left out of everything")
     parser.add_argument("--keep-weights", action="store_true", help="fit the intercepts alone")
     parser.add_argument("--write", action="store_true", help="the weights into the package")
-    add_record_option(parser)
     options = parser.parse_args()
     sets = {
         name: [record for path in paths for record in ledger.read(path)]

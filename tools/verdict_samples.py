@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
-from benchmarks.accuracy import data_cases, table_cases
+from benchmarks.accuracy.cases import UNDETECTABLE
 from benchmarks.accuracy.ledger import Record
 from benchmarks.accuracy.verdicts import STATUSES, class_of
 from calibgraph.model.verdict import TOLERANCE, ErrorProbability
@@ -29,7 +29,6 @@ AMBIGUOUS = ("two_poses_45",)
 """Kinds in which the matches cannot tell which of two extrinsics is right: a FAIL is wanted,
 although the result is right. They take no part in the fit nor in how well the probability holds;
 verdicts are counted with them."""
-UNCOUNTED = (*table_cases.UNDETECTABLE, *data_cases.UNDETECTABLE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ def samples_of(records: Iterable[Record]) -> list[Sample]:
     """The results of cases that data can tell from right ones, without those decided anyway."""
     return [
         _sample(record, camera)
-        for record in records if record["kind"] not in UNCOUNTED
+        for record in records if record["kind"] not in UNDETECTABLE
         for camera in record.get("cameras", {}).values()
         if not any(decisive for *_, decisive in camera["checks"])
     ]  # fmt: skip

@@ -17,7 +17,6 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,7 @@ from scipy.stats import chi2
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import Folders
-from benchmarks.tables import ROOT, Table, add_record_option
+from benchmarks.tables import Table
 from calibgraph import Calibration, calibrate, perturb
 from calibgraph.model.geometry import pose_rows, twist_between
 from calibgraph.solver.joint import solve_joint
@@ -77,19 +76,12 @@ def main() -> None:
 
 def parse_options() -> argparse.Namespace:
     """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ledger.case_parser(__doc__, "disjoint")
     names: Callable[[str], list[str]] = lambda text: [*filter(None, text.split(","))]  # noqa: E731
     parser.add_argument("--halves", type=names, default=["kitti_places", "00", "05+06+07+08"])
     parser.add_argument("--pairs", type=names, default=["05/06", "05/07", "06/08", "07/08"])
     parser.add_argument("--draws", type=int, default=6, help="of halves")
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "disjoint.jsonl")
-    parser.add_argument("--summary", type=Path, help="print the table of a file, run nothing")
-    add_record_option(parser)
     return parser.parse_args()
 
 

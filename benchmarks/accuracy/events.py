@@ -28,7 +28,7 @@ from benchmarks.accuracy.drives import (
     move_lidar,
     random_step,
 )
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import IncrementalCalibrator, Rig, perturb
 from calibgraph.model.geometry import twist_between
 from tests.draws.drives import simulate_drive
@@ -231,16 +231,13 @@ def main() -> None:
 
 def parse_options() -> argparse.Namespace:
     """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("scenario", nargs="*", default=list(SCENARIOS), help=", ".join(SCENARIOS))
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="seed of the first run")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--verbose", action="store_true", help="print the reports of wrong runs")
     parser.add_argument("--picture", type=Path, help="draw data/track.png instead")
-    add_record_option(parser)
     return parser.parse_args()
 
 

@@ -13,7 +13,6 @@ Stated regions should hold the share of the results that they state.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from scipy.stats import chi2
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Record
-from benchmarks.tables import Table, add_record_option
+from benchmarks.tables import Table, parser_of
 
 Array = NDArray[np.float64]
 
@@ -55,11 +54,8 @@ class Errors:
 
 def main() -> None:
     """Read records, print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("records", type=Path, nargs="+", help="files of other benchmarks")
-    add_record_option(parser)
     options = parser.parse_args()
     records = [record for path in options.records for record in ledger.read(path)]
     found = errors_of(records)

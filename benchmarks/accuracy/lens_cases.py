@@ -12,22 +12,20 @@ reference. Cases are kept in ``--out``, a line each; a stopped run continues.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.lens import values_of
 from benchmarks.accuracy.scenes import Folders
-from benchmarks.tables import ROOT, Table, add_record_option
+from benchmarks.tables import Table
 from calibgraph import Calibration, Config, Dataset, Rig, calibrate, evaluate, load_dataset, perturb
 from calibgraph.model.geometry import twist_between
 from calibgraph.model.rig import Camera
-from factors.free_lens import COEFFICIENT_NUMBERS
 from tests.draws.lenses import put_lens_error
 
 KITTI = ("05", "06", "07", "08", "06+07+08")
@@ -137,7 +135,7 @@ def _to_record(result: Calibration, truth: Rig) -> Record:
     record = ledger.to_record(result, truth)
     corners_px = evaluate(result.rig, truth).lens_px
     for name, camera in record["cameras"].items():
-        right = _values_of(truth.cameras[name])
+        right = values_of(truth.cameras[name])
         camera["corners_px"] = corners_px.get(name, 0.0)
         camera["lens"] = [
             {
@@ -149,18 +147,6 @@ def _to_record(result: Calibration, truth: Rig) -> Record:
             for one in result.lens.get(name, ())
         ]
     return record
-
-
-def _values_of(camera: Camera) -> dict[str, float]:
-    """Parameters of a lens and a clock, as results name them."""
-    k, packed = camera.intrinsics_px, camera.lens.packed
-    numbers = COEFFICIENT_NUMBERS[camera.lens.kind]
-    return {
-        "focal": float(np.sqrt(k.fx * k.fy)), "aspect": k.fx / k.fy, "centre_x": k.cx,
-        "centre_y": k.cy,
-        "offset": camera.time_offset_s or 0.0, "readout": camera.readout_s or 0.0,
-        **{name: float(packed[4 + number]) for name, number in numbers.items()},
-    }  # fmt: skip
 
 
 def _moved(before: Calibration, after: Calibration, name: str) -> float | None:
@@ -269,17 +255,10 @@ REPORTS = {
 
 def main() -> None:
     """Run the cases that are left, and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ledger.case_parser(__doc__, "lens_cases")
     parser.add_argument("--sets", nargs="+", choices=[*REPORTS], default=[*REPORTS])
     parser.add_argument("--data", type=lambda text: text.split(","), default=[], help="only these")
     parser.add_argument("--kind", help="only cases of this kind, as 'focal 0.03 fixed'")
-    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "lens_cases.jsonl")
-    parser.add_argument("--summary", type=Path, help="print the tables of a file, run no case")
-    add_record_option(parser)
     options = parser.parse_args()
     chosen = [
         case for case in cases(options.sets, options.data) if options.kind in (None, case.kind)

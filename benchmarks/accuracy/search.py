@@ -28,7 +28,7 @@ import numpy as np
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import Folders, Scene, with_clouds, with_images
-from benchmarks.tables import ROOT, Table, add_record_option
+from benchmarks.tables import Table
 from calibgraph import Camera, Dataset, Frame, calibrate, evaluate, perturb
 
 SUCCESS_DEG, SUCCESS_CM = 0.5, 15.0
@@ -56,21 +56,14 @@ def main() -> None:
 
 def parse_options() -> argparse.Namespace:
     """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ledger.case_parser(__doc__, "search")
     words: Callable[[str], list[str]] = lambda text: text.split(",")  # noqa: E731
     parser.add_argument("--data", type=words, default=["00", "00+01", "05", "05+06+07+08"])
     parser.add_argument("--within", type=words, default=["20/1.5", "10/0.5", "5/0.3", "2/0.2"])
     parser.add_argument("--kinds", type=words, default=["good"], help=", ".join(KINDS))
     parser.add_argument("--starts", type=int, default=20, help="draws per case")
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
-    parser.add_argument("--jobs", type=int, default=1, help="1 to measure time")
-    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "search.jsonl")
-    parser.add_argument("--summary", type=Path, help="print the table of a file, run nothing")
     parser.add_argument("--cameras", action="store_true", help="a row per camera, too")
-    add_record_option(parser)
     return parser.parse_args()
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import (
     Config,
     Correspondences,
@@ -66,15 +66,12 @@ def main() -> None:
 
 def parse_options() -> argparse.Namespace:
     """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--matches", type=int, default=100)
     parser.add_argument("--awkward", action="store_true", help="few frames, copies, tied cameras")
     parser.add_argument("--cases", nargs="+", default=[*CASES], choices=[*CASES])
-    add_record_option(parser)
     return parser.parse_args()
 
 

@@ -24,16 +24,23 @@ import argparse
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
-from benchmarks.accuracy import data_cases, ledger, table_cases
-from benchmarks.accuracy.data_cases import data_for, data_problem
+from benchmarks.accuracy import ledger
+from benchmarks.accuracy.cases import (
+    DATA,
+    TABLES,
+    UNDETECTABLE,
+    data_for,
+    data_problem,
+    rig_for,
+    table_problem,
+)
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import MOTORWAY, Folders
-from benchmarks.accuracy.table_cases import UNDETECTABLE, rig_for, table_problem
-from benchmarks.tables import ROOT, Table, add_record_option
+from benchmarks.tables import ROOT, Table
 
 SCENES = ROOT / "out" / "scenes"
 OFF_DEG, OFF_CM = 0.5, 10.0
@@ -47,20 +54,10 @@ GOOD_KINDS = ("good",)
 def main() -> None:
     """Run cases, print the summary."""
     options = parse_options()
-    if options.summary is not None:
-        records = [record for path in options.summary for record in ledger.read(path)]
-    else:
-        folders = Folders(
-            options.realdata if options.realdata.is_dir() else None,
-            options.scenes if options.scenes.is_dir() else None,
-        )
-        cases = [
-            case
-            for case in cases_of(options, folders)
-            if options.kinds is None or case.kind in options.kinds
-        ]
-        work = partial(run_case, folders=folders)
-        records = ledger.run(cases, work, out=options.out, jobs=options.jobs)
+    there = (path if path.is_dir() else None for path in (options.realdata, options.scenes))
+    folders = Folders(*there)
+    cases = [case for case in cases_of(options, folders) if case.kind in options.kinds]
+    records = ledger.records_of(options, cases, partial(run_case, folders=folders))
     counted = [record for record in records if record["kind"] not in options.uncounted]
     tables = [summary(records, counted), figures(counted)]
     ledger.publish_cases("accuracy.verdicts", tables, records, record=options.record)
@@ -69,36 +66,21 @@ def main() -> None:
 
 def parse_options() -> argparse.Namespace:
     """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    known = sorted({*table_cases.KINDS, *data_cases.KINDS})
-    parser.add_argument("--set", choices=FIRST_SEED, default="tune")
-    parser.add_argument("--tables", type=int, default=0, help="cases per kind of table")
-    parser.add_argument("--data", type=int, default=0, help="cases per kind of images and clouds")
-    parser.add_argument("--first", type=int, default=0, help="number of the first case of a kind")
-    parser.add_argument("--kinds", type=_names, help=", ".join(known))
-    parser.add_argument(
-        "--uncounted",
-        type=_names,
-        default=(*UNDETECTABLE, *data_cases.UNDETECTABLE),
-        help="left out of the sums",
-    )
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--scenes", type=Path, default=SCENES, help="folder of scene_0, ...")
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "verdicts.jsonl")
-    parser.add_argument("--summary", type=Path, nargs="+", help="summarise files, run nothing")
-    add_record_option(parser)
+    known, parser = sorted({*TABLES, *DATA}), ledger.case_parser(__doc__, "verdicts")
+    names: Callable[[str], tuple[str, ...]] = lambda text: tuple(text.split(","))  # noqa: E731
+    add = parser.add_argument
+    add("--set", choices=FIRST_SEED, default="tune")
+    add("--tables", type=int, default=0, help="cases per kind of table")
+    add("--data", type=int, default=0, help="cases per kind of images and clouds")
+    add("--first", type=int, default=0, help="number of the first case of a kind")
+    add("--kinds", type=names, default=known, help=", ".join(known))
+    add("--uncounted", type=names, default=UNDETECTABLE, help="left out of the sums")
+    add("--scenes", type=Path, default=SCENES, help="folder of scene_0, ...")
     arguments = parser.parse_args()
-    unknown = {*(arguments.kinds or ())} - {*known}
+    unknown = {*arguments.kinds} - {*known}
     if unknown:
         parser.error(f"unknown kinds {', '.join(sorted(unknown))}; known: {', '.join(known)}")
     return arguments
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(text.split(","))
 
 
 def cases_of(arguments: argparse.Namespace, folders: Folders) -> Iterator[Key]:
@@ -107,10 +89,10 @@ def cases_of(arguments: argparse.Namespace, folders: Folders) -> Iterator[Key]:
     names = folders.names(arguments.set)
     for seed in range(first, first + max(arguments.tables, arguments.data)):
         if seed < first + arguments.tables:
-            for kind in table_cases.KINDS:
+            for kind in TABLES:
                 yield Key("table", kind, rig_for(kind, seed), seed)
         if seed < first + arguments.data:
-            for kind in data_cases.KINDS:
+            for kind in DATA:
                 name = data_for(kind, names, seed)
                 missing = name is None or (name == MOTORWAY and not folders.realdata)
                 if not missing:
@@ -169,7 +151,7 @@ def cells(name: str, group: list[Record]) -> tuple[str, ...]:
 
 
 def _order(record: Record) -> tuple[str, int]:
-    kinds = [*(table_cases if record["level"] == "table" else data_cases).KINDS]
+    kinds = [*(TABLES if record["level"] == "table" else DATA)]
     return record["level"], kinds.index(record["kind"])
 
 

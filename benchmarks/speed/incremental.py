@@ -8,7 +8,6 @@ per camera and frame and keeps them all; it does one pass per frame, ours does t
 
 from __future__ import annotations
 
-import argparse
 import gc
 import os
 import time
@@ -20,7 +19,7 @@ import gtsam
 import numpy as np
 
 from benchmarks.accuracy.drives import camera
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import IncrementalCalibrator, MatcherErrors, Rig, perturb, solve
 from calibgraph.graph.objective import pose_key, prior_graph
 from calibgraph.model.config import Config
@@ -148,11 +147,8 @@ def measure_batch(count: int) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, default=20_000, help="at least 150")
-    add_record_option(parser)
     options = parser.parse_args()
     ours, updates = measure_ours(options.frames)
     plain = measure_plain_isam2(min(options.frames, PLAIN_AT[-1]))

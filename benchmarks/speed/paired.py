@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from benchmarks.tables import Table, add_record_option, commit, publish
+from benchmarks.tables import Table, commit, parser_of, publish
 from calibgraph import Calibration, evaluate, load_calibration, load_rig, perturb
 
 SEQUENCES = {"00": ("00",), "05-08": ("05", "06", "07", "08")}
@@ -101,9 +101,7 @@ def main() -> None:
 
 def parse_options() -> argparse.Namespace:
     """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     kept = Path(tempfile.gettempdir()) / "calibgraph_paired"
     parser.add_argument("before", type=Path, help="source tree")
     parser.add_argument("after", type=Path, help="source tree; the sample is this one's")
@@ -113,7 +111,6 @@ def parse_options() -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--cores", type=int, nargs="+", default=[os.cpu_count() or 1])
     parser.add_argument("--folder", type=Path, default=kept, help="guesses, results, caches")
-    add_record_option(parser)
     return parser.parse_args()
 
 

@@ -24,7 +24,6 @@ of as many passes, and to our whole call. Ours is the shortest of several runs.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Callable
@@ -46,7 +45,7 @@ from benchmarks.speed.solvers import (
     solve_trf,
     solve_trf_once,
 )
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import solve
 
 JACOBIAN_BYTES = 3e9  # of TRF, which keeps a few of them
@@ -233,14 +232,11 @@ def _work(solver: str, size: tuple[int, int, int]) -> int:
 
 def main() -> None:
     """Time all solvers on problems of all sizes."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, nargs="+", default=[10, 100, 1000])
     parser.add_argument("--cameras", type=int, nargs="+", default=[2, 12])
     parser.add_argument("--matches", type=int, default=MATCHES)
     parser.add_argument("--longest-s", type=float, default=300.0)
-    add_record_option(parser)
     options = parser.parse_args()
     warm_up = Problem.draw(*WARM_UP)
     solve_ours(warm_up)
