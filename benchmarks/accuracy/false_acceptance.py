@@ -35,7 +35,13 @@ SEQUENCES = tuple(name for name in OTHER if "+" not in name)
 
 def main() -> None:
     """Run cases, print the table."""
-    arguments = parse_options()
+    parser = ledger.case_parser(__doc__, "false_acceptance")
+    parser.add_argument("--scenes", type=Path, help="folder of rendered scenes, scene_N each")
+    parser.add_argument("--recordings", action="store_true", help="KITTI's sequences")
+    parser.add_argument("--starts", type=int, default=5, help="other clouds and guesses per scene")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first")
+    parser.add_argument("--whole", action="store_true", help="calibrate where one is accepted")
+    arguments = parser.parse_args()
     folders = Folders(arguments.realdata, arguments.scenes)
     cases = [
         Key("wrong clouds", kind, data, seed)
@@ -49,17 +55,6 @@ def main() -> None:
     )
     for record in records:
         print(record.get("crash", ""), end="")
-
-
-def parse_options() -> argparse.Namespace:
-    """The options."""
-    parser = ledger.case_parser(__doc__, "false_acceptance")
-    parser.add_argument("--scenes", type=Path, help="folder of rendered scenes, scene_N each")
-    parser.add_argument("--recordings", action="store_true", help="KITTI's sequences")
-    parser.add_argument("--starts", type=int, default=5, help="other clouds and guesses per scene")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first")
-    parser.add_argument("--whole", action="store_true", help="calibrate where one is accepted")
-    return parser.parse_args()
 
 
 def _sources(arguments: argparse.Namespace, folders: Folders, seed: int) -> list[tuple[str, str]]:

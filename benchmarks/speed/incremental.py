@@ -18,7 +18,6 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from benchmarks.accuracy.drives import camera
 from benchmarks.tables import Table, parser_of, publish
 from calibgraph import IncrementalCalibrator, MatcherErrors, Rig, perturb, solve
 from calibgraph.graph.objective import pose_key, prior_graph
@@ -31,6 +30,7 @@ from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from calibgraph.tracking import warm_up_tracker
 from factors import block_factor
 from tests.draws.drives import simulate_drive
+from tools.scenes.drives import camera
 
 RIG = Rig(
     cameras={"left": camera((0.3, 0.1, -0.1), 0), "right": camera((0.3, -0.4, -0.1), 0)},

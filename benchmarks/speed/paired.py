@@ -92,8 +92,9 @@ def main() -> None:
     runs = Runs()
     for case, repeat, setting in product(cases, range(options.repeats), settings):
         measured = run(case, setting, options.folder, options.frames)
-        key = case.name, setting
-        runs[key] = fastest(runs.get(key, measured), measured)
+        before = runs.get((case.name, setting), measured)
+        shortest = (min(getattr(m, of) for m in (before, measured)) for of in ("wall_s", "cpu_s"))
+        runs[case.name, setting] = Measured(*shortest, measured.result)
         seconds = f"{measured.wall_s:.1f} s, CPU {measured.cpu_s:.1f} s"
         print(f"{case.name}, {label(setting)}, repeat {repeat + 1}: {seconds}", flush=True)
     publish("speed.paired", list(tables(cases, settings, runs)), record=options.record)
@@ -183,11 +184,6 @@ def bound_to(cores: int) -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, every)
-
-
-def fastest(one: Measured, other: Measured) -> Measured:
-    """The shortest times of two runs, and the result of the second."""
-    return Measured(min(one.wall_s, other.wall_s), min(one.cpu_s, other.cpu_s), other.result)
 
 
 def version(tree: Path) -> str:

@@ -194,11 +194,12 @@ def main() -> None:
         from calibgraph import load_calibration
 
         verdict = load_calibration(out).verdict.status
-    wall_s, cpu_s = (
-        {**each, "all": sum(each.values())} for each in (sampler.wall_s, sampler.cpu_s)
-    )
-    rows = [(stage, f"{wall_s[stage]:.2f}", f"{cpu_s[stage]:.2f}", f"{cpu_s[stage] / cpu_s['all']:.0%}")
-            for stage in wall_s]  # fmt: skip
+    both = sampler.wall_s, sampler.cpu_s
+    wall_s, cpu_s = ({**seconds, "all": sum(seconds.values())} for seconds in both)
+    rows = [
+        (stage, f"{wall_s[stage]:.2f}", f"{used:.2f}", f"{used / cpu_s['all']:.0%}")
+        for stage, used in cpu_s.items()
+    ]
     table = Table(f"{verdict}, {peak_mb:.0f} MB at most", ("stage", "wall [s]", "CPU [s]", "share"),
                   tuple(rows))  # fmt: skip
     publish("speed.stages", [table], record=options.record)
