@@ -74,11 +74,7 @@ def main() -> None:
     ]
     work = partial(run_case, scenes=arguments.scenes)
     records = ledger.records_of(arguments, cases, work)
-    tables = [
-        report(records),
-        report_places(records, arguments.scenes),
-        report_changes(records, arguments.scenes),
-    ]
+    tables = [report(records), *report_together(records, arguments.scenes)]
     ledger.publish_cases("accuracy.error_bars", tables, records, record=arguments.record)
 
 
@@ -306,36 +302,26 @@ def _calibration(nees_over_6: Iterable[float]) -> tuple[str, str]:
     return f"{values.mean():.2f}", f"{np.mean(6 * values < chi2.ppf(0.95, 6)):.1%}"
 
 
-def report_places(records: Sequence[Record], scenes: Path) -> Table:
-    """A row per number of places and size of the errors: cameras and pairs."""
-    found: dict[tuple[int, str, str], list[Found]] = {}
+def report_together(records: Sequence[Record], scenes: Path) -> list[Table]:
+    """A row per number of places and size of the errors, and per change of five places."""
+    places: dict[tuple[int, str, str], list[Found]] = {}
+    changes: dict[tuple[str, str, str], list[Found]] = {}
     for size, folders in streets_of_groups(records, scenes):
-        for places in (1, 2, STREETS, 10, 20):
-            for start in range(0, len(folders) - places + 1, places):
-                for what in solve_streets(load_streets(folders[start : start + places])):
-                    found.setdefault((places, size, what.of), []).append(what)
-    rows = [
-        (str(places), size, of, *_cells(values))
-        for (places, size, of), values in sorted(found.items())
-    ]
-    columns = ("places", "size", "of", *_CELLS)
-    return Table("Streets of one sensor solved together", columns, tuple(rows))
-
-
-def report_changes(records: Sequence[Record], scenes: Path) -> Table:
-    """A row per change and size of the errors: five places."""
-    found: dict[tuple[str, str, str], list[Found]] = {}
-    for size, folders in streets_of_groups(records, scenes):
-        if len(folders) < STREETS:
-            continue
-        streets = load_streets(folders[:STREETS])
-        for name, change in CHANGES.items():
+        for count in (1, 2, STREETS, 10, 20):
+            for start in range(0, len(folders) - count + 1, count):
+                for what in solve_streets(load_streets(folders[start : start + count])):
+                    places.setdefault((count, size, what.of), []).append(what)
+        for name, change in CHANGES.items() if len(folders) >= STREETS else ():
             rng = np.random.default_rng([11, int(folders[0].name.split("_")[1])])
-            for what in solve_streets(change(streets, rng)):
-                found.setdefault((name, size, what.of), []).append(what)
-    rows = [(*key, *_cells(values)) for key, values in found.items()]
-    columns = ("five places", "size", "of", *_CELLS)
-    return Table("Streets of one sensor solved together, changed", columns, tuple(rows))
+            for what in solve_streets(change(load_streets(folders[:STREETS]), rng)):
+                changes.setdefault((name, size, what.of), []).append(what)
+    title = "Streets of one sensor solved together"
+    return [
+        Table(title, ("places", "size", "of", *_CELLS),
+              tuple((*map(str, key), *_cells(found)) for key, found in sorted(places.items()))),
+        Table(f"{title}, changed", ("five places", "size", "of", *_CELLS),
+              tuple((*key, *_cells(found)) for key, found in changes.items())),
+    ]  # fmt: skip
 
 
 _CELLS = (

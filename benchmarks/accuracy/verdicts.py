@@ -25,6 +25,7 @@ import re
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 
@@ -48,7 +49,6 @@ RIGHT_DEG, RIGHT_CM = 0.15, 4.0
 FIRST_SEED = {"tune": 0, "count": 1000}
 STATUSES = ("PASS", "WARN", "FAIL")
 CLASSES = ("off", "between", "right")
-GOOD_KINDS = ("good",)
 
 
 def main() -> None:
@@ -160,66 +160,45 @@ def figures(counted: list[Record]) -> Table:
     found = Counter(cameras_of(counted))
     off, right = (sum(found[which, s] for s in STATUSES) for which in ("off", "right"))
     wrong_cases = [r for r in counted if any(which == "off" for which, _ in cameras_of([r]))]
-    refused_good = sum("refusal" in r for r in counted if r["kind"] in GOOD_KINDS)
+    refused_good = sum("refusal" in r for r in counted if r["kind"] == "good")
     calm = found["right", "PASS"] + found["right", "WARN"]
     off_by = f"off by more than {OFF_DEG} deg or {OFF_CM:g} cm"
-    return Table(
-        "Wrong verdicts",
-        ("", "share"),
-        (
-            (f"PASS, of results {off_by}", share(found["off", "PASS"], off)),
-            (f"PASS, of cases with a result {off_by}",
-             share(len(_passed(counted)), len(wrong_cases))),
-            (f"PASS or WARN, of results within {RIGHT_DEG} deg and {RIGHT_CM:g} cm and good cases "
-             "that were refused", share(calm, right + refused_good)),
-            *((f"cannot_tell, of WARN of results that are {which}", _unsure(counted, which))
-              for which in ("off", "right")),
-        ),
-    )  # fmt: skip
-
-
-def _unsure(counted: list[Record], which: str) -> str:
-    """Of the results of a class that WARN, those for lack of data."""
-    warned = [
-        camera.get("cannot_tell", False)
-        for record in counted
-        for camera in record.get("cameras", {}).values()
-        if (class_of(camera), camera["status"]) == (which, "WARN")
+    within = f"within {RIGHT_DEG} deg and {RIGHT_CM:g} cm and good cases that were refused"
+    rows = [
+        (f"PASS, of results {off_by}", share(found["off", "PASS"], off)),
+        (f"PASS, of cases with a result {off_by}", share(len(_passed(counted)), len(wrong_cases))),
+        (f"PASS or WARN, of results {within}", share(calm, right + refused_good)),
     ]
-    return share(sum(warned), len(warned))
+    for which in ("off", "right"):
+        cameras = [c for r in counted for c in r.get("cameras", {}).values()]
+        warned = [c.get("cannot_tell", False) for c in cameras
+                  if (class_of(c), c["status"]) == (which, "WARN")]  # fmt: skip
+        what = f"cannot_tell, of WARN of results that are {which}"
+        rows.append((what, share(sum(warned), len(warned))))
+    return Table("Wrong verdicts", ("", "share"), tuple(rows))
 
 
-def remarks(records: list[Record], counted: list[Record]) -> list[str]:
+def remarks(records: list[Record], counted: list[Record]) -> Iterator[str]:
     """Cases that PASS although off, reasons of refusals, and crashes."""
+    for record in _passed(counted):
+        wrong = {
+            name: f"{camera['error_deg']:.2f} deg {camera['error_cm']:.1f} cm"
+            for name, camera in record["cameras"].items()
+            if class_of(camera) == "off" and camera["status"] == "PASS"
+        }
+        yield f"PASS but off: {' '.join(map(str, astuple(ledger.key_of(record))))}: {wrong}"
     refusals = Counter(
-        (r["level"], r["kind"], _masked(r["refusal"])) for r in records if "refusal" in r
-    )
+        (r["level"], r["kind"], re.sub(r"[0-9.]+", "#", r["refusal"])[:120])
+        for r in records if "refusal" in r
+    )  # fmt: skip
     crashes = Counter(r["crash"].strip().splitlines()[-1] for r in records if "crash" in r)
-    return [
-        *(f"PASS but off: {_line(record)}" for record in _passed(counted)),
-        *(f"refused, {n}: {' '.join(what)}" for what, n in refusals.items()),
-        *(f"CRASHED, {n}: {what}" for what, n in crashes.items()),
-    ]
+    yield from (f"refused, {n}: {' '.join(what)}" for what, n in refusals.items())
+    yield from (f"CRASHED, {n}: {what}" for what, n in crashes.items())
 
 
 def _passed(counted: list[Record]) -> list[Record]:
     """Cases with a camera that PASSes although off."""
     return [r for r in counted if ("off", "PASS") in {*cameras_of([r])}]
-
-
-def _masked(text: str) -> str:
-    """A message without its numbers, so that equal ones can be counted, and not too long."""
-    return re.sub(r"[0-9.]+", "#", text)[:120]
-
-
-def _line(record: Record) -> str:
-    wrong = {
-        name: f"{camera['error_deg']:.2f} deg {camera['error_cm']:.1f} cm"
-        for name, camera in record["cameras"].items()
-        if class_of(camera) == "off" and camera["status"] == "PASS"
-    }
-    key = ledger.key_of(record)
-    return f"{key.level} {key.kind} {key.data} {key.seed}: {wrong}"
 
 
 def share(part: int, whole: int) -> str:
