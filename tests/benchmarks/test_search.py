@@ -30,17 +30,3 @@ def test_sigmas_and_squared_errors_are_of_results_that_are_no_fail() -> None:
     assert found["translation x, y, z"] == "9.0, 0.0, 0.0"
     assert found["sigma [deg]"] == "0.10" and found["in the covariance, over 6"] == "1.5"
     assert found["median [deg]"] == "0.30"  # of all three
-
-
-def test_verdicts_are_counted_apart_for_results_that_are_found() -> None:
-    refused = {"level": "20/1.5", "kind": "good", "data": "05", "seed": 3, "refusal": "no match"}
-    found = row([start(0, "PASS", 0.1), start(1, "WARN", 0.6), start(2, "FAIL", 9.0), refused])
-    assert (found["found: PASS"], found["not found: WARN"], found["not found: FAIL"]) == tuple(
-        "111"
-    )
-    assert (found["starts"], found["refused"]) == ("4", "1")
-
-
-def test_places_are_named_where_starts_differ_in_them_and_empty_where_unknown() -> None:
-    assert row([start(0, "PASS", 0.1), start(1, "PASS", 0.1, places=3)])["places"] == "2/3"
-    assert row([start(0, "PASS", 0.1, places=None)])["places"] == ""
