@@ -1,4 +1,4 @@
-"""What our method is compared with: the paper's solver, and one camera at a time."""
+"""What our method is compared with: the solver that the paper publishes."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert, relative_transform, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock, camera_blocks
-from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.objective import Transforms
-from calibgraph.solver.stage1 import Stage1
 
 Array = NDArray[np.float64]
 
@@ -60,12 +58,9 @@ def paper_solve(
 
 
 def _minimize_pass(
-    blocks: Mapping[str, CameraBlock],
-    start: Transforms,
-    T_hat: Transforms,
-    config: Config,
+    blocks: Mapping[str, CameraBlock], start: Transforms, T_hat: Transforms, config: Config,
     terms: Terms,
-) -> Transforms:
+) -> Transforms:  # fmt: skip
     def residuals(T: Transforms) -> Array:
         rows = [_weighted_residuals(block, T[name]) for name, block in blocks.items()]
         return np.concatenate([*rows, np.empty((0, 2))])
@@ -107,12 +102,9 @@ def _log(T: Array) -> Array:
 
 
 def minimize_trf(
-    residuals: Callable[[Transforms], Array],
-    priors: Callable[[Transforms], Array],
-    start: Transforms,
-    *,
-    scale_px: float,
-) -> Transforms:
+    residuals: Callable[[Transforms], Array], priors: Callable[[Transforms], Array],
+    start: Transforms, *, scale_px: float,
+) -> Transforms:  # fmt: skip
     """Minimize sum rho(|r_k|^2) + sum priors^2 by SciPy's TRF, as in "Implementation Details".
 
     Axis-angle and translation per camera, tolerances of 1e-6, at most 2000 evaluations, a Jacobian
@@ -160,23 +152,3 @@ def _unpack(names: list[str], x: Array) -> Transforms:
         T[name][:3, :3] = Rotation.from_rotvec(six[:3]).as_matrix()
         T[name][:3, 3] = six[3:]
     return T
-
-
-def per_camera_adjustment(
-    rig: Rig, table: Correspondences, config: Config, *, pairwise: Stage1 | None = None
-) -> Transforms:
-    """Bundle adjustment of each camera alone: the two passes with its reprojection term only.
-
-    Args:
-        rig: lenses and the guess; its relative poses are not used.
-        table: correspondences.
-        config: with the scales of the loss and the gate.
-        pairwise: Stage 1 of all cameras; computed if None.
-    """
-    T_camera_lidar: Transforms = {}
-    for name, camera in rig.cameras.items():
-        alone = Rig(lidar=rig.lidar, cameras={name: camera})
-        own = table.of_camera(name)
-        solution = solve_joint(alone, own, config, "reprojection", pairwise=pairwise)
-        T_camera_lidar |= solution.T_camera_lidar
-    return T_camera_lidar

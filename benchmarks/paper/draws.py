@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.paper.baselines import paper_solve, per_camera_adjustment
+from benchmarks.paper.baselines import paper_solve
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.io.dataset import load_dataset
 from calibgraph.io.kitti import CALIBRATION_NAME, read_kitti_rig
@@ -236,9 +236,16 @@ class PreparedDraw:
         return solve_joint(rig, self.draw.table, self.ours, terms, pairwise=known).T_camera_lidar
 
     def solve_each_camera(self) -> Transforms:
-        """Each camera alone, with the paper's scales."""
-        known = self.draw.stage1(self.theirs)
-        return per_camera_adjustment(self.draw.rig, self.draw.table, self.theirs, pairwise=known)
+        """Bundle adjustment of each camera alone, with the paper's scales."""
+        known, rig, found = self.draw.stage1(self.theirs), self.draw.rig, {}
+        for name, camera in rig.cameras.items():
+            alone, own = (
+                Rig(lidar=rig.lidar, cameras={name: camera}),
+                self.draw.table.of_camera(name),
+            )
+            solved = solve_joint(alone, own, self.theirs, "reprojection", pairwise=known)
+            found |= solved.T_camera_lidar
+        return found
 
     def solve_with_relative_poses(self) -> Transforms:
         """Ours, with the relative poses of neighbours, which have noise of 1 mrad and 2 mm."""
