@@ -46,12 +46,6 @@ def test_right_results_are_counted_below_the_best_result_that_is_off() -> None:
     assert found["probability"] == ("50%", "50%")
 
 
-def test_one_in_twenty_may_pass_where_five_percent_are_allowed() -> None:
-    right = [sample(off=False, by_bar=0.02)]
-    off = [sample(off=True, by_bar=0.01), *(sample(off=True, by_bar=0.5) for _ in range(19))]
-    assert cells(discrimination("", MODEL, [*right, *off]))["probability"] == ("0%", "100%")
-
-
 def test_no_result_passes_whose_data_are_missing() -> None:
     missing = sample(off=False, severity=1.5, kind="frames")
     found = cells(discrimination("", MODEL, [missing, sample(off=True, by_bar=0.5)]))
@@ -67,18 +61,6 @@ def test_a_certain_and_right_probability_has_no_error() -> None:
     bins = reliability("", MODEL, both)
     assert bins.title.endswith("mean squared error 0.0000")
     assert [row[1] for row in bins.rows] == ["1", "1"]
-
-
-def test_a_camera_that_was_not_found_is_no_sample() -> None:
-    found: Record = {
-        "error_deg": 0.1, "error_cm": 1.0, "covariance": None, "beyond": 0.25,
-        "checks": [["outliers", "PASS", 0.1, 0.2, False], ["outliers", "WARN", 0.4, 1.2, False]],
-    }  # fmt: skip
-    lost: Record = {**found, "checks": [["search", "FAIL", None, 2.5, True]]}
-    record = {"level": "data", "kind": "good", "cameras": {"left": found, "right": lost}}
-    (only,) = samples_of([record])
-    assert (only.statuses, only.by_bar) == ({"outliers": "WARN"}, 0.25)
-    assert only.right and not only.off
 
 
 def test_a_pose_found_by_chance_counts_beside_a_wrong_lens() -> None:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
-import pytest
 
 from benchmarks.paper.baselines import (
     TRF_TOLERANCE,
-    paper_solve,
     prior_rows,
 )
 from benchmarks.paper.draws import PreparedDraw, source_from
-from calibgraph import Config, preset
+from calibgraph import preset
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.joint import solve_joint
 
@@ -67,9 +65,3 @@ def test_priors_alone_have_their_minimum_at_stage_1() -> None:
     solved, T_hat = prepared.solve_as_paper("priors"), prepared.aggregate_pnp("median")
     for name, T in T_hat.items():
         np.testing.assert_allclose(solved[name], T, atol=1e-9)
-
-
-def test_the_papers_solver_refuses_settings_that_are_not_the_papers() -> None:
-    draw = source_from("kitti").draw(1, seed=0)
-    with pytest.raises(ValueError, match="needs a Cauchy loss"):
-        paper_solve(draw.rig, draw.table, draw.rig.T_camera_lidar, Config(), "full")

@@ -13,9 +13,8 @@ import pytest
 from benchmarks.paper.__main__ import main
 from benchmarks.paper.draws import HEADLINE, METHODS, STAGE1, TRF_TERMS, Draw, Source, source_from
 from benchmarks.paper.experiment import interval, run_experiment
-from benchmarks.paper.output import PAIR, markdown, published, to_mapping, write_report
-from calibgraph import CorrespondenceError, preset
-from tests.conftest import SAMPLE
+from benchmarks.paper.output import PAIR, markdown, published, to_mapping
+from calibgraph import preset
 
 KITTI = preset("kitti")
 
@@ -77,11 +76,6 @@ def test_the_same_seed_gives_the_same_numbers() -> None:
     assert numbers_of(seed=1)["blocks"] != numbers_of()["blocks"]
 
 
-@pytest.mark.slow
-def test_several_processes_give_the_same_numbers() -> None:
-    assert numbers_of(jobs=2) == numbers_of()
-
-
 def test_intervals_are_medians_and_quantiles() -> None:
     found = interval([5.0, 1.0, 3.0, 2.0, 4.0, np.nan])
     # Linear between order statistics: 5 % of the way along 1 .. 5 is 1.2.
@@ -94,47 +88,6 @@ def test_rows_that_fail_are_counted_and_marked() -> None:
     rows = report.blocks[0].rows
     assert all(rows[name].failed == 1 for name in (STAGE1, HEADLINE, *TRF_TERMS))
     assert "| failed |" in markdown(report)
-
-
-def test_a_recording_without_matches_fails_in_every_row(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def find_nothing(*arguments: object, **options: object) -> None:
-        raise CorrespondenceError("nothing", camera="left")
-
-    monkeypatch.setattr("benchmarks.paper.draws.match_in_rounds", find_nothing)
-    report = run_experiment(source_from(str(SAMPLE)), frames=[2], draws=1, config=KITTI)
-    assert report.published_as == ""
-    assert all(row.failed == 1 for row in report.blocks[0].rows.values())
-    assert len(write_report(report, tmp_path)) == 2
-    with pytest.raises(SystemExit):
-        run_main(monkeypatch, SAMPLE, "--frames", 2, "--draws", 1, "--out", tmp_path / "new")
-    assert "calibgraph calibrate reports why" in capsys.readouterr().err
-    assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("nowhere",), "'nowhere' is no scenario (kitti, walkley"),
-        (("kitti", "--frames", "ten"), "--frames: invalid int value: 'ten'"),
-        (("kitti", "--preset", "auto"), "--preset: invalid choice: 'auto'"),
-        (("kitti", "--frames", "10001"), "10001 frames: at most 10000"),
-        (("kitti", "--draws", "0"), "nothing to do: 0 draws"),
-    ],
-)
-def test_wrong_arguments_are_one_line(
-    arguments: tuple[str, ...],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with pytest.raises(SystemExit) as exit_code:
-        run_main(monkeypatch, *arguments, "--out", tmp_path / "out")
-    assert exit_code.value.code == 2
-    assert message in capsys.readouterr().err.splitlines()[-1]
-    assert not (tmp_path / "out").exists()
 
 
 def test_the_papers_numbers_are_those_of_its_tables() -> None:
