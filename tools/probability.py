@@ -30,13 +30,7 @@ from benchmarks.accuracy import ledger
 from benchmarks.tables import ROOT, parser_of
 from calibgraph.model.verdict import FAIL_ABOVE
 from calibgraph.trust.probability import STRUCTURE, TABLES, WORST, steps
-from tools.verdict_samples import (
-    AMBIGUOUS,
-    SHARE_OFF,
-    Sample,
-    judged,
-    samples_of,
-)
+from tools.verdict_samples import AMBIGUOUS, SHARE_OFF, Sample, judged, samples_of
 
 Array = np.ndarray
 

@@ -114,8 +114,7 @@ def with_lenses(rig: Rig, change: Callable[[Camera], Drawn]) -> Rig:
 def with_intrinsics(rig: Rig, change: Callable[[Intrinsics], Drawn]) -> Rig:
     """The rig with some intrinsics of every camera changed."""
     return with_lenses(
-        rig,
-        lambda c: {"intrinsics_px": c.intrinsics_px.model_copy(update=change(c.intrinsics_px))},
+        rig, lambda c: {"intrinsics_px": c.intrinsics_px.model_copy(update=change(c.intrinsics_px))}
     )
 
 

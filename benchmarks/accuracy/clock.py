@@ -16,13 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.accuracy.lens import (
-    Drawn,
-    cells_of,
-    errors_of,
-    nees_of,
-    simulated,
-)
+from benchmarks.accuracy.lens import Drawn, cells_of, errors_of, nees_of, simulated
 from benchmarks.tables import Table, parser_of, publish
 from calibgraph import Config, Dataset, calibrate, evaluate, load_dataset, perturb
 from calibgraph.solver.joint import solve_joint

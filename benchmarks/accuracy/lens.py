@@ -18,14 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.tables import Table, parser_of, publish
-from calibgraph import (
-    Camera,
-    Config,
-    Correspondences,
-    MatcherErrors,
-    Rig,
-    simulate_correspondences,
-)
+from calibgraph import Camera, Config, Correspondences, MatcherErrors, Rig, simulate_correspondences
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import twist_between
 from calibgraph.simulation.rigs import rig_of

@@ -95,13 +95,7 @@ class SimulatedMatcher:
         self.bias_field = errors.bias_px * _draw_polynomial(self.rng)
 
     def match(
-        self,
-        rng: Rng,
-        name: str,
-        frame: int,
-        *,
-        count: int,
-        depth_m: tuple[float, float] | None,
+        self, rng: Rng, name: str, frame: int, *, count: int, depth_m: tuple[float, float] | None
     ) -> Correspondences:
         """Draw the table of one frame.
 

@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import disjoint
-from benchmarks.accuracy.disjoint import (
-    Estimate,
-    difference,
-    repeat_covariances,
-    report,
-    split,
-)
+from benchmarks.accuracy.disjoint import Estimate, difference, repeat_covariances, report, split
 from benchmarks.accuracy.ledger import Key, Record
 from calibgraph import Rig, solve
 from tests.trust.conftest import simulated

@@ -5,10 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from benchmarks.paper.baselines import (
-    TRF_TOLERANCE,
-    prior_rows,
-)
+from benchmarks.paper.baselines import TRF_TOLERANCE, prior_rows
 from benchmarks.paper.draws import PreparedDraw, source_from
 from calibgraph import preset
 from calibgraph.model.geometry import to_T_lidar_camera
