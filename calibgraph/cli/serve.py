@@ -27,7 +27,7 @@ def serve(
     recording_gb: Annotated[float, typer.Option(min=0.001)] = 20.0,
     free_gb: Annotated[float, typer.Option(min=0.0)] = 1.0,
     keep_days: Annotated[float, typer.Option(min=0.001)] = 30.0,
-    tracker_processes: Annotated[int, typer.Option(min=0)] = 2,
+    tracker_processes: Annotated[int, typer.Option(min=1)] = 2,
 ) -> None:
     """Calibrate, check and track for others, over HTTP, until stopped.
 

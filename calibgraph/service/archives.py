@@ -12,7 +12,6 @@ MOST_FILES = 100_000
 MOST_RATIO = 100
 """Clouds and images of sensors pack to a third at best; zeros to a thousandth."""
 _ANY_RATIO_BYTES = 10**8
-_CHUNK = 2**20
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}"
 _LAYOUT = re.compile(
     rf"(?:rig\.yaml|calib\.txt|times\.txt|metadata\.yaml|{_NAME}\.(?:db3|mcap)"
@@ -80,7 +79,7 @@ def _unpack(packed: Path, folder: Path, most_bytes: int) -> None:
             path = folder / target
             path.parent.mkdir(parents=True, exist_ok=True)
             with archive.open(name) as source, path.open("xb") as file:
-                shutil.copyfileobj(source, file, _CHUNK)
+                shutil.copyfileobj(source, file, 2**20)
 
 
 def _targets(names: list[str], where: str) -> dict[str, str]:

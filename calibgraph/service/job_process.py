@@ -102,8 +102,8 @@ def _fetched(task: JobTask, uri: str, name: str) -> Path:
 
 
 def _recordings(task: JobTask) -> list[Path]:
-    found = (_input(task, recording_name(i)) for i in range(task.job.recordings))
-    return [path for path in found if path is not None]
+    names = map(recording_name, range(task.job.recordings))
+    return [path for name in names if (path := _input(task, name)) is not None]
 
 
 def _solve(task: JobTask, progress: Progress) -> JobOutcome:

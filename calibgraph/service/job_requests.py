@@ -42,7 +42,6 @@ def _checked_config(content: object) -> object:
 
 
 Frames = Annotated[str, StringConstraints(max_length=10_000)]
-Tolerance = Annotated[float, Field(gt=0, le=1000)]
 
 
 class _Strict(BaseModel):
@@ -87,8 +86,8 @@ class CheckSettings(_Strict):
         frames: which, as ``--frames``.
     """
 
-    tolerance_deg: Annotated[Tolerance, Field(le=180)] = 0.5
-    tolerance_cm: Tolerance = 10.0
+    tolerance_deg: Annotated[float, Field(gt=0, le=180)] = 0.5
+    tolerance_cm: Annotated[float, Field(gt=0, le=1000)] = 10.0
     frames: Frames | None = None
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
 

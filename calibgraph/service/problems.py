@@ -17,8 +17,6 @@ from calibgraph.errors import CalibrationError
 
 log = logging.getLogger("calibgraph.service")
 
-_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-
 
 class Problem(Exception):
     """An answer that refuses a request; its detail states in one line what to do."""
@@ -51,7 +49,9 @@ def add_problem_handlers(app: FastAPI) -> None:
 
 
 def _problem_of(request: Request, error: Exception) -> Problem:
-    is_full = getattr(error, "errno", 0) in _DISK_FULL or "disk is full" in str(error)
+    is_full = getattr(error, "errno", 0) in (errno.ENOSPC, errno.EDQUOT) or "disk is full" in str(
+        error
+    )
     found = Problem(500, f"internal error {secrets.token_hex(4)}; the server's log has more")
     match error:
         case Problem():

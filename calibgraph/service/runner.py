@@ -61,10 +61,6 @@ class Runner:
             thread.start()
             self._threads.append(thread)
 
-    def is_alive(self) -> bool:
-        """Whether all threads run."""
-        return all(thread.is_alive() for thread in self._threads)
-
     def cancel(self, id: str) -> bool:
         """Cancel a job; False if it is finished."""
         if not self._table.cancel(id):
@@ -104,7 +100,9 @@ class Runner:
                 self.added.clear()
                 if slot.job is not None:  # what it came to could not be written
                     self._table.put_back(slot.job)
-                record = self._take(slot)
+                with self._taking:
+                    record = self._table.start_next()
+                    slot.job = None if record is None else record.id
                 if record is None:
                     self.added.wait(_LOOK_EVERY_S)
                 else:
@@ -114,12 +112,6 @@ class Runner:
                 slot.child.stop()
                 self._is_stopping.wait(_RETRY_AFTER_S)
 
-    def _take(self, slot: _Slot) -> JobRecord | None:
-        with self._taking:
-            record = self._table.start_next()
-            slot.job = None if record is None else record.id
-        return record
-
     def _run(self, slot: _Slot, record: JobRecord) -> None:
         """Run a job and write down how it ended."""
         outcome = self._ask(slot, record)
@@ -127,10 +119,11 @@ class Runner:
             self._table.put_back(record.id)
         else:
             if outcome.error_kind is None:
-                self._keep_result(record.id)
+                folder = self._folder.of_job(record.id)
+                shutil.rmtree(folder / RESULT, ignore_errors=True)
+                (folder / WORK).rename(folder / RESULT)
             self._table.finish(record.id, outcome)
-        known = self._table.get(record.id)
-        if known is None or known.is_finished:
+        if (known := self._table.get(record.id)) is None or known.is_finished:
             self._discard_input(record.id)
         with self._taking:
             slot.job = None
@@ -169,11 +162,6 @@ class Runner:
         if failed or slot.jobs >= _JOBS_PER_CHILD:
             slot.child.stop()
             slot.jobs = 0
-
-    def _keep_result(self, id: str) -> None:
-        folder = self._folder.of_job(id)
-        shutil.rmtree(folder / RESULT, ignore_errors=True)
-        (folder / WORK).rename(folder / RESULT)
 
     def _discard_input(self, id: str) -> None:
         """Remove all of a finished job that is not its result."""

@@ -19,8 +19,7 @@ HEADER_BYTES = 16 * 1024
 """Of the request line and headers, before which a connection ends."""
 IDLE_S = 20.0
 """A connection ends after this without a request, or with headers that are not complete."""
-_CLOSE_S = 5
-_BACKLOG = 4096
+_CLOSE_S, _BACKLOG = 5, 4096
 
 
 def require_safe(host: str, *, has_tokens: bool) -> None:

@@ -30,7 +30,7 @@ class Settings(BaseModel):
         recording_bytes: most bytes of an upload, packed and unpacked, and of a remote recording.
         free_bytes: of the disk; with less, nothing is accepted.
         keep_s: how long the results of finished jobs are kept.
-        tracker_processes: that hold the trackers; 0 for no trackers.
+        tracker_processes: that hold the trackers; they start with the first.
         body_bytes: most bytes of a body that is no upload: frames of a tracker.
         grace_s: how long jobs may run on when the server is told to stop.
     """
@@ -49,6 +49,6 @@ class Settings(BaseModel):
     recording_bytes: Bytes = 20 * GB
     free_bytes: Count = 1 * GB
     keep_s: Seconds = 30 * 86400.0
-    tracker_processes: Count = 2
+    tracker_processes: Annotated[int, Field(ge=1)] = 2
     body_bytes: Bytes = 16 * MB
     grace_s: Seconds = 10.0

@@ -59,14 +59,15 @@ class Service:
         Raises:
             Problem: if the server stops, its disk would be full, or its queue is.
         """
-        self.runner.remove_expired()
         if self.is_stopping:
             raise Problem(503, "the server is being stopped; try again soon")
         if shutil.disk_usage(self.folder.path).free - 2 * size < self.settings.free_bytes:
+            self.runner.remove_expired()
             raise Problem(507, "the server's disk has no room for it; try again later")
 
     def add(self, id: str, job: Job) -> JobRecord:
         """Add a job whose folder is in its place; it is durable when this returns."""
+        self.runner.remove_expired()
         try:
             waiting = self.jobs.counts().get("queued", 0)
             if waiting >= self.settings.most_queued:

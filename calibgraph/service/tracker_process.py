@@ -20,55 +20,52 @@ from calibgraph.tracking.streams import Refused
 from calibgraph.tracking.update import json_lines
 
 Held = dict[Path, DurableCalibrator]
-Request = tuple[str, Path, bytes, str]  # method of HTTP, folder, body, JSON of settings
-Answer = tuple[int, str, int]  # status, JSON or why it is refused, frames taken in
 
 
-def answer(held: Held, request: Request) -> Answer:
-    """Answer a request; after an error the state on disk is what counts."""
+def answer(held: Held, request: tuple[str, Path, bytes, str]) -> tuple[int, str]:
+    """Answer a method, folder, body and settings; after an error the state on disk counts."""
     method, folder, body, config = request
     rig, settings = folder / "rig.yaml", folder / "config.json"
     is_gone = not rig.exists()
     if is_gone != (method == "PUT"):
-        return (404, "no such tracker", 0) if is_gone else (409, "there is one; remove it", 0)
+        return (404, "no such tracker") if is_gone else (409, "there is one; remove it first")
     try:
         if method == "PUT":
-            require_offset_alone(config_from(json.loads(config), "config"))
-            folder.mkdir(mode=0o700, exist_ok=True)
+            shutil.rmtree(folder, ignore_errors=True)  # of one that was removed in part
+            folder.mkdir(mode=0o700)
             write_text(settings, config)
             write_bytes(rig, body)
             sync_folder(folder.parent)
         if method != "DELETE":
             if folder not in held:
                 given = config_from(json.loads(settings.read_text()), "config")
+                require_offset_alone(given)
                 held[folder] = DurableCalibrator(folder / "state", load_rig(rig), given)
-            return _take_frames(held[folder], body) if method == "POST" else _state(held[folder])
+            if method == "POST":
+                return 200, _take_frames(held[folder], body)
+            tracker = held[folder].tracker
+            state = {"frame": tracker.frame, **result_summary(tracker.calibration(), [])}
+            return 200, json.dumps(finite(state))
         is_gone, status, text = True, 200, "null"
     except Exception as error:
         kind, text = describe_failure(error)
-        status = {"bad input": 422, "out of memory": 413, "io": 507}.get(kind, 500)
         text = text.replace(f"{folder}/", "").replace(str(folder), "the tracker")
+        status = {"bad input": 422, "out of memory": 413, "io": 507}.get(kind, 500)
     if folder in held:
         held.pop(folder).abandon()
     if is_gone:
         rig.unlink(missing_ok=True)  # without it there is no tracker
         shutil.rmtree(folder, ignore_errors=True)
-    return status, text, 0
+    return status, text
 
 
-def _state(calibrator: DurableCalibrator) -> Answer:
-    tracker = calibrator.tracker
-    summary = finite(result_summary(tracker.calibration(), []))
-    return 200, json.dumps({"frame": tracker.frame, **summary}), 0
-
-
-def _take_frames(calibrator: DurableCalibrator, body: bytes) -> Answer:
+def _take_frames(calibrator: DurableCalibrator, body: bytes) -> str:
     """Take in frames, ten by one write; one with a motion of no vehicle refuses all of them."""
     items = [*frames_of_lines([body], "frames")]
     updates, refused, known = list[Update](), list[str](), 0
-    wrong = [item.message for item in items if isinstance(item, Refused) and item.by_motion]
-    if wrong:  # slower frames look right, and are not
-        raise ValueError(f"{wrong[0]}; none of these frames was taken in")
+    for item in items:  # slower frames look right, and are not
+        if isinstance(item, Refused) and item.by_motion:
+            raise ValueError(f"{item.message}; none of these frames was taken in")
     for group in in_groups(items, 10):
         if isinstance(group, Refused):
             refused.append(group.message)
@@ -82,13 +79,13 @@ def _take_frames(calibrator: DurableCalibrator, body: bytes) -> Answer:
                     refused.append(found.message)
                 else:
                     updates += found
-    rest = json.dumps({"known": known, "refused": refused}).removeprefix("{")
-    return 200, f'{{"updates": [{", ".join(json_lines(updates))}], {rest}', len(updates)
+    lines = ", ".join(json_lines(updates))
+    return f'{{"updates": [{lines}], "known": {known}, "refused": {json.dumps(refused)}}}'
 
 
 if __name__ == "__main__":
     warm_up_tracker()
     gc.freeze()  # what is loaded by now stays: each full collection would visit it
-    open_trackers: Held = {}
+    held_trackers: Held = {}
     with memory_limit(int(sys.argv[2])):
-        answer_requests(lambda request, _: answer(open_trackers, request))
+        answer_requests(lambda request, _: answer(held_trackers, request))

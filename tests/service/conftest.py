@@ -49,7 +49,7 @@ def make_server(tmp_path: Path) -> Iterator[Make]:
     with ExitStack() as stack:
 
         def make(name: str = "data", **changes: Any) -> TestClient:
-            none = {"jobs_at_once": 0, "tracker_processes": 0, "free_bytes": 0}
+            none = {"jobs_at_once": 0, "tracker_processes": 1, "free_bytes": 0}
             app = create_app(Settings(data=tmp_path / name, **(none | changes)))
             client = TestClient(app, URL, raise_server_exceptions=False, follow_redirects=False)
             return stack.enter_context(client)
