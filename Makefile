@@ -70,7 +70,6 @@ docs: $(VENV)/docs ## Build the documentation into build/docs, without a network
 bench: $(VENV)/test ## Compare ratios of processor times with the last release's; measure parts by themselves
 	$(BIN)/python -m benchmarks.speed.gate --against benchmarks/ratios.json
 	$(BIN)/python -m benchmarks.speed.stages data/sample
-	$(BIN)/python -m benchmarks.speed.kernel
 	$(BIN)/python -m benchmarks.speed.solve --frames 10 100 --cameras 2
 	$(BIN)/python -m benchmarks.speed.solve --frames 20 --cameras 12 --matches 500
 	$(BIN)/python -m benchmarks.speed.scaling --rows 1e3 1e5 1e7

@@ -71,8 +71,8 @@ from .model.verdict import Check as Check
 from .model.verdict import Verdict as Verdict
 from .pipeline import calibrate as calibrate
 from .pipeline import solve as solve
+from .simulation.correspondences import MatcherErrors as MatcherErrors
 from .simulation.correspondences import simulate_correspondences as simulate_correspondences
-from .simulation.matcher_errors import MatcherErrors as MatcherErrors
 from .simulation.recording import simulate_street as simulate_street
 from .tracking import DurableCalibrator as DurableCalibrator
 from .tracking import Event as Event

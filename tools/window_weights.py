@@ -13,7 +13,6 @@ all windows of one weight and with the network's.
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -25,10 +24,8 @@ import numpy as np
 import torch
 
 from benchmarks.accuracy import ledger
-from benchmarks.accuracy.alignment import aligned_rig
-from benchmarks.accuracy.error_bars import pair, wide
 from benchmarks.accuracy.scenes import Folders
-from benchmarks.tables import ROOT, Table, add_record_option, publish
+from benchmarks.tables import ROOT, Table, parser_of, publish
 from calibgraph import Dataset, Rig, load_dataset, simulate_street
 from calibgraph.files import write_text
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
@@ -45,6 +42,7 @@ from calibgraph.matching.structure.window_weights import (
 )
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.simulation.scan_errors import draw_scan_errors
+from tools.scenes.sensor_streets import aligned_rig, pair, wide
 from tools.scenes.surroundings import SURROUNDINGS
 
 LEVEL = replace(LEVELS[3], weighed=False)
@@ -74,15 +72,12 @@ class Sample:
 
 def main() -> None:
     """Train, write, judge."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--scenes", type=Path, default=ROOT / "out" / "weights")
     parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--write", action="store_true", help="train, and write into the package")
     parser.add_argument("--judge", action="store_true", help="print the table of the recordings")
-    add_record_option(parser)
     options = parser.parse_args()
     if options.write:
         samples = [sample_of(*scene, "rendered") for scene in rendered(options.scenes)]

@@ -8,7 +8,6 @@ processor time of a frame, of trackers that send without a pause. Clients and se
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import secrets
@@ -22,7 +21,7 @@ import httpx
 import numpy as np
 
 from benchmarks.service.server import Server
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import Correspondences, MatcherErrors, Rig, perturb, simulate_correspondences
 from calibgraph.arrays import Array
 from calibgraph.simulation.rigs import rig_of
@@ -212,12 +211,11 @@ def _table(counts: Counts, lost: int, trackers: int, hz: float, wall_s: float) -
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--trackers", type=int, default=200)
     parser.add_argument("--hz", type=float, default=10.0)
     parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument("--port", type=int, default=8395)
-    add_record_option(parser)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         server = Server(Path(temporary) / "data", options.port)

@@ -37,7 +37,7 @@ def read_bin(path: Path, columns: Sequence[str] | None = None) -> RawCloud:
         rows = _rows(path, data, len(columns))
         return raw_cloud(path, columns, dict(zip(columns, rows.T, strict=True)).__getitem__)
     named = 5 if path.name.lower().endswith(".pcd.bin") else 4
-    found = _count_columns(path, np.frombuffer(data, "<f4", len(data) // 4)) or named
+    found = _count_columns(path, np.frombuffer(data, "<f4", len(data) // 4), named)
     if found != named == 5:  # noqa: PLR2004 - of nuScenes
         raise FileError(path, f"holds points of {found} columns by its content, expected nuScenes' "
                         f"5; end its name in .bin alone, or {_ASK}")  # fmt: skip
@@ -53,10 +53,10 @@ def _rows(path: Path, data: bytes, columns: int) -> NDArray[np.float32]:
     return np.frombuffer(data, "<f4").reshape(-1, columns)
 
 
-def _count_columns(path: Path, values: NDArray[np.float32]) -> int | None:
-    """The smallest number of columns that explains as much as any; None of few or alike ones."""
+def _count_columns(path: Path, values: NDArray[np.float32], named: int) -> int:
+    """The named number of columns if it explains as much as any, or else the smallest that does."""
     if len(values) < _FEW:
-        return None
+        return named
     ranks = rankdata(np.abs(np.nan_to_num(values[:_MOST]))) / min(len(values), _MOST)
     explained = {
         c: float(ranks[: len(ranks) // c * c].reshape(-1, c).mean(axis=0).var())
@@ -71,9 +71,8 @@ def _count_columns(path: Path, values: NDArray[np.float32]) -> int | None:
         raise FileError(
             path, "has all x first, then all y, by its content; write it point by point"
         )
-    best = next((c for c in explained if explained[c] >= _ENOUGH * most - 4 / len(ranks)), None)
-    if best is None:
-        return None
+    likely = [c for c in explained if explained[c] >= _ENOUGH * most - 4 / len(ranks)]
+    best = named if named in likely or not likely else likely[0]
     rows = values[: len(values) // best * best].reshape(-1, best)[:, :3]
     with np.errstate(invalid="ignore"):
         implausible = bool((np.abs(rows) > MAX_COORDINATE).any())

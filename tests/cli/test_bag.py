@@ -102,7 +102,7 @@ def test_wrong_options_are_one_line(call: Call, tmp_path: Path, table: Path) -> 
     for options, expected in (
         (("--topic", "/points"), "--topic /points: expected NAME=/TOPIC"),
         (("--stamps", "best"), "stamps 'best': known are header, record"),
-        (("--tolerance-s", 0.001), "do not meet; give --stamps record"),
+        (("--tolerance-s", 0.001), "give --stamps record if the clocks differ"),
     ):
         assert expected in error_line(*call("calibrate", bag, "--out", out, *options))
     line = error_line(*call("calibrate", SAMPLE, "--out", out, "--every-s", 2))

@@ -18,7 +18,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.verdict import COMMON_ERROR
-from calibgraph.simulation.matcher_errors import PoseSpread
+from calibgraph.simulation.correspondences import PoseSpread
 
 ZERO = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
 

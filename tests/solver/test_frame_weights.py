@@ -17,7 +17,7 @@ from calibgraph import (
     solve,
 )
 from calibgraph.model.correspondences import concatenate
-from calibgraph.simulation.matcher_errors import PoseSpread
+from calibgraph.simulation.correspondences import PoseSpread
 from calibgraph.solver.frame_weights import confidence_sigmas
 from calibgraph.solver.joint import solve_joint
 

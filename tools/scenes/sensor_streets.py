@@ -1,4 +1,4 @@
-"""The true alignment of cameras with a LiDAR that errs: where its points best meet the images.
+"""Rendered streets with sensors that err, and the true alignment of their cameras.
 
 A point that is delivered where it is not is seen by a camera at the pixel of the surface that the
 beam met. The alignment of a camera is the pose that brings the delivered points of its view nearest
@@ -7,20 +7,61 @@ to these pixels, all of equal weight.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
 
-from calibgraph import Camera, Rig, load_dataset
+from calibgraph import Camera, Intrinsics, Rig, load_dataset, simulate_street
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera, twist_between
 from calibgraph.simulation.lidar import lidar_of
+from calibgraph.simulation.rigs import rig_of
 from calibgraph.simulation.scan_errors import ScanErrors
 from factors import ProjectionBlock, block_factor
 
 ALIGNMENT = "alignment.yaml"
 _MOST = 20_000  # points of a camera
+FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+def pair() -> Rig:
+    """KITTI's stereo pair, of half the size."""
+    lens = Intrinsics(fx=359.4, fy=359.4, cx=303.6, cy=92.6)
+    places = {"left": (0.27, 0.06, -0.08), "right": (0.27, -0.48, -0.08)}
+    return Rig(cameras={n: _camera(620, 188, lens, xyz, 0.9) for n, xyz in places.items()})
+
+
+def wide() -> Rig:
+    """Two cameras of 93 degrees, half to the left and half to the right."""
+    lens = Intrinsics(fx=303.0, fy=303.0, cx=319.5, cy=199.5)
+    views = {"left": ((0.3, 0.2, -0.2), 35.0), "right": ((0.3, -0.2, -0.2), -35.0)}
+    return Rig(cameras={n: _camera(640, 400, lens, *view) for n, view in views.items()})
+
+
+def _camera(
+    width: int, height: int, lens: Intrinsics, xyz_m: tuple[float, ...], yaw_deg: float
+) -> Camera:
+    turn, (sine, cosine) = np.eye(3), (np.sin(np.radians(yaw_deg)), np.cos(np.radians(yaw_deg)))
+    turn[:2, :2] = [[cosine, sine], [-sine, cosine]]
+    T = np.eye(4)
+    T[:3, :3] = FORWARD @ turn
+    T[:3, 3] = -T[:3, :3] @ xyz_m
+    return Camera(width_px=width, height_px=height, intrinsics_px=lens, T_camera_lidar=T)
+
+
+RIGS = (("pair", pair, 64), ("sample", partial(rig_of, "sample"), 64),
+        ("wide", wide, 64), ("sector", partial(rig_of, "sample"), 32))  # fmt: skip
+"""Name, rig and beams of the LiDAR; groups of streets take turns with them."""
+
+
+def render(folder: Path, truth: Rig, beams: int, errors: ScanErrors, **options: Any) -> None:
+    """Render a street of another layout than others."""
+    shutil.rmtree(folder, ignore_errors=True)
+    simulate_street(folder, truth, beams=beams, sensor_errors=errors, vary_layout=True, **options)
 
 
 def true_points(points_m: np.ndarray, beams: int, errors: ScanErrors) -> np.ndarray:

@@ -78,10 +78,7 @@ class World:
     def guess(self) -> Rig:
         """The truth, displaced."""
         return perturb(
-            self.truth,
-            rotation_deg=self.guess_deg,
-            translation_m=self.guess_m,
-            seed=self.seed + 1,
+            self.truth, rotation_deg=self.guess_deg, translation_m=self.guess_m, seed=self.seed + 1
         )
 
     def table(self, rig_at: Callable[[int], Rig] | None = None) -> Correspondences:
