@@ -1,26 +1,16 @@
 """CameraInfo: messages as ``ros2 topic echo`` prints them, and files of ``camera_info_manager``."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
-import numpy as np
 from pydantic import AliasChoices, Field
 
-from calibgraph.arrays import Array
-from calibgraph.errors import CalibrationError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.bags.camera_info import lens_of
-from calibgraph.io.formats.documents import commented_yaml
 from calibgraph.io.formats.part import Part
-from calibgraph.io.formats.rig_export import RigExport, frame_id, no_place_for
-from calibgraph.model.rig import Camera, Finite, Size
+from calibgraph.model.rig import Finite, Size
 
-_MODELS: Final = {"pinhole": "plumb_bob", "fisheye": "equidistant", "omnidirectional": "mei"}
-_PLUMB_BOB = 5
-LENS_MARK: Final = "the extrinsic is not part of a camera_info"
-"""Text of exported lenses alone."""
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
@@ -53,54 +43,6 @@ class _Message(StrictNumbers):
     binning_x: _Count = 0
     binning_y: _Count = 0
     roi: _Window = _Window()
-
-
-def write_camera_infos(export: RigExport) -> Mapping[str, str]:
-    """Per name of a file, the lens of one camera, as ROS's ``camera_info_manager`` loads it.
-
-    K and D are of the images as recorded; R is the identity and P is K.
-
-    Raises:
-        CalibrationError: if a lens has no name in ROS, or two cameras one name of a file.
-    """
-    files: dict[str, str] = {}
-    for name, camera in export.cameras.items():
-        file = f"{frame_id(name)}.yaml"
-        if file.casefold() in map(str.casefold, files):  # one file where systems ignore case
-            raise CalibrationError(f"camera {name!r}: another has the file {file}; rename one")
-        statement = (
-            export.origin,
-            "K and D are of the images as recorded, R is the identity, P is K",
-            f"{LENS_MARK}: export it as tf2, ros2-launch or urdf",
-            f"optical frame: {export.optical_frames[name]}",
-        )
-        files[file] = commented_yaml(statement, _content(name, camera))
-    return files
-
-
-def _content(name: str, camera: Camera) -> dict[str, Any]:
-    K, distortion = camera.matrix_px, [*camera.distortion]
-    if camera.model == "pinhole":
-        distortion += [0.0] * (_PLUMB_BOB - len(distortion))
-    is_rational = camera.model == "pinhole" and len(distortion) > _PLUMB_BOB
-    model = "rational_polynomial" if is_rational else _MODELS.get(camera.model)
-    if model is None:
-        raise no_place_for(name, camera, "ROS's camera_info")
-    return {
-        "image_width": camera.width_px,
-        "image_height": camera.height_px,
-        "camera_name": frame_id(name),
-        "camera_matrix": _matrix(K),
-        "distortion_model": model,
-        "distortion_coefficients": _matrix(np.array([distortion])),
-        "rectification_matrix": _matrix(np.eye(3)),
-        "projection_matrix": _matrix(np.column_stack([K, np.zeros(3)])),
-    }
-
-
-def _matrix(values: Array) -> dict[str, Any]:
-    rows, columns = values.shape
-    return {"rows": rows, "cols": columns, "data": values.ravel().tolist()}
 
 
 def is_camera_info(content: dict[str, Any]) -> bool:

@@ -1,6 +1,7 @@
 """Write a result or a rig in the format of another program."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -8,21 +9,19 @@ from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.files import read_yaml, require_place_for_folder, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
-from calibgraph.io.formats.autoware import write_autoware
-from calibgraph.io.formats.camera_info import LENS_MARK, write_camera_infos
 from calibgraph.io.formats.documents import commented
-from calibgraph.io.formats.kalibr import write_kalibr
 from calibgraph.io.formats.names import EXPORT_FORMATS
-from calibgraph.io.formats.plain import write_json, write_opencv
 from calibgraph.io.formats.rig_export import RigExport, prepare_export
-from calibgraph.io.formats.ros_transforms import (
-    write_ros1,
-    write_ros2,
-    write_ros2_launch,
-    write_tf2,
-    write_urdf,
+from calibgraph.io.formats.transforms import TRANSFORMS, write_transforms
+from calibgraph.io.formats.writers import (
+    LENS_MARK,
+    kitti_statement,
+    write_camera_infos,
+    write_json,
+    write_kalibr,
+    write_kitti,
+    write_opencv,
 )
-from calibgraph.io.formats.undistorted import kitti_statement, write_kitti
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import Calibration
@@ -34,12 +33,7 @@ Writer = Callable[[RigExport], str | Mapping[str, str]]
 
 WRITERS: Final[Mapping[str, Writer]] = {
     "kalibr": write_kalibr,
-    "ros1": write_ros1,
-    "ros2": write_ros2,
-    "ros2-launch": write_ros2_launch,
-    "tf2": write_tf2,
-    "urdf": write_urdf,
-    "autoware": write_autoware,
+    **{name: partial(write_transforms, format=name) for name in TRANSFORMS},
     "kitti": write_kitti,
     "camera_info": write_camera_infos,
     "opencv": write_opencv,

@@ -1,11 +1,11 @@
 """Cameras and transforms under the keys of other programs, which ``foreign_keys.yaml`` lists.
 
 A camera is any mapping that holds the numbers of a lens, at any depth of a YAML, JSON or XML file.
+Kalibr's camchain and ROS's CameraInfo are read so, too.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -18,8 +18,9 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model, holds_truth_value
-from calibgraph.io.formats.part import IMU, ONLY_CAMERA, FrameLink, Part
+from calibgraph.io.formats.part import IMU, ONLY_CAMERA, FrameLink, Part, RelativeCamera
 from calibgraph.io.formats.rig_export import frame_id
+from calibgraph.io.formats.writers import DERIVED
 from calibgraph.io.lenses import (
     CameraLens,
     fitted_coefficients,
@@ -92,27 +93,31 @@ def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> Part 
     lenses: dict[str, CameraLens] = {}
     extrinsics: dict[str, Array] = {}
     links: list[FrameLink] = []
+    pairs: list[RelativeCamera] = []
     frames: dict[str, str] = {}
     notes: list[str] = []
     for each in maps:
         camera = owner if single or not each.holds_a_lens else each.name or path.stem
+        before = next(reversed(lenses), "")
         if each.holds_a_lens:
             if camera in lenses:
                 raise FileError(path, f"gives two cameras the name {camera!r}; give each its own")
             lenses[camera], note = each.lens()
             notes += [note] if note else []
         for row, T in each.transforms():
-            if row.end == IMU:
+            if row.start == "camera before":
+                pairs += [RelativeCamera(camera, before, T)] * bool(before)
+            elif IMU in (row.start, row.end):
+                of, T_imu_other = (row.start, T) if row.end == IMU else (row.end, invert(T))
                 frames[camera] = f"{frame_id(camera)}_optical_frame"
-                of = {"camera": frames[camera], "lidar": "lidar"}
-                child = of.get(row.start, f"{row.start}_optical_frame")
-                links.append(FrameLink(IMU, child, T))
-                continue
-            found = T if row.end == "camera" else invert(T)
-            if np.abs(extrinsics.setdefault(camera, found) - found).max() > _SAME:
-                raise FileError(path, "two of its keys give different T_camera_lidar; keep one")
+                named = {"camera": frames[camera], "lidar": "lidar"}
+                links.append(FrameLink(IMU, named.get(of, f"{of}_optical_frame"), T_imu_other))
+            else:
+                found = T if row.end == "camera" else invert(T)
+                if np.abs(extrinsics.setdefault(camera, found) - found).max() > _SAME:
+                    raise FileError(path, "two of its keys give different T_camera_lidar; keep one")
         notes += each.left_out()
-    part = Part(path, lenses, extrinsics, links=tuple(links), frame_ids=frames, notes=tuple(notes))
+    part = Part(path, lenses, extrinsics, tuple(pairs), tuple(links), frames, notes=tuple(notes))
     if part.is_empty and any(each.holds_a_size for each in maps):
         raise FileError(path, "holds no camera matrix; expected the key camera_matrix, K or fx")
     return None if part.is_empty else part
@@ -121,47 +126,45 @@ def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> Part 
 def _one_map_per_camera(content: dict[str, Any], path: Path, name: str | None) -> dict[str, Any]:
     """Files whose numbers are no mapping per camera as such; others as they are.
 
-    Basalt's calibration.json has a list per quantity. The calib.json of koide3's
-    direct_visual_lidar_calibration has one camera, and its poses beside it, of which the result
-    comes first; behind its focal lengths comes xi, and a panorama has width and height instead.
+    Kalibr's camchain has cam0, cam1, ..., xi before the focal lengths, and what our export adds.
+    The calib.json of koide3's direct_visual_lidar_calibration has one camera, and its poses beside
+    it, of which the result comes first; behind its focal lengths comes xi.
     """
     try:
-        if "T_imu_cam" in (lists := _mapping(content, "value0")):
-            rows = zip(*(lists[k] for k in ("intrinsics", "resolution", "T_imu_cam")), strict=True)
-            axes = ("px", "py", "pz", "qx", "qy", "qz", "qw")
-            return {f"cam{k}": {**lens, "resolution": size, "T_imu_cam": [pose[a] for a in axes]}
-                    for k, (lens, size, pose) in enumerate(rows)}  # fmt: skip
+        if "cam0" in content:
+            keys = [key for key in content if re.fullmatch(r"cam\d+", str(key))]
+            in_order = sorted(keys, key=lambda key: int(key[3:]))
+            return {key: _of_camchain(key, content[key], path) for key in in_order}
         if "intrinsics" in (camera := _mapping(content, "camera")):
             poses = _mapping(content, "results")
             ways = ("T_lidar_camera", "init_T_lidar_camera", "init_T_lidar_camera_auto")
-            given = [poses[way] for way in ways if poses.get(way)]
-            pose = {"T_lidar_camera": given[0]} if given else {}
-            values = camera["intrinsics"]
-            if stated_model(camera, path) == "equirectangular":
-                if len(values) != 2:  # noqa: PLR2004
-                    raise FileError(path, f"has the intrinsics {values}, expected width and height")
-                width, height = values
-                focal = {"fx": width / (2 * math.pi), "fy": height / math.pi}
-                lens = {**focal, "cx": width / 2, "cy": height / 2, "model": "equirectangular"}
-                return {"camera": lens | pose | _named(content, name)}
+            given = [("T_lidar_camera", poses[way]) for way in ways if poses.get(way)]
+            pose = dict(given[:1])
             if stated_model(camera, path) == "omnidirectional":
+                values = camera["intrinsics"]
                 camera = {**camera, "xi": values[-1], "intrinsics": values[:-1]}
-            return {"camera": {**camera, **pose, **_named(content, name)}}
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
-        raise FileError(path, f"is no calibration of Basalt or koide3: {error}") from error
+            own = _mapping(content, "meta").get("camera", name)
+            return {"camera": {**camera, **pose, **({"name": str(own)} if own else {})}}
+    except (TypeError, IndexError, KeyError, AttributeError) as error:
+        raise FileError(path, f"is no calibration of Kalibr or koide3: {error}") from error
     return content
+
+
+def _of_camchain(key: str, camera: dict[str, Any], path: Path) -> dict[str, Any]:
+    """A camera of a camchain; a T_cn_cnm1 that was computed from T_cam_lidar is no measurement."""
+    own = _mapping(camera, "calibgraph")
+    kept = {**camera, "name": own.get("camera", key)}
+    if own.get("T_cn_cnm1") == DERIVED:
+        del kept["T_cn_cnm1"]
+    if stated_model(camera, path) == "omnidirectional":
+        kept["xi"], *kept["intrinsics"] = camera["intrinsics"]
+    return {key: value for key, value in kept.items() if key not in ("calibgraph", "rostopic")}
 
 
 def _mapping(content: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     """The mapping under a key; empty if there is none."""
     found = content.get(key)
     return found if isinstance(found, dict) else {}
-
-
-def _named(content: Mapping[str, Any], name: str | None) -> dict[str, str]:
-    """The name of koide3's camera, if it has one."""
-    given = _mapping(content, "meta").get("camera", name)
-    return {"name": str(given)} if given else {}
 
 
 def _maps(content: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -208,7 +211,9 @@ class _Map:
     def lens(self) -> tuple[CameraLens, str]:
         """The lens, and a note on what was assumed; empty if nothing was."""
         model, coefficients, note = self._distortion(stated_model(self._content, self._where))
-        return CameraLens(model, self._size(), self._intrinsics(), coefficients), note
+        shift = self._key("time_offset_s")
+        offset_s = None if shift is None else self._number(shift)
+        return CameraLens(model, self._size(), self._intrinsics(), coefficients, offset_s), note
 
     def transforms(self) -> Iterator[tuple[_Transform, Array]]:
         """The rows of the table whose keys are here, with their (4, 4)."""
@@ -276,7 +281,7 @@ class _Map:
         if found.size == len(Intrinsics.model_fields):
             return listed_intrinsics(found.ravel().tolist(), where)
         if found.size != 9:  # noqa: PLR2004 - 3 x 3
-            raise FileError(where, f"has {found.size} numbers, expected 3 x 3")
+            raise FileError(where, f"has {found.size} numbers, expected 3 x 3 or fx, fy, cx, cy")
         return intrinsics_of_matrix(found.reshape(3, 3), where)
 
     def _size(self) -> tuple[int, int] | None:

@@ -21,7 +21,7 @@ EXPORT_FORMATS: Final[Mapping[str, str]] = {
 IMPORT_FORMATS: Final = (
     "Kalibr camchain, ROS camera_info and transforms (files, or as ros2 topic echo prints them), "
     "OpenCV FileStorage (.yaml, .xml, .json), Autoware sensor kit, parameters of "
-    "VINS, LVI-SAM and FAST-LIVO, Basalt (.json), URDF, "
+    "VINS, LVI-SAM and FAST-LIVO, URDF, "
     "static_transform_publisher in launch files (XML) and scripts (.sh), "
     "COLMAP cameras.txt, koide3 calib.json, KITTI and KITTI-360 (calib_cam_to_velo.txt, "
     "perspective.txt), a ROS bag, a rig file, a result or a JSON export of calibgraph"

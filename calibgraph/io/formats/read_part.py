@@ -8,7 +8,6 @@ from calibgraph.errors import FileError
 from calibgraph.files import read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.rig import read_bag_rig
-from calibgraph.io.formats.autoware import is_autoware, read_autoware
 from calibgraph.io.formats.camera_info import is_camera_info, read_camera_info
 from calibgraph.io.formats.documents import (
     YAML_SUFFIXES,
@@ -17,12 +16,13 @@ from calibgraph.io.formats.documents import (
     read_xml,
 )
 from calibgraph.io.formats.foreign_keys import read_foreign
-from calibgraph.io.formats.kalibr import is_kalibr, read_kalibr
 from calibgraph.io.formats.matrix_lines import read_lines
 from calibgraph.io.formats.part import Part, RelativeCamera
-from calibgraph.io.formats.ros_transforms import (
+from calibgraph.io.formats.transforms import (
+    is_autoware,
     is_tf2,
     publisher_lines,
+    read_autoware,
     read_publishers,
     read_tf2,
     read_urdf,
@@ -128,7 +128,6 @@ def _is_rig(content: dict[str, Any]) -> bool:
 _READERS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[..., Part]], ...] = (
     (is_camera_info, read_camera_info),
     (_is_rig, lambda _, path, __: _part_of_rig(path)),
-    (is_kalibr, lambda content, path, _: read_kalibr(content, path)),
     (is_autoware, lambda content, path, _: read_autoware(content, path)),
 )
 

@@ -68,12 +68,6 @@ class RigExport:
         """(4, 4) the pose of a camera in the LiDAR frame."""
         return invert(self.cameras[name].T_camera_lidar)
 
-    def T_base_camera(self, name: str) -> Array:
-        """(4, 4) the pose of a camera in the base frame, which is the LiDAR's if none is given."""
-        base = np.eye(4) if self.T_base_lidar is None else self.T_base_lidar
-        T_base_camera: Array = base @ self.T_lidar_camera(name)
-        return T_base_camera
-
     def ros_covariance(self, name: str) -> Array | None:
         """(6, 6) of the pose in the LiDAR frame, in the order of ROS; None without error bar."""
         if name not in self.covariance:

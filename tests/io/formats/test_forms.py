@@ -255,27 +255,6 @@ def test_lvi_sam_s_lidar_to_cam_is_left_out_and_said_so(tmp_path: Path) -> None:
     assert "params_camera.yaml: lidar_to_cam_tx is not read" in note
 
 
-BASALT = {"value0": {
-    "T_imu_cam": [
-        {**dict(zip(("px", "py", "pz"), T_IMU_CAMERA[:3, 3], strict=True)),
-         **dict(zip(("qx", "qy", "qz", "qw"),
-                    Rotation.from_matrix(T_IMU_CAMERA[:3, :3]).as_quat().tolist(), strict=True))}],
-    "intrinsics": [{"camera_type": "kb4", "intrinsics": {
-        "fx": 480.0, "fy": 481.0, "cx": 320.0, "cy": 180.0,
-        "k1": 0.01, "k2": -0.02, "k3": 0.003, "k4": 0.0}}],
-    "resolution": [[640, 360]], "calib_accel_bias": [0.0] * 9}}  # fmt: skip
-
-
-def test_basalt_has_the_pose_of_each_camera_in_the_imu(tmp_path: Path) -> None:
-    files = [saved(tmp_path / "basalt.json", BASALT), saved(tmp_path / "lio.yaml", LIO)]
-    rig = import_rig(files)
-    assert_front(rig, "cam0")
-    assert (rig.cameras["cam0"].model, rig.cameras["cam0"].distortion[1]) == ("fisheye", -0.02)
-    other = json.loads(json.dumps(BASALT).replace("kb4", "ds"))
-    with pytest.raises(CalibrationError, match="lens model 'ds' is none of calibgraph's"):
-        import_rig([saved(tmp_path / "basalt.json", other)])
-
-
 def test_json_of_no_known_program_is_named_by_its_keys(tmp_path: Path) -> None:
     path = saved(tmp_path / "a.json", {"version": 3, "speed": {"max": 2}})
     with pytest.raises(CalibrationError, match=r"its keys \(version, speed\) are of no known"):

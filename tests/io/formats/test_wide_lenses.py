@@ -85,17 +85,6 @@ def test_a_panorama_is_written_where_there_is_room_for_it(tmp_path: Path) -> Non
             export_calibration(rig, tmp_path / format, format)
 
 
-def test_panoramas_of_koide_have_a_size_in_place_of_focal_lengths(tmp_path: Path) -> None:
-    camera = {"camera_model": "equirectangular", "intrinsics": [2000, 1000]}
-    pose = {"T_lidar_camera": [0, 0, 0, 0, 0, 0, 1]}
-    (tmp_path / "calib.json").write_text(json.dumps({"camera": camera, "results": pose}))
-    (found,) = import_rig([tmp_path / "calib.json"], size_px=(2000, 1000)).cameras.values()
-    ray = POINT / np.linalg.norm(POINT)
-    longitude, latitude = np.arctan2(ray[0], ray[2]), np.arcsin(ray[1])
-    expected = [2000 * (0.5 + longitude / (2 * np.pi)), 1000 * (0.5 + latitude / np.pi)]
-    np.testing.assert_allclose(found.lens.project(POINT)[0], [expected], atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("model", "distortion", "found"),
     [

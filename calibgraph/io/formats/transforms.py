@@ -1,28 +1,30 @@
-"""Static transforms of ROS: publisher lines, a launch file, tf2's message, URDF."""
+"""Transforms of ROS: one writer for publishers, launch files, tf2, URDF and Autoware; readers."""
 
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
+from pydantic import ConfigDict
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
 from calibgraph.io.formats.documents import commented, commented_xml, commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
-from calibgraph.io.formats.rig_export import RigExport
+from calibgraph.io.formats.rig_export import RigExport, frame_id
 from calibgraph.io.rotations import (
     pose_of_angles,
     pose_of_quaternion,
     quaternion_xyzw,
     roll_pitch_yaw,
 )
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import T_OPTICAL_LINK, invert
+from calibgraph.model.rig import Finite
 
+TRANSFORMS = ("ros1", "ros2", "ros2-launch", "tf2", "urdf", "autoware")
 _DIRECTION = "each transform is the pose of the child frame in its parent: p_parent = T * p_child"
 _OF_LIDAR = (
     "{camera}: the optical frame (child) in the LiDAR frame (parent): p_lidar = T * p_camera, the "
@@ -33,68 +35,146 @@ _OF_TREE = (
     "{camera}: {child} in {parent}, so that the camera, which hangs from {child}, is where it was "
     "measured; it replaces this transform of the robot's description, whose others stay"
 )
+_MORE = {
+    "ros1": "numbers: x y z qx qy qz qw, then parent and child frame",
+    "tf2": "publish: ros2 topic pub --once --qos-durability transient_local /tf_static "
+    'tf2_msgs/msg/TFMessage "$(cat FILE)"',
+    "urdf": "rpy about fixed x, y, z",
+}
+_PUBLISHER = "static_transform_publisher"
+_COMMANDS = {"ros1": ["rosrun", "tf2_ros"], "ros2": ["ros2", "run", "tf2_ros"]}
+_NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_KIT, _OPTICAL_LINK = "sensor_kit_base_link", "/camera_optical_link"
+_ANGLES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
-def _statement(export: RigExport, *more: str) -> list[str]:
-    """The lines of a comment: direction, and of each camera which transform is written."""
-    lines = []
+def write_transforms(export: RigExport, format: str) -> str:
+    """Poses of frames in the form of one of ``TRANSFORMS``."""
+    links = _WHICH.get(format, _measured)(export)
+    directions = _of_kit(export) if format == "autoware" else _of_transforms(export, format)
+    statement = export.statement(*directions)
+    if format in _COMMANDS:
+        lines = (shlex.join([*_COMMANDS[format], _PUBLISHER, *_arguments(each, format)])
+                 for each in links)  # fmt: skip
+        return commented(statement) + "".join(f"{line} &\n" for line in lines) + "wait\n"
+    if format == "tf2":
+        return commented_yaml(statement, {"transforms": [*map(_stamped, links)]})
+    if format == "autoware":
+        poses = {each.child: dict(zip(_ANGLES, _six(each), strict=True)) for each in links}
+        return commented_yaml(statement, {_KIT: poses})
+    return commented_xml(statement, _robot(export, links) if format == "urdf" else _launch(links))
+
+
+def _of_transforms(export: RigExport, format: str) -> Iterator[str]:
+    """The direction, and of each camera which transform is written."""
+    yield _DIRECTION
     for name in export.cameras:
         parent, child, _ = export.link(name)
         text = _OF_LIDAR if export.mount(name) is None else _OF_TREE
-        lines.append(text.format(camera=name, parent=parent, child=child))
-    return export.statement(_DIRECTION, *lines, *more)
+        yield text.format(camera=name, parent=parent, child=child)
+    if format in _MORE:
+        yield _MORE[format]
 
 
-def write_ros1(export: RigExport) -> str:
-    """Lines ``static_transform_publisher x y z qx qy qz qw frame_id child_frame_id`` of tf2_ros."""
-    publisher = ["rosrun", "tf2_ros", "static_transform_publisher"]
-    links = (export.link(name) for name in export.cameras)
-    lines = [shlex.join([*publisher, *_numbers(T), *frames]) for *frames, T in links]
-    order = "numbers: x y z qx qy qz qw, then parent and child frame"
-    return _script(_statement(export, order), lines)
+def _measured(export: RigExport) -> list[FrameLink]:
+    """The transforms that the calibration changes."""
+    return [FrameLink(*export.link(name)) for name in export.cameras]
 
 
-def write_ros2(export: RigExport) -> str:
-    """Lines ``ros2 run tf2_ros static_transform_publisher --x ...``."""
-    lines = [
-        shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *arguments])
-        for arguments in _arguments(export)
-    ]
-    return _script(_statement(export), lines)
+def _arguments(link: FrameLink, format: str = "ros2") -> list[str]:
+    """The arguments of a publisher."""
+    values = [repr(float(value)) for value in (*link.T_parent_child[:3, 3],
+                                               *quaternion_xyzw(link.T_parent_child))]  # fmt: skip
+    if format == "ros1":
+        return [*values, link.parent, link.child]
+    named = (word for name, value in zip(_NAMES, values, strict=True)
+             for word in (f"--{name}", value))  # fmt: skip
+    return [*named, "--frame-id", link.parent, "--child-frame-id", link.child]
 
 
-def _script(statement: list[str], lines: list[str]) -> str:
-    """A shell script that runs all lines until it is ended."""
-    return commented(statement) + "".join(f"{line} &\n" for line in lines) + "wait\n"
-
-
-def write_ros2_launch(export: RigExport) -> str:
-    """An XML launch file with one publisher per camera."""
+def _launch(links: Iterable[FrameLink]) -> ElementTree.Element:
     root = ElementTree.Element("launch")
-    for arguments in _arguments(export):
-        attributes = {"pkg": "tf2_ros", "exec": _PUBLISHER, "args": " ".join(arguments)}
+    for each in links:
+        attributes = {"pkg": "tf2_ros", "exec": _PUBLISHER, "args": " ".join(_arguments(each))}
         ElementTree.SubElement(root, "node", attributes)
-    return commented_xml(_statement(export), root)
+    return root
 
 
-_PUBLISHER = "static_transform_publisher"
-_KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+def _stamped(link: FrameLink) -> dict[str, Any]:
+    T = link.T_parent_child
+    return {
+        "header": {"frame_id": link.parent},
+        "child_frame_id": link.child,
+        "transform": {
+            "translation": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
+            "rotation": dict(zip("xyzw", quaternion_xyzw(T), strict=True)),
+        },
+    }
 
 
-def _arguments(export: RigExport) -> list[list[str]]:
-    """The arguments of each ROS 2 publisher."""
-    found = []
-    for name in export.cameras:
-        parent, child, T = export.link(name)
-        pairs = zip(_KEYS, _numbers(T), strict=True)
-        numbers = (part for key, number in pairs for part in (f"--{key}", number))
-        found.append([*numbers, "--frame-id", parent, "--child-frame-id", child])
-    return found
+def _six(link: FrameLink) -> list[float]:
+    """Place, and roll, pitch, yaw."""
+    return [*link.T_parent_child[:3, 3].tolist(), *roll_pitch_yaw(link.T_parent_child)]
 
 
-def _numbers(T: Array) -> list[str]:
-    """The seven numbers x y z qx qy qz qw of a pose."""
-    return [repr(float(value)) for value in (*T[:3, 3], *quaternion_xyzw(T))]
+def _joints(export: RigExport) -> list[FrameLink]:
+    """The transforms that are measured, and those between LiDAR and cameras that stay."""
+    joints: dict[str, tuple[str, Array]] = {}
+    for name, optical in export.optical_frames.items():
+        parent, child, T_parent_child = export.link(name)
+        joints[child] = parent, T_parent_child
+        mount = export.mount(name)
+        if mount is not None and child != optical:
+            joints[optical] = child, invert(mount.T_camera_child)
+        if mount is None or parent == export.lidar_frame:
+            continue
+        if export.lidar_frame not in joints:
+            joints[export.lidar_frame] = parent, mount.T_parent_lidar
+        elif joints[export.lidar_frame][0] != parent:
+            joints[parent] = export.lidar_frame, invert(mount.T_parent_lidar)
+    return [FrameLink(parent, child, T) for child, (parent, T) in joints.items()]
+
+
+def _robot(export: RigExport, links: list[FrameLink]) -> ElementTree.Element:
+    root = ElementTree.Element("robot", name="calibgraph")
+    frames = [export.lidar_frame, *(each.parent for each in links), *(each.child for each in links)]
+    for frame in dict.fromkeys(frames):
+        ElementTree.SubElement(root, "link", name=frame)
+    for each in links:
+        joint = ElementTree.SubElement(root, "joint", name=f"{each.child}_joint", type="fixed")
+        ElementTree.SubElement(joint, "parent", link=each.parent)
+        ElementTree.SubElement(joint, "child", link=each.child)
+        values = [repr(float(value)) for value in _six(each)]
+        ElementTree.SubElement(joint, "origin", xyz=" ".join(values[:3]), rpy=" ".join(values[3:]))
+    return root
+
+
+def _sensor_kit(export: RigExport) -> list[FrameLink]:
+    """The LiDAR and the camera_link of each camera: x forward, not optical."""
+    T_base_lidar = np.eye(4) if export.T_base_lidar is None else export.T_base_lidar
+    links = [FrameLink(_KIT, export.lidar_frame, T_base_lidar)]
+    for name, optical in export.optical_frames.items():
+        above = optical.removesuffix(_OPTICAL_LINK)  # as Autoware names it; else by the camera
+        link = f"{above if above != optical else frame_id(name)}/camera_link"
+        T_base_camera = T_base_lidar @ export.T_lidar_camera(name)
+        links.append(FrameLink(_KIT, link, T_base_camera @ T_OPTICAL_LINK))
+    return links
+
+
+def _of_kit(export: RigExport) -> Iterator[str]:
+    yield f"each entry is the pose of a link (child) in {_KIT} (parent): p_base = T * p_link"
+    yield (
+        "camera_link: x forward, y left, z up; "
+        "optical from camera_link: roll -pi/2, pitch 0, yaw -pi/2"
+    )
+    yield (
+        f"{_KIT} is put at the LiDAR, as no --lidar-pose was given: take the differences only"
+        if export.T_base_lidar is None
+        else f"{_KIT} is where --lidar-pose puts it"
+    )
+
+
+_WHICH = {"urdf": _joints, "autoware": _sensor_kit}
 
 
 def publisher_lines(launch: ElementTree.Element) -> list[str]:
@@ -130,8 +210,7 @@ def _published(text: str, path: Path) -> FrameLink:
         if text.lstrip().startswith("--"):
             frames = given["--frame-id"], given["--child-frame-id"]
             x, y, z, roll, pitch, yaw, *turn = (
-                float(given.get(f"--{key}", "0"))
-                for key in ("x", "y", "z", "roll", "pitch", "yaw", *_KEYS[3:6])
+                float(given.get(f"--{key}", "0")) for key in (*_ANGLES, *_NAMES[3:6])
             )
             by_quaternion = "--qw" in given
             turn.append(float(given.get("--qw", "1")))
@@ -158,28 +237,6 @@ def _is_number(word: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def write_tf2(export: RigExport) -> str:
-    """``tf2_msgs/TFMessage`` as YAML."""
-    content = {"transforms": [_stamped(export, name) for name in export.cameras]}
-    publish = (
-        "publish: ros2 topic pub --once --qos-durability transient_local /tf_static "
-        'tf2_msgs/msg/TFMessage "$(cat FILE)"'
-    )
-    return commented_yaml(_statement(export, publish), content)
-
-
-def _stamped(export: RigExport, name: str) -> dict[str, Any]:
-    parent, child, T = export.link(name)
-    return {
-        "header": {"frame_id": parent},
-        "child_frame_id": child,
-        "transform": {
-            "translation": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
-            "rotation": dict(zip("xyzw", quaternion_xyzw(T), strict=True)),
-        },
-    }
 
 
 class _Vector(StrictNumbers):
@@ -244,34 +301,40 @@ def _link(stamped: _Stamped) -> FrameLink:
     return FrameLink(parent, child, T)
 
 
-def write_urdf(export: RigExport) -> str:
-    """A robot of the LiDAR's link and, for each camera, links and fixed joints to it."""
-    joints: dict[str, tuple[str, Array]] = {}
-    for name, optical in export.optical_frames.items():
-        parent, child, T_parent_child = export.link(name)
-        joints[child] = parent, T_parent_child
-        mount = export.mount(name)
-        if mount is not None and child != optical:
-            joints[optical] = child, invert(mount.T_camera_child)
-        if mount is None or parent == export.lidar_frame:
-            continue
-        if export.lidar_frame not in joints:
-            joints[export.lidar_frame] = parent, mount.T_parent_lidar
-        elif joints[export.lidar_frame][0] != parent:
-            joints[parent] = export.lidar_frame, invert(mount.T_parent_lidar)
-    root = ElementTree.Element("robot", name="calibgraph")
-    for link in dict.fromkeys([export.lidar_frame, *(p for p, _ in joints.values()), *joints]):
-        ElementTree.SubElement(root, "link", name=link)
-    for child, (parent, T) in joints.items():
-        joint = ElementTree.SubElement(root, "joint", name=f"{child}_joint", type="fixed")
-        ElementTree.SubElement(joint, "parent", link=parent)
-        ElementTree.SubElement(joint, "child", link=child)
-        ElementTree.SubElement(joint, "origin", xyz=_text(T[:3, 3]), rpy=_text(roll_pitch_yaw(T)))
-    return commented_xml(_statement(export, "rpy about fixed x, y, z"), root)
+class _Pose(StrictNumbers):
+    model_config = ConfigDict(extra="forbid")
+
+    x: Finite
+    y: Finite
+    z: Finite
+    roll: Finite
+    pitch: Finite
+    yaw: Finite
 
 
-def _text(values: list[float] | NDArray[np.float64]) -> str:
-    return " ".join(repr(float(value)) for value in values)
+def is_autoware(content: dict[str, Any]) -> bool:
+    """Whether the content of a YAML file is parent: {child: {x, y, z, roll, pitch, yaw}}."""
+    return any(isinstance(pose, dict) and "roll" in pose for _, _, pose in _entries(content))
+
+
+def _entries(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
+    for parent, children in content.items():
+        for child, pose in children.items() if isinstance(children, dict) else ():
+            yield str(parent), str(child), pose
+
+
+def read_autoware(content: dict[str, Any], path: Path) -> Part:
+    """The frames of a sensor kit."""
+    return Part(path, links=tuple(_kit_link(*entry, path) for entry in _entries(content)))
+
+
+def _kit_link(parent: str, child: str, pose: Any, path: Path) -> FrameLink:
+    p = checked_model(_Pose, pose, f"{path}: {parent}: {child}")
+    try:
+        T = pose_of_angles((p.x, p.y, p.z), (p.roll, p.pitch, p.yaw))
+    except ValueError as error:
+        raise FileError(path, f"{parent}: {child}: {error}") from error
+    return FrameLink(parent, child, T)
 
 
 def read_urdf(root: ElementTree.Element, path: Path) -> Part:
