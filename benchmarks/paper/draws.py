@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.paper.baselines import paper_solve
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.io.dataset import load_dataset
-from calibgraph.io.kitti import CALIBRATION_NAME, read_kitti_rig
+from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import REFERENCE_FILE, load_rig
 from calibgraph.matching.structure import StructureMatcher
 from calibgraph.model.config import Config, PresetName, Terms, preset
@@ -81,7 +81,7 @@ class Source:
             return scenario_of(self.name).rig
         folder = self.folders[0]
         if (folder / CALIBRATION_NAME).is_file():
-            return read_kitti_rig(folder).rig
+            return load_rig(folder / CALIBRATION_NAME)
         if not (folder / REFERENCE_FILE).is_file():
             raise FileError(folder / REFERENCE_FILE, "no such file; a benchmark needs a reference")
         return load_rig(folder / REFERENCE_FILE)

@@ -12,7 +12,7 @@ from calibgraph.guessing.lens_words import parse_lens
 from calibgraph.guessing.mounting import check_forward, parse_mounting
 from calibgraph.io.bags import is_bag
 from calibgraph.io.clouds import CLOUD_SUFFIXES
-from calibgraph.io.dataset_folders import folder_layout, published_format
+from calibgraph.io.dataset_folders import folder_layout, published_folder
 from calibgraph.io.frame_files import files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES, image_size
 from calibgraph.io.kitti import CALIBRATION_NAME
@@ -103,7 +103,7 @@ def _require_plain_folder(folder: Path) -> None:
         raise FileError(folder, "is a ROS bag with lenses of its own; calibgraph bag writes them")
     if not folder.is_dir():
         raise FileError(folder, "no such folder; expected one with lidar/ and cameras/NAME/")
-    if published_format(folder) or (folder / CALIBRATION_NAME).is_file():
+    if published_folder(folder) or (folder / CALIBRATION_NAME).is_file():
         raise FileError(
             folder, "brings its own rig, from which calibrate starts; calibgraph doctor shows it"
         )

@@ -198,14 +198,6 @@ def cloud_of_array(array: NDArray[Any], path: Path | str) -> RawCloud:
     return RawCloud(make_cloud(*array[:, :_XYZI].T), ("x", "y", "z", "intensity")[:columns])
 
 
-def _read_rows(path: Path) -> RawCloud:
-    """Of unsynchronised drives of KITTI: x y z intensity, a point a line."""
-    try:
-        return cloud_of_array(np.loadtxt(path, dtype=np.float32, ndmin=2), path)
-    except ValueError as error:
-        raise FileError(path, f"cannot be read as rows of numbers ({error})") from None
-
-
 def _read_sweep(path: Path) -> RawCloud:
     """Of Argoverse 2."""
     names = feather_columns(path)
@@ -214,11 +206,9 @@ def _read_sweep(path: Path) -> RawCloud:
 
 _READERS: dict[str, Callable[[Path], RawCloud]] = {
     ".npy": _read_npy, ".bin": read_bin, ".pcd": read_pcd, ".ply": read_ply,
-    ".feather": _read_sweep, ".txt": _read_rows,
+    ".feather": _read_sweep,
 }  # fmt: skip
-CLOUD_SUFFIXES = tuple(suffix for suffix in _READERS if suffix != ".txt")
-"""Of clouds in folders of any data set: a .txt may be anything there."""
-
+CLOUD_SUFFIXES = tuple(_READERS)
 
 _COST = "the error bars become about twice as wide without; record it, or name its field intensity"
 """Measured on data/sample: 1.8 to 2.8 times the error bars without it, with half of the matches."""

@@ -25,7 +25,7 @@ from calibgraph.io.dataset_folders import (
     FolderFrames,
     folder_layout,
     frames_of_folder,
-    published_format,
+    published_folder,
 )
 from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import Frame, twist_by_scans
@@ -198,8 +198,8 @@ def _with_folder(
         data = replace(data, notes=(*data.notes, of_folder.pairing))
     if interval_s is not None:
         found = _driven(found, interval_s)
-    published = published_format(path)
-    if published is not None and (note := published.describe(path)):
+    published = published_folder(path)
+    if published is not None and (note := published.note()):
         data = replace(data, notes=(*data.notes, note))
     return _with(data, found, found)
 
@@ -286,7 +286,7 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
     for number, path in enumerate(paths):
         if path.resolve() in {other.resolve() for other in paths[:number]}:
             raise DatasetError(f"{path}: is given twice, and its frames would count twice")
-        if is_bag(path) or published_format(path) or folder_layout(path).clouds.is_dir():
+        if is_bag(path) or published_folder(path) or folder_layout(path).clouds.is_dir():
             continue
         if not path.is_dir():
             unread = way_out(path) if path.is_file() else None

@@ -5,7 +5,7 @@ Folders of published data sets hold their own rig; each of their formats is one 
 
 import glob
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -13,19 +13,21 @@ from typing import NamedTuple
 import numpy as np
 
 from calibgraph.errors import DatasetError, FileError
-from calibgraph.io import argoverse, kitti, kitti_drives, nuscenes
+from calibgraph.io import kitti
+from calibgraph.io.argoverse import argoverse
 from calibgraph.io.bags.options import NEAR_S
 from calibgraph.io.bags.stamps import TopicStamps, describe_offsets, nearest, offsets_of
 from calibgraph.io.clouds import CLOUD_SUFFIXES
 from calibgraph.io.frame_files import (
     FrameFiles,
-    RigRead,
+    PublishedFolder,
     files_by_stem,
     frames_by_stem,
     stamp_ns_in_name,
     way_out,
 )
 from calibgraph.io.images import IMAGE_SUFFIXES
+from calibgraph.io.nuscenes import nuscenes
 
 
 @dataclass(frozen=True)
@@ -69,9 +71,9 @@ def frames_of_folder(
             where names are no stamps.
         tolerance_s: largest difference of the stamps that name a cloud and its images.
     """
-    published = published_format(folder)
+    published = published_folder(folder)
     if published is not None:
-        frames = published.frames(folder, cameras)
+        frames = published.frames(cameras)
         for name in cameras if complete else ():
             stems = ({f.stem for f in frames}, {f.stem for f in frames if name in f.images})
             _require_pairs(folder, name, *stems)
@@ -212,35 +214,10 @@ def _require_pairs(folder: Path, camera: str, clouds: set[str], images: set[str]
     )
 
 
-@dataclass(frozen=True)
-class PublishedFormat:
-    """How a data set is read; ``describe`` gives a line for the log, or an empty text."""
-
-    is_one: Callable[[Path], bool]
-    read_rig: Callable[[Path], RigRead]
-    frames: Callable[[Path, Sequence[str]], list[FrameFiles]]
-    describe: Callable[[Path], str] = lambda _: ""
+_PUBLISHED = (nuscenes, kitti.kitti_drive, kitti.kitti_object, argoverse)
 
 
-_FORMATS = (
-    PublishedFormat(
-        nuscenes.is_nuscenes, nuscenes.read_nuscenes_rig, nuscenes.nuscenes_frames,
-        nuscenes.describe_motion,
-    ),
-    PublishedFormat(
-        kitti_drives.is_kitti_raw, kitti_drives.read_kitti_raw_rig, kitti_drives.kitti_raw_frames
-    ),
-    PublishedFormat(
-        kitti_drives.is_kitti_object, kitti_drives.read_kitti_object_rig,
-        kitti_drives.kitti_object_frames, kitti_drives.describe_calibrations,
-    ),
-    PublishedFormat(
-        argoverse.is_argoverse, argoverse.read_argoverse_rig, argoverse.argoverse_frames,
-        argoverse.describe_motion,
-    ),
-)  # fmt: skip
-
-
-def published_format(path: Path | str) -> PublishedFormat | None:
-    """The format of a folder of a published data set, or of its scene; None of others."""
-    return next((each for each in _FORMATS if each.is_one(Path(path))), None)
+def published_folder(path: Path | str) -> PublishedFolder | None:
+    """A folder of a published data set with a rig of its own, or its scene; None of others."""
+    found = (read(Path(path)) for read in _PUBLISHED)
+    return next((each for each in found if each is not None), None)

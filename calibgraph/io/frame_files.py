@@ -1,11 +1,13 @@
 """What readers of data sets return: the files of frames, and the rig of the complete cameras."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, is_utf8, require_file
@@ -126,18 +128,43 @@ class RigRead(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def rig_of_complete(
-    lidar: str, names: Iterable[str], read: Callable[[str], Camera], path: Path
-) -> RigRead:
-    """The rig of the cameras that have all parts."""
-    cameras: dict[str, Camera] = {}
-    missing: dict[str, IncompleteCamera] = {}
-    for name in names:
-        try:
-            cameras[name] = read(name)
-        except IncompleteCamera as error:
-            missing[name] = error
-    if missing and not cameras:
-        raise next(iter(missing.values()))
-    notes = tuple(f"{error}: camera {name!r} is left out" for name, error in missing.items())
-    return RigRead(checked_model(Rig, {"lidar": lidar, "cameras": cameras}, path), notes)
+class PublishedFolder(NamedTuple):
+    """A folder of a published data set, read as far as it is asked.
+
+    Attributes:
+        lidar: its name.
+        cameras: their names.
+        read: the lens and T_camera_lidar of one; IncompleteCamera if a part is missing.
+        frames: the clouds in order, with the images of the cameras that have one.
+        note: a line for the log, or an empty text.
+    """
+
+    lidar: str
+    cameras: Callable[[], Sequence[str]]
+    read: Callable[[str], Camera]
+    frames: Callable[[Sequence[str]], list[FrameFiles]]
+    note: Callable[[], str] = lambda: ""
+
+    def read_rig(self, path: Path) -> RigRead:
+        """The rig of the cameras that have all parts; the path is for errors."""
+        cameras: dict[str, Camera] = {}
+        missing: dict[str, IncompleteCamera] = {}
+        for name in self.cameras():
+            try:
+                cameras[name] = self.read(name)
+            except IncompleteCamera as error:
+                missing[name] = error
+        if missing and not cameras:
+            raise next(iter(missing.values()))
+        notes = tuple(f"{error}: camera {name!r} is left out" for name, error in missing.items())
+        return RigRead(checked_model(Rig, {"lidar": self.lidar, "cameras": cameras}, path), notes)
+
+
+def describe_motion(where: Path, moved_m: Sequence[float]) -> str:
+    """How far the vehicle moves between scans and their images, in a line; empty without poses."""
+    if not len(moved_m):
+        return ""
+    return (
+        f"{where}: the vehicle moves {np.median(moved_m):.2f} m (median), at most "
+        f"{max(moved_m):.2f} m, between a scan and its images"
+    )

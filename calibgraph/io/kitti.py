@@ -1,6 +1,21 @@
-"""KITTI odometry sequence folders: ``calib.txt``, ``velodyne/``, ``image_2/``, ``image_3/``, ..."""
+"""KITTI: odometry sequences, rectified raw drives (``_sync``), and folders of the object data set.
+
+Camera k projects by P_k R [T; 0 0 0 1] with P_k = K [I | b], from the frame that rectification R
+makes of the first camera's, so T_camera_lidar is translate(K^-1 P_k[:, 3]) R T.
+
+==========  ======================================  =================  ===========  ==============
+part        calibration                             P_k                R            T
+==========  ======================================  =================  ===========  ==============
+odometry    calib.txt                               P2                 in Tr        Tr
+raw         calib_cam_to_cam, calib_velo_to_cam     P_rect_02          R_rect_00    R and T
+object      calib/FRAME.txt; the commonest counts   P2                 R0_rect      Tr_velo_to_cam
+==========  ======================================  =================  ===========  ==============
+"""
 
 import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -8,13 +23,21 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_text, require_file
-from calibgraph.io.frame_files import IncompleteCamera, RigRead, rig_of_complete
-from calibgraph.io.images import image_size
+from calibgraph.io.frame_files import (
+    FrameFiles,
+    IncompleteCamera,
+    PublishedFolder,
+    files_by_stem,
+    frames_by_stem,
+)
+from calibgraph.io.images import IMAGE_SUFFIXES, image_size
 from calibgraph.io.lenses import intrinsics_of_matrix
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 
 CALIBRATION_NAME = "calib.txt"
-CLOUD_FOLDER = "velodyne"
+CLOUD_FOLDER, _RAW_CLOUDS = "velodyne", "velodyne_points"
+_RAW, _OBJECT = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt"), "calib"
 
 
 def camera_folders(sequence: Path) -> dict[str, Path]:
@@ -22,53 +45,142 @@ def camera_folders(sequence: Path) -> dict[str, Path]:
     return {folder.name: folder for folder in sorted(sequence.glob("image_[0-3]"))}
 
 
-def read_kitti_rig(sequence: Path) -> RigRead:
-    """The rig of a KITTI odometry sequence, from its own calibration.
+def kitti_sequence(folder: Path) -> PublishedFolder:
+    """An odometry sequence, by its ``calib.txt``."""
+    lines, images = NumberLines(require_file(folder / CALIBRATION_NAME)), camera_folders(folder)
+    T = np.vstack([lines.array("Tr", 3, 4), [0.0, 0.0, 0.0, 1.0]])
+    return _folder(folder, folder / CLOUD_FOLDER, images, lambda name: _camera(
+        lines, f"P{name[-1]}", T, _first_image(images[name])))  # fmt: skip
 
-    Camera k projects by P_k [Tr; 0 0 0 1] with P_k = K [I | b], so T_camera_lidar is
-    translate(K^-1 P_k[:, 3]) Tr.
-    """
-    path = require_file(sequence / CALIBRATION_NAME)
-    lines = NumberLines(path)
-    folders = camera_folders(sequence)
-    if not folders:
-        raise FileError(sequence, "has no image folder (image_0 .. image_3)")
-    T_rectified_lidar = np.vstack([lines.array("Tr", 3, 4), [0.0, 0.0, 0.0, 1.0]])
+
+def kitti_drive(drive: Path) -> PublishedFolder | None:
+    """A raw drive; None if the folder is none."""
+    clouds = drive / _RAW_CLOUDS / "data"
+    if not clouds.is_dir():
+        return None
+    images = {each.name: each / "data" for each in sorted(drive.glob("image_0[0-3]"))}
 
     def read(name: str) -> Camera:
-        line = f"P{name[-1]}"
-        if line not in lines:
-            raise IncompleteCamera(path, f"line {line!r} is missing")
-        size = first_image_size(folders[name])
-        return camera_of_projection(
-            lines.array(line, 3, 4), T_rectified_lidar, size, f"{path}: {line}"
-        )
+        cameras, lidar = (_of_date(drive, file) for file in _RAW)
+        image, number = _first_image(images[name]), name.removeprefix("image_")
+        T = transform(lidar.array("R", 3, 3), lidar.array("T", 3))
+        for line in (f"P_rect_{number}", f"S_rect_{number}"):
+            if line not in cameras:
+                raise IncompleteCamera(cameras.path, f"line {line!r} is missing")
+        width, height = cameras.array(f"S_rect_{number}", 2).astype(int)
+        if (size := image_size(image)) != (width, height):
+            raise FileError(
+                image.parent,
+                f"images are {size[0]}x{size[1]} px, and in {cameras.path.name} S_rect_{number} "
+                f"{width}x{height}; take the rectified drive (_sync)",
+            )
+        return _camera(cameras, f"P_rect_{number}", _rectified(cameras, "R_rect_00", T), image)
 
-    return rig_of_complete(CLOUD_FOLDER, folders, read, sequence)
+    return _folder(drive, clouds, images, read)
 
 
-def camera_of_projection(
-    P: Array, T_rectified_lidar: Array, size_px: tuple[int, int], where: str
-) -> Camera:
-    """A camera of a rectified rig.
+def kitti_object(folder: Path) -> PublishedFolder | None:
+    """The training or testing part of the object data set; None if the folder is none."""
+    is_one = (folder / _OBJECT).is_dir() and (folder / CLOUD_FOLDER).is_dir()
+    if not is_one or (folder / CALIBRATION_NAME).exists():
+        return None
+    images = camera_folders(folder)
 
-    Args:
-        P: (3, 4) K [I | b], from the rectified frame that all cameras share.
-        T_rectified_lidar: (4, 4) to that frame.
-        size_px: width and height.
-        where: the file and its line, for errors.
-    """
-    K = P[:, :3]
-    intrinsics = intrinsics_of_matrix(K, where)
-    shift = np.eye(4)
-    shift[:3, 3] = np.linalg.solve(K, P[:, 3])
+    def read(name: str) -> Camera:
+        stem = _commonest(folder)[0]
+        lines = NumberLines(folder / _OBJECT / f"{stem}.txt")
+        T = np.vstack([lines.array("Tr_velo_to_cam", 3, 4), [0.0, 0.0, 0.0, 1.0]])
+        found = [images[name] / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES]
+        image = next((path for path in found if path.is_file()), found[0])
+        return _camera(lines, f"P{name[-1]}", _rectified(lines, "R0_rect", T), image)
+
+    def note() -> str:
+        count, kept = len([*(folder / CLOUD_FOLDER).glob("*.bin")]), len(_commonest(folder))
+        return "" if count == kept else (
+            f"{folder}: its {count} frames have several calibrations; taken are the {kept} of the "
+            "commonest, the others need folders of their own"
+        )  # fmt: skip
+
+    whole = _folder(folder, folder / CLOUD_FOLDER, images, read)
+    return whole._replace(
+        frames=lambda names: [f for f in whole.frames(names) if f.stem in _commonest(folder)],
+        note=note,
+    )
+
+
+def _folder(
+    folder: Path, clouds: Path, images: Mapping[str, Path], read: Callable[[str], Camera]
+) -> PublishedFolder:
+    def cameras() -> Sequence[str]:
+        if not images:
+            raise FileError(folder, "has no image folder (image_0 .. image_3, image_00 ..)")
+        return [*images]
+
+    def frames(names: Sequence[str]) -> list[FrameFiles]:
+        of = {n: files_by_stem(images.get(n, folder / n), IMAGE_SUFFIXES) for n in names}
+        return frames_by_stem(files_by_stem(clouds, (".bin",)), of)
+
+    name = _RAW_CLOUDS if clouds.name == "data" else CLOUD_FOLDER
+    return PublishedFolder(name, cameras, read, frames)
+
+
+def _commonest(folder: Path) -> tuple[str, ...]:
+    """The stems of the frames of the commonest calibration."""
+    return _read_stems(
+        folder, *((folder / name).stat().st_mtime_ns for name in (_OBJECT, CLOUD_FOLDER))
+    )
+
+
+@lru_cache(4)
+def _read_stems(folder: Path, *_changed_ns: int) -> tuple[str, ...]:
+    texts = {}
+    for stem in files_by_stem(folder / CLOUD_FOLDER, (".bin",)):
+        path = folder / _OBJECT / f"{stem}.txt"
+        if not path.is_file():
+            raise FileError(path, f"no such file; the cloud {stem} needs its calibration")
+        texts[stem] = read_text(path)
+    commonest = Counter(texts.values()).most_common(1)[0][0]
+    return tuple(stem for stem, text in texts.items() if text == commonest)
+
+
+def _of_date(drive: Path, name: str) -> "NumberLines":
+    """A calibration file in the drive or in the folder of its date."""
+    found = [folder / name for folder in (drive, drive.parent) if (folder / name).is_file()]
+    if not found:
+        path = drive.parent / name
+        raise FileError(path, "no such file; put the calibration of the drive's date there")
+    return NumberLines(found[0])
+
+
+def _rectified(lines: "NumberLines", key: str, T_camera0_lidar: Array) -> Array:
+    rectify = np.eye(4)
+    rectify[:3, :3] = lines.array(key, 3, 3)
+    T: Array = rectify @ T_camera0_lidar
+    return T
+
+
+def _camera(lines: "NumberLines", key: str, T_rectified_lidar: Array, image: Path) -> Camera:
+    """The camera with this line P and images of this size."""
+    if key not in lines:
+        raise IncompleteCamera(lines.path, f"line {key!r} is missing")
+    P, where = lines.array(key, 3, 4), f"{lines.path}: {key}"
+    intrinsics, shift = intrinsics_of_matrix(P[:, :3], where), np.eye(4)
+    shift[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
+    width, height = image_size(image)
     content = {
-        "width_px": size_px[0],
-        "height_px": size_px[1],
+        "width_px": width,
+        "height_px": height,
         "intrinsics_px": intrinsics,
         "T_camera_lidar": shift @ T_rectified_lidar,
     }
     return checked_model(Camera, content, f"{where} and the LiDAR's pose")
+
+
+def _first_image(folder: Path) -> Path:
+    images = sorted(folder.glob("*.png"))
+    if not images:
+        raise IncompleteCamera(folder, "holds no .png image")
+    return images[0]
 
 
 class NumberLines:
@@ -105,11 +217,3 @@ def matrix_of_line(path: Path, key: str, numbers: Array, shape: tuple[int, ...])
         text = f"line {key!r} has {len(numbers)} numbers, expected {count} finite ones"
         raise FileError(path, text)
     return numbers.reshape(shape)
-
-
-def first_image_size(folder: Path) -> tuple[int, int]:
-    """Width and height of the first image of a folder."""
-    images = sorted(folder.glob("*.png"))
-    if not images:
-        raise IncompleteCamera(folder, "holds no .png image")
-    return image_size(images[0])

@@ -9,9 +9,9 @@ from calibgraph.files import checked_model, read_json, read_yaml
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
-from calibgraph.io.dataset_folders import published_format
+from calibgraph.io.dataset_folders import published_folder
 from calibgraph.io.frame_files import RigRead
-from calibgraph.io.kitti import CALIBRATION_NAME, read_kitti_rig
+from calibgraph.io.kitti import CALIBRATION_NAME, kitti_sequence
 from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import RIG_FORMAT, Camera, Rig
 
@@ -42,11 +42,11 @@ def read_rig(path: Path | str, bag: BagOptions | None = None) -> RigRead:
     if is_bag(path):
         read = read_bag_rig(path, bag)
         return RigRead(read.to_rig(), read.notes)
-    published = published_format(path)
+    published = published_folder(path)
     if published is not None:
         return published.read_rig(path)
     if path.name == CALIBRATION_NAME:
-        return read_kitti_rig(path.parent)
+        return kitti_sequence(path.parent).read_rig(path.parent)
     return RigRead(_rig_of_file(path))
 
 
@@ -105,7 +105,7 @@ def _placeholders(content: object, key: str) -> Iterator[str]:
 def rig_file(path: Path | str) -> Path:
     """The file that :func:`load_rig` reads: the path itself, or the rig file of a folder."""
     found = find_rig_file(path)
-    if found is None or not (found.exists() or published_format(found)):
+    if found is None or not (found.exists() or published_folder(found)):
         what = f"holds none of {CALIBRATION_FILE}, {RIG_FILE}, {CALIBRATION_NAME} (KITTI)"
         raise FileError(
             path,
@@ -119,7 +119,7 @@ def rig_file(path: Path | str) -> Path:
 def find_rig_file(path: Path | str) -> Path | None:
     """The path itself, or the rig file of a folder of files; None if it holds none."""
     folder = Path(path)
-    if not folder.is_dir() or is_bag(folder) or published_format(folder):
+    if not folder.is_dir() or is_bag(folder) or published_folder(folder):
         return folder
     names = (CALIBRATION_FILE, RIG_FILE)
     if (folder / "lidar").is_dir():  # a dataset, which may have a result written into it
