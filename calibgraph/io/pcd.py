@@ -3,7 +3,6 @@
 import re
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,16 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.io.point_fields import (
+    Field,
     RawCloud,
+    binary_columns,
     choose_fields,
     lines_of_text,
     raw_cloud,
     read_count,
     read_rows,
     too_long,
+    truncated,
 )
 from factors.compiled import compiled
 
@@ -28,25 +30,6 @@ _SIZES = struct.Struct("<II")  # compressed and uncompressed
 _KINDS = {f"{letter}{size}" for letter in "IU" for size in (1, 2, 4, 8)} | {"F2", "F4", "F8"}
 _PADDING = "_"
 _MOST_BYTES = 2 * 2**30  # unpacked
-
-
-@dataclass(frozen=True)
-class _Field:
-    """A field of each point: ``count`` numbers of a kind such as F4."""
-
-    name: str
-    kind: str
-    count: int
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Of one number."""
-        return np.dtype(f"<{self.kind.lower()}")
-
-    @property
-    def bytes(self) -> int:
-        """In each point."""
-        return self.dtype.itemsize * self.count
 
 
 def read_pcd(path: Path) -> RawCloud:
@@ -71,14 +54,15 @@ def read_pcd(path: Path) -> RawCloud:
     return raw_cloud(path, names, named.__getitem__)
 
 
-def _layout(path: Path, header: str) -> tuple[int, list[_Field]]:
+def _layout(path: Path, header: str) -> tuple[int, list[Field]]:
     """The number of points and the fields of each."""
     lines = {words[0]: words[1:] for words in map(str.split, header.split("\n")) if words}
     try:
         names = lines.get("FIELDS") or lines["COLUMNS"]
         counts = [read_count(word) for word in lines.get("COUNT", ["1"] * len(names))]
         kinds = [a + b for a, b in zip(lines["TYPE"], lines["SIZE"], strict=True)]
-        fields = [_Field(*each) for each in zip(names, kinds, counts, strict=True)]
+        types = [f"<{kind.lower()}" for kind in kinds]
+        fields = [Field(*each) for each in zip(names, types, counts, strict=True)]
         sides = [read_count(lines[side][0]) for side in ("WIDTH", "HEIGHT") if side in lines]
         points = read_count(lines["POINTS"][0]) if "POINTS" in lines else sides[0] * sides[1]
     except (KeyError, IndexError, ValueError) as error:
@@ -93,7 +77,7 @@ def _layout(path: Path, header: str) -> tuple[int, list[_Field]]:
 
 
 def _ascii_columns(
-    path: Path, body: memoryview, count: int, fields: Sequence[_Field]
+    path: Path, body: memoryview, count: int, fields: Sequence[Field]
 ) -> Iterator[NDArray[Any]]:
     """The first number of each field; padding may be left out of the lines."""
     widths = [sum(f.count for f in fields), sum(f.count for f in fields if f.name != _PADDING)]
@@ -108,29 +92,22 @@ def _ascii_columns(
 
 
 def _binary_columns(
-    path: Path, body: memoryview, count: int, fields: Sequence[_Field]
+    path: Path, body: memoryview, count: int, fields: Sequence[Field]
 ) -> Iterator[NDArray[Any]]:
-    """The first number of each field."""
-    row_bytes = sum(each.bytes for each in fields)
-    if len(body) < count * row_bytes:
-        raise FileError(path, f"is truncated: it ends before its {count} points; write it again")
-    if len(body) >= (count + 1) * row_bytes:
+    if len(body) >= (count + 1) * sum(each.bytes for each in fields):
         raise too_long(path, count)
-    at = 0
-    for each in fields:
-        yield np.ndarray((count,), each.dtype, body, at, (row_bytes,))
-        at += each.bytes
+    yield from binary_columns(path, body, count, fields)
 
 
 def _compressed_columns(
-    path: Path, body: memoryview, count: int, fields: Sequence[_Field]
+    path: Path, body: memoryview, count: int, fields: Sequence[Field]
 ) -> Iterator[NDArray[Any]]:
     """The first number of each field: the fields lie one after the other, PCL's without padding."""
     packed, unpacked = _SIZES.unpack(body[:8]) if len(body) >= _SIZES.size else (1, 0)
     full = sum(each.bytes for each in fields) * count
     short = sum(each.bytes for each in fields if each.name != _PADDING) * count
     if len(body) < _SIZES.size + packed:
-        raise FileError(path, f"is truncated: it ends before its {count} points; write it again")
+        raise truncated(path, count)
     fits = unpacked in (full, short) and unpacked <= min(packed * MOST_RATIO, _MOST_BYTES)
     data = np.frombuffer(body, np.uint8, packed, _SIZES.size)
     plain = unpack_lzf(data, unpacked) if fits else None
@@ -139,7 +116,7 @@ def _compressed_columns(
     at = 0
     for each in fields:
         skipped = unpacked != full and each.name == _PADDING
-        yield np.ndarray((0 if skipped else count,), each.dtype, plain, at, (each.bytes,))
+        yield np.ndarray((0 if skipped else count,), each.kind, plain, at, (each.bytes,))
         at += 0 if skipped else each.bytes * count
 
 

@@ -1,8 +1,8 @@
 """Point clouds in .ply files: the vertices, among elements of any kind."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.io.point_fields import (
+    Field,
     RawCloud,
+    binary_columns,
     choose_fields,
     lines_of_text,
     raw_cloud,
@@ -32,26 +34,12 @@ _KINDS = {
 
 
 @dataclass(frozen=True)
-class _Property:
-    """A number of each item; or a list of them, and ``length`` is the kind of its length."""
-
-    name: str
-    kind: str
-    length: str | None = None
-
-    @property
-    def bytes(self) -> int:
-        """Of one number."""
-        return np.dtype(self.kind).itemsize
-
-
-@dataclass(frozen=True)
 class _Element:
     """Items with the same properties, one after the other."""
 
     name: str
     count: int
-    properties: list[_Property]
+    properties: list[Field]
 
     @property
     def has_lists(self) -> bool:
@@ -96,10 +84,10 @@ def _parse(path: Path, header: str) -> tuple[str, list[_Element]]:
                 case ["element", name, count]:
                     elements.append(_Element(name, read_count(count), []))
                 case ["property", "list", length, kind, name] if _KINDS[length][0] != "f":
-                    each = _Property(name, _KINDS[kind], _KINDS[length])
+                    each = Field(name, _KINDS[kind], 1, _KINDS[length])
                     elements[-1].properties.append(each)
                 case ["property", kind, *words] if words:
-                    elements[-1].properties.append(_Property(" ".join(words), _KINDS[kind]))
+                    elements[-1].properties.append(Field(" ".join(words), _KINDS[kind]))
                 case _:
                     raise ValueError(line)
         except (KeyError, IndexError, ValueError):
@@ -111,7 +99,7 @@ def _parse(path: Path, header: str) -> tuple[str, list[_Element]]:
 
 def _ascii_columns(
     path: Path, body: memoryview, _: str, elements: Sequence[_Element]
-) -> list[NDArray[Any]]:
+) -> Iterable[NDArray[Any]]:
     """The values of each property of the vertices: a line per item."""
     at = _vertices_at(elements)
     before = sum(each.count for each in elements[:at] if each.properties)
@@ -119,26 +107,21 @@ def _ascii_columns(
     rows = read_rows(path, rest, elements[at].count, [len(elements[at].properties)])
     if not elements[at + 1 :] and next(rest, None) is not None:
         raise too_long(path, elements[at].count)
-    return list(rows.T)
+    return rows.T
 
 
 def _binary_columns(
     path: Path, body: memoryview, order: str, elements: Sequence[_Element]
-) -> list[NDArray[Any]]:
+) -> Iterable[NDArray[Any]]:
     """The values of each property of the vertices, without a copy."""
     at, start = _vertices_at(elements), 0
     for each in elements[:at]:
         start = _end_of(each, body, order, start)
-    count, step = elements[at].count, elements[at].item_bytes
-    if start + count * step > len(body):
-        raise FileError(path, f"is truncated: it ends before its {count} points; write it again")
-    if not elements[at + 1 :] and start + (count + 1) * step <= len(body):
-        raise too_long(path, count)
-    columns = []
-    for prop in elements[at].properties:
-        columns.append(np.ndarray((count,), order + prop.kind, body, start, (step,)))
-        start += prop.bytes
-    return columns
+    vertices = elements[at]
+    if not elements[at + 1 :] and start + (vertices.count + 1) * vertices.item_bytes <= len(body):
+        raise too_long(path, vertices.count)
+    fields = [replace(each, kind=order + each.kind) for each in vertices.properties]
+    return binary_columns(path, body, vertices.count, fields, start=start)
 
 
 def _vertices_at(elements: Sequence[_Element]) -> int:
@@ -149,18 +132,16 @@ def _end_of(element: _Element, body: memoryview, order: str, start: int) -> int:
     """Where an element ends; beyond the file if it is truncated."""
     if not element.has_lists:
         return start + element.count * element.item_bytes
-    at = start
     byte_order: Literal["little", "big"] = "little" if order == "<" else "big"
     for _ in range(element.count):
         for each in element.properties:
+            count = 1
             if each.length is not None:
-                size = np.dtype(each.length).itemsize
-                length = int.from_bytes(
-                    body[at : at + size], byte_order, signed=each.length.startswith("i")
-                )
-                at += size + (length * each.bytes if length >= 0 else len(body))
-            else:
-                at += each.bytes
-        if at > len(body):
+                place = slice(start, start + np.dtype(each.length).itemsize)
+                signed = each.length.startswith("i")
+                count = int.from_bytes(body[place], byte_order, signed=signed)
+                start = place.stop
+            start += count * each.bytes if count >= 0 else len(body)
+        if start > len(body):
             break
-    return at
+    return start

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -34,6 +35,28 @@ class RawCloud(NamedTuple):
     points: NDArray[np.float32]
     fields: tuple[str, ...]
     told: str = ""
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of each point.
+
+    Attributes:
+        name: in the file.
+        kind: numpy's type of one number, as <f4.
+        count: how many numbers it has.
+        length: the type of a list's length, if it is a list of numbers.
+    """
+
+    name: str
+    kind: str
+    count: int = 1
+    length: str | None = None
+
+    @property
+    def bytes(self) -> int:
+        """In each point, if it is no list."""
+        return np.dtype(self.kind).itemsize * self.count
 
 
 def find_intensity(names: Iterable[str]) -> str | None:
@@ -88,6 +111,23 @@ def read_count(word: str) -> int:
 def too_long(path: Path, count: int) -> FileError:
     """The error of a file that has more points than its header."""
     return FileError(path, f"goes on after the {count} points of its header; write it again")
+
+
+def truncated(path: Path, count: int) -> FileError:
+    """The error of a file that has fewer points than its header."""
+    return FileError(path, f"is truncated: it ends before its {count} points; write it again")
+
+
+def binary_columns(
+    path: Path, body: memoryview, count: int, fields: Sequence[Field], *, start: int = 0
+) -> Iterator[NDArray[Any]]:
+    """The first number of each field of points that lie one after the other, without a copy."""
+    step = sum(each.bytes for each in fields)
+    if start + count * step > len(body):
+        raise truncated(path, count)
+    for each in fields:
+        yield np.ndarray((count,), each.kind, body, start, (step,))
+        start += each.bytes
 
 
 def lines_of_text(body: memoryview) -> Iterator[str]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibgraph import load_dataset
 from examples.datasets.kitti_360 import convert
-from tests.io.kitti_files import CLOUD
+from tests.io.written import CLOUD
 
 DRIVE = "2013_05_28_drive_0000_sync"
 # The camera 0.4 m ahead of the LiDAR, 0.1 m left and 0.2 m below it, looking ahead.

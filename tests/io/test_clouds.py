@@ -14,7 +14,7 @@ from calibgraph import FileError
 from calibgraph.io import clouds
 from calibgraph.io.clouds import load_cloud, read_cloud_notes
 from calibgraph.io.frame import Frame
-from tests.io.kitti_files import CLOUD
+from tests.io.written import CLOUD
 
 
 def test_npy_and_bin_clouds_are_read(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from calibgraph import DatasetError, FileError, Rig, load_dataset, load_rig
 from calibgraph.io.frame import twist_by_scans, twist_of_entry
 from calibgraph.simulation.rigs import rig_of
 from tests.conftest import SAMPLE
-from tests.io.kitti_files import written_kitti
+from tests.io.written import written_kitti
 
 
 def test_the_sample_is_read() -> None:

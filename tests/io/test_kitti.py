@@ -10,7 +10,7 @@ import pytest
 
 from calibgraph import FileError, load_dataset, load_rig
 from tests.conftest import make_camera
-from tests.io.kitti_files import written_kitti
+from tests.io.written import written_kitti
 
 
 def test_kitti_extrinsics_use_the_whole_fourth_column(tmp_path: Path) -> None:

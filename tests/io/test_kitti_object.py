@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibgraph import FileError, load_dataset, load_rig
-from tests.io.kitti_files import BASELINES, CLOUD, RECTIFY, T_CAMERA0_LIDAR, text_of
+from tests.io.written import BASELINES, CLOUD, RECTIFY, T_CAMERA0_LIDAR, text_of
 
 WIDTH, HEIGHT = 1242, 375
 K = np.array([[721.5, 0, 609.6], [0, 721.5, 172.9], [0, 0, 1]])

@@ -8,6 +8,7 @@ wherever the path of an image or a cloud does.
 from __future__ import annotations
 
 import os
+import struct
 import weakref
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -15,12 +16,13 @@ from functools import cache, lru_cache
 from itertools import islice
 from pathlib import Path
 from threading import Lock
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from calibgraph.errors import FileError
-from calibgraph.io.bags.recording import Topic
+from calibgraph.io.bags.files import Topic
 from calibgraph.io.bags.storage import errors_in_one_line, is_bag, open_recording
 
 if TYPE_CHECKING:
@@ -31,15 +33,14 @@ LIVOX_CLOUDS = tuple(
     for package in ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
 )
 
-_FIELDS = {"offset_time": (6, 0), "x": (7, 4), "y": (7, 8), "z": (7, 12),
-           "reflectivity": (2, 16), "tag": (2, 17), "line": (2, 18)}  # fmt: skip
+_POINT = {"offset_time": (6, 0), "x": (7, 4), "y": (7, 8), "z": (7, 12), "reflectivity": (2, 16),
+          "tag": (2, 17), "line": (2, 18)}  # fmt: skip
 """The type's code in PointField, and the offset."""
 _POINT_BYTES = 19
-_TAIL_BYTES = 8 + 4 + 1 + 3 + 4  # timebase to the number of points
 
 
-def read_custom_msg(data: bytes, types: Any, *, ros1: bool) -> Any:
-    """The PointCloud2 of a Livox CustomMsg, from its bytes as in ROS 1, or as CDR, which aligns.
+def read_custom_msg(data: bytes, *, ros1: bool) -> Any:
+    """A Livox CustomMsg as a PointCloud2, from its bytes as in ROS 1, or as CDR, which aligns.
 
     rosbags would make an object of every point. The message of livox_ros_driver,
     livox_ros_driver2 and livox_interfaces::
@@ -47,40 +48,23 @@ def read_custom_msg(data: bytes, types: Any, *, ros1: bool) -> Any:
         Header header; uint64 timebase; uint32 point_num; uint8 lidar_id; uint8[3] rsvd
         CustomPoint[] points: uint32 offset_time; float32 x, y, z; uint8 reflectivity, tag, line
     """
-    big_endian = not ros1 and data[1] == 0
-    order = ">" if big_endian else "<"
-    body = np.frombuffer(data, np.uint8, offset=0 if ros1 else 4)
-
-    def number(at: int, kind: str = "u4") -> int:
-        return int(body[at : at + np.dtype(kind).itemsize].view(order + kind)[0])
-
-    stamp_at = 4 if ros1 else 0  # after the number of the message
-    text_at, length = stamp_at + 12, number(stamp_at + 8)
-    frame = body[text_at : text_at + length].tobytes().rstrip(b"\0").decode()
-    end = text_at + length
-    points_at = (end if ros1 else -(-end // 8) * 8) + _TAIL_BYTES
-    count = number(points_at - 4)
+    order = ">" if not ros1 and data[1] == 0 else "<"
+    sec, nanosec, length = struct.unpack_from(f"{order}iII", data, 4)  # after number or form
+    end = 16 + length
+    start = end if ros1 else 4 + -(-(end - 4) // 8) * 8
+    (count,) = struct.unpack_from(f"{order}8xI4xI", data, start)[1:]
     step = _POINT_BYTES if ros1 else _POINT_BYTES + 1
-    points = np.zeros(count * step, np.uint8)
-    taken = points[: len(points) - (step - _POINT_BYTES if count else 0)]
-    taken[:] = body[points_at : points_at + len(taken)]  # raises: truncated
-    stamp = types["builtin_interfaces/msg/Time"](number(stamp_at, "i4"), number(stamp_at + 4))
-    header = types["std_msgs/msg/Header"](
-        stamp=stamp, frame_id=frame, **({"seq": number(0)} if ros1 else {})
-    )
-    return _cloud(types, header, points, step, big_endian=big_endian)
-
-
-def _cloud(types: Any, header: Any, points: Any, step: int, *, big_endian: bool) -> Any:
-    """A PointCloud2 of points of ``step`` bytes."""
-    fields = [
-        types["sensor_msgs/msg/PointField"](name=name, offset=offset, datatype=code, count=1)
-        for name, (code, offset) in _FIELDS.items()
-    ]
-    return types["sensor_msgs/msg/PointCloud2"](
-        header=header, height=1, width=len(points) // step, fields=fields,
-        is_bigendian=big_endian, point_step=step, row_step=len(points), data=points,
-        is_dense=True,
+    points = bytes(data[start + 20 : start + 20 + count * step])
+    if len(points) < count * step - (step - _POINT_BYTES):
+        raise ValueError("truncated")
+    stamp = SimpleNamespace(sec=sec, nanosec=nanosec)
+    frame = bytes(data[16:end]).rstrip(b"\0").decode()
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id=frame), height=1, width=count,
+        fields=[SimpleNamespace(name=name, datatype=code, offset=at, count=1)
+                for name, (code, at) in _POINT.items()],
+        is_bigendian=order == ">", point_step=step, row_step=count * step,
+        data=np.frombuffer(points.ljust(count * step, b"\0"), np.uint8),
     )  # fmt: skip
 
 
@@ -169,7 +153,7 @@ class Bag:
         store = type_store(ros1=ros1)
         try:
             if kind.type in LIVOX_CLOUDS:
-                return read_custom_msg(data, store.types, ros1=ros1)
+                return read_custom_msg(data, ros1=ros1)
             deserialize = store.deserialize_ros1 if ros1 else store.deserialize_cdr
             return deserialize(data, TRANSFORMS if kind.type in TREES else kind.type)
         except Exception as error:  # whatever the bytes make the parser raise

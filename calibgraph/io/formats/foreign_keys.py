@@ -53,7 +53,7 @@ class _Transform(NamedTuple):
 
 
 class ForeignKeys(NamedTuple):
-    """The table of keys, plain; coefficients and COLMAP's models as they are written."""
+    """The table of keys, plain; coefficients as they are written."""
 
     lens: dict[str, list[str]]
     groups: list[str]
@@ -61,7 +61,6 @@ class ForeignKeys(NamedTuple):
     coefficients: dict[str, list[str]]
     transforms: list[_Transform]
     not_read: dict[str, str]
-    colmap: dict[str, tuple[LensModel, int, int]]
 
 
 @cache
@@ -79,7 +78,6 @@ def foreign_keys() -> ForeignKeys:
             for row in table["transforms"]
         ],
         not_read={plain_key(row["key"]): row["why"] for row in table["not_read"]},
-        colmap=table["colmap"],
     )
 
 

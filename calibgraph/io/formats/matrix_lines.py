@@ -1,6 +1,4 @@
-"""Text files of lines: lenses of COLMAP's cameras.txt, and matrices as KITTI and others write them.
-
-COLMAP's pixel (0.5, 0.5) is the centre of the first one. Matrices are lines ``KEY: numbers``:
+"""Text files of matrices as KITTI and others write them: lines ``KEY: numbers``, or bare numbers.
 
 =======================  ==========================  ==============================================
 file                     lines                       direction
@@ -13,7 +11,6 @@ perspective.txt          P_rect_0k, R_rect_0k,       lenses of the rectified ima
 =======================  ==========================  ==============================================
 """
 
-import math
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -24,20 +21,13 @@ from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
 from calibgraph.io.clouds import read_npy
-from calibgraph.io.formats.foreign_keys import foreign_keys
 from calibgraph.io.formats.part import ONLY_CAMERA, FrameLink, Part
 from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.io.kitti import matrix_of_line
-from calibgraph.io.lenses import (
-    CameraLens,
-    fitted_coefficients,
-    intrinsics_of_matrix,
-    listed_intrinsics,
-)
+from calibgraph.io.lenses import CameraLens, intrinsics_of_matrix
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import rigid_transform
 
-_COLMAP_FIELDS = 4  # before the parameters: id, model, width, height
 _TO_LIDAR = re.compile(r"cam[a-z]*_?(to|2)_?(velo|lidar)", re.IGNORECASE)
 _TO_CAMERA = re.compile(r"(velo[a-z]*|lidar)_?(to|2)_?cam", re.IGNORECASE)
 _EXPECTED = (
@@ -53,45 +43,10 @@ def read_lines(path: Path, name: str | None) -> Part | None:
         if array.dtype.kind not in "fiu" or array.size not in (12, 16):
             raise FileError(path, f"holds {array.shape} of {array.dtype}, expected 3 x 4 or 4 x 4")
         return _matrices({"": array.astype(np.float64).ravel().tolist()}, path, name)
-    numbered = enumerate(read_text(path).splitlines(), start=1)
-    lines = {number: line for number, line in numbered if line.strip()}
-    cameras = {k: line.split() for k, line in lines.items() if not line.lstrip().startswith("#")}
-    first = next(iter(cameras.values()), [""])
-    if path.name == "cameras.txt" or (
-        first[0].isdecimal() and len(first) > 1 and first[1][0].isalpha()
-    ):
-        if not cameras:
-            raise FileError(
-                path, "holds no camera; expected lines CAMERA_ID MODEL WIDTH HEIGHT ..."
-            )
-        return Part(path, lenses=dict(_colmap_lens(each, path) for each in cameras.items()))
-    head = next(iter(lines.values()), "")
-    if ":" in head or len(_row(head)) in (4, 12, 16):
-        return _matrices(dict(_keyed(lines.values())), path, name)
-    return None
-
-
-def _colmap_lens(numbered: tuple[int, list[str]], path: Path) -> tuple[str, CameraLens]:
-    """The name camera_ID and the lens of a line."""
-    number, words = numbered
-    where = f"line {number}"
-    try:
-        identity, name, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
-        values = [float(word) for word in words[_COLMAP_FIELDS:]]
-    except (IndexError, ValueError) as error:
-        raise FileError(path, f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from error
-    models = foreign_keys().colmap
-    if name not in models:
-        raise FileError(path, f"{where}: lens model {name!r} is none of calibgraph's; of COLMAP's "
-                        f"there are {', '.join(models)}")  # fmt: skip
-    model, focals, distorted = models[name]
-    count = focals + 2 + distorted
-    if len(values) != count or not all(map(math.isfinite, values)):
-        raise FileError(path, f"{where}: {name} has {count} parameters, found {len(values)}")
-    cx, cy = (centre - 0.5 for centre in values[focals : focals + 2])
-    K = listed_intrinsics((values[0], values[focals - 1], cx, cy), f"{path}: {where}")
-    distortion = fitted_coefficients(values[focals + 2 :], model, path)
-    return f"camera_{identity}", CameraLens(model, (width, height), K, distortion)
+    lines = [line for line in read_text(path).splitlines() if line.strip()]
+    head = lines[0] if lines else ""
+    is_one = ":" in head or len(_row(head)) in (4, 12, 16)
+    return _matrices(dict(_keyed(lines)), path, name) if is_one else None
 
 
 def _matrices(lines: dict[str, list[float]], path: Path, name: str | None) -> Part:

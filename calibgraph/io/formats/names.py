@@ -23,7 +23,7 @@ IMPORT_FORMATS: Final = (
     "OpenCV FileStorage (.yaml, .xml, .json), Autoware sensor kit, parameters of "
     "VINS, LVI-SAM and FAST-LIVO, URDF, "
     "static_transform_publisher in launch files (XML) and scripts (.sh), "
-    "COLMAP cameras.txt, koide3 calib.json, KITTI and KITTI-360 (calib_cam_to_velo.txt, "
+    "koide3 calib.json, KITTI and KITTI-360 (calib_cam_to_velo.txt, "
     "perspective.txt), a ROS bag, a rig file, a result or a JSON export of calibgraph"
 )
 """What ``calibgraph import`` reads."""

@@ -92,7 +92,7 @@ def _unknown(what: str, text: str = "") -> str:
         return "is the .ini of camera_calibration; give the .yaml that it writes beside it"
     return (
         f"{what} of no known format; known are those of Kalibr, ROS (camera_info, /tf_static, "
-        "URDF), OpenCV, Autoware, KITTI, COLMAP and others in docs/formats.md; or write "
+        "URDF), OpenCV, Autoware, KITTI and others in docs/formats.md; or write "
         "T_camera_lidar into rig.yaml"
     )
 

@@ -59,8 +59,7 @@ def test_without_a_library_the_command_that_installs_it_is_named(
             raise ImportError(f"No module named {name!r}")
         return imports(name, *rest)
 
-    for module in ("mcap_files", "ros1_files"):
-        monkeypatch.delitem(sys.modules, f"calibgraph.io.bags.{module}", raising=False)
+    monkeypatch.delitem(sys.modules, "calibgraph.io.bags.files", raising=False)
     monkeypatch.setattr(builtins, "__import__", without_library)
     with pytest.raises(CalibrationError, match=r"needs rosbags and mcap: pip install 'calibgraph"):
         load_rig(bag)

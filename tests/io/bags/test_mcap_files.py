@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from calibgraph import FileError, load_dataset, load_rig
-from calibgraph.io.bags.mcap_files import McapFile
+from calibgraph.io.bags.files import McapFile
 from calibgraph.io.bags.messages import Bag
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (

@@ -1,4 +1,4 @@
-"""Every exported file, read by an independent reader."""
+"""Every exported file, read by an independent reader; lenses by the formulas of others."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ from urdf_parser_py.urdf import URDF
 from calibgraph import (
     Calibration,
     CalibrationError,
+    Camera,
     FileError,
     Rig,
     export_calibration,
+    import_rig,
     load_rig,
 )
 from calibgraph.io.formats.export import WRITERS
 from calibgraph.io.formats.names import EXPORT_FORMATS
+from calibgraph.simulation.rigs import rig_of
 from tests.conftest import make_pair
 from tests.io.formats.conftest import rig_for, varied_rig
 from tests.io.formats.readers import READERS, angles_pose, worked_points
@@ -252,3 +255,184 @@ def test_kitti_sequences_read_what_was_exported(tmp_path: Path) -> None:
     again = load_rig(tmp_path)
     for name, T in rig.T_camera_lidar.items():
         np.testing.assert_allclose(again.T_camera_lidar[name], T, atol=1e-12)
+
+
+_KEYS = [
+    "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model",
+    "distortion_coefficients", "rectification_matrix", "projection_matrix",
+]  # fmt: skip
+"""camera_calibration_parsers/parse_yml.cpp: all of them are required."""
+
+
+def with_its_lens_again(rig: Rig, folder: Path) -> Rig:
+    """Export lenses as camera_info and extrinsics as tf2, and import both."""
+    infos = export_calibration(rig, folder / "infos", "camera_info")
+    (tree,) = export_calibration(rig, folder / "tree.yaml", "tf2")
+    return import_rig([*infos, tree])
+
+
+@pytest.mark.parametrize("name", ["kitti", "walkley", "fisheye", "omni"])
+def test_lenses_are_imported_as_they_were_exported(name: str, tmp_path: Path) -> None:
+    rig = rig_of(name)
+    again = with_its_lens_again(rig, tmp_path)
+    assert list(again.cameras) == list(rig.cameras)
+    for camera, own in rig.cameras.items():
+        found = again.cameras[camera]
+        point = np.array([0.4, -0.3, 2.0])
+        np.testing.assert_array_equal(found.lens.project(point)[0], own.lens.project(point)[0])
+        assert (found.model, found.intrinsics_px) == (own.model, own.intrinsics_px)
+        assert (found.width_px, found.height_px) == (own.width_px, own.height_px)
+
+
+def test_eight_coefficients_are_rational(mixed_rig: Rig, tmp_path: Path) -> None:
+    again = with_its_lens_again(mixed_rig, tmp_path)
+    found = yaml.safe_load((tmp_path / "infos" / "wide.yaml").read_text())
+    assert found["distortion_model"] == "rational_polynomial"
+    for name, camera in mixed_rig.cameras.items():
+        assert again.cameras[name].distortion == camera.distortion
+
+
+def test_a_file_has_what_the_parser_of_ros_requires(tmp_path: Path) -> None:
+    rig = make_pair()
+    files = export_calibration(rig, tmp_path / "infos", "camera_info", cameras=["left"])
+    assert [file.name for file in files] == ["left.yaml"]
+    text = files[0].read_text()
+    found, K = yaml.safe_load(text), rig.cameras["left"].matrix_px
+    assert list(found) == _KEYS
+    for key, matrix in (
+        ("camera_matrix", K),
+        ("rectification_matrix", np.eye(3)),
+        ("projection_matrix", np.column_stack([K, np.zeros(3)])),
+    ):
+        assert (found[key]["rows"], found[key]["cols"]) == matrix.shape
+        assert found[key]["data"] == matrix.ravel().tolist()
+    assert found["distortion_coefficients"] == {"rows": 1, "cols": 5, "data": [0.0] * 5}
+    assert "export it as tf2" in text
+
+
+def test_only_lenses_that_were_exported_are_replaced(tmp_path: Path) -> None:
+    rig = make_pair()
+    for _ in range(2):
+        export_calibration(rig, tmp_path, "camera_info")
+    (tmp_path / "right.yaml").write_text("mine")
+    before = (tmp_path / "left.yaml").stat().st_mtime_ns
+    with pytest.raises(FileError, match="would be replaced"):
+        export_calibration(rig, tmp_path, "camera_info")
+    assert (tmp_path / "left.yaml").stat().st_mtime_ns == before
+
+
+def test_what_has_no_place_in_files_of_ros_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="cannot hold a lens of the model equirect"):
+        export_calibration(rig_of("panorama"), tmp_path / "infos", "camera_info")
+    camera = make_pair().cameras["left"]
+    other = camera.model_copy(update={"frame_id": "other"})
+    for names in (("a b", "a_b"), ("A_b", "a_b")):  # one file where systems ignore case
+        alike = Rig(cameras=dict(zip(names, (other, camera), strict=True)))
+        with pytest.raises(CalibrationError, match="another has the file a_b.yaml"):
+            export_calibration(alike, tmp_path / "infos", "camera_info")
+    assert not (tmp_path / "infos").exists()
+
+
+def test_the_name_in_a_file_is_the_files(tmp_path: Path) -> None:
+    rig = Rig(cameras={"front left": make_pair().cameras["left"]})
+    (file,) = export_calibration(rig, tmp_path, "camera_info")
+    assert yaml.safe_load(file.read_text())["camera_name"] == file.stem == "front_left"
+
+
+def test_lenses_of_cameras_that_the_rig_has_no_more_are_removed(tmp_path: Path) -> None:
+    """Unless single cameras are exported; files of other kinds stay."""
+    rig = make_pair()
+    export_calibration(rig, tmp_path, "camera_info")
+    export_calibration(rig, tmp_path / "tree.yaml", "tf2")
+    (tmp_path / "mine.yaml").write_text("mine")
+    export_calibration(rig, tmp_path, "camera_info", cameras=["left"])
+    names = {"left.yaml", "mine.yaml", "tree.yaml"}
+    assert {file.name for file in tmp_path.iterdir()} == names | {"right.yaml"}
+    export_calibration(Rig(cameras={"left": rig.cameras["left"]}), tmp_path, "camera_info")
+    assert {file.name for file in tmp_path.iterdir()} == names
+
+
+POINT = np.array([2.0, -0.7, -0.4])  # behind the lens
+
+
+@pytest.fixture
+def omni() -> Camera:
+    return rig_of("omni").cameras["front"]
+
+
+def unified_pixel(xi: float, focal: list[float], coefficients: list[float]) -> list[float]:
+    """cv2.omnidir.projectPoints, and Kalibr's omni-radtan, of a point in the camera frame."""
+    x, y, z = POINT / np.linalg.norm(POINT)
+    u, v = x / (z + xi), y / (z + xi)
+    k1, k2, p1, p2 = coefficients
+    r2 = u * u + v * v
+    radial = 1 + k1 * r2 + k2 * r2 * r2
+    fx, fy, cx, cy = focal
+    return [
+        fx * (u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)) + cx,
+        fy * (v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v) + cy,
+    ]
+
+
+@pytest.mark.parametrize("format", ["kalibr", "opencv", "json"])
+def test_a_unified_lens_projects_in_other_formats_as_here(
+    format: str, omni: Camera, tmp_path: Path
+) -> None:
+    path = tmp_path / "file.yml"
+    export_calibration(Rig(cameras={"front": omni}), path, format)
+    if format == "kalibr":
+        camera = yaml.safe_load(path.read_text())["cam0"]
+        assert (camera["camera_model"], camera["distortion_model"]) == ("omni", "radtan")
+        (xi, *focal), coefficients = camera["intrinsics"], camera["distortion_coeffs"]
+    elif format == "opencv":
+        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        node = file.getNode("camera_0")
+        K = node.getNode("camera_matrix").mat()
+        focal, xi = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], node.getNode("xi").real()
+        coefficients = node.getNode("distortion_coefficients").mat().ravel().tolist()
+    else:
+        camera = json.loads(path.read_text())["cameras"]["front"]
+        assert camera["model"] == "omnidirectional"
+        focal = [camera["intrinsics_px"][key] for key in ("fx", "fy", "cx", "cy")]
+        xi, *coefficients = camera["distortion"]
+    pixels, valid = omni.lens.project(POINT)
+    np.testing.assert_allclose(unified_pixel(xi, focal, coefficients), pixels[0], atol=1e-9)
+    assert valid.all()
+
+
+@pytest.mark.parametrize("format", ["kalibr", "opencv"])
+def test_a_unified_lens_is_imported_as_it_was_exported(
+    format: str, omni: Camera, tmp_path: Path
+) -> None:
+    path = tmp_path / "file.yaml"
+    export_calibration(Rig(cameras={"front": omni}), path, format)
+    again = import_rig([path], size_px=(1280, 1280)).cameras["front"]
+    np.testing.assert_allclose(again.T_camera_lidar, omni.T_camera_lidar, atol=1e-9)
+    theirs, ours = (c.model_dump(exclude={"T_camera_lidar"}) for c in (again, omni))
+    assert theirs == ours
+
+
+def test_a_panorama_is_written_where_there_is_room_for_it(tmp_path: Path) -> None:
+    rig = rig_of("panorama")
+    for format in ("opencv", "json", "urdf"):
+        export_calibration(rig, tmp_path / f"{format}.yml", format)
+    again = import_rig([tmp_path / "opencv.yml"]).cameras["panorama"]
+    pixels, _ = rig.cameras["panorama"].lens.project(POINT)
+    np.testing.assert_allclose(again.lens.project(POINT)[0], pixels, atol=1e-9)
+    for format in ("kalibr", "kitti"):
+        with pytest.raises(CalibrationError, match="cannot hold a.* equirectangular"):
+            export_calibration(rig, tmp_path / format, format)
+
+
+def test_an_omni_lens_with_another_distortion_is_refused(omni: Camera, tmp_path: Path) -> None:
+    export_calibration(Rig(cameras={"front": omni}), tmp_path / "chain.yaml", "kalibr")
+    text = (tmp_path / "chain.yaml").read_text()
+    for old, new, said in (
+        ("distortion_model: radtan", "distortion_model: fov", "lens model 'fov' is none of"),
+        ("distortion_model: radtan", "distortion_model: equi", "contradict each other"),
+        ("intrinsics: [1.3,", "intrinsics: [-1.3,", "xi of the unified model is -1.3"),
+    ):
+        assert old in text
+        (tmp_path / "wrong.yaml").write_text(text.replace(old, new))
+        with pytest.raises(CalibrationError, match=said):
+            import_rig([tmp_path / "wrong.yaml"])

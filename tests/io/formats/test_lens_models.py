@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 from calibgraph import Camera, import_rig
-from calibgraph.errors import CalibrationError
-from calibgraph.io.formats.rig_import import RigParts, read_rig_parts
-from calibgraph.io.lenses import stated_model
+from calibgraph.errors import CalibrationError, FileError
+from calibgraph.io.formats.rig_import import read_rig_parts
+from calibgraph.io.lenses import intrinsics_of_matrix, stated_model
 from tests.io.formats.calibration_files import FRONT
 
 K = [320.0, 0.0, 640.0, 0.0, 320.0, 400.0, 0.0, 0.0, 1.0]
@@ -37,14 +37,13 @@ def lens(coefficients: Any, matrix_px: list[float] | None = None, **keys: Any) -
     }
 
 
-def as_yaml(folder: Path, content: dict[str, Any]) -> Path:
-    (folder / "a.yaml").write_text(yaml.safe_dump(content))
+def as_yaml(folder: Path, content: dict[str, Any], first: str = "") -> Path:
+    (folder / "a.yaml").write_text(first + yaml.safe_dump(content))
     return folder / "a.yaml"
 
 
 def as_opencv_yaml(folder: Path, content: dict[str, Any]) -> Path:
-    (folder / "a.yml").write_text("%YAML:1.0\n---\n" + yaml.safe_dump(content))
-    return folder / "a.yml"
+    return as_yaml(folder, content, "%YAML:1.0\n---\n")
 
 
 def as_json(folder: Path, content: dict[str, Any]) -> Path:
@@ -90,25 +89,11 @@ def test_a_model_is_understood_under_any_key(index: int, write: Writer, tmp_path
 
 
 @pytest.mark.parametrize("name", FISHEYES)
-def test_names_of_fisheyes_are_understood_by_all_readers(name: str, tmp_path: Path) -> None:
-    assert stated_model({"DistModel": name}, "a") == "fisheye"
-    chain = {
-        "cam0": {
-            "camera_model": "pinhole",
-            "distortion_model": name,
-            "intrinsics": [320, 320, 640, 400],
-            "distortion_coeffs": FOUR,
-            "resolution": [1280, 800],
-            "T_cam_lidar": FRONT.tolist(),
-        }
-    }
-    assert camera_of(as_yaml(tmp_path, chain)).model == "fisheye"
-    koide = {"camera": {"camera_model": name, "intrinsics": [320, 320, 640, 400],
-                        "distortion_coeffs": FOUR}}  # fmt: skip
-    koide["results"] = {"T_lidar_camera": [0, 0, 0, 0, 0, 0, 1]}  # type: ignore[dict-item]
-    (tmp_path / "calib.json").write_text(json.dumps(koide))
-    (camera,) = import_rig([tmp_path / "calib.json"], size_px=(1280, 800)).cameras.values()
-    assert camera.model == "fisheye"
+def test_names_of_fisheyes_are_understood_in_a_camchain(name: str, tmp_path: Path) -> None:
+    camera = {"camera_model": "pinhole", "distortion_model": name, "resolution": [1280, 800],
+              "intrinsics": [320, 320, 640, 400], "distortion_coeffs": FOUR,
+              "T_cam_lidar": FRONT.tolist()}  # fmt: skip
+    assert camera_of(as_yaml(tmp_path, {"cam0": camera})).model == "fisheye"
 
 
 @pytest.mark.parametrize("name", PINHOLES)
@@ -141,19 +126,15 @@ def test_four_in_a_column_and_no_model_are_a_question(write: Writer, tmp_path: P
             import_rig([as_json(tmp_path, content)])
 
 
-def notes_of(path: Path) -> RigParts:
-    return read_rig_parts([path])
-
-
 @pytest.mark.parametrize("coefficients", [matrix(1, 4, FOUR), FOUR, [FOUR]])
 def test_four_in_a_row_and_no_model_are_a_pinhole_with_a_note(
     coefficients: Any, tmp_path: Path
 ) -> None:
     path = as_yaml(tmp_path, lens(coefficients))
     assert camera_of(path).model == "pinhole"
-    (note,) = notes_of(path).notes
+    (note,) = read_rig_parts([path]).notes
     assert "four numbers and no key names the lens model" in note
-    assert notes_of(as_yaml(tmp_path, lens(coefficients, model="plumb_bob"))).notes == []
+    assert read_rig_parts([as_yaml(tmp_path, lens(coefficients, model="plumb_bob"))]).notes == []
 
 
 @pytest.mark.parametrize(
@@ -162,7 +143,7 @@ def test_four_in_a_row_and_no_model_are_a_pinhole_with_a_note(
 def test_five_coefficients_or_zeros_are_no_question(coefficients: Any, tmp_path: Path) -> None:
     path = as_yaml(tmp_path, lens(coefficients))
     assert camera_of(path).model == "pinhole"
-    assert notes_of(path).notes == []
+    assert read_rig_parts([path]).notes == []
 
 
 @pytest.mark.parametrize(
@@ -237,3 +218,30 @@ def test_named_coefficients_without_a_model_are_a_question(tmp_path: Path) -> No
         import_rig([path])
     path = as_yaml(tmp_path, {**named, "k1": 0.1, "k2": 0.0, "p1": 0.1, "p2": 0.0})
     assert camera_of(path).distortion == (0.1, 0.0, 0.1, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("K", "said"),
+    [
+        ([[480, 9, 320], [0, 480, 180], [0, 0, 1]], "its skew is 9 px"),
+        ([[480, -0.2, 320], [0, 480, 180], [0, 0, 1]], "its skew is -0.2 px"),
+        ([[960, 0, 640], [0, 960, 360], [0, 0, 2]], "undo its scale: divide by 2"),
+        ([[480, 0, 0], [0, 480, 0], [320, 180, 1]], "write its rows first"),
+        ([[480, 0, 0], [0, 1, 0], [0, 7e-310, 2.5e-323]], "write the camera matrix"),
+        ([[0, 480, 320], [480, 0, 180], [0, 0, 1]], "holds no focal length"),
+        ([[0] * 3] * 3, "holds no focal length"),
+        ([[-480, 0, 320], [0, 480, 180], [0, 0, 1]], "holds no focal length"),
+        ([[480, 0, float("nan")], [0, 480, 180], [0, 0, 1]], "holds no focal length"),
+        ([[480, 0, 320, 0], [0, 480, 180, 0], [0, 0, 1, 0]], "has the shape (3, 4)"),
+    ],
+)
+def test_what_is_no_camera_matrix_is_refused(K: Any, said: str) -> None:
+    with pytest.raises(FileError) as caught:
+        intrinsics_of_matrix(K, "lens.yaml: K")
+    assert said in str(caught.value)
+    assert str(caught.value).startswith("lens.yaml: K")
+
+
+def test_a_skew_that_moves_no_point_by_a_tenth_of_a_pixel_is_rounded() -> None:
+    found = intrinsics_of_matrix([[480, 0.04, 320], [0, 481, 180], [0, 0, 1]], "K")
+    assert tuple(found.model_dump().values()) == (480, 481, 320, 180)

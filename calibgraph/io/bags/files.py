@@ -1,0 +1,425 @@
+"""Files of bags, each as a recording: ROS 1 by rosbags, ROS 2 by sqlite3 and by the library mcap.
+
+A recording has ``topics`` by name, and messages as bytes in the order in which they were recorded.
+"""
+
+import bz2
+import sqlite3
+from bisect import bisect_left
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import ExitStack
+from copy import copy
+from dataclasses import dataclass
+from functools import partial
+from heapq import heappop, heappush, merge
+from io import BytesIO
+from itertools import accumulate, count
+from operator import itemgetter
+from pathlib import Path, PurePath
+from struct import Struct
+from tempfile import TemporaryDirectory
+from typing import IO, Any
+from zlib import crc32
+
+import lz4.frame
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Chunk, ChunkIndex
+from rosbags.rosbag1 import Reader
+
+from calibgraph.errors import FileError
+from calibgraph.files import read_yaml
+from calibgraph.io.bags.storage import METADATA, REPAIR_ROS2
+
+ENCODINGS = ("cdr", "ros1")
+"""How messages of ROS 2 and of ROS 1 are serialized."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag; the type names the encoding if that is none of ROS."""
+
+    name: str
+    type: str
+    count: int
+    encoding: str = "cdr"
+
+
+def make_topic(name: str, type_: str, count: int, encoding: str) -> Topic:
+    """A topic; a type of ROS 1 gets the name that it has in ROS 2."""
+    if encoding not in ENCODINGS:
+        return Topic(name, f"{type_} ({encoding or 'of no encoding'})", count, encoding)
+    package, _, last = type_.rpartition("/")
+    is_short = package and not package.endswith("/msg")
+    return Topic(name, f"{package}/msg/{last}" if is_short else type_, count, encoding)
+
+
+def topics_by_name(topics: Iterable[Topic]) -> dict[str, Topic]:
+    """Topics, sorted by name; with the messages of all their publishers, files and types."""
+    found: dict[str, Topic] = {}
+    for each in sorted(topics, key=lambda topic: topic.name):
+        before = found.get(each.name, each)
+        same = (before.type, before.encoding) == (each.type, each.encoding)
+        type_ = each.type if same else f"{before.type}, {each.type}"
+        earlier = before.count if each.name in found else 0
+        found[each.name] = Topic(each.name, type_, earlier + each.count, each.encoding)
+    return found
+
+
+Buffer = bytes | memoryview
+
+_ALWAYS, _RATIO, _MOST = 2**26, 50, 2**30
+"""Of one part: a black image of 20 MP is 60 MB and packs to nothing; other data of sensors shrink
+to a fiftieth at most."""
+_ALWAYS_WHOLE, _RATIO_WHOLE = 2**28, 1000
+
+
+def unpack(path: Path, kind: str, data: Buffer) -> Buffer:
+    """The content of a compressed chunk or message.
+
+    Args:
+        path: its bag.
+        kind: bz2, lz4 or zstd; empty or ``none`` if it is not compressed.
+        data: the chunk or message.
+
+    Raises:
+        FileError: if the kind is unknown, or the content larger than a recording's can be.
+        Exception: what the library raises for damaged data.
+    """
+    if kind in ("", "none"):
+        return data
+    most = max(_ALWAYS, min(_RATIO * len(data), _MOST))
+    if kind == "zstd":
+        import zstandard
+
+        stated = zstandard.frame_content_size(data)  # -1 if it is not
+        content: bytes = (
+            zstandard.decompress(data) if 0 <= stated <= most
+            else _zstd_stream(data).read(most + 1)
+        )  # fmt: skip
+    elif kind == "lz4":
+        import lz4.frame
+
+        content = lz4.frame.LZ4FrameDecompressor().decompress(data, most + 1)
+    elif kind == "bz2":
+        content = bz2.BZ2Decompressor().decompress(data, most + 1)
+    else:
+        raise FileError(
+            path,
+            f"is compressed by {kind!r}; known are bz2, lz4 and zstd: write it again with "
+            "`mcap compress` or `rosbag compress`",
+        )
+    if len(content) > most:
+        raise FileError(
+            path,
+            f"{len(data)} bytes of it unpack to more than {most >> 20} MiB, which no recording "
+            "does; record it again, in chunks of a few MiB",
+        )
+    return content
+
+
+def require_plausible(path: Path, packed: int, content: int) -> None:
+    """Check what a whole file unpacks to.
+
+    Raises:
+        FileError: if it is more than a recording's can be.
+    """
+    if content > max(_ALWAYS_WHOLE, _RATIO_WHOLE * packed):
+        raise FileError(
+            path,
+            f"its {packed} bytes unpack to {content >> 20} MiB or more, which no recording does; "
+            "record it again",
+        )
+
+
+def unpack_file(path: Path, out: Path) -> None:
+    """Write the content of a file compressed by zstd.
+
+    Raises:
+        FileError: if it is more than a recording's can be.
+    """
+    packed = path.stat().st_size
+    with path.open("rb") as file, out.open("wb") as written:
+        stream = _zstd_stream(file)
+        while block := stream.read(2**20):
+            written.write(block)
+            require_plausible(path, packed, written.tell())
+
+
+def _zstd_stream(source: Buffer | IO[bytes]) -> Any:
+    import zstandard
+
+    return zstandard.ZstdDecompressor().stream_reader(source)
+
+
+_MAGIC, _HEAD, _MESSAGE = b"\x89MCAP0\r\n", Struct("<BQ"), Struct("<HIQQ")
+_KNOWN = frozenset(map(int, Opcode))
+_KINDS = {bz2.decompress: "bz2", lz4.frame.decompress: "lz4"}
+_TABLES = """
+    SELECT count(*) FROM sqlite_master
+    WHERE type = 'table' AND name IN ('messages', 'topics') AND sql LIKE 'CREATE TABLE %'"""
+_TOPICS = """
+    SELECT name, type, count(topic_id), serialization_format
+    FROM topics LEFT JOIN messages ON topics.id = topic_id GROUP BY topics.id"""
+_MESSAGES = """
+    SELECT name, timestamp, data FROM messages JOIN topics ON topics.id = topic_id
+    WHERE name IN ({}) AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, messages.id"""
+_LEAST_LIMIT = 10_000  # of sqlite3, for its statements
+
+
+class Db3File:
+    """A database, open for reading.
+
+    It may be anyone's: it is not written, views and virtual tables are not read, and no value is
+    longer than the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        name = f"{path.absolute().as_uri()}?immutable=1"  # quotes %, ? and #
+        self._database = sqlite3.connect(name, uri=True, check_same_thread=False)
+        self.close = self._database.close
+        try:
+            self._database.setlimit(
+                sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, _LEAST_LIMIT)
+            )
+            if self._database.execute(_TABLES).fetchone() != (2,):
+                raise ValueError("it has no tables messages and topics")
+            found = self._database.execute(_TOPICS)
+            self.topics = topics_by_name(make_topic(*each) for each in found)
+        except BaseException:
+            self.close()
+            raise
+
+    def messages(
+        self, topics: Collection[str], start_ns: int, stop_ns: int
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+        query = _MESSAGES.format(", ".join("?" * len(topics)))
+        yield from self._database.execute(query, [*topics, start_ns, stop_ns])
+
+
+class McapFile:
+    """An MCAP file, open for reading: its chunks are found by the index at the end.
+
+    Recorders may leave out message indexes or the profile, and may write channels of any encoding
+    beside ROS's. A file whose index lacks chunks or counts is not read.
+
+    Raises:
+        FileError: if its index is not whole, or it unpacks to more than a recording's can be.
+        Exception: what the library raises for a damaged file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file = path.open("rb")
+        self.close = self._file.close
+        try:
+            self._read_index(path.stat().st_size)
+        except BaseException:
+            self.close()
+            raise
+
+    def _read_index(self, size: int) -> None:
+        found = SeekingReader(self._file, record_size_limit=size).get_summary()
+        if self._file.seek(-len(_MAGIC), 2) and self._file.read() != _MAGIC:
+            raise ValueError("its end is missing")
+        of = found and found.statistics
+        if (
+            not (found and of)
+            or (of.chunk_count, of.message_count)
+            != (len(found.chunk_indexes), sum(of.channel_message_counts.values()))
+            or (of.message_count and not found.chunk_indexes)
+            or not of.channel_message_counts.keys() <= found.channels.keys()
+            or not {c.schema_id for c in found.channels.values()} - {0} <= found.schemas.keys()
+        ):
+            raise FileError(
+                self._path,
+                "its index is not whole (chunks, channels and counts at the end); write one with "
+                f"`mcap recover {self._path.name} -o whole.mcap`, and give that file",
+            )
+        chunks = sorted(found.chunk_indexes, key=lambda each: each.message_start_time)
+        if any(each.chunk_start_offset + each.chunk_length > size for each in chunks):
+            raise ValueError("its index names chunks behind its end")
+        require_plausible(self._path, size, sum(each.uncompressed_size for each in chunks))
+        self._channels = {number: each.topic for number, each in found.channels.items()}
+        self._chunks = chunks
+        self._starts_ns = [each.message_start_time for each in chunks]
+        self._latest_ns = [*accumulate((each.message_end_time for each in chunks), max)]
+        self.topics = topics_by_name(
+            make_topic(
+                each.topic,
+                found.schemas[each.schema_id].name if each.schema_id else "of no type",
+                of.channel_message_counts.get(number, 0),
+                each.message_encoding,
+            )
+            for number, each in found.channels.items()
+        )
+
+    def messages(
+        self, topics: Collection[str], start_ns: int, stop_ns: int
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+        chosen = {number: topic for number, topic in self._channels.items() if topic in topics}
+        waiting: list[tuple[int, int, str, bytes]] = []
+        number = count()
+        first = bisect_left(self._latest_ns, start_ns)
+        for chunk in self._chunks[first : bisect_left(self._starts_ns, stop_ns)]:
+            channels = chunk.message_index_offsets.keys()  # none if the file has no such index
+            if chunk.message_end_time < start_ns or (channels and channels.isdisjoint(chosen)):
+                continue
+            while waiting and waiting[0][0] < chunk.message_start_time:
+                time_ns, _, topic, data = heappop(waiting)
+                yield topic, time_ns, data
+            for opcode, body in _records(self._content(chunk)):
+                if opcode != Opcode.MESSAGE:
+                    continue
+                channel, _, time_ns, _ = _MESSAGE.unpack_from(body)
+                if channel in chosen and start_ns <= time_ns < stop_ns:
+                    message = bytes(body[_MESSAGE.size :])
+                    heappush(waiting, (time_ns, next(number), chosen[channel], message))
+        while waiting:
+            time_ns, _, topic, data = heappop(waiting)
+            yield topic, time_ns, data
+
+    def _content(self, index: ChunkIndex) -> bytes | memoryview:
+        """The records of a chunk."""
+        self._file.seek(index.chunk_start_offset)
+        if _HEAD.unpack(self._file.read(_HEAD.size)) != (
+            Opcode.CHUNK, index.chunk_length - _HEAD.size
+        ):  # fmt: skip
+            raise ValueError("a chunk is not where its index states")
+        body = BytesIO(self._file.read(index.chunk_length - _HEAD.size))
+        chunk = Chunk.read(ReadDataStream(body))
+        content = unpack(self._path, chunk.compression, chunk.data)
+        if len(content) != index.uncompressed_size:
+            raise ValueError("a chunk is not as long as its index states")
+        if chunk.uncompressed_crc not in (0, crc32(content)):
+            raise ValueError("the checksum of a chunk is not that of its content")
+        return content
+
+
+def _records(data: bytes | memoryview) -> Iterator[tuple[int, memoryview]]:
+    """The kind and content of each record.
+
+    Raises:
+        ValueError: if a kind is unknown, or the last record incomplete.
+    """
+    view, end = memoryview(data), 0
+    while end < len(data):
+        opcode, length = _HEAD.unpack_from(data, end)
+        start, end = end + _HEAD.size, end + _HEAD.size + length
+        if opcode not in _KNOWN:
+            raise ValueError(f"a record of the unknown kind {opcode}")
+        if end > len(data):
+            raise ValueError("a record is incomplete")
+        yield opcode, view[start:end]
+
+
+class _Ros1Reader(Reader):
+    """The library's, whose chunks do not unpack to any size."""
+
+    def read_chunk(self) -> Any:
+        """A chunk's place and how it is unpacked."""
+        chunk: Any = super().read_chunk()
+        kind = _KINDS.get(chunk.decompressor, "")
+        return chunk._replace(decompressor=partial(unpack, Path(str(self.path)), kind))
+
+    def narrowed(self, start_ns: int, stop_ns: int) -> Any:
+        """The reader with the part of its index within these times.
+
+        The library goes through the whole index: 0.16 s for a window late in 200,000 messages.
+        """
+        part = copy(self)
+        part.current_chunk = (-1, BytesIO())  # closed when the next is read, so not the original's
+        part.indexes = {
+            connection: entries[
+                bisect_left(entries, (start_ns,)) : bisect_left(entries, (stop_ns,))
+            ]
+            for connection, entries in self.indexes.items()
+        }
+        return part
+
+
+class Ros1File:
+    """A bag, open for reading."""
+
+    def __init__(self, path: Path) -> None:
+        self._reader = _Ros1Reader(path)
+        self.close = self._reader.close
+        self._reader.open()
+        self.topics = topics_by_name(
+            make_topic(each.topic, each.msgtype, each.msgcount, "ros1")
+            for each in self._reader.connections
+        )
+
+    def messages(
+        self, topics: Collection[str], start_ns: int, stop_ns: int
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+        chosen = [each for each in self._reader.connections if each.topic in topics]
+        if chosen:  # the library takes none for all
+            for connection, record_ns, data in self._reader.narrowed(start_ns, stop_ns).messages(
+                chosen
+            ):
+                yield connection.topic, record_ns, data
+
+
+class BagFolder:
+    """The files of a ROS 2 bag as one recording, of whichever storage and compression."""
+
+    topics: dict[str, Topic]
+    close: Callable[[], None]
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        stated = read_yaml(folder / METADATA)["rosbag2_bagfile_information"]
+        self._mode = (stated.get("compression_mode") or "none").lower()
+        with ExitStack() as opened:
+            self._parts: list[Recording] = []
+            for file in _files_of(folder, stated["relative_file_paths"]):
+                self._parts.append(open_file(self._unpacked(file, opened)))
+                opened.callback(self._parts[-1].close)
+            self.topics = topics_by_name(t for part in self._parts for t in part.topics.values())
+            self.close = opened.pop_all().close
+
+    def _unpacked(self, file: Path, opened: ExitStack) -> Path:
+        """The file or, where files are compressed, a copy that is not, until the bag is closed."""
+        if self._mode != "file":
+            return file
+        copy = Path(opened.enter_context(TemporaryDirectory())) / file.stem
+        unpack_file(file, copy)
+        return copy
+
+    def messages(
+        self, topics: Collection[str], start_ns: int, stop_ns: int
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+        parts = (part.messages(topics, start_ns, stop_ns) for part in self._parts)
+        kind = "zstd" if self._mode == "message" else ""
+        for topic, record_ns, data in merge(*parts, key=itemgetter(1)):
+            yield topic, record_ns, bytes(unpack(self._folder, kind, data))
+
+
+def _files_of(folder: Path, stated: Iterable[str]) -> list[Path]:
+    """The files of a folder."""
+    files = [folder / PurePath(name).name for name in stated]
+    for file in files:
+        if not file.is_file():
+            raise FileError(
+                folder,
+                f"its {METADATA} names {file.name}, which is not there; copy it there, or write "
+                f"the metadata again with `{REPAIR_ROS2}`",
+            )
+    return files
+
+
+Recording = Ros1File | McapFile | Db3File | BagFolder
+
+
+def open_file(path: Path) -> Recording:
+    """Open a bag by its suffix; of a folder, all files that its metadata.yaml names."""
+    if path.is_dir():
+        return BagFolder(path)
+    kinds: dict[str, Callable[[Path], Recording]] = {".bag": Ros1File, ".mcap": McapFile}
+    return kinds.get(path.suffix.lower(), Db3File)(path)
