@@ -20,7 +20,7 @@ import numpy as np
 
 from calibgraph import FileError
 from calibgraph.io.clouds import load_cloud
-from tests.io.cloud_files import CLOUD, pcd, ply
+from tests.io.written import CLOUD, pcd, ply
 
 NUMBERS = [b"0", b"1", b"-1", b"3", b"255", b"499", b"501", b"65536", b"2147483648", b"4294967295",
            b"9223372036854775807", b"18446744073709551616", b"9" * 400, b"1e9", b"nan", b"0x10",

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibgraph import load_dataset
 from calibgraph.io.clouds import read_cloud_notes
-from tests.io.cloud_files import CLOUD, pcd
+from tests.io.written import CLOUD, pcd
 
 SAMPLE = Path(__file__).parents[2] / "data" / "sample"
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibgraph import FileError
 from calibgraph.io.clouds import load_cloud, read_cloud
 from calibgraph.io.pcd import unpack_lzf
-from tests.io.cloud_files import CLOUD, fields_of, lzf_of_literals, padded, pcd, pcd_of, ply
+from tests.io.written import CLOUD, fields_of, lzf_of_literals, padded, pcd, pcd_of, ply
 
 ENCODINGS = ["ascii", "binary", "binary_compressed"]
 OUSTER = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("_0", "u1", 4), ("intensity", "<f4"),

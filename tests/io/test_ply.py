@@ -9,7 +9,7 @@ import pytest
 
 from calibgraph import FileError
 from calibgraph.io.clouds import load_cloud
-from tests.io.cloud_files import CLOUD, ply
+from tests.io.written import CLOUD, ply
 
 FACES = b"element face 2\nproperty list uchar int vertex_indices\nproperty float area\n"
 BINARY_FACES = b"\x03" + bytes(16) + b"\x00" + bytes(4)

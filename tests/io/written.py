@@ -1,16 +1,24 @@
-"""A cloud, and data sets as KITTI publishes them."""
+"""Clouds and data sets as others write them: .pcd, .ply, KITTI, nuScenes."""
 
 from __future__ import annotations
 
+import json
+import shutil
+import struct
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calibgraph import Dataset
 from tests.conftest import make_camera
 
-CLOUD = np.random.default_rng(0).normal(size=(500, 4)).astype(np.float32)
+CLOUD = np.random.default_rng(0).normal(0, (20, 10, 1), (500, 3))
+CLOUD = np.column_stack([CLOUD, np.random.default_rng(1).integers(1, 256, 500) / 256])
+CLOUD = CLOUD.astype(np.float32)
 
 
 def written_kitti(folder: Path, frames: int = 2) -> Path:
@@ -36,12 +44,191 @@ def written_kitti(folder: Path, frames: int = 2) -> Path:
 
 RECTIFY = Rotation.from_euler("xyz", [0.4, -0.3, 0.5], degrees=True).as_matrix()
 
-
 T_CAMERA0_LIDAR = make_camera((0.27, 0.0, -0.08), yaw_deg=0.5).T_camera_lidar
-
 
 BASELINES = {"02": [0.06, 0.001, 0.003], "03": [-0.47, 0.002, 0.003]}
 
 
 def text_of(name: str, values: np.ndarray) -> str:
     return f"{name}: " + " ".join(f"{value:.15e}" for value in np.ravel(values))
+
+
+T_EGO_LIDAR = np.eye(4)
+T_EGO_LIDAR[:3, :3] = Rotation.from_euler("z", -90, degrees=True).as_matrix()  # x to the right
+T_EGO_LIDAR[:3, 3] = 0.94, 0.0, 1.84
+START_US, PERIOD_US = 1_532_402_927_000_000, 500_000
+Tables = dict[str, list[dict[str, Any]]]
+
+
+def pose(T: np.ndarray) -> dict[str, Any]:
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    return {"translation": T[:3, 3].tolist(), "rotation": [w, x, y, z]}
+
+
+def tables_of(data: Dataset, *, scene: str = "scene-0001", moved_m: float = 0.0) -> Tables:
+    """The tables; the vehicle moves so far between a scan and its images."""
+    sensors = {"LIDAR_TOP": "lidar", **dict.fromkeys(data.rig.cameras, "camera"), "RADAR": "radar"}
+    poses = {"LIDAR_TOP": T_EGO_LIDAR, "RADAR": np.eye(4)}
+    for name, camera in data.rig.cameras.items():
+        poses[name] = T_EGO_LIDAR @ np.linalg.inv(camera.T_camera_lidar)
+    tables: Tables = {
+        "sensor": [
+            {"token": f"s-{name}", "channel": name, "modality": kind}
+            for name, kind in sensors.items()
+        ],
+        "calibrated_sensor": [
+            {
+                "token": f"{scene}-{name}", "sensor_token": f"s-{name}", **pose(T),
+                "camera_intrinsic": data.rig.cameras[name].matrix_px.tolist()
+                if name in data.rig.cameras else [],
+            }
+            for name, T in poses.items()
+        ],
+        "scene": [{"token": scene, "name": scene, "log_token": "log"}],
+        "sample": [], "sample_data": [], "ego_pose": [],
+    }  # fmt: skip
+    for number, frame in enumerate(data.frames):
+        stamp, sample = START_US + number * PERIOD_US, f"{scene}-{number}"
+        tables["sample"].append({"token": sample, "timestamp": stamp, "scene_token": scene})
+        files = {"LIDAR_TOP": f"{sample}.pcd.bin", "RADAR": f"{sample}.pcd"}
+        files |= {name: f"{sample}{path.suffix}" for name, path in frame.image_paths.items()}
+        for name, file in files.items():
+            camera = data.rig.cameras.get(name)
+            tables["ego_pose"].append(
+                {"token": f"{sample}-{name}", "timestamp": stamp,
+                 "translation": [10.0 * number + moved_m * (camera is not None), 0.0, 0.0],
+                 "rotation": [1.0, 0.0, 0.0, 0.0]}
+            )  # fmt: skip
+            record = {
+                "sample_token": sample, "ego_pose_token": f"{sample}-{name}",
+                "calibrated_sensor_token": f"{scene}-{name}", "timestamp": stamp,
+                "filename": f"samples/{name}/{file}", "fileformat": "pcd",
+                "width": camera.width_px if camera else 0,
+                "height": camera.height_px if camera else 0,
+            }  # fmt: skip
+            sweep = {"token": f"{sample}-{name}-sweep", "is_key_frame": False, **record}
+            tables["sample_data"] += [
+                {"token": f"{sample}-{name}-data", "is_key_frame": True, **record},
+                {**sweep, "filename": f"sweeps/{name}/{file}"},
+            ]
+    return tables
+
+
+def write_files(folder: Path, data: Dataset, scene: str = "scene-0001") -> None:
+    """Scans of x y z intensity ring, and images."""
+    for number, frame in enumerate(data.frames):
+        scan = folder / "samples" / "LIDAR_TOP" / f"{scene}-{number}.pcd.bin"
+        scan.parent.mkdir(parents=True, exist_ok=True)
+        cloud = frame.load_cloud()
+        ring = np.arange(len(cloud), dtype=np.float32) % 32
+        np.column_stack([cloud, ring]).astype("<f4").tofile(scan)
+        for name, path in frame.image_paths.items():
+            image = folder / "samples" / name / f"{scene}-{number}{path.suffix}"
+            image.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, image)
+
+
+def write_tables(folder: Path, *parts: Tables, version: str = "v1.0-mini") -> None:
+    """Write the tables; records of several scenes one after another, sensors once."""
+    (folder / version).mkdir(parents=True, exist_ok=True)
+    for table in parts[0]:
+        records = {each["token"]: each for part in parts for each in part[table]}
+        (folder / version / f"{table}.json").write_text(json.dumps(list(records.values())))
+
+
+def pcd(encoding: str = "binary", *, padding: bool = False) -> bytes:
+    """CLOUD as PCL writes it: with padding, as a PointXYZI in memory."""
+    rows = padded() if padding else fields_of(CLOUD)
+    return pcd_of(rows, encoding)
+
+
+def fields_of(cloud: NDArray[np.float32], kind: str = "<f4") -> NDArray[np.void]:
+    """(n,) x, y, z, intensity of a cloud."""
+    rows = np.zeros(len(cloud), [(name, kind) for name in ("x", "y", "z", "intensity")])
+    for column, name in enumerate(rows.dtype.names or ()):
+        rows[name] = cloud[:, column]
+    return rows
+
+
+def padded() -> NDArray[np.void]:
+    """(n,) CLOUD with padding of 4 and 12 bytes; names after the first underscore are cut."""
+    kind = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("_0", "u1", 4), ("intensity", "<f4"),
+            ("_1", "u1", 12)]  # fmt: skip
+    rows = np.zeros(len(CLOUD), kind)
+    for column, name in enumerate(("x", "y", "z", "intensity")):
+        rows[name] = CLOUD[:, column]
+    rows["_0"], rows["_1"] = 0xA5, 0x5A  # as if from memory
+    return rows
+
+
+def pcd_of(
+    rows: NDArray[np.void], encoding: str = "binary", first: str = "", points: int = 0
+) -> bytes:
+    """The .pcd of a structured array; names that begin with _ are padding.
+
+    Args:
+        rows: (n,) fields, of several numbers each, too.
+        encoding: of DATA.
+        first: lines above the header.
+        points: as the header states it; their number if 0.
+    """
+    names = rows.dtype.names or ()
+    kinds = [rows.dtype[name] for name in names]
+    count = points or len(rows)
+    header = {
+        "VERSION": ["0.7"],
+        "FIELDS": ["_" if name.startswith("_") else name for name in names],
+        "SIZE": [kind.base.itemsize for kind in kinds],
+        "TYPE": [{"f": "F", "i": "I", "u": "U"}[kind.base.kind] for kind in kinds],
+        "COUNT": [int(np.prod(kind.shape, dtype=int)) for kind in kinds],
+        "WIDTH": [count], "HEIGHT": [1], "VIEWPOINT": [0, 0, 0, 1, 0, 0, 0], "POINTS": [count],
+        "DATA": [encoding],
+    }  # fmt: skip
+    lines = "".join(f"{key} {' '.join(map(str, words))}\n" for key, words in header.items())
+    return (first + lines).encode() + _BODIES[encoding](rows)
+
+
+def _text(rows: NDArray[np.void]) -> bytes:
+    columns = [rows[name].reshape(len(rows), -1) for name in rows.dtype.names or ()]
+    numbers = zip(*(column.tolist() for column in columns), strict=True)
+    lines = (" ".join(repr(n) for part in row for n in part) for row in numbers)
+    return "".join(f"{line}\n" for line in lines).encode()
+
+
+def _packed(rows: NDArray[np.void]) -> bytes:
+    plain = b"".join(rows[name].tobytes() for name in rows.dtype.names or ())
+    packed = lzf_of_literals(plain)
+    return struct.pack("<II", len(packed), len(plain)) + packed
+
+
+def lzf_of_literals(data: bytes) -> bytes:
+    """LZF that repeats nothing."""
+    parts = [data[at : at + 32] for at in range(0, len(data), 32)]
+    return b"".join(bytes([len(part) - 1]) + part for part in parts)
+
+
+_BODIES = {
+    "ascii": _text, "binary": lambda rows: rows.tobytes(), "binary_compressed": _packed,
+}  # fmt: skip
+
+
+def ply(
+    encoding: str = "binary_little_endian", *, before: bytes = b"", after: bytes = b"",
+    body: bytes | None = None, names: tuple[str, ...] = ("x", "y", "z", "intensity"),
+) -> bytes:  # fmt: skip
+    """CLOUD as .ply.
+
+    Args:
+        encoding: of its numbers.
+        before: elements of the header before the vertices.
+        after: elements after them.
+        body: in place of CLOUD's.
+        names: of the properties.
+    """
+    order = ">" if encoding == "binary_big_endian" else "<"
+    rows = fields_of(CLOUD, f"{order}f4")
+    written = _text(rows) if encoding == "ascii" else rows.tobytes()
+    properties = "".join(f"property float {name}\n" for name in names)
+    header = f"ply\nformat {encoding} 1.0\ncomment by hand\n".encode() + before
+    header += f"element vertex {len(rows)}\n{properties}".encode() + after + b"end_header\n"
+    return header + (written if body is None else body)
