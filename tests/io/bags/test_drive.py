@@ -21,7 +21,7 @@ from calibgraph import (
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.model.geometry import invert, relative_transform
 from tests.conftest import SAMPLE
-from tests.io.bags.motion_messages import messages as messages_of_a_drive
+from tests.io.bags.test_moving import messages as messages_of_a_drive
 from tests.io.bags.writing import (
     PERIOD_NS,
     START_NS,

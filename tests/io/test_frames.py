@@ -1,15 +1,22 @@
-"""Datasets of arrays are those of files; what does not fit together is refused in one line."""
+"""Frames in memory: arrays, what is kept of them, and points moved to one instant."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 
+import calibgraph
 from calibgraph import CalibrationError, Dataset, Rig, dataset_from_arrays
+from calibgraph.io import kept_frames
+from calibgraph.io.kept_frames import KeptFrame, keep_frames
+from calibgraph.io.motion import ScanMotion, twist_between
+from calibgraph.matching.camera_pairs.features import Features, features_of
+from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
 from calibgraph.pipeline import hash_inputs
-from tests.conftest import make_camera
+from tests.conftest import SAMPLE, make_camera
 
 SMALL = make_camera().model_copy(update={"width_px": 8, "height_px": 6})
 RIG = Rig(cameras={"front": SMALL})
@@ -132,3 +139,104 @@ def test_arguments_that_are_no_lists_are_one_line(clouds: Any, images: Any, mess
     with pytest.raises(CalibrationError, match=message) as caught:
         dataset_from_arrays(RIG, clouds, images)
     assert "\n" not in str(caught.value)
+
+
+def test_features_of_kept_frames_are_found_once_per_lens() -> None:
+    data = calibgraph.load_dataset(SAMPLE)
+    frame, camera = keep_frames(data).frames[0], data.rig.cameras["left"]
+    found = features_of(frame, "left", camera)
+    assert features_of(frame, "left", camera) is found
+    other = camera.model_copy(
+        update={"intrinsics_px": camera.intrinsics_px.model_copy(update={"fx": 500.0})}
+    )
+    assert not np.allclose(features_of(frame, "left", other).rays, found.rays)
+    plain = features_of(data.frames[0], "left", camera)
+    np.testing.assert_array_equal(plain.descriptors, found.descriptors)
+
+
+def test_kept_frames_share_one_cache_of_windows() -> None:
+    data, own = calibgraph.load_dataset(SAMPLE), FrameCache()
+    kept = keep_frames(data)
+    assert keep_frames(kept) is kept
+    assert cache_of(kept.frames, own) is cache_of(kept.frames[2:], own) is not own
+    assert cache_of(data.frames, own) is own
+    assert cache_of(keep_frames(data).frames, own) is not cache_of(kept.frames, own)
+
+
+def test_no_size_drops_the_cache_of_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_frames, "MAX_BYTES", 1)
+    data = keep_frames(calibgraph.load_dataset(SAMPLE))
+    cache, camera = cache_of(data.frames, FrameCache()), data.rig.cameras["left"]
+    images = [cache.image(frame, "left", camera) for frame in data.frames]
+    assert cache_of(data.frames, FrameCache()) is cache
+    for frame, image in zip(data.frames, images, strict=True):
+        assert cache.image(frame, "left", camera) is image
+
+
+def test_what_was_used_last_is_kept_up_to_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, made = keep_frames(calibgraph.load_dataset(SAMPLE)).frames[0], list[str]()
+    assert isinstance(frame, KeptFrame)
+    monkeypatch.setattr(kept_frames, "MAX_BYTES", 2 * size(100))
+
+    def derive(key: str) -> None:
+        frame.derive(key, lambda: made.append(key) or of(100))
+
+    for key in "aabacab":
+        derive(key)
+    assert "".join(made) == "abcb"
+
+
+def of(rows: int) -> Features:
+    return Features(np.zeros((rows, 2)), np.zeros((rows, 3)), np.zeros((rows, 128), np.float32))
+
+
+def size(rows: int) -> int:
+    return of(rows).nbytes
+
+
+RNG = np.random.default_rng(4)
+TURNING = (0.02, -0.05, 0.4, 12.0, 0.3, -0.1)
+
+
+def pose_at(twist: tuple[float, ...], seconds: float) -> np.ndarray:
+    return np.asarray(gtsam.Pose3.Expmap(np.array(twist) * seconds).matrix())
+
+
+def test_a_point_ahead_of_a_vehicle_that_drives_towards_it() -> None:
+    """At 10 m/s, what is 20 m ahead at the end of a scan was 21 m ahead 0.1 s before."""
+    motion = ScanMotion((0, 0, 0, 10.0, 0, 0), to_s=0.1)
+    moved = motion.correct(np.array([[21.0, 1, 2], [20.0, 1, 2]]), np.array([0.0, 0.1]))
+    np.testing.assert_allclose(moved, [[20, 1, 2], [20, 1, 2]], atol=1e-12)
+
+
+def test_a_point_beside_a_vehicle_that_turns() -> None:
+    """After a quarter turn to the left, what was on the left is ahead."""
+    motion = ScanMotion((0, 0, np.pi / 2, 0, 0, 0), to_s=1.0)
+    moved = motion.correct(np.array([[0.0, 5, 1]]), np.zeros(1))
+    np.testing.assert_allclose(moved, [[5, 0, 1]], atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e-9, 0.0])
+def test_a_moving_scan_is_that_of_one_instant(scale: float) -> None:
+    """Each point seen from where the LiDAR is at its time; turning fast, slowly and not at all."""
+    twist = tuple(scale * w for w in TURNING[:3]) + TURNING[3:]
+    world = RNG.uniform(-50, 50, (500, 3))
+    times = RNG.uniform(-0.1, 0.1, 500)
+    seen = np.array(
+        [np.linalg.inv(pose_at(twist, t)) @ [*p, 1] for t, p in zip(times, world, strict=True)]
+    )
+    inverse = np.linalg.inv(pose_at(twist, 0.03))
+    expected = world @ inverse[:3, :3].T + inverse[:3, 3]
+    found = ScanMotion(twist, to_s=0.03).correct(seen[:, :3], times)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)  # 50 m of float64
+
+
+def test_the_twist_is_that_of_the_poses() -> None:
+    T = pose_at((0.3, 0.2, -0.1, 5, 4, 3), 1.7)
+    found = twist_between(T, T @ pose_at(TURNING, 0.1), 0.1)
+    np.testing.assert_allclose(found, TURNING, atol=1e-9)
+
+
+def test_an_entry_keeps_the_motion() -> None:
+    motion = ScanMotion(TURNING, -0.02)
+    assert ScanMotion.of_entry(motion.entry()) == motion

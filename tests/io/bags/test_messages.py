@@ -1,7 +1,9 @@
-"""Image messages of any encoding are the image that was recorded."""
+"""Messages of images and clouds, in any encoding and layout, are what was recorded."""
 
 from __future__ import annotations
 
+import struct
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -9,10 +11,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibgraph import DatasetError
+from calibgraph import DatasetError, load_dataset
+from calibgraph.io.bags.messages import LIVOX_CLOUDS, read_custom_msg
 from calibgraph.io.bags.pictures import is_depth, picture_of
+from calibgraph.io.bags.point_clouds import has_points, points_of, time_fields
 from tests.conftest import SAMPLE
-from tests.io.bags.writing import START_NS, Messages
+from tests.io.bags.writing import (
+    KINDS,
+    START_NS,
+    STORES,
+    Messages,
+    Stamped,
+    sample_messages,
+    structured,
+    without,
+    write_bag,
+)
 
 BGR = np.asarray(cv2.imread(str(SAMPLE / "cameras" / "left" / "000000.jpg")))
 GRAY = cv2.cvtColor(BGR, cv2.COLOR_BGR2GRAY)
@@ -169,3 +183,158 @@ def test_depth_is_no_image() -> None:
     assert is_depth(MAKE.compressed(b"", "16UC1; compressedDepth png", START_NS))
     assert not is_depth(MAKE.image(GRAY.astype(np.uint16), "mono16", START_NS))
     assert not is_depth(MAKE.compressed(b"", "bgr8; jpeg compressed bgr8", START_NS))
+
+
+CLOUD = np.random.default_rng(3).normal(0.0, 20.0, (120, 4)).astype(np.float32)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(("names", "gap"), [("xyzi", 0), ("izyx", 0), ("yixz", 3), ("xyzi", 12)])
+def test_fields_of_any_order_and_byte_order_are_read(order: str, names: str, gap: int) -> None:
+    message = MAKE.cloud(structured(CLOUD, names, order=order, gap=gap), START_NS)
+    assert message.is_bigendian == (order == ">")
+    np.testing.assert_array_equal(points_of(message, "here"), CLOUD)
+
+
+def test_organised_clouds_with_padded_rows_are_read() -> None:
+    message = MAKE.cloud(structured(CLOUD), START_NS, height=6, padding=5)
+    assert (message.height, message.width, message.row_step) == (6, 20, 20 * 16 + 5)
+    np.testing.assert_array_equal(points_of(message, "here"), CLOUD)
+
+
+def test_points_without_a_return_are_left_out() -> None:
+    cloud = CLOUD.copy()
+    cloud[3, :3] = np.nan
+    cloud[5, 1] = np.nan
+    cloud[8, 0] = np.inf
+    cloud[20, :3] = 0.0
+    found = points_of(MAKE.cloud(structured(cloud), START_NS, height=4), "here")
+    np.testing.assert_array_equal(found, np.delete(CLOUD, [3, 5, 8, 20], axis=0))
+
+
+def test_doubles_and_whole_numbers_are_read() -> None:
+    kind = np.dtype(
+        [("ring", "<u2"), ("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("reflectivity", "u1")]
+    )
+    points = np.zeros(len(CLOUD), kind)
+    points["x"], points["y"], points["z"] = CLOUD[:, :3].T
+    points["reflectivity"] = np.arange(len(CLOUD))
+    found = points_of(MAKE.cloud(points, START_NS), "here")
+    np.testing.assert_array_equal(found[:, :3], CLOUD[:, :3])
+    np.testing.assert_array_equal(found[:, 3], np.arange(len(CLOUD)))
+
+
+def test_intensity_is_known_by_the_names_that_files_have_for_it() -> None:
+    kind = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("scalar_Intensity", "f4")]
+    points = np.zeros(len(CLOUD), kind)
+    for column, (name, _) in enumerate(kind):
+        points[name] = CLOUD[:, column]
+    np.testing.assert_array_equal(points_of(MAKE.cloud(points, START_NS), "here"), CLOUD)
+
+
+def test_a_cloud_without_intensity_has_none() -> None:
+    found = points_of(MAKE.cloud(structured(CLOUD, "xyz"), START_NS), "here")
+    assert np.isnan(found[:, 3]).all()
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_a_scan_that_sees_nothing_has_no_points(value: float) -> None:
+    assert not has_points(MAKE.cloud(structured(np.full_like(CLOUD, value)), START_NS), "here")
+    assert not has_points(MAKE.cloud(structured(CLOUD[:0]), START_NS), "here")
+    assert has_points(MAKE.cloud(structured(CLOUD), START_NS), "here")
+
+
+def test_clouds_without_coordinates_or_cut_short_are_named() -> None:
+    with pytest.raises(DatasetError, match=r"here: its fields x, y, intensity have no x y z"):
+        points_of(MAKE.cloud(structured(CLOUD, "xyi"), START_NS), "here")
+    message = MAKE.cloud(structured(CLOUD), START_NS)
+    message.data = message.data[:-1]
+    with pytest.raises(DatasetError, match=r"has 1919 bytes for 120 x 1 points of 16 bytes"):
+        points_of(message, "here")
+
+
+POINT = (
+    "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line"
+)
+DEFINITION = (
+    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+    "CustomPoint[] points"
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def definitions() -> None:
+    """The drivers' messages, in the stores that the tests write with."""
+    from rosbags.typesys import get_types_from_msg
+
+    for store in STORES.values():
+        for name in LIVOX_CLOUDS:
+            if name not in store.fielddefs:
+                point = get_types_from_msg(POINT, name.replace("CustomMsg", "CustomPoint"))
+                store.register({**point, **get_types_from_msg(DEFINITION, name)})
+
+
+def custom_msg(make: Messages, cloud: np.ndarray, stamp_ns: int, name: str) -> Any:
+    points = [
+        make.make(
+            name.replace("CustomMsg", "CustomPoint"), offset_time=1000 * number, x=x, y=y, z=z,
+            reflectivity=int(200 * intensity), tag=16, line=number % 4,
+        )
+        for number, (x, y, z, intensity) in enumerate(cloud.tolist())
+    ]  # fmt: skip
+    return make.make(
+        name, header=make.header(stamp_ns, "livox_frame"), timebase=stamp_ns,
+        point_num=len(points), lidar_id=1, rsvd=np.zeros(3, np.uint8), points=points,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LIVOX_CLOUDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_of_a_livox_are_read_from_a_bag(tmp_path: Path, kind: str, name: str) -> None:
+    make, data = Messages(kind), load_dataset(SAMPLE, frames="0:2")
+    messages = without(sample_messages(make, data), "/points")
+    clouds = [frame.load_cloud()[:500] for frame in data.frames]
+    for number, cloud in enumerate(clouds):
+        stamp_ns = messages[0].record_ns + number * 100_000_000
+        content = custom_msg(make, cloud, stamp_ns, name)
+        messages.append(Stamped("/livox/lidar", name, stamp_ns, content))
+    messages.sort(key=lambda each: each.record_ns)
+    found = load_dataset(write_bag(tmp_path, kind, messages), data.rig)
+    assert len(found.frames) == 2
+    for frame, cloud in zip(found.frames, clouds, strict=True):
+        read = frame.load_cloud()
+        np.testing.assert_array_equal(read[:, :3], cloud[:, :3])
+        np.testing.assert_array_equal(read[:, 3], (200 * cloud[:, 3].astype(float)).astype(int))
+    assert "points have a offset_time" in found.notes[0]
+
+
+@pytest.mark.parametrize("frame", ["", "a", "abcdefg", "livox_frame"])
+@pytest.mark.parametrize("ros1", [True, False])
+@pytest.mark.parametrize("little", [True, False])
+def test_any_alignment_of_the_points_is_read(frame: str, ros1: bool, little: bool) -> None:
+    if ros1 and not little:
+        return  # ROS 1 has one byte order
+    make = Messages("ros1" if ros1 else "mcap")
+    cloud = np.random.default_rng(5).uniform(0.1, 1, (7, 4)).astype(np.float32)
+    for count in (7, 1, 0):
+        message = custom_msg(make, cloud[:count], 5_000_000_012, LIVOX_CLOUDS[1])
+        message.header.frame_id = frame
+        store = STORES[ros1]
+        if ros1:
+            data = bytes(store.serialize_ros1(message, LIVOX_CLOUDS[1]))
+        else:
+            data = bytes(store.serialize_cdr(message, LIVOX_CLOUDS[1], little_endian=little))
+        found = read_custom_msg(data, ros1=ros1)
+        assert (found.header.frame_id, found.header.stamp.sec) == (frame, 5)
+        assert found.header.stamp.nanosec == 12
+        np.testing.assert_array_equal(points_of(found, "here")[:, :3], cloud[:count, :3])
+        assert time_fields(each.name for each in found.fields) == ["offset_time"]
+
+
+def test_a_truncated_cloud_is_refused() -> None:
+    make = Messages("mcap")
+    message = custom_msg(make, np.ones((9, 4), np.float32), 0, LIVOX_CLOUDS[0])
+    data = bytes(STORES[False].serialize_cdr(message, LIVOX_CLOUDS[0]))
+    for length in (len(data) - 30, 40, 10, 3):
+        with pytest.raises((ValueError, IndexError, struct.error)):
+            read_custom_msg(data[:length], ros1=False)
