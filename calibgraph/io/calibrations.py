@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import AliasChoices, BaseModel, BeforeValidator, Field, StrictBool
+from pydantic import BaseModel, BeforeValidator, StrictBool
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
@@ -154,10 +154,7 @@ class _JointOfLens(BaseModel):
 class _Checks(BaseModel):
     status: Status
     checks: tuple[Check, ...]
-    error_probability: ErrorProbability | None = Field(
-        None,
-        validation_alias=AliasChoices("error_probability", "doubt"),  # its former key
-    )
+    error_probability: ErrorProbability | None = None
 
 
 class _Parts(BaseModel):

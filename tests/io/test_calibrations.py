@@ -202,18 +202,3 @@ def test_whether_an_error_bar_holds_is_true_or_false(
     path = edited({"error_bar_holds": {"left": "yes"}}, calibrated_sample, tmp_path)
     with pytest.raises(FileError, match="error_bar_holds.left"):
         error_bars(path)
-
-
-def test_the_former_key_of_an_error_probability_is_read(
-    calibrated_sample: CommandRun, tmp_path: Path
-) -> None:
-    path = calibrated_sample.folder / "calibration.yaml"
-    verdicts = content_of(calibrated_sample)["camera_verdicts"]
-    former = {
-        name: {**verdict, "doubt": verdict.pop("error_probability")}
-        for name, verdict in verdicts.items()
-    }
-    old = load_calibration(edited({"camera_verdicts": former}, calibrated_sample, tmp_path))
-    for name, verdict in load_calibration(path).camera_verdicts.items():
-        assert verdict.error_probability is not None
-        assert old.camera_verdicts[name].error_probability == verdict.error_probability
