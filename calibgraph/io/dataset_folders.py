@@ -16,7 +16,13 @@ from calibgraph.errors import DatasetError, FileError
 from calibgraph.io import kitti
 from calibgraph.io.argoverse import argoverse
 from calibgraph.io.bags.options import NEAR_S
-from calibgraph.io.bags.stamps import TopicStamps, describe_offsets, nearest, offsets_of
+from calibgraph.io.bags.stamps import (
+    TopicStamps,
+    describe_offsets,
+    describe_spans,
+    nearest,
+    offsets_of,
+)
 from calibgraph.io.clouds import CLOUD_SUFFIXES
 from calibgraph.io.frame_files import (
     FrameFiles,
@@ -139,10 +145,15 @@ def _paired_by_stamps(
         rows = nearest(clouds, found, round(tolerance_s * 1e9))
         paired = np.flatnonzero(rows >= 0)
         if not len(paired):
+            apart_ns = offsets_of(clouds, found)
+            said = (
+                describe_offsets(name, apart_ns) if len(apart_ns)
+                else describe_spans({"clouds are from": clouds, "images from": found})
+            )  # fmt: skip
             raise DatasetError(
                 f"{folder}: no cloud has an image of {name} within {tolerance_s:g} s by the stamps "
-                f"in their names: {_apart(clouds, found, name)}; give a larger --tolerance-s, or "
-                "name the files by one clock",
+                f"in their names: {said}; give a larger --tolerance-s, or name the "
+                "files by one clock",
                 camera=name,
             )
         for cloud in paired:
@@ -159,18 +170,6 @@ def _paired_by_stamps(
     if not complete:
         raise DatasetError(f"{pairing}; calibrate the cameras apart")
     return FolderFrames(frames, pairing)
-
-
-def _apart(clouds: TopicStamps, images: TopicStamps, name: str) -> str:
-    """How far stamps are apart of which none are near enough."""
-    apart_ns = offsets_of(clouds, images)
-    if len(apart_ns):
-        return describe_offsets(name, apart_ns)
-    spans = [
-        f"{each.stamp_ns[0] / 1e9:.3f} to {each.stamp_ns[-1] / 1e9:.3f} s"
-        for each in (clouds, images)
-    ]
-    return f"clouds are from {spans[0]}, images from {spans[1]}"
 
 
 def describe_pairing(folder: Path) -> str:

@@ -15,6 +15,7 @@ from calibgraph.io.bags.point_clouds import doubtful_time_fields, time_fields
 from calibgraph.io.bags.stamps import (
     TopicStamps,
     describe_offsets,
+    describe_spans,
     nearest,
     offsets_of,
     read_messages,
@@ -215,11 +216,8 @@ def _advice(stamps: Mapping[str, TopicStamps], topics: RigTopics, pairs: Mapping
             f"the nearest images of {describe_offsets(worst, apart)}; give --stamps record if the "
             "clocks differ, or a larger --tolerance-s if that is acceptable"
         )
-    spans = [
-        f"{topic} {stamps[topic].stamp_ns[0] / _S:.3f} to {stamps[topic].stamp_ns[-1] / _S:.3f} s"
-        for topic in (topics.lidar, topics.cameras[worst].image)
-    ]
+    both = {topic: stamps[topic] for topic in (topics.lidar, topics.cameras[worst].image)}
     return (
-        f"the stamps of {' and of '.join(spans)} do not meet; give --stamps record if the clocks "
+        f"the stamps of {describe_spans(both)} do not meet; give --stamps record if the clocks "
         "differ, or a larger --tolerance-s"
     )

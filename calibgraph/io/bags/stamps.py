@@ -1,7 +1,7 @@
 """The stamps of a bag's clouds and images: one pass over the messages, none of which is kept."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -119,6 +119,14 @@ def offsets_of(clouds: TopicStamps, images: TopicStamps) -> NDArray[np.int64]:
     found = np.flatnonzero(rows >= 0)
     stamp_ns = np.array(images.stamp_ns, dtype=np.int64)
     return stamp_ns[rows[found]] - np.array(clouds.stamp_ns, dtype=np.int64)[found]
+
+
+def describe_spans(named: Mapping[str, TopicStamps]) -> str:
+    """From when to when stamps are, by what they are of."""
+    return " and ".join(
+        f"{name} {each.stamp_ns[0] / _S:.3f} to {each.stamp_ns[-1] / _S:.3f} s"
+        for name, each in named.items()
+    )
 
 
 def nearest(clouds: TopicStamps, images: TopicStamps, tolerance_ns: int) -> NDArray[np.int64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,11 +43,11 @@ def motion_finder(path: Path, frames: Sequence[BagFrame], options: BagOptions) -
         FileError, DatasetError: if the bag has no such topic or no such transforms.
     """
     if options.motion == "scans":
-        return _ByScans(frames)
+        return partial(_by_scans, frames)
     bag = Bag(path)
     lidar = read_message(frames[0].cloud)[1].header.frame_id.lstrip("/")
     poses = _odometry if options.motion == "odometry" else _moving_transforms
-    return _ByPoses(_Trajectory.of(path, poses(bag, lidar, options)))
+    return partial(_by_poses, _Trajectory.of(path, poses(bag, lidar, options)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,43 +91,35 @@ class _Trajectory:
         return transform(turn(np.clip(share, 0, 1)), shift)
 
 
-@dataclass(frozen=True, eq=False)
-class _ByPoses:
-    trajectory: _Trajectory
-
-    def __call__(self, frame: BagFrame) -> ScanMotion:
-        stamp_s = (frame.stamp_ns - self.trajectory.start_ns) / 1e9
-        middle_s = stamp_s + frame.to_s / 2
-        before, after = (self.trajectory.at(middle_s + t) for t in (-_HALF_S, _HALF_S))
-        found = _motion(twist_between(before, after, 2 * _HALF_S), frame)
-        return replace(found, T_world_lidar=self.trajectory.at(stamp_s))
+def _by_poses(trajectory: _Trajectory, frame: BagFrame) -> ScanMotion:
+    stamp_s = (frame.stamp_ns - trajectory.start_ns) / 1e9
+    middle_s = stamp_s + frame.to_s / 2
+    before, after = (trajectory.at(middle_s + t) for t in (-_HALF_S, _HALF_S))
+    found = _motion(twist_between(before, after, 2 * _HALF_S), frame)
+    return replace(found, T_world_lidar=trajectory.at(stamp_s))
 
 
-@dataclass(frozen=True, eq=False)
-class _ByScans:
-    frames: Sequence[BagFrame]
+def _by_scans(frames: Sequence[BagFrame], frame: BagFrame) -> ScanMotion:
+    """The mean velocity from the scan before to this one, and to the one after.
 
-    def __call__(self, frame: BagFrame) -> ScanMotion:
-        """The mean velocity from the scan before to this one, and to the one after.
-
-        Raises:
-            DatasetError: if there is neither, or they do not fit.
-        """
-        place = next(k for k, other in enumerate(self.frames) if other.number == frame.number)
-        beside = [*self.frames[max(place - 1, 0) : place], *self.frames[place + 1 : place + 2]]
-        near = [f for f in beside if 0 < abs(f.stamp_ns - frame.stamp_ns) < _NEIGHBOUR_S * 1e9]
-        if not near:
-            raise DatasetError(
-                f"{frame.cloud}: no scan within {_NEIGHBOUR_S} s before or after it, of which its "
-                "motion could be found; choose other frames, or --motion odometry or tf"
-            )
-        own = prepare_scan(_xyz(frame))
-        twists = [
-            twist_between(np.eye(4), register(own, prepare_scan(_xyz(other)), frame.cloud),
-                          (other.stamp_ns - frame.stamp_ns) / 1e9)
-            for other in near
-        ]  # fmt: skip
-        return _motion(np.mean(twists, axis=0), frame)
+    Raises:
+        DatasetError: if there is neither, or they do not fit.
+    """
+    place = next(k for k, other in enumerate(frames) if other.number == frame.number)
+    beside = [*frames[max(place - 1, 0) : place], *frames[place + 1 : place + 2]]
+    near = [f for f in beside if 0 < abs(f.stamp_ns - frame.stamp_ns) < _NEIGHBOUR_S * 1e9]
+    if not near:
+        raise DatasetError(
+            f"{frame.cloud}: no scan within {_NEIGHBOUR_S} s before or after it, of which its "
+            "motion could be found; choose other frames, or --motion odometry or tf"
+        )
+    own = prepare_scan(_xyz(frame))
+    twists = [
+        twist_between(np.eye(4), register(own, prepare_scan(_xyz(other)), frame.cloud),
+                      (other.stamp_ns - frame.stamp_ns) / 1e9)
+        for other in near
+    ]  # fmt: skip
+    return _motion(np.mean(twists, axis=0), frame)
 
 
 def _motion(twist: Array, frame: BagFrame) -> ScanMotion:

@@ -2,13 +2,16 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Annotated, Any
+
+from pydantic import AliasChoices, Field
 
 from calibgraph.errors import FileError
-from calibgraph.files import read_text, require_file
+from calibgraph.files import StrictNumbers, checked_model, read_text, require_file
 from calibgraph.io.bags import is_bag
+from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.bags.rig import read_bag_rig
-from calibgraph.io.formats.camera_info import is_camera_info, read_camera_info
 from calibgraph.io.formats.documents import (
     YAML_SUFFIXES,
     content_of_storage,
@@ -30,7 +33,7 @@ from calibgraph.io.formats.transforms import (
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rigs import is_exported_rig, read_rig
-from calibgraph.model.rig import KNOWLEDGE, Camera
+from calibgraph.model.rig import KNOWLEDGE, Camera, Finite, Size
 
 _MAX_BYTES, _HEAD_BYTES = 32 * 2**20, 2**16
 
@@ -102,7 +105,7 @@ def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None)
     content = documents[0]
     if is_tf2(content):
         return read_tf2(documents, path)
-    if is_camera_info(content):
+    if _is_camera_info(content):
         documents = [content, *(each for each in documents if _message(each) != _message(content))]
     if len(documents) > 1:
         raise FileError(path, f"holds {len(documents)} different YAML documents; keep one of them")
@@ -121,12 +124,63 @@ def _message(content: dict[str, Any]) -> dict[str, Any]:
     return {**content, "header": None}
 
 
+_Count = Annotated[int, Field(ge=0, le=1_000_000)]
+
+
+def _list_of(name: str, length: int | None) -> Any:
+    """A list of numbers under its name in ROS 1 or 2."""
+    return Field(validation_alias=AliasChoices(name, name.lower()), min_length=length or 0,
+                 max_length=length)  # fmt: skip
+
+
+class _Header(StrictNumbers):
+    frame_id: str = ""
+
+
+class _Window(StrictNumbers):
+    x_offset: _Count = 0
+    y_offset: _Count = 0
+    height: _Count = 0
+    width: _Count = 0
+
+
+class _Message(StrictNumbers):
+    header: _Header = _Header()
+    height: Size
+    width: Size
+    distortion_model: str
+    D: Annotated[list[Finite], _list_of("D", None)]
+    K: Annotated[list[Finite], _list_of("K", 9)]
+    R: Annotated[list[Finite], _list_of("R", 9)]
+    P: Annotated[list[Finite], _list_of("P", 12)]
+    binning_x: _Count = 0
+    binning_y: _Count = 0
+    roi: _Window = _Window()
+
+
+def _is_camera_info(content: dict[str, Any]) -> bool:
+    """Whether the content of a file is a CameraInfo message, as ``ros2 topic echo`` prints it."""
+    return {"height", "width", "distortion_model"} <= content.keys() and (
+        {"K", "D", "P"} <= content.keys() or {"k", "d", "p"} <= content.keys()
+    )
+
+
+def _read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> Part:
+    """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame."""
+    message = checked_model(_Message, content, path)
+    stated = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
+    camera = name or path.stem
+    return Part(
+        path, {camera: stated.lens}, frame_ids={camera: stated.frame} if stated.frame else {}
+    )
+
+
 def _is_rig(content: dict[str, Any]) -> bool:
     return "format" in content or is_exported_rig(content)
 
 
 _READERS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[..., Part]], ...] = (
-    (is_camera_info, read_camera_info),
+    (_is_camera_info, _read_camera_info),
     (_is_rig, lambda _, path, __: _part_of_rig(path)),
     (is_autoware, lambda content, path, _: read_autoware(content, path)),
 )

@@ -185,17 +185,6 @@ def no_place_for(name: str, camera: Camera, what: str) -> CalibrationError:
     """The error of a format that has no place for a camera's lens model."""
     return CalibrationError(
         f"camera {name!r}: {what} cannot hold a lens of the model {camera.model}; choose another "
-        "--format (opencv, json)",
+        "--format (opencv, json), or undistort the images and calibrate these",
         camera=name,
     )
-
-
-def require_undistorted(name: str, camera: Camera, what: str) -> None:
-    """Check that a camera is a pinhole without distortion."""
-    if camera.model != "pinhole":
-        raise CalibrationError(
-            f"camera {name!r}: {what} cannot hold a {camera.model} lens; choose another --format, "
-            "or undistort the images and calibrate these",
-            camera=name,
-        )
-    carried_coefficients(name, camera, 0, what)

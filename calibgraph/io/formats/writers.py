@@ -16,7 +16,6 @@ from calibgraph.io.formats.rig_export import (
     carried_coefficients,
     frame_id,
     no_place_for,
-    require_undistorted,
 )
 from calibgraph.model.calibration import FRAMES_SENTENCE
 from calibgraph.model.geometry import relative_transform
@@ -100,7 +99,9 @@ def write_kitti(export: RigExport) -> str:
     Tr = first.T_camera_lidar[:3]
     lines = []
     for name, camera in export.cameras.items():
-        require_undistorted(name, camera, "KITTI's calib.txt")
+        if camera.model != "pinhole":
+            raise no_place_for(name, camera, "KITTI's calib.txt")
+        carried_coefficients(name, camera, 0, "KITTI's calib.txt")
         if np.abs(camera.T_camera_lidar[:3, :3] - Tr[:, :3]).max() > _SAME:
             raise CalibrationError(
                 f"camera {name!r}: KITTI's calib.txt has one rotation for all cameras, and this "

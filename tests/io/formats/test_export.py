@@ -146,7 +146,7 @@ def test_lenses_are_exported_under_the_names_of_others(mixed_rig: Rig, tmp_path:
     ("format", "camera", "said"),
     [
         ("kalibr", "front", "Kalibr's radtan holds 4 distortion coefficients"),
-        ("kitti", "side", "cannot hold a fisheye lens"),
+        ("kitti", "side", "cannot hold a lens of the model fisheye"),
         ("kitti", "wide", "holds no distortion coefficients"),
     ],
 )
