@@ -9,6 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from calibgraph import DatasetError, load_dataset
@@ -27,6 +29,7 @@ from tests.io.bags.writing import (
     without,
     write_bag,
 )
+from tests.io.test_clouds import expected_of, layouts, often
 
 BGR = np.asarray(cv2.imread(str(SAMPLE / "cameras" / "left" / "000000.jpg")))
 GRAY = cv2.cvtColor(BGR, cv2.COLOR_BGR2GRAY)
@@ -188,12 +191,14 @@ def test_depth_is_no_image() -> None:
 CLOUD = np.random.default_rng(3).normal(0.0, 20.0, (120, 4)).astype(np.float32)
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize(("names", "gap"), [("xyzi", 0), ("izyx", 0), ("yixz", 3), ("xyzi", 12)])
-def test_fields_of_any_order_and_byte_order_are_read(order: str, names: str, gap: int) -> None:
-    message = MAKE.cloud(structured(CLOUD, names, order=order, gap=gap), START_NS)
-    assert message.is_bigendian == (order == ">")
-    np.testing.assert_array_equal(points_of(message, "here"), CLOUD)
+@often
+@given(rows=layouts(padding=False), order=st.sampled_from("<>"), padding=st.integers(0, 5))
+def test_clouds_of_any_fields_and_byte_order_are_read(
+    rows: NDArray[np.void], order: str, padding: int
+) -> None:
+    given_rows = rows.astype(rows.dtype.newbyteorder(order))  # type: ignore[call-overload]
+    message = MAKE.cloud(given_rows, START_NS, padding=padding)
+    np.testing.assert_array_equal(points_of(message, "here"), expected_of(rows))
 
 
 def test_organised_clouds_with_padded_rows_are_read() -> None:
@@ -210,31 +215,6 @@ def test_points_without_a_return_are_left_out() -> None:
     cloud[20, :3] = 0.0
     found = points_of(MAKE.cloud(structured(cloud), START_NS, height=4), "here")
     np.testing.assert_array_equal(found, np.delete(CLOUD, [3, 5, 8, 20], axis=0))
-
-
-def test_doubles_and_whole_numbers_are_read() -> None:
-    kind = np.dtype(
-        [("ring", "<u2"), ("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("reflectivity", "u1")]
-    )
-    points = np.zeros(len(CLOUD), kind)
-    points["x"], points["y"], points["z"] = CLOUD[:, :3].T
-    points["reflectivity"] = np.arange(len(CLOUD))
-    found = points_of(MAKE.cloud(points, START_NS), "here")
-    np.testing.assert_array_equal(found[:, :3], CLOUD[:, :3])
-    np.testing.assert_array_equal(found[:, 3], np.arange(len(CLOUD)))
-
-
-def test_intensity_is_known_by_the_names_that_files_have_for_it() -> None:
-    kind = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("scalar_Intensity", "f4")]
-    points = np.zeros(len(CLOUD), kind)
-    for column, (name, _) in enumerate(kind):
-        points[name] = CLOUD[:, column]
-    np.testing.assert_array_equal(points_of(MAKE.cloud(points, START_NS), "here"), CLOUD)
-
-
-def test_a_cloud_without_intensity_has_none() -> None:
-    found = points_of(MAKE.cloud(structured(CLOUD, "xyz"), START_NS), "here")
-    assert np.isnan(found[:, 3]).all()
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan])
