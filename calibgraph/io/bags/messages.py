@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibgraph.errors import FileError
+from calibgraph.errors import FileError, needs_extra
 from calibgraph.io.bags.files import Topic
-from calibgraph.io.bags.storage import errors_in_one_line, is_bag, open_recording
+from calibgraph.io.bags.storage import errors_in_one_line, is_bag, require_closed
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -101,7 +101,10 @@ class Bag:
         self.path = path
         self._lock = Lock()
         with errors_in_one_line(path):
-            self._recording = open_recording(path)
+            require_closed(path)
+            with needs_extra("ros", f"{path}: reading ROS bags needs rosbags and mcap"):
+                from calibgraph.io.bags.files import open_file
+            self._recording = open_file(path)
         weakref.finalize(self, self._recording.close)
         self.topics = self._recording.topics
 

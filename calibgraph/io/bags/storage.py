@@ -3,12 +3,8 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING
 
-from calibgraph.errors import CalibrationError, FileError, in_words, needs_extra
-
-if TYPE_CHECKING:
-    from calibgraph.io.bags.files import Recording
+from calibgraph.errors import CalibrationError, FileError, in_words
 
 METADATA, REPAIR_ROS2 = "metadata.yaml", "ros2 bag reindex"
 _HEAD_BYTES = 1000
@@ -49,21 +45,7 @@ def _refuse_as_it_is(path: Path) -> None:
         raise FileError(path, f"is compressed: unpack it first with `{_UNPACK[last]} {path.name}`")
 
 
-def open_recording(path: Path) -> "Recording":
-    """Open a bag.
-
-    Raises:
-        CalibrationError: if a library is missing.
-        FileError: if a file is missing, or was not closed.
-        Exception: what the libraries raise for a damaged bag.
-    """
-    _require_closed(path)
-    with needs_extra("ros", f"{path}: reading ROS bags needs rosbags and mcap"):
-        from calibgraph.io.bags.files import open_file
-    return open_file(path)
-
-
-def _require_closed(path: Path) -> None:
+def require_closed(path: Path) -> None:
     """Check that a database's messages are all in its file: a recorder that crashed leaves some."""
     for log in (path.parent if path.is_file() else path).glob("*.db3-wal"):
         if log.stat().st_size and (path.is_dir() or log.name == f"{path.name}-wal"):
