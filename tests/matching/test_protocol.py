@@ -12,7 +12,7 @@ import pytest
 import calibgraph
 from calibgraph import Config, Correspondences, Dataset, Rig
 from calibgraph.errors import CorrespondenceError
-from calibgraph.matching.protocol import Start, to_full_matcher
+from calibgraph.matching.protocol import FullMatcher, Start
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.progress import Progress, no_progress
 from calibgraph.rounds import match_in_rounds
@@ -86,7 +86,7 @@ def test_a_matcher_may_know_what_is_estimated_beside_the_pose() -> None:
             other.rounds = 1 + len(parts)
             return other
 
-    plain, knowing = (to_full_matcher(each) for each in (Minimal(), Knowing()))
+    plain, knowing = (FullMatcher(each) for each in (Minimal(), Knowing()))
     assert plain.with_estimate(("focal",)) is plain
     assert knowing.with_estimate(("focal", "offset")).rounds == 3
 

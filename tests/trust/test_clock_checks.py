@@ -16,7 +16,7 @@ from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.io.motion import ScanMotion
-from calibgraph.matching.protocol import Matcher, to_full_matcher
+from calibgraph.matching.protocol import FullMatcher, Matcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.verdict import Check
 from calibgraph.progress import Stopwatch
@@ -114,7 +114,7 @@ def run_of(
     data = Dataset(rig=rig, frames=tuple(frames), folders=())
     solution = solve_joint(rig, found, Config())
     run = MatchingRun(
-        data, to_full_matcher(matcher), rig, found, solution, rounds=(), watch=Stopwatch()
+        data, FullMatcher(matcher), rig, found, solution, rounds=(), watch=Stopwatch()
     )
     return RunEvidence(run, {})
 

@@ -1,6 +1,6 @@
 """The matcher ``cmrnext``: a schedule of networks from coarse to fine, and its findings."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -21,8 +21,7 @@ from calibgraph.matching.cmrnext.image_results import (
 )
 from calibgraph.matching.cmrnext.inputs import View
 from calibgraph.matching.cmrnext.network import torch_device
-from calibgraph.matching.protocol import Start
-from calibgraph.model.config import Config, LensPart, Stage1Source
+from calibgraph.model.config import Config, Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Rig
@@ -56,10 +55,6 @@ class CmrNextMatcher:
     """
 
     stage1: Stage1Source = "pnp"
-    most_frames: int | None = None
-    tracking_rounds: tuple[int, ...] = ()
-    image_checks_can_fail = False
-    knows_motion = False
 
     def __init__(
         self,
@@ -87,16 +82,6 @@ class CmrNextMatcher:
         loaded = {path: self._load(path) for path in dict.fromkeys(map(str, weights))}
         self.networks = [loaded[str(path)] for path in weights]
         self.rounds = len(self.networks) if start_from == "joint" else 1
-
-    def with_estimate(self, parts: Sequence[LensPart]) -> "CmrNextMatcher":  # noqa: ARG002
-        """The same matcher: each of its frames has a pose of its own."""
-        return self
-
-    def locate(
-        self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
-    ) -> Start:
-        """The rounds begin at the initial guess."""
-        return Start(rig)
 
     def match(
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
@@ -126,9 +111,6 @@ class CmrNextMatcher:
             "failed_frames": list_failed_frames(results),
         }
         return concatenate(tables).with_metadata(metadata).with_findings(findings)
-
-    def release(self) -> None:
-        """Nothing is kept of frames."""
 
     def _load(self, path: str) -> FlowMatcher:
         checkpoint = load_checkpoint(path)
