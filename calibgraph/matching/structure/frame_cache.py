@@ -30,8 +30,8 @@ class FrameCache:
     """
 
     def __init__(self) -> None:
-        self._clouds: KeyedCache[tuple[FileVersion, ScanMotion | None], PreparedCloud] = (
-            KeyedCache(MAX_CLOUD_BYTES)
+        self._clouds: KeyedCache[tuple[FileVersion, ScanMotion | None], PreparedCloud] = KeyedCache(
+            MAX_CLOUD_BYTES
         )
         self._images: KeyedCache[tuple[FileVersion, int, int], PreparedImage] = KeyedCache(
             MAX_IMAGE_BYTES

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph.matching.structure import prepared_image
+from calibgraph.matching.structure import frame_cache
 from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import LEVELS
+from calibgraph.matching.structure.score_kernel import pad
 from calibgraph.model.rig import Camera
 from tests.conftest import SAMPLE
 
@@ -18,15 +19,21 @@ def test_an_image_is_scaled_once_for_each_size(monkeypatch: pytest.MonkeyPatch) 
     image, other = (cache.image(frame, "left", camera) for frame in data.frames[:2])
     small, scale = image.log_gray(camera, 0.02, 1.0)
     assert small.shape == (round(scale[1] * camera.height_px), round(scale[0] * camera.width_px))
-    assert image.log_gray(camera, 0.02, 1.0)[0] is small
-    assert image.log_gray(camera, 0.01, 1.0)[0].shape > small.shape
-    assert (other.log_gray(camera, 0.02, 1.0)[0] != small).any()
+    padded, same = image.padded_log_gray(camera, 0.02, 1.0)
+    np.testing.assert_array_equal(padded, pad(small))
+    np.testing.assert_array_equal(scale, same)
+    assert image.padded_log_gray(camera, 0.02, 1.0)[0] is padded
+    assert image.padded_log_gray(camera, 0.01, 1.0)[0].shape > padded.shape
+    assert (other.padded_log_gray(camera, 0.02, 1.0)[0] != padded).any()
     np.testing.assert_array_equal(image.mirrored().gray, image.gray[:, ::-1])
-    monkeypatch.setattr(prepared_image, "MAX_BYTES", small.nbytes)
-    assert other.log_gray(camera, 0.02, 1.0)[0].shape == small.shape
-    assert image.log_gray(camera, 0.02, 1.0)[0] is not small
     cache.keep_only(data.frames[2:])
     assert not image.smaller.values()
+    monkeypatch.setattr(frame_cache, "MAX_SMALL_BYTES", padded.nbytes)
+    cache = FrameCache()
+    image, other = (cache.image(frame, "left", camera) for frame in data.frames[:2])
+    kept = image.padded_log_gray(camera, 0.02, 1.0)[0]
+    other.padded_log_gray(camera, 0.02, 1.0)
+    assert image.padded_log_gray(camera, 0.02, 1.0)[0] is not kept
 
 
 def test_images_finer_than_the_finest_level_needs_are_reduced() -> None:

@@ -16,6 +16,7 @@ from calibgraph.matching.structure.score_kernel import (
     GRAY_NOISE,
     MIN_RESIDUAL_SHARE,
     OPPOSITE,
+    pad,
     score_windows,
 )
 from calibgraph.matching.structure.shift_scores import score_frame
@@ -40,7 +41,7 @@ def test_the_score_of_a_window_is_its_share_of_the_images_variance(
     basis[:, 2:] *= not likelihood
     grids = np.zeros((1, 5, 5), np.float32)
     score_windows(
-        image, places[None], np.array([12], np.int32), basis[None], np.zeros(1, np.int32),
+        pad(image), places[None], np.array([12], np.int32), basis[None], np.zeros(1, np.int32),
         np.array([-2, -2]), likelihood, grids,
     )  # fmt: skip
     seen = image[places[:, 1] - 1, places[:, 0] + 2]  # at the shift (2, -1)
@@ -70,7 +71,7 @@ def test_scores_are_those_of_the_formula_wherever_a_window_is_in_the_image(
     origin = -np.array(size[::-1]) // 2
     grids, expected = np.zeros((4, *size), np.float32), np.zeros((4, *size))
     score_windows(
-        image, places.astype(np.int32), counts.astype(np.int32), basis, group.astype(np.int32),
+        pad(image), places.astype(np.int32), counts.astype(np.int32), basis, group.astype(np.int32),
         origin, likelihood, grids,
     )  # fmt: skip
     for window, n, columns, g in zip(places, counts, basis, group, strict=True):
@@ -106,7 +107,7 @@ def test_unrelated_windows_score_no_higher_on_structure_than_on_a_flat_image() -
         basis = np.zeros((1, 25, 4), np.float32)
         basis[0, :, 0] = (near - near.mean()) / np.linalg.norm(near - near.mean())
         score_windows(
-            image, places.astype(np.int32), np.array([25], np.int32), basis,
+            pad(image), places.astype(np.int32), np.array([25], np.int32), basis,
             np.zeros(1, np.int32), np.zeros(2, np.int64), False, grids,
         )  # fmt: skip
     flat, structured = grids[0, 5:55, 5:25].mean() / 400, grids[0, 5:55, 35:55].mean() / 400

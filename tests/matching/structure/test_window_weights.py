@@ -16,7 +16,7 @@ from calibgraph.matching.structure.consensus import z_score
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import LEVELS
-from calibgraph.matching.structure.score_kernel import score_windows
+from calibgraph.matching.structure.score_kernel import pad, score_windows
 from calibgraph.matching.structure.shift_scores import score_frame
 from calibgraph.matching.structure.window_kernels import FEATURES, ROOM, fill_features
 from calibgraph.matching.structure.window_weights import WindowNetwork, window_network
@@ -93,7 +93,7 @@ def test_a_weight_lessens_the_share_that_a_window_explains() -> None:
         grids = np.zeros((1, 9, 9), np.float32)
         group, first = np.zeros(1, np.int32), np.array([-4, -4])
         at = places.reshape(1, WINDOW_POINTS, 2).astype(np.int32)
-        score_windows(image, at, of.counts, of.basis, group, first, True, grids)
+        score_windows(pad(image), at, of.counts, of.basis, group, first, True, grids)
         return grids[0].astype(float)
 
     always = np.zeros((len(FEATURES), 1)), np.array([np.log(0.3 / 0.7)])
