@@ -142,8 +142,7 @@ class CommandRun:
 
 def leave_out_diagrams(patch: pytest.MonkeyPatch) -> None:
     for name in (
-        "convergence", "coverage", "distances", "error_bars", "residual_by_distance",
-        "residual_map", "residual_scatter",
+        "convergence", "coverage", "residual_by_distance", "residual_map", "residual_scatter",
     ):  # fmt: skip
         patch.setattr(plots, name, lambda *_: "data:image/png;base64,")
 

@@ -12,12 +12,12 @@ from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.cmrnext import confidence, probe
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint, load_checkpoint
-from calibgraph.matching.cmrnext.flow_matching import FlowMatcher, MatchingJob, load_job
-from calibgraph.matching.cmrnext.image_results import (
+from calibgraph.matching.cmrnext.flow_matching import (
+    FlowMatcher,
     ImageResult,
-    list_failed_frames,
+    MatchingJob,
+    load_job,
     to_findings,
-    without_failed,
 )
 from calibgraph.matching.cmrnext.inputs import View
 from calibgraph.matching.cmrnext.network import torch_device
@@ -104,11 +104,15 @@ class CmrNextMatcher:
                     result = self._probe(result, schedule[-1])  # noqa: PLW2901
                 results[result.job.name].append(result)
             done += len(jobs)
-        tables = [result.matches for each in results.values() for result in without_failed(each)]
+        # Of a camera whose images all failed, all are given: the solve reports the failure.
+        good = [[r for r in each if not r.failed] or each for each in results.values()]
+        tables = [result.matches for each in good for result in each]
         findings = to_findings(results, schedule[-1].checkpoint)
         metadata = {
             **self._metadata(schedule[-1].checkpoint, round_index),
-            "failed_frames": list_failed_frames(results),
+            "failed_frames": {
+                n: [r.job.frame.name for r in e if r.failed] for n, e in results.items()
+            },
         }
         return concatenate(tables).with_metadata(metadata).with_findings(findings)
 
@@ -147,7 +151,10 @@ class CmrNextMatcher:
                 for job, table, before in zip(jobs, tables, failed, strict=True)
             ]
             failed = [result.failed for result in results]
-            jobs = [result.next_job() for result in results]
+            jobs = [  # of the next network: from the new estimate, unless it failed
+                r.job if r.failed else replace(r.job, T_camera_lidar=r.T_camera_lidar)
+                for r in results
+            ]
         return results
 
     def _estimate(

@@ -5,8 +5,6 @@ uncertainty (Cattaneo and Valada, "CMRNext"; Teed and Deng, "RAFT"). Parameters 
 shaped as in the published checkpoints.
 """
 
-from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -59,16 +57,8 @@ class Flow:
     peak: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class _Iteration:
-    flow: Tensor  # (B, 2, h, w) cells
-    step: Tensor  # (B, 2, h, w) cells
-    raw_sigma: Tensor | None
-    hidden: Tensor
-
-
 class CmrNext(nn.Module):
-    """The network, in evaluation or training."""
+    """The network."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
@@ -91,39 +81,12 @@ class CmrNext(nn.Module):
             lidar: (B, C, H, W) from :func:`calibgraph.matching.cmrnext.inputs.encode_depth`.
             iterations: at least 1.
         """
-        correlation = self.correlation(rgb, lidar)
-        (last,) = deque(self._iterations(correlation, rgb, lidar, iterations), maxlen=1)
-        weights = self._upsampling_weights(last.hidden)
-        sigma = None
-        if last.raw_sigma is not None:
-            sigma = _upsample(F.elu(last.raw_sigma) + 2, weights)
-        return Flow(
-            flow_px=_upsample(CELL * last.flow, weights),
-            sigma_px=sigma,
-            step_px=CELL * last.step.norm(dim=1),
-            peak=_peak(correlation, last.flow),
-        )
-
-    def all_flows(
-        self, correlation: Correlation, rgb: Tensor, lidar: Tensor, *, iterations: int
-    ) -> Iterator[Tensor]:
-        """The flow (B, 2, H, W) [px] after every iteration, for training."""
-        for each in self._iterations(correlation, rgb, lidar, iterations):
-            yield _upsample(CELL * each.flow, self._upsampling_weights(each.hidden))
-
-    def correlation(self, rgb: Tensor, lidar: Tensor) -> Correlation:
-        """The correlation of both images' features, as a volume below ``VOLUME_BYTES_MAX``."""
         _require_size(rgb, lidar)
         features = self.fnet_lidar(lidar), self.fnet_img(rgb)
         batch, _, height, width = rgb.shape
-        small = volume_bytes(batch, height, width) <= VOLUME_BYTES_MAX
-        return Volume(*features) if small else OnTheFly(*features)
-
-    def _iterations(
-        self, correlation: Correlation, rgb: Tensor, lidar: Tensor, iterations: int
-    ) -> Iterator[_Iteration]:
-        raw = self.cnet(lidar if self.architecture.context == "lidar" else rgb)
-        h, context = raw.chunk(2, dim=1)
+        is_small = volume_bytes(batch, height, width) <= VOLUME_BYTES_MAX
+        correlation = Volume(*features) if is_small else OnTheFly(*features)
+        h, context = self.cnet(lidar if self.architecture.context == "lidar" else rgb).chunk(2, 1)
         h, context = torch.tanh(h), F.relu(context)
         blocks = [self.update_block]
         if self.architecture.uncertainty == "nll_frozen":
@@ -133,16 +96,21 @@ class CmrNext(nn.Module):
         grid = _identity_grid(h)
         flow = torch.zeros_like(grid).expand(len(h), -1, -1, -1)
         for _ in range(iterations):
-            flow = flow.detach()  # as RAFT: gradients stay within one iteration
             windows = correlation.window(grid + flow)
             outputs = []
             for i, block in enumerate(blocks):
                 hiddens[i], output = block(hiddens[i], terms[i], windows, flow)
                 outputs.append(output)
             both = torch.cat(outputs, dim=1)  # the flow's step, and raw uncertainty if there is one
-            step, raw_sigma = both[:, :2], both[:, 2:] if both.shape[1] > 2 else None  # noqa: PLR2004
+            step, raw_sigma = both[:, :2], both[:, 2:]
             flow = flow + step
-            yield _Iteration(flow, step, raw_sigma, hiddens[0])
+        weights = self._upsampling_weights(hiddens[0])
+        return Flow(
+            flow_px=_upsample(CELL * flow, weights),
+            sigma_px=_upsample(F.elu(raw_sigma) + 2, weights) if raw_sigma.shape[1] else None,
+            step_px=CELL * step.norm(dim=1),
+            peak=_peak(correlation, flow),
+        )
 
     def _upsampling_weights(self, h: Tensor) -> Tensor:
         """(B, 1, 9, 8, 8, h, w) weights of the 3 x 3 neighbours of every pixel's cell."""
