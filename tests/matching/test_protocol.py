@@ -12,6 +12,7 @@ import pytest
 import calibgraph
 from calibgraph import Config, Correspondences, Dataset, Rig
 from calibgraph.errors import CorrespondenceError
+from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher, Start
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.progress import Progress, no_progress
@@ -194,3 +195,35 @@ def test_findings_survive_a_file(truth: Rig, tmp_path: Path) -> None:
 def test_findings_of_another_kind_are_errors(metadata: dict[str, object], words: str) -> None:
     with pytest.raises(CorrespondenceError, match=words):
         MatcherFindings.from_metadata(metadata)
+
+
+@pytest.fixture(scope="module")
+def table(truth: Rig) -> Correspondences:
+    return calibgraph.simulate_correspondences(truth, frames=4, matches=20)
+
+
+@pytest.mark.parametrize("source", ["memory", ".parquet", ".csv"])
+def test_a_table_matches_the_frames_of_the_dataset(
+    table: Correspondences, truth: Rig, tmp_path: Path, source: str
+) -> None:
+    path = tmp_path / f"table{source}"
+    if source != "memory":
+        table.save(path)
+    matcher = find_matcher(table if source == "memory" else path)
+    data = calibgraph.load_dataset(SAMPLE, truth).select("1:3")
+    rows = matcher.match(data, truth, round_index=0, progress=no_progress)
+    assert set(np.unique(rows.frame)) == {1, 2}
+    assert len(rows) == np.count_nonzero(np.isin(table.frame, (1, 2)))
+    assert (matcher.rounds, matcher.stage1, matcher.tracking_rounds) == (1, "pnp", ())
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("cmrnext", "the matcher 'cmrnext' needs weights"),
+        ("sift", "unknown matcher 'sift'; known are 'structure', 'cmrnext' and a table"),
+    ],
+)
+def test_other_names_are_errors(name: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        find_matcher(name)
