@@ -3,7 +3,12 @@
 from dataclasses import replace
 
 from calibgraph.errors import CalibrationError
-from calibgraph.matching.camera_pairs import match_some_frames, overlapping_pairs, with_surfaces
+from calibgraph.matching.camera_pairs import (
+    PAIR_FRAMES,
+    match_cameras,
+    overlapping_pairs,
+    with_surfaces,
+)
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.progress import Progress
@@ -47,8 +52,9 @@ def _match_cameras(run: MatchingRun, progress: Progress) -> CameraMatches | None
         if not pairs:
             return None
         rig = run.guess.with_lenses_of(run.solution.solved_rig)  # as far as they are estimated
-        return match_some_frames(
-            run.dataset, rig, pairs, seed=run.solution.config.seed, progress=progress
+        seed = run.solution.config.seed
+        return match_cameras(
+            run.dataset, rig, pairs, most_frames=PAIR_FRAMES, seed=seed, progress=progress
         )
 
 
