@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Camera, Dataset, Intrinsics, Rig, simulate_street
+from calibgraph import Camera, Dataset, Intrinsics, Rig
 from calibgraph.matching.camera_pairs import match_cameras, overlapping_pairs, with_surfaces
 from calibgraph.matching.camera_pairs.features import detect_features
 from calibgraph.matching.camera_pairs.geometry import (
@@ -66,11 +66,6 @@ def test_matches_are_right_where_the_lidar_knows(
         assert np.mean(errors < 4) > 0.85
 
 
-def test_matching_is_repeatable(found: CameraMatches, data: Dataset, truth: Rig) -> None:
-    again = match_cameras(data, truth)
-    np.testing.assert_array_equal(found.pixels_px, again.pixels_px)
-
-
 def test_features_have_no_bias(data: Dataset, truth: Rig) -> None:
     """A mirrored image has the mirrored features."""
     camera = truth.cameras["front_left"]
@@ -84,30 +79,6 @@ def test_features_have_no_bias(data: Dataset, truth: Rig) -> None:
     assert close.mean() > 0.7
     shift = (a.pixels_px - mirrored[nearest])[close].mean(axis=0)
     assert np.abs(shift).max() < 0.02  # the default of OpenCV's SIFT has 0.5 here: twice 0.25
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("open3d")
-def test_fisheyes_a_right_angle_apart_have_matches(tmp_path: Path) -> None:
-    """Of 190 degrees, to the front, the left and the back; nothing is in the first and the last."""
-    rig = Rig(
-        cameras={n: half_size(rig_of("fisheye").cameras[n]) for n in ("front", "left", "back")}
-    )
-    simulate_street(tmp_path / "street", rig, frames=2, seed=0)
-    data = calibgraph.load_dataset(tmp_path / "street")
-    matches = match_cameras(data, rig)
-    assert matches.pairs() == [("front", "left"), ("left", "back")]
-    # At the true poses, without any use of the LiDAR; features are good to 0.3 px.
-    (front_left, _) = pair_terms(rig, matches, Config())
-    assert np.median(front_left.errors_px(rig.T_camera_lidar)) < 0.6
-
-
-def half_size(camera: Camera) -> Camera:
-    k = camera.intrinsics_px
-    center = {"cx": (k.cx + 0.5) / 2 - 0.5, "cy": (k.cy + 0.5) / 2 - 0.5}
-    small = k.model_copy(update={"fx": k.fx / 2, "fy": k.fy / 2, **center})
-    size = {"width_px": camera.width_px // 2, "height_px": camera.height_px // 2}
-    return camera.model_copy(update={**size, "intrinsics_px": small})
 
 
 @pytest.mark.realdata

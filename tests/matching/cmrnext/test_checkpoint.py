@@ -194,10 +194,9 @@ def test_wrapped_half_and_strided_weights_are_read(tmp_path: Path) -> None:
 
 def test_sizes_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = saved(tmp_path / "a.tar", good_content())
-    for limit, message in (("MAX_BYTES", "bytes, expected at most"),):
-        monkeypatch.setattr(torch_file, limit, 50)
-        with pytest.raises(FileError, match=message):
-            load_checkpoint(path)
+    monkeypatch.setattr(torch_file, "MAX_BYTES", 50)
+    with pytest.raises(FileError, match="bytes, expected at most"):
+        load_checkpoint(path)
 
 
 class Command:
@@ -269,14 +268,6 @@ def truncated(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-5000])
 
 
-def zip_entry_of_10_gb(path: Path) -> None:
-    torch.save(good_content(), path)
-    data = bytearray(path.read_bytes())
-    directory = data.rindex(b"PK\x01\x02")  # the last entry of the central directory
-    data[directory + 20 : directory + 28] = struct.pack("<II", 2**32 - 2, 2**32 - 2)
-    path.write_bytes(data)
-
-
 def zeros_packed(path: Path) -> None:
     repacked(path, {"data/0": bytes(2**24)}, compress=True)
 
@@ -284,14 +275,6 @@ def zeros_packed(path: Path) -> None:
 def program(body: bytes) -> Callable[[Path], None]:
     """A good checkpoint whose pickle is replaced."""
     return lambda path: repacked(path, {"data.pkl": body})
-
-
-def flagged(path: Path) -> None:
-    """A good checkpoint, marked as encrypted."""
-    torch.save(good_content(), path)
-    data = bytearray(path.read_bytes())
-    data[data.index(b"PK\x01\x02") + 8] |= 1
-    path.write_bytes(data)
 
 
 def overlapping(path: Path) -> None:
@@ -319,48 +302,16 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "a command in place of weights": (command_beside_weights, "posix is blocked"),
     "truncated": (truncated, "damaged"),
     "a tensor that claims 10 GB": (claim(BIG, (1,)), "not resizable"),
-    "a tensor that claims its storage to be 10 GB": (
-        claim(BIG, (1,), count=BIG[0]), "does not match expected size",
-    ),
-    "a tensor of 10 GB that repeats one number": (claim(BIG, (0,)), "expected a convolution's"),
-    "a tensor of negative strides": (claim((10,), (-1,)), "overflow"),
     "a tensor of 2^124 numbers": (claim((2**62, 2**62), (2**62, 1)), "overflow"),
-    "a zip entry that claims 4 GB": (zip_entry_of_10_gb, "claim|damaged"),
     "packed zeros": (zeros_packed, "packed"),
-    "encryption": (flagged, "unsupported encryption"),
     "overlapping entries": (overlapping, "more bytes than the file has"),
     "a memo of 2^31 places": (program(b"\x80\x02Nr\xff\xff\xff\x7f."), "no mapping"),
-    "100,000 nested lists": (
-        program(b"\x80\x02" + b"]" * 100_000 + b"a" * 99_999 + b"."), "no mapping",
-    ),
-    "a call of a list": (program(b"\x80\x02])R."), "unrecognized function"),
-    "bytes that claim 2 GB": (
-        program(b"\x80\x05\x96" + struct.pack("<Q", 2 * 10**9) + b"x."), "Unsupported operand",
-    ),
     "an array of 2^52 bytes": (
         program(b"\x80\x02c__builtin__\nbytearray\n\x8a\7\0\0\0\0\0\0\x10\x85R."),
         "more memory than there is",
     ),
-    "a tensor made of its size": (
-        program(b"\x80\x02ctorch\nFloatTensor\n\x8a\7\0\0\0\0\0\0\x10\x85R."),
-        "can't allocate memory",
-    ),
-    "evaluated code": (
-        program(b"\x80\x02c__builtin__\neval\nX\1\0\0\x001\x85R."), "no mapping",
-    ),
     "an instruction cut short": (program(b"\x80\x02r\x00"), "ends too early"),
-    "a value that was not stored": (program(b"\x80\x02h\x05."), "cannot be read"),
-    "a mark in place of a value": (program(b"\x80\x02(Q."), "missing or damaged"),
-    "changed functions": (
-        program(b"\x80\x02c_codecs\nencode\nN}X\x0c\0\0\0__defaults__X\1\0\0\0x\x85s\x86b."),
-        "Can only build",
-    ),
-    "a storage of invented numbers": (
-        program(b"\x80\x02(X\7\0\0\0storageX\4\0\0\0<f16X\1\0\0\0" + b"0NK\1tQ."),
-        "a part of it is missing or damaged",
-    ),
     "an empty file": (lambda path: path.write_bytes(b"") and None, "not a checkpoint"),
-    "text": (lambda path: path.write_text("weights") and None, "not a checkpoint"),
 }  # fmt: skip
 
 
