@@ -31,11 +31,6 @@ class CheckRow:
     fail: str
 
 
-def check_rows(checks: Sequence[Check]) -> tuple[CheckRow, ...]:
-    """The rows of a camera's checks, the worst first."""
-    return tuple(check_row(check) for check in sorted(checks, key=_severity))
-
-
 def _severity(check: Check) -> int:
     return _WORST_FIRST.index(check.status)
 
@@ -107,18 +102,15 @@ def pose_text(T: Array) -> str:
     )
 
 
-Sigmas = tuple[list[float], list[float]]
-"""Standard deviations of rotation [deg] and translation [cm], per axis."""
-
-
 @dataclass(frozen=True, eq=False)
 class CameraSection:
     """What the template prints of one camera beside what the result has.
 
     Attributes:
-        rows: its checks.
+        rows: its checks, the worst first.
         moved: change from the guess.
-        sigmas, bootstrap: None where there are none, or they do not hold.
+        sigmas, bootstrap: (3,) of rotation [deg], and of translation [cm]; None where there are
+            none, or they do not hold.
         no_error_bar: why there is none; empty if there is one.
         overlays: None where there is no image.
         overlay_width_px: at most so wide they are shown.
@@ -131,10 +123,10 @@ class CameraSection:
     name: str
     anchor: str
     verdict: Verdict
-    rows: tuple[CheckRow, ...]
+    rows: Sequence[CheckRow]
     moved: PoseError
-    sigmas: Sigmas | None
-    bootstrap: Sigmas | None
+    sigmas: Sequence[Array] | None
+    bootstrap: Sequence[Array] | None
     no_error_bar: str
     overlays: Overlays | None
     overlay_width_px: int
@@ -156,14 +148,15 @@ def camera_section(
 ) -> CameraSection:
     """Collect what the page shows of a camera."""
     camera, verdict = result.rig.cameras[name], result.camera_verdicts[name]
+    bootstrap = result.bootstrap.get(name) if result.error_bar_holds(name) else None
     return CameraSection(
         name=name,
         anchor=f"camera-{index}",
         verdict=verdict,
-        rows=check_rows(verdict.checks),
+        rows=[check_row(check) for check in sorted(verdict.checks, key=_severity)],
         moved=pose_error(result.T_camera_lidar[name], result.initial_rig.T_camera_lidar[name]),
-        sigmas=_sigmas(result, result.covariance, name),
-        bootstrap=_sigmas(result, result.bootstrap, name),
+        sigmas=result.error_bar(name),
+        bootstrap=None if bootstrap is None else degrees_and_centimetres(bootstrap),
         no_error_bar=_why_no_error_bar(result, name),
         overlays=overlays,
         overlay_width_px=width_on_page(camera),
@@ -173,16 +166,6 @@ def camera_section(
         inverse=pose_text(invert(camera.T_camera_lidar)),
         worked=worked_point(camera, None if errors is None else errors.after),
     )
-
-
-def _sigmas(
-    result: Calibration, covariances: Mapping[str, Array | None], name: str
-) -> Sigmas | None:
-    covariance = covariances.get(name) if result.error_bar_holds(name) else None
-    if covariance is None:
-        return None
-    rotation_deg, translation_cm = degrees_and_centimetres(covariance)
-    return rotation_deg.tolist(), translation_cm.tolist()
 
 
 def _why_no_error_bar(result: Calibration, name: str) -> str:

@@ -44,7 +44,7 @@ def test_a_solved_table_is_reported_without_overlays(
     assert f'<strong class="big">{status}</strong>' in text
     assert text.count("Overlays are left out:") == 1
     assert "Pictures of the residuals are left out" not in text
-    assert "One standard deviation, about and along" in text
+    assert "Error bar per axis: one standard deviation, about and along it" in text
     for name in solved_pair.rig.cameras:
         assert f"Residuals over the image of {name}" in text
     for check in solved_pair.camera_verdicts["left"].checks:

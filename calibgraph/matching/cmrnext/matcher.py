@@ -10,13 +10,14 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.matching.cmrnext import confidence, probe
+from calibgraph.matching.cmrnext import probe
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint, load_checkpoint
 from calibgraph.matching.cmrnext.flow_matching import (
     FlowMatcher,
     ImageResult,
     MatchingJob,
     load_job,
+    lower_by_residuals,
     to_findings,
 )
 from calibgraph.matching.cmrnext.inputs import View
@@ -221,4 +222,4 @@ def _weigh(job: MatchingJob, table: Correspondences, T_camera_lidar: Array) -> C
     projected, valid = job.camera.lens.project(points)
     residuals = np.linalg.norm(projected - table.pixels_px, axis=1)
     residuals = np.where(valid, residuals, np.inf)
-    return replace(table, confidence=confidence.lower_by_residuals(table.confidence, residuals))
+    return replace(table, confidence=lower_by_residuals(table.confidence, residuals))
