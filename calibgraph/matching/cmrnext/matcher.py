@@ -153,7 +153,9 @@ class CmrNextMatcher:
             ]
             failed = [result.failed for result in results]
             jobs = [  # of the next network: from the new estimate, unless it failed
-                r.job if r.failed else replace(r.job, T_camera_lidar=r.T_camera_lidar)
+                r.job
+                if r.failed or r.T_camera_lidar is None
+                else replace(r.job, T_camera_lidar=r.T_camera_lidar)
                 for r in results
             ]
         return results

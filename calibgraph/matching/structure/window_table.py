@@ -121,7 +121,7 @@ class _Buffer:
                 self._windows.put(first, windows.select(useful))
                 self._slots[missing] = _USELESS
                 self._slots[missing[useful]] = np.arange(first, self._count)
-            slots = self._slots[chosen]
+            slots = self._slots[chosen].astype(np.intp)
             return self._windows, slots[slots >= 0]
 
     @property
