@@ -175,8 +175,9 @@ def select_windows(
     if level.fine:
         return select()
     lens = camera.lens.kind, camera.lens.packed.tobytes(), camera.width_px, camera.height_px
-    seen = camera.T_camera_lidar.tobytes(), lens, level.spacing_rad, level.stride_spacings
-    return cloud.tables.select((cloud.identity, *seen, max_windows), select)
+    cut = level.spacing_rad, level.stride_spacings, level.weighed
+    key = cloud.identity, camera.T_camera_lidar.tobytes(), lens, cut, max_windows
+    return cloud.tables.select(key, select)
 
 
 def _select_windows(
