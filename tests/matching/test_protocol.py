@@ -153,9 +153,8 @@ def test_rounds_of_some_cameras_match_these_alone(truth: Rig, guess: Rig) -> Non
     data = calibgraph.load_dataset(SAMPLE, guess)
     run = match_in_rounds(data, matcher=Complete(truth), progress=no_progress)
     config = run.solution.config.changed(excluded_cameras=("left",))
-    run = replace(
-        run, solution=replace(run.solution, config=config), matcher=FullMatcher(Minimal())
-    )
+    solution = replace(run.solution, objective=replace(run.solution.objective, config=config))
+    run = replace(run, solution=solution, matcher=FullMatcher(Minimal()))
     some = Rig(cameras={"front_left": guess.cameras["front_left"]})
     last = rounds_from(run, some, (0,), no_progress)
     assert last is not None and last.correspondences.cameras == ("front_left",)
