@@ -101,7 +101,7 @@ def test_a_guess_in_millimetres_is_named_by_what_the_images_show_first() -> None
     assert found.points_in_image["left"] == 0
     assert texts(found, "error") == [
         "the images of left fit clearly better if the guess has a translation in millimetres; undo "
-        "it with calibgraph import RIG --correct left=millimetres --out FILE.yaml",
+        "it with calibgraph rig RIG --correct left=millimetres --out FILE.yaml",
         "left: by the guess, no point of the cloud lies in the image",
     ]
     assert texts(found, "warning") == [
@@ -119,7 +119,7 @@ def test_axes_of_the_lidar_turned_about_z_are_the_only_hint(folder: Path) -> Non
     errors = texts(diagnose([folder], frames="0"), "error")
     assert errors[0] == (
         "the images fit clearly better if the LiDAR's axes are turned by 180 deg about z (its x "
-        "points behind, y right, z up); undo it with calibgraph import RIG --correct "
+        "points behind, y right, z up); undo it with calibgraph rig RIG --correct "
         "cloud-behind-right-up --out FILE.yaml"
     )
     assert all("no point of the cloud lies in the image" in error for error in errors[1:])

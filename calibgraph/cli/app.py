@@ -21,13 +21,12 @@ import typer
 from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.declaration import declare, help_of
-from calibgraph.cli.exchange import export, import_
+from calibgraph.cli.export import export
 from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
-from calibgraph.cli.guess import bag, guess, init
-from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
+from calibgraph.cli.inspect import doctor, evaluate, perturb, report
 from calibgraph.cli.learned import weights
-from calibgraph.cli.outputs import keep_files
 from calibgraph.cli.pick import pick
+from calibgraph.cli.rig import rig
 from calibgraph.cli.serve import serve, token
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
@@ -75,15 +74,14 @@ def _options(
 
 
 COMMANDS: tuple[Callable[..., None], ...] = (
-    calibrate, check, drift, match, solve, report, view, evaluate, perturb, bag, doctor, init,
-    guess, export, import_, simulate, weights, track, pick, fleet,
-    fleet_model, fleet_report, serve, token,
+    calibrate, check, drift, rig, doctor, match, solve, report, evaluate, export, track, pick,
+    simulate, perturb, weights,
 )  # fmt: skip
 """In the order of the help."""
 for _command in COMMANDS:
-    app.command(_command.__name__.rstrip("_").replace("_", "-"), help=help_of(_command))(
-        keep_files(declare(_command))
-    )
+    app.command(_command.__name__, help=help_of(_command))(_command)
+for _command in (fleet, fleet_model, fleet_report, serve, token):
+    app.command(_command.__name__.replace("_", "-"), help=help_of(_command))(declare(_command))
 
 
 def main() -> None:

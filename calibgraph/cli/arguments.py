@@ -1,8 +1,9 @@
-"""Option values to library objects: the dataset, the matcher and the settings of a command."""
+"""Option values to library objects: the dataset and the matcher of a command."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,9 +14,9 @@ if TYPE_CHECKING:
     from calibgraph.io.bags import BagOptions
     from calibgraph.io.dataset import Dataset
     from calibgraph.matching.protocol import Matcher
-    from calibgraph.model.config import Config, Terms
 
 _SEARCH_OPTIONS = ("search_deg", "search_m")
+_SEARCH_LIMIT_S = 1800.0
 
 
 @contextmanager
@@ -74,11 +75,12 @@ def _name_and_topic(text: str) -> tuple[str, str]:
 
 def matcher_from(
     name: str,
-    weights: list[Path] | None,
+    weights: list[Path] | None = None,
     *,
     seed: int,
     all_frames: bool = False,
-    **options: Any,
+    of_cmrnext: Mapping[str, Any] | None = None,
+    **search: str | None,
 ) -> Matcher:
     """The matcher of that name, or a table of correspondences.
 
@@ -87,28 +89,30 @@ def matcher_from(
         weights: of cmrnext.
         seed: of everything random.
         all_frames: match all frames, as when the user has selected them.
-        options: of cmrnext, and the search_deg and search_m of structure; None if not given.
+        of_cmrnext: its settings.
+        search: the search_deg and search_m of structure; None if not given.
     """
-    given = {key: value for key, value in options.items() if value is not None}
-    own = {key: given.pop(key) for key in _SEARCH_OPTIONS if key in given}
-    if own and name != "structure":
-        raise ValueError(f"{_flag(next(iter(own)))} is for --matcher structure only")
+    given = {key: value for key, value in search.items() if value is not None}
+    if given and name != "structure":
+        raise ValueError(f"{_flag(next(iter(given)))} is for --matcher structure only")
     if name == "cmrnext" and weights:
         from calibgraph.matching.cmrnext import CmrNextMatcher
 
-        return CmrNextMatcher(weights, seed=seed, **given)
+        return CmrNextMatcher(weights, seed=seed, **of_cmrnext or {})
     if name != "cmrnext":
-        _refuse_cmrnext_options(weights, given)
+        for what in ("--weights",) if weights else of_cmrnext or ():
+            raise ValueError(f"{what} is for --matcher cmrnext only")
     if name == "structure":
-        return _structure_matcher(own, seed=seed, all_frames=all_frames)
+        return _structure_matcher(given, seed=seed, all_frames=all_frames)
     from calibgraph.matching.named import find_matcher
 
     return find_matcher(name, seed=seed)
 
 
-def _refuse_cmrnext_options(weights: list[Path] | None, given: dict[str, Any]) -> None:
-    for option in (*(["weights"] if weights else []), *given):
-        raise ValueError(f"{_flag(option)} is for --matcher cmrnext only")
+def time_limit_of(matcher: str, time_limit_s: float | None) -> float | None:
+    """The time limit, by default the search's. Networks may need hours on a CPU."""
+    default = _SEARCH_LIMIT_S if matcher == "structure" else None
+    return default if time_limit_s is None else time_limit_s
 
 
 def _structure_matcher(given: dict[str, Any], *, seed: int, all_frames: bool) -> Matcher:
@@ -139,32 +143,16 @@ def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def config_from(
-    config: Path | None, preset_name: str | None, **given: float | str | None
-) -> Config:
-    """The settings of a file or of a preset; options that are given replace theirs."""
-    from calibgraph.model.config import load_config, preset
-
-    if config is not None and preset_name is not None:
-        raise ValueError("--config and --preset exclude each other; put `preset:` into the file")
-    if (start := given.get("estimate")) in ("frame", "joint"):  # its former meaning
-        raise ValueError(f"--estimate {start}: is of lens and clock; give --start-from {start}")
-    settings = (
-        load_config(config)
-        if config is not None
-        else preset("auto" if preset_name is None else preset_name)
-    )
-    return settings.changed(**{k: v for k, v in given.items() if v is not None})
-
-
-def terms_from(name: str) -> Terms:
-    """The terms of the objective of that name."""
-    from calibgraph.model.config import TERMS
-
-    for terms in TERMS:
-        if name == terms:
-            return terms
-    raise ValueError(f"--terms {name!r}: known are {', '.join(TERMS)}")
+def parse_names(option: str, texts: list[str] | None) -> dict[str, str]:
+    """The pairs of a repeated option A=B."""
+    for text in texts or ():
+        if "=" not in text:
+            raise ValueError(f"{option} {text!r}: give two names with = between them")
+    pairs = [text.partition("=") for text in texts or ()]
+    for name, count in Counter(name for name, _, _ in pairs).items():
+        if count > 1:
+            raise ValueError(f"{option} {name}=...: given {count} times; give it once")
+    return {name: value for name, _, value in pairs}
 
 
 def require_service() -> None:

@@ -7,41 +7,46 @@ from typing import Annotated
 
 import typer
 
-from calibgraph.cli import outputs
+from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
-from calibgraph.cli.options import JsonOption, SeedOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 _EXIT_CODES = {"OK": 0, "WRONG": 1, "CHANGED": 1, "CANNOT TELL": 3}
 
 
 def check(
-    rig: Path,
-    dataset: list[Path],
-    tolerance_deg: float = 0.5,
-    tolerance_cm: float = 10.0,
-    frames: str | None = None,
-    seed: SeedOption = 0,
-    page: Annotated[Path | None, outputs.PAGE_OF_AUDIT] = None,
-    as_json: JsonOption = False,
+    rig: Annotated[
+        Path,
+        typer.Argument(metavar="RIG", help="The deployed calibration: a result or a rig."),
+    ],
+    dataset: options.Datasets,
+    tolerance_deg: options.ToleranceDeg = 0.5,
+    tolerance_cm: options.ToleranceCm = 10.0,
+    frames: options.Frames = None,
+    seed: options.Seed = 0,
+    page: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Show the answer on a page, with pictures."),
+    ] = None,
+    as_json: options.JsonOption = False,
+    force: options.Force = False,
 ) -> None:
     """Is a deployed calibration still right? Exit 0: all OK, 1: WRONG, 3: the data cannot tell.
 
     Compares it with images and clouds of a recent recording, per camera and axis. Writes no file
     but the page, if one is wanted.
-
-    Args:
-        rig (RIG): The deployed calibration: a result or a rig.
-        page (FILE.html): Show the answer on a page, with pictures.
     """
     from calibgraph.audit import check
     from calibgraph.audit.check import provenance
     from calibgraph.audit.significance import Tolerance
+    from calibgraph.files import require_new_file
     from calibgraph.io.rigs import load_rig
 
+    if page is not None:
+        require_new_file(page, ".html", ".htm", force=force)
     with checked_arguments():
         Tolerance(tolerance_deg, tolerance_cm)
-        matcher = matcher_from("structure", None, seed=seed, all_frames=frames is not None)
+        matcher = matcher_from("structure", seed=seed, all_frames=frames is not None)
     data, deployed = dataset_from(dataset, rig, frames), load_rig(rig)
     origin = provenance(rig, data)
     with progress_bar() as progress:
@@ -71,27 +76,46 @@ def check(
 
 
 def drift(
-    results: list[Path],
-    days: str | None = None,
-    tolerance_deg: float = 0.5,
-    tolerance_cm: float = 10.0,
-    own_lenses: bool = False,
-    plot: Annotated[Path | None, outputs.PLOT_OF_DRIFT] = None,
-    as_json: JsonOption = False,
+    results: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RESULT...",
+            help="Results of one rig: their folders, or calibration.yaml files.",
+        ),
+    ],
+    days: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DAY,DAY,...",
+            help="When each was recorded, for the trend: dates like 2026-03-01, or numbers of "
+            "days. (default: the order given)",
+        ),
+    ] = None,
+    tolerance_deg: options.ToleranceDeg = 0.5,
+    tolerance_cm: options.ToleranceCm = 10.0,
+    own_lenses: Annotated[
+        bool,
+        typer.Option(
+            "--own-lenses", help="Lenses may differ: several vehicles, each with its own."
+        ),
+    ] = False,
+    plot: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.png", help="Draw the deviations, per camera."),
+    ] = None,
+    as_json: options.JsonOption = False,
+    force: options.Force = False,
 ) -> None:
     """Which of several results of one rig deviates? Exit 0: none, 1: one CHANGED, 3: cannot tell.
 
     Compares each result with the others that agree, per camera and axis, without a reference: of
     several days, or of several vehicles. One false alarm in 100 calls.
-
-    Args:
-        results (RESULT...): Results of one rig: their folders, or calibration.yaml files.
-        days (DAY,DAY,...): When each was recorded, for the trend: dates like 2026-03-01, or numbers
-            of days. (default: the order given)
-        own_lenses: Lenses may differ: several vehicles, each with its own.
-        plot (FILE.png): Draw the deviations, per camera.
     """
     from calibgraph.audit import drift
+    from calibgraph.files import require_new_file
+
+    if plot is not None:
+        require_new_file(plot, ".png", force=force)
 
     with checked_arguments():
         found = drift(

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from calibgraph.cli import outputs
 from calibgraph.cli.options import JsonOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
@@ -108,7 +107,7 @@ def _print(summary: Summary, out: str, *, as_json: bool) -> None:
 
 def fleet_report(
     rows: str,
-    out: Annotated[Path, outputs.FLEET_PAGE] = Path("fleet.html"),
+    out: Path = Path("fleet.html"),
     before: str | None = None,
     link: str = "",
 ) -> None:
@@ -119,9 +118,11 @@ def fleet_report(
         before (URI): Earlier rows to compare with. (default: those of a week before the newest)
         link (TEMPLATE): Of a vehicle's own report: vehicles/{vehicle}/report.html
     """
+    from calibgraph.files import require_place_for_file
     from calibgraph.fleet.page import write_fleet_report
     from calibgraph.fleet.rows import read_rows
 
+    require_place_for_file(out, ".html", ".htm")
     earlier = None if before is None else read_rows(before)
     _print_fleet(write_fleet_report(read_rows(rows), out, before=earlier, link=link))
     print_plain(terminal(), f"wrote {out}")
@@ -129,7 +130,7 @@ def fleet_report(
 
 def fleet_model(
     rows: str,
-    out: Annotated[Path, outputs.FLEET_MODEL] = Path("fleet_model"),
+    out: Path = Path("fleet_model"),
     rig: list[str] | None = None,
 ) -> None:
     """What a fleet knows: nominal rigs with spreads, improved estimates, priors for new vehicles.
@@ -141,11 +142,13 @@ def fleet_model(
         rig ([MODEL=]RIG): A rig of a model of vehicle, for its lenses: a prior for its next vehicle
             is written. Repeat it for further models.
     """
+    from calibgraph.file_sets import require_own_folder
     from calibgraph.fleet.model import fit_fleet
     from calibgraph.fleet.model_files import write_fleet_model
     from calibgraph.fleet.observations import newest_rows, observe
     from calibgraph.fleet.rows import read_rows
 
+    require_own_folder(out)
     fleet = fit_fleet(observe(newest_rows(read_rows(rows))))
     written = write_fleet_model(fleet, out, _rigs(rig or [], fleet))
     _print_fleet(fleet)

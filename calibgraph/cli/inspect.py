@@ -1,28 +1,22 @@
-"""The commands about a result, a rig or a dataset: report, view, evaluate, perturb, doctor."""
+"""The commands about a result, a rig or a dataset: report, evaluate, perturb, doctor."""
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calibgraph.cli import options, outputs
-from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.option_groups import DatasetOptions
-from calibgraph.cli.options import JsonOption, SeedOption
+from calibgraph.cli import options
+from calibgraph.cli.arguments import bag_options_from, checked_arguments
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.model.calibration import Calibration
 
-
-_MOVED = typer.Option(
-    metavar="DATASET",
-    help="Where the images and clouds are now, if they have moved; repeat it for several folders, "
-    "in the order in which they were calibrated.",
-)
+_PAGES = (".html", ".htm")
 
 
 def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
@@ -39,36 +33,72 @@ def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
 
 
 def report(
-    result: Path,
-    out: Annotated[Path | None, outputs.PAGE] = None,
-    dataset: Annotated[list[Path] | None, _MOVED] = None,
+    result: Annotated[
+        Path,
+        typer.Argument(metavar="RESULT", help="Result: its folder, or its calibration.yaml."),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.html",
+            help="Page to write. (default: report.html in the folder; none with --rerun or --mcap)",
+        ),
+    ] = None,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.rrd", help="Recording for Rerun: `rerun FILE.rrd` shows it."),
+    ] = None,
+    mcap: Annotated[
+        Path | None, typer.Option(metavar="FILE.mcap", help="Recording for Foxglove.")
+    ] = None,
+    dataset: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DATASET",
+            help="Where the images and clouds are now, if they have moved; repeat it for several "
+            "folders, in the order in which they were calibrated.",
+        ),
+    ] = None,
+    force: options.Force = False,
 ) -> None:
-    """Write a result as one HTML page that opens without a network.
+    """Show a result: as one HTML page that opens without a network, or for viewers.
 
-    Args:
-        out (FILE): Page to write. (default: DIR/report.html)
+    Viewers show clouds, images and projected points, before and after.
     """
+    from calibgraph.files import require_new_file
     from calibgraph.model.result_files import REPORT_FILE
     from calibgraph.report.html import write_report
 
+    for path, suffixes in ((out, _PAGES), (rerun, (".rrd",)), (mcap, (".mcap",))):
+        if path is not None:
+            require_new_file(path, *suffixes, force=force)
     loaded = _load_result(result, dataset)
-    folder = result if result.is_dir() else result.parent
-    path = write_report(loaded, out or folder / REPORT_FILE)
-    print_plain(terminal(), f"{path}: written; the verdict is {loaded.verdict.status}")
+    written = []
+    if out is not None or (rerun is None and mcap is None):
+        folder = result if result.is_dir() else result.parent
+        written.append(write_report(loaded, out or folder / REPORT_FILE))
+    os.environ.setdefault("RUST_LOG", "off")  # Rerun logs what our line states
+    with progress_bar("reading") as progress:
+        if rerun is not None:
+            from calibgraph.view.rerun_file import write_rerun
+
+            written.append(write_rerun(loaded, rerun, progress=progress))
+        if mcap is not None:
+            from calibgraph.view.mcap_file import write_mcap
+
+            written.append(write_mcap(loaded, mcap, progress=progress))
+    for path in written:
+        print_plain(terminal(), f"{path}: written; the verdict is {loaded.verdict.status}")
 
 
 def evaluate(
-    estimate: Path,
-    reference: Path,
-    as_json: JsonOption = False,
+    estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help="Rig to evaluate.")],
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="Rig to compare with.")],
+    as_json: options.JsonOption = False,
 ) -> None:
     """Compare an estimate with a reference: the paper's metrics, per camera and per pair.
 
     Of a reference with error bars, as `calibgraph pick` writes it, in standard deviations as well.
-
-    Args:
-        estimate (ESTIMATE): Rig to evaluate.
-        reference (REFERENCE): Rig to compare with.
     """
     from calibgraph.io.calibrations import error_bars
     from calibgraph.io.rigs import load_rig, rig_file
@@ -85,26 +115,28 @@ def evaluate(
 
 
 def perturb(
-    rig: Path,
-    out: Annotated[Path, typer.Option(), outputs.rig_of("perturb")],
-    rotation_deg: Annotated[float, typer.Option(min=0)] = 20.0,
-    translation_m: Annotated[float, typer.Option(min=0)] = 1.5,
-    seed: SeedOption = 0,
-    uniform: bool = False,
+    rig: Annotated[
+        Path, typer.Argument(metavar="RIG", help="Rig to displace, usually a reference.")
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE.yaml", help="Rig file to write: the displaced guess.")
+    ],
+    rotation_deg: Annotated[float, typer.Option(min=0, help="Angle, about a random axis.")] = 20.0,
+    translation_m: Annotated[
+        float, typer.Option(min=0, help="Length, in a random direction.")
+    ] = 1.5,
+    seed: options.Seed = 0,
+    uniform: Annotated[
+        bool, typer.Option("--uniform", help="Per axis, uniform within +- the values.")
+    ] = False,
+    force: options.Force = False,
 ) -> None:
-    """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses.
-
-    Args:
-        rig (RIG): Rig to displace, usually a reference.
-        out (FILE.yaml): Rig file to write: the displaced guess.
-        rotation_deg: Angle, about a random axis.
-        translation_m: Length, in a random direction.
-        uniform: Per axis, uniform within +- the values.
-    """
+    """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses."""
+    from calibgraph.files import require_new_file
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.perturbation import perturb
-    from calibgraph.outputs import yaml_mark
 
+    require_new_file(out, ".yaml", ".yml", force=force)
     given = load_rig(rig)
     with checked_arguments():
         displaced = perturb(
@@ -114,61 +146,44 @@ def perturb(
             seed=seed,
             uniform=uniform,
         )
-    displaced.save(out, first_line=yaml_mark("perturb"))
+    displaced.save(out)
     print_plain(terminal(), f"{out}: {len(displaced.cameras)} cameras displaced (seed {seed})")
 
 
-def view(
-    result: Path,
-    rerun: Annotated[Path | None, outputs.RERUN] = None,
-    mcap: Annotated[Path | None, outputs.MCAP] = None,
-    dataset: Annotated[list[Path] | None, _MOVED] = None,
-) -> None:
-    """Write a result for viewers: clouds, images and projected points, before and after.
-
-    Args:
-        rerun (FILE.rrd): Recording for Rerun: `rerun FILE.rrd` shows it.
-        mcap (FILE.mcap): Recording for Foxglove.
-    """
-    from calibgraph.errors import CalibrationError
-    from calibgraph.view.mcap_file import write_mcap
-    from calibgraph.view.rerun_file import write_rerun
-
-    if rerun is None and mcap is None:
-        raise CalibrationError("nothing to write; give --rerun FILE.rrd, --mcap FILE.mcap or both")
-    loaded = _load_result(result, dataset)
-    os.environ.setdefault("RUST_LOG", "off")  # Rerun logs what our line states
-    written = []
-    with progress_bar("reading") as progress:
-        if rerun is not None:
-            written.append(write_rerun(loaded, rerun, progress=progress))
-        if mcap is not None:
-            written.append(write_mcap(loaded, mcap, progress=progress))
-    for path in written:
-        print_plain(terminal(), f"{path}: written; the verdict is {loaded.verdict.status}")
-
-
 def doctor(
-    dataset: list[Path],
-    chosen: DatasetOptions,
-    out: Annotated[Path | None, outputs.PICTURES] = None,
+    dataset: options.Datasets,
+    rig: options.RigFile = None,
+    frames: options.Frames = None,
+    every_s: options.EveryS = None,
+    topic: options.Topic = None,
+    motion: options.Motion = None,
+    config: options.ConfigFile = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for guess_CAMERA.png, the guess on an image of each camera, and the "
+            "findings, doctor.json.",
+        ),
+    ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything.
-
-    Args:
-        out (DIR): Folder for guess_CAMERA.png: the guess on an image of each camera.
-    """
+    """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""
+    from calibgraph.cli.settings import read_settings
     from calibgraph.doctor import diagnose
-    from calibgraph.files import require_place_for_folder
+    from calibgraph.file_sets import require_own_folder
+    from calibgraph.files import write_text
     from calibgraph.io.rigs import load_rig
 
     if out is not None:
-        require_place_for_folder(out)
-    bag = chosen.bag
+        require_own_folder(out, dataset)
     with checked_arguments(), progress_bar("reading"):
-        guess = load_rig(chosen.rig) if chosen.rig else None
-        found = diagnose(dataset, guess, frames=chosen.frames, bag=bag, pictures=out)
+        _, rare = read_settings(config)
+        bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
+        guess = load_rig(rig) if rig else None
+        found = diagnose(dataset, guess, frames=frames, bag=bag, pictures=out)
+    if out is not None:
+        write_text(out / "doctor.json", json.dumps(found.to_mapping(), indent=1))
     if as_json:
         print_json(found.to_mapping())
     else:

@@ -3,22 +3,25 @@
 from pathlib import Path
 from typing import Annotated
 
-from calibgraph.cli import outputs
-from calibgraph.cli.options import JsonOption
+import typer
+
+from calibgraph.cli import options
 from calibgraph.cli.terminal import print_json, terminal
 
 
 def weights(
-    file: Path,
-    out: Annotated[Path | None, outputs.WEIGHTS] = None,
-    as_json: JsonOption = False,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Weights, .tar or .safetensors.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Convert to this .safetensors file.")
+    ] = None,
+    as_json: options.JsonOption = False,
+    force: options.Force = False,
 ) -> None:
-    """Check a file of CMRNext weights, print what is in it, and convert it to safetensors.
+    """Check a file of CMRNext weights, print what is in it, and convert it to safetensors."""
+    from calibgraph.files import require_new_file
 
-    Args:
-        file (FILE): Weights, .tar or .safetensors.
-        out (FILE): Convert to this .safetensors file.
-    """
+    if out is not None:
+        require_new_file(out, ".safetensors", force=force)
     from calibgraph.matching.cmrnext import load_checkpoint
 
     checkpoint = load_checkpoint(file)

@@ -6,35 +6,41 @@ from typing import Annotated
 
 import typer
 
-from calibgraph.cli import outputs
+from calibgraph.cli import options
 from calibgraph.cli.arguments import dataset_from
 from calibgraph.cli.terminal import print_plain, terminal
 from calibgraph.errors import CalibrationError
 
 
 def pick(
-    dataset: list[Path],
-    out: Annotated[Path, typer.Option(), outputs.PICKED],
-    rig: Path | None = None,
-    frames: str | None = None,
-    port: Annotated[int, typer.Option(min=0, max=65535)] = 0,
-    show: Annotated[bool, typer.Option("--show/--no-show")] = True,
+    dataset: options.Datasets,
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the session, which is continued if it is there, and of what it gives: "
+            "reference.yaml and picked.parquet.",
+        ),
+    ],
+    rig: options.RigFile = None,
+    frames: options.Frames = None,
+    port: Annotated[
+        int,
+        typer.Option(min=0, max=65535, help="Of this machine. (default: any that is free)"),
+    ] = 0,
+    show: Annotated[
+        bool, typer.Option("--show/--no-show", help="Open the page in the browser.")
+    ] = True,
 ) -> None:
     """Pick a reference by hand: a page on which pixels and LiDAR points are paired.
 
     The server answers this machine only. Ends with Ctrl-C; every change is saved at once.
-
-    Args:
-        out (DIR): Folder of the session, which is continued if it is there, and of what it gives:
-            reference.yaml and picked.parquet.
-        port: Of this machine. (default: any that is free)
-        show: Open the page in the browser.
     """
-    from calibgraph.files import require_place_for_folder
+    from calibgraph.file_sets import require_own_folder
     from calibgraph.pick.server import PickServer
     from calibgraph.pick.workspace import Workspace
 
-    require_place_for_folder(out)
+    require_own_folder(out, dataset)
     workspace = Workspace(dataset_from(dataset, rig, frames), out)
     try:
         server = PickServer(workspace, port)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calibgraph.cli import options, outputs
-from calibgraph.cli.arguments import bag_options_from, checked_arguments, config_from, matcher_from
+from calibgraph.cli import options
+from calibgraph.cli.arguments import bag_options_from, checked_arguments, matcher_from
 from calibgraph.cli.terminal import print_plain, terminal
 
 if TYPE_CHECKING:
@@ -16,20 +16,45 @@ if TYPE_CHECKING:
 
 
 def track(
-    rig: Path,
-    source: list[Path],
-    out: Annotated[Path, outputs.RESULT] = Path("tracking"),
-    every: Annotated[int, typer.Option(min=1)] = 1,
-    follow: bool = False,
-    matcher: str | None = None,
-    estimate: str | None = None,
-    interval_s: float | None = None,
-    motion: options.MotionOption = None,
-    config: Path | None = None,
-    preset: str | None = None,
-    seed: options.ConfigSeedOption = None,
-    weights: options.WeightsOption = None,
-    device: options.DeviceOption = None,
+    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig with the initial guess.")],
+    source: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE...",
+            help="Table of correspondences (.parquet, .csv), a growing folder of them, or - for "
+            "standard input (a JSON line per frame). With --matcher: dataset folders, KITTI "
+            "sequences or ROS bags of one rig, as one drive.",
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for the state, the result and a picture. A state in it is resumed.",
+        ),
+    ] = Path("tracking"),
+    every: Annotated[int, typer.Option(min=1, help="Take every N-th frame only.")] = 1,
+    follow: Annotated[
+        bool,
+        typer.Option("--follow", help="Wait for new files in the folder, until stopped."),
+    ] = False,
+    matcher: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Match the frames of a dataset: structure or cmrnext."),
+    ] = None,
+    estimate: Annotated[
+        str | None,
+        typer.Option(
+            metavar="offset",
+            help="Follow the time offset of each camera: how long after its points an image is "
+            "taken. The motion of the LiDAR must be known.",
+        ),
+    ] = None,
+    interval_s: options.IntervalS = None,
+    motion: options.Motion = None,
+    weights: options.Weights = None,
+    config: options.ConfigFile = None,
+    seed: options.SeedOrConfig = None,
 ) -> None:
     """Keep all cameras calibrated while driving: one frame in, one line of JSON out.
 
@@ -41,33 +66,21 @@ def track(
     Frames of one place (within some 20 m) share errors: name it in each line ("place") or list the
     frames of each in the table ("places"). Otherwise all are of one place, and the error bar stays
     as wide. With --matcher structure places are found from the images.
-
-    Args:
-        rig (RIG): Rig with the initial guess.
-        source (SOURCE...): Table of correspondences (.parquet, .csv), a growing folder of them, or
-            - for standard input (a JSON line per frame). With --matcher:
-            dataset folders, KITTI sequences or ROS bags of one rig, as one drive.
-        out (DIR): Folder for the state, the result and a picture. A state in it is resumed.
-        every: Take every N-th frame only.
-        follow: Wait for new files in the folder, until stopped.
-        matcher (NAME): Match the frames of a dataset: structure or cmrnext.
-        estimate (offset): Follow the time offset of each camera: how long after its points an image
-            is taken. The motion of the LiDAR must be known.
-        interval_s (SECONDS): Time between neighbouring clouds of a folder, with --matcher: the
-            motion of the LiDAR is found by their registration. For --estimate offset. (default:
-            unknown)
     """
+    from calibgraph.cli.settings import read_settings
     from calibgraph.cli.tables import print_result
     from calibgraph.io.rigs import load_rig
+    from calibgraph.model.result_files import require_result_folder
     from calibgraph.tracking.command import Tracking, track
     from calibgraph.tracking.offsets import require_offset_alone
 
+    require_result_folder(out, [rig, *source])
     with checked_arguments():
-        settings = config_from(config, preset, seed=seed, estimate=estimate)
+        settings, rare = read_settings(config, seed=seed, estimate=estimate)
         require_offset_alone(settings)
         if not matcher:
             _require_matcher_for(interval_s=interval_s, motion=motion)
-        chosen = _tracking_matcher(matcher, weights, source, seed=settings.seed, device=device)
+        chosen = _tracking_matcher(matcher, weights, source, settings.seed, rare.of_cmrnext)
     console = terminal()
     wanted = Tracking(
         rig=load_rig(rig),
@@ -77,7 +90,7 @@ def track(
         follow=follow,
         matcher=chosen,
         interval_s=interval_s,
-        bag=bag_options_from(None, motion=motion),
+        bag=bag_options_from(None, motion=motion, **rare.of_bags),
     )
     result, written = track(wanted, source, notify=lambda text: print_plain(console, text))
     print_result(console, result, written)
@@ -100,16 +113,14 @@ def _tracking_matcher(
     name: str | None,
     weights: list[Path] | None,
     source: list[Path],
-    *,
     seed: int,
-    device: str | None,
+    of_cmrnext: dict[str, Any],
 ) -> Matcher | None:
     """The matcher for the frames of datasets; None for a source of correspondences."""
     if name:
-        return matcher_from(name, weights, seed=seed, device=device)
-    for option, value in (("--weights", weights), ("--device", device)):
-        if value:
-            raise ValueError(f"{option} is for --matcher cmrnext only")
+        return matcher_from(name, weights, seed=seed, of_cmrnext=of_cmrnext)
+    for what in ("--weights",) if weights else of_cmrnext:
+        raise ValueError(f"{what} is for --matcher cmrnext only")
     if len(source) > 1:
         raise ValueError(f"{len(source)} sources given; several go with --matcher only")
     return None

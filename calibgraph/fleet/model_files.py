@@ -19,22 +19,9 @@ from calibgraph.fleet.fit import Mount, Pooled
 from calibgraph.fleet.model import FleetModel, ModelFit
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import RelativePose, Rig
-from calibgraph.outputs import Output, marked_yaml, yaml_mark
 
 ESTIMATES_FILE, MODEL_FILE = "estimates.parquet", "fleet_model.json"
 FORMAT = "calibgraph-fleet-model/1"
-COMMAND = "fleet-model"
-_MARK = f'{{\n "format": "{FORMAT}"'.encode()
-
-
-def outputs_of_fleet_model(folder: Path) -> list[Output]:
-    """The files in a folder; its priors are those there."""
-    model = folder / MODEL_FILE
-    return [
-        Output(model, COMMAND, (_MARK,)),
-        Output(folder / ESTIMATES_FILE, COMMAND, (_MARK,), marked=model),
-        *(marked_yaml(path, COMMAND) for path in folder.glob("prior_*.yaml")),
-    ]
 
 
 def write_fleet_model(fleet: FleetModel, folder: Path, rigs: Mapping[str, Rig]) -> list[Path]:
@@ -53,7 +40,7 @@ def write_fleet_model(fleet: FleetModel, folder: Path, rigs: Mapping[str, Rig]) 
     write_atomically(paths[0], lambda path: parquet.write_table(table, path))
     write_text(paths[1], json.dumps(summary(fleet), indent=1))
     for name, rig in priors.items():
-        rig.save(folder / name, first_line=yaml_mark(COMMAND))
+        rig.save(folder / name)
     return [*paths, *(folder / name for name in priors)]
 
 

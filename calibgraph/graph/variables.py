@@ -16,8 +16,6 @@ e_cp  that lens as its matches at place p showed it, where it walks from place t
 
 import gtsam
 
-from calibgraph.outputs import DOT_MARK
-
 CLOUD = int(gtsam.symbol("o", 0))
 DISTORTION = int(gtsam.symbol("d", 0))
 
@@ -82,4 +80,4 @@ def to_dot(graph: gtsam.NonlinearFactorGraph) -> str:
     values = gtsam.Values()
     for key in graph.keyVector():
         values.insert(key, gtsam.Pose3())
-    return f"{DOT_MARK}\n{graph.dot(values)}"
+    return graph.dot(values)

@@ -175,7 +175,7 @@ def test_what_to_do_about_a_wide_error_bar_follows_from_its_sources() -> None:
     [
         (ESTIMATED, "Estimate fewer parts of the lens (--estimate)"),
         (LENSES, "State how well lenses and clocks are known"),
-        (UNMODELLED, "Leave --preset out"),
+        (UNMODELLED, "Leave preset out"),
     ],
 )
 def test_a_wide_bar_advises_on_its_largest_source(source: str, expected: str) -> None:

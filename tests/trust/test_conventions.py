@@ -55,7 +55,7 @@ def test_a_mistake_is_recognised_by_the_images_at_a_rough_guess(error: str, seed
     T = {name: mistaken(error, T) for name, T in rough.T_camera_lidar.items()}
     wrong = rough.moved_to(T)
     assert likely_intended_guess(one_frame(), wrong) == (
-        f"the images fit clearly better if {in_words(error)}; undo it with calibgraph import RIG "
+        f"the images fit clearly better if {in_words(error)}; undo it with calibgraph rig RIG "
         f"--correct {error} --out FILE.yaml"
     )
     undone = correct_guess(wrong, [error])
@@ -69,7 +69,7 @@ def test_the_camera_is_named_if_only_its_guess_is_wrong() -> None:
     found = likely_intended_guess(one_frame(), rough.moved_to({"left": wrong}))
     assert found == (
         "the images of left fit clearly better if the guess is inverted (it is T_lidar_camera); "
-        "undo it with calibgraph import RIG --correct left=inverse --out FILE.yaml"
+        "undo it with calibgraph rig RIG --correct left=inverse --out FILE.yaml"
     )
 
 

@@ -117,7 +117,7 @@ def test_images_pair_with_the_cloud_of_the_nearest_stamp(tmp_path: Path) -> None
 
     bag = changed(tmp_path, delay)
     assert numbers(load_dataset(bag)) == [0, 1, 2, 3, 4, 5]
-    near = load_dataset(bag, bag=BagOptions(tolerance_s=0.012))  # 3 ms, and 0, 4, 8, ...
+    near = load_dataset(bag, bag=BagOptions(sync_tolerance_s=0.012))  # 3 ms, and 0, 4, 8, ...
     assert numbers(near) == [0, 1, 2]
     assert "6 clouds, 3 with all images within 0.012 s" in near.notes[-1]
     assert "left +7 ms (median), at most 11; 3 without an image of left" in near.notes[-1]
@@ -180,7 +180,7 @@ def test_clocks_that_differ_are_named_and_the_time_of_recording_serves(tmp_path:
         return restamped(each, stamp_of(each) - START_NS) if each.topic == LEFT else each
 
     bag = changed(tmp_path, since_start)
-    with pytest.raises(DatasetError, match=r"/left.* 0.003 to 0.503 s do not meet; give --stamps"):
+    with pytest.raises(DatasetError, match=r"/left.* 0.003 to 0.503 s do not meet; set stamps"):
         load_dataset(bag)
     assert numbers(load_dataset(bag, bag=BagOptions(stamps="record"))) == [0, 1, 2, 3, 4, 5]
 
@@ -284,6 +284,6 @@ def test_threads_read_a_bag_at_the_same_time(tmp_path: Path) -> None:
 def test_options_of_bags_are_checked() -> None:
     with pytest.raises(ValueError, match="are given without a bag"):
         load_dataset(SAMPLE, bag=BagOptions(every_s=1.0))
-    for wrong in ({"every_s": 0.0}, {"tolerance_s": -1.0}, {"stamps": "best"}):
+    for wrong in ({"every_s": 0.0}, {"sync_tolerance_s": -1.0}, {"stamps": "best"}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             BagOptions(**wrong)  # type: ignore[arg-type]

@@ -1,0 +1,372 @@
+"""The command for a rig to begin with: from a bag, a folder, words, files of others, a search."""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from calibgraph.cli import options
+from calibgraph.cli.arguments import bag_options_from, checked_arguments, parse_names
+from calibgraph.cli.export import print_doubts
+from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
+from calibgraph.io.formats.names import IMPORT_FORMATS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from calibgraph.guessing.guess import RigGuess
+    from calibgraph.io.formats.rig_import import RigParts
+    from calibgraph.model.rig import Rig
+
+_SEARCH = "search"
+
+
+def rig(
+    source: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SOURCE...",
+            help="A ROS bag; a folder with lidar/ and cameras/NAME/; or files: "
+            f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.yaml",
+            help="Rig file to write. (default: rig.yaml in the folder; of bags and files none)",
+        ),
+    ] = None,
+    mount: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=WORDS",
+            help="How a camera is mounted: front, front-left, left, rear-left, rear, ...; then "
+            "NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, "
+            "NUMBER m|cm ahead|behind|left|right|above|below of the LiDAR; or search, in the "
+            "images of --dataset, although a file has an extrinsic. May be repeated.",
+        ),
+    ] = None,
+    lens: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[NAME=]HOW",
+            help="Of a folder: how the lens of a camera, or of all, is known: calibration; a "
+            "horizontal field of view, as '90 deg'; or focal length and size of a pixel, as "
+            "'4 mm 3 um'. May be repeated. (default: asked in a terminal, else calibration)",
+        ),
+    ] = None,
+    dataset: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DATASET",
+            help="Images and clouds: cameras without words or an extrinsic in a file are searched "
+            "for over all headings. Slower, and less sure. May be repeated.",
+        ),
+    ] = None,
+    forward: Annotated[
+        str,
+        typer.Option(
+            metavar="+x|-x|+y|-y", help="Axis of the LiDAR frame that points ahead; z is up."
+        ),
+    ] = "+x",
+    topic: options.Topic = None,
+    rename: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="OLD=NEW",
+            help="Another name of a camera, as its folder in the dataset; may be repeated.",
+        ),
+    ] = None,
+    lidar_frame: Annotated[
+        str | None,
+        typer.Option(metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"),
+    ] = None,
+    camera_frame: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FRAME",
+            help="Frame of a camera, where the names differ; may be repeated. A frame with "
+            "'optical' in its name is x right, y down, z forward, others are x forward, z up.",
+        ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(metavar="WIDTHxHEIGHT", help="Image size, for files that have none."),
+    ] = None,
+    tie_deg: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DEG",
+            min=0.001,
+            help="Relative poses are measured, with this sigma per axis; with --tie-m. (default: "
+            "0.1 of files as Kalibr's; those of a bag are only a guess)",
+        ),
+    ] = None,
+    tie_m: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M", min=1e-5, help="The sigma in translation, per axis. (default: 0.005)"
+        ),
+    ] = None,
+    correct: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[CAMERA=]MISTAKE",
+            help="Undo a mistake of the guess, by the name that doctor gives it, as inverse or "
+            "camera-flu; of all cameras or of one. May be repeated.",
+        ),
+    ] = None,
+    as_json: options.JsonOption = False,
+    force: options.Force = False,
+) -> None:
+    """Write a rig to begin a calibration with, and print where each camera looks and sits.
+
+    Of a ROS bag: its topics, lenses and /tf_static. Of a folder: its cameras, and each key that is
+    left to fill in explained. Of files of other programs: what they hold together, and how good a
+    guess it is if cameras are described or searched for.
+    """
+    from calibgraph.files import require_new_file
+    from calibgraph.io.bags.storage import is_bag
+
+    given = {
+        "mount": mount, "lens": lens, "dataset": dataset, "topic": topic, "rename": rename,
+        "lidar_frame": lidar_frame, "camera_frame": camera_frame, "size": size, "tie_deg": tie_deg,
+        "tie_m": tie_m, "correct": correct,
+    }  # fmt: skip
+    path = Path(source[0])
+    is_of_bag = len(source) == 1 and is_bag(path) and not (mount or dataset)
+    if len(source) == 1 and not correct and _is_to_fill_in(path):
+        _refuse(given, "files", but=("mount", "lens"))
+        _write_template(path, out, mount, lens, forward=forward, force=force)
+        return
+    if out is not None:
+        require_new_file(out, ".yaml", ".yml", force=force)
+    _refuse(given, "a folder of images and clouds", but=tuple(given.keys() - {"lens"}))
+    with checked_arguments():
+        sigmas = _sigmas(tie_deg, tie_m)
+    if is_of_bag:
+        _refuse(given, "files", but=("topic", "tie_deg", "tie_m", "correct"))
+        made, notes, topics = _rig_of_bag(path, topic, sigmas)
+        guess = None
+    else:
+        _refuse(given, "a bag alone", but=tuple(given.keys() - {"topic"}))
+        topics = []
+        with checked_arguments(), progress_bar("reading") as progress:
+            parts = _parts(source, rename, lidar_frame, camera_frame)
+            made, guess = _rig_of_files(
+                parts, parse_names("--mount", mount), dataset, forward=forward,
+                size_px=_size_px(size), sigmas=sigmas, progress=progress,
+            )  # fmt: skip
+        notes = [f"note: {note}" for note in parts.notes]
+    _finish(made, guess, notes, topics, out=out, correct=correct or (), as_json=as_json)
+
+
+def _is_to_fill_in(path: Path) -> bool:
+    """Whether a source is a folder without a rig, or with one such as this command writes."""
+    from calibgraph.io.bags.storage import is_bag
+    from calibgraph.io.rigs import RIG_FILE, find_rig_file
+
+    return path.is_dir() and not is_bag(path) and find_rig_file(path) in (None, path / RIG_FILE)
+
+
+def _refuse(given: dict[str, Any], of: str, *, but: tuple[str, ...]) -> None:
+    """Refuse options that would change nothing."""
+    from calibgraph.errors import CalibrationError
+
+    for name, value in given.items():
+        if value is not None and name not in but:
+            raise CalibrationError(f"--{name.replace('_', '-')} is for {of} only; leave it out")
+
+
+def _parts(
+    source: list[str],
+    rename: list[str] | None,
+    lidar_frame: str | None,
+    camera_frame: list[str] | None,
+) -> RigParts:
+    """What the files hold."""
+    from calibgraph.io.formats.rig_import import read_rig_parts
+
+    named = [_parse_file(text) for text in source]
+    return read_rig_parts(
+        [path for _, path in named],
+        names={path: name for name, path in named if name},
+        rename=parse_names("--rename", rename),
+        lidar_frame=lidar_frame,
+        camera_frames=parse_names("--camera-frame", camera_frame),
+    )
+
+
+def _parse_file(text: str) -> tuple[str, Path]:
+    """The camera's name, if there is one before ``=``, and the file."""
+    name, equals, file = text.partition("=")
+    return (name, Path(file)) if equals and not Path(text).exists() else ("", Path(text))
+
+
+def _size_px(size: str | None) -> tuple[int, int] | None:
+    """Width and height of images whose file has none."""
+    if size is None:
+        return None
+    match = re.fullmatch(r"(\d+)x(\d+)", size)
+    if match is None:
+        raise ValueError(f"--size {size!r}: give WIDTHxHEIGHT, as 1920x1200")
+    return int(match[1]), int(match[2])
+
+
+def _sigmas(tie_deg: float | None, tie_m: float | None) -> tuple[float, float] | None:
+    """The sigmas of relative poses, [deg] and [m]."""
+    if tie_deg is None and tie_m is None:
+        return None
+    if tie_deg is None or tie_m is None:
+        raise ValueError("--tie-deg and --tie-m: give both")
+    return tie_deg, tie_m
+
+
+def _rig_of_files(
+    parts: RigParts,
+    mountings: dict[str, str],
+    dataset: list[Path] | None,
+    *,
+    forward: str,
+    size_px: tuple[int, int] | None,
+    sigmas: tuple[float, float] | None,
+    progress: Any,
+) -> tuple[Rig, RigGuess | None]:
+    """The rig, and how good its guess is, where cameras are described or searched for."""
+    from calibgraph.guessing.guess import guess_rig
+    from calibgraph.io.formats.rig_import import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
+
+    tie_deg, tie_m = sigmas or (RELATIVE_SIGMA_DEG, RELATIVE_SIGMA_CM / 100.0)
+    if not mountings and not dataset:
+        made = parts.to_rig(
+            size_px=size_px, relative_sigma_deg=tie_deg, relative_sigma_cm=100.0 * tie_m
+        )
+        return made, None
+    if sigmas is not None:
+        raise ValueError("--tie-deg is for files alone; leave --mount and --dataset out")
+    guess = guess_rig(
+        parts,
+        mountings={name: text for name, text in mountings.items() if text != _SEARCH},
+        data=dataset or None,
+        search=[name for name, text in mountings.items() if text == _SEARCH],
+        forward=forward,
+        size_px=size_px,
+        progress=progress,
+    )
+    return guess.rig, guess
+
+
+def _rig_of_bag(
+    path: Path, topic: list[str] | None, sigmas: tuple[float, float] | None
+) -> tuple[Rig, list[str], list[dict[str, Any]]]:
+    """The rig of a bag, what is to be said of it, and its topics."""
+    from math import radians
+
+    from calibgraph.io.bags.messages import Bag
+    from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
+
+    topics = sorted(Bag(path).topics.values(), key=lambda each: each.name)
+    read = read_bag_rig(path, bag_options_from(topic))
+    made = read.to_rig(None if sigmas is None else (radians(sigmas[0]), sigmas[1]))
+    listed = [{"topic": each.name, "type": each.type, "messages": each.count} for each in topics]
+    return made, [*doubtful_axes(made), *read.notes], listed
+
+
+def _finish(
+    made: Rig,
+    guess: RigGuess | None,
+    notes: Sequence[str],
+    topics: list[dict[str, Any]],
+    *,
+    out: Path | None,
+    correct: Sequence[str],
+    as_json: bool,
+) -> None:
+    """Correct, write and print a rig."""
+    from calibgraph.io.formats.describe import describe_rig
+    from calibgraph.model.lens_knowledge import state_calibrated
+    from calibgraph.model.plausibility import find_implausible
+    from calibgraph.trust.conventions import correct_guess
+
+    with checked_arguments():
+        made = state_calibrated(correct_guess(made, correct))
+    guess = None if guess is None else replace(guess, rig=made)
+    if out is not None:
+        (made if guess is None else guess).save(out)
+    if as_json:
+        notes = [*notes, *(f"warning: {line}" for line in find_implausible(made))]
+        print_json(
+            {
+                "topics": topics,
+                "rig": made.model_dump(mode="json"),
+                "notes": notes,
+                "out": None if out is None else str(out),
+                **({} if guess is None else guess.to_mapping()),
+            }
+        )
+        return
+    for each in topics:
+        print_plain(terminal(), f"{each['topic']}  {each['type']}  {each['messages']}")
+    for line in describe_rig(made) if guess is None else guess.lines:
+        print_plain(terminal(), line)
+    for note in notes:
+        print_plain(terminal(), note)
+    print_doubts(made)
+    written = f"{out}: written" if out is not None else "nothing was written; --out writes the rig"
+    print_plain(terminal(), f"{written}; check the sentences above against the vehicle")
+
+
+def _write_template(
+    folder: Path,
+    out: Path | None,
+    mount: list[str] | None,
+    lens: list[str] | None,
+    *,
+    forward: str,
+    force: bool,
+) -> None:
+    """Write the rig of a folder, with what is left to fill in, and say what comes next."""
+    from calibgraph.guessing.lens_words import CALIBRATION
+    from calibgraph.guessing.template import cameras_of_folder, write_rig_template
+    from calibgraph.io.dataset_folders import describe_pairing
+
+    with checked_arguments():
+        words = parse_names("--mount", mount)
+        known = _lenses(lens, [*cameras_of_folder(folder)])
+        path = write_rig_template(
+            folder, out, mountings=words, lenses=known, forward=forward, replace=force
+        )
+        pairing = describe_pairing(folder)
+    if pairing:
+        print_plain(terminal(), pairing)
+    left = "FILL_IN" in path.read_text(encoding="utf-8").partition("\nformat:")[2]
+    where = f"{folder}" if out is None else f"{folder} --rig {out}"
+    first = "replace every FILL_IN; then" if left else "next"
+    print_plain(terminal(), f"{path}: written; {first}: calibgraph doctor {where}")
+    if any(how != CALIBRATION for how in known.values()):
+        print_plain(
+            terminal(),
+            "a lens from a spec sheet or a field of view is known to 2 %, so estimate it: "
+            f"calibgraph calibrate {where} --estimate lens",
+        )
+
+
+def _lenses(given: list[str] | None, cameras: list[str]) -> dict[str, str]:
+    """How the lens of each camera is known, as given for all or one, or asked for."""
+    from calibgraph.guessing.lens_words import CALIBRATION, LENS_GRAMMAR
+
+    for_all = [how for how in given or () if "=" not in how]
+    if not given and sys.stdin.isatty() and sys.stderr.isatty():
+        answers = [CALIBRATION]
+        for name in cameras:
+            question = f"{name}: how is its lens known? {LENS_GRAMMAR}"
+            answers.append(typer.prompt(question, default=answers[-1], err=True))
+        return dict(zip(cameras, answers[1:], strict=True))
+    named = parse_names("--lens", [how for how in given or () if "=" in how])
+    return dict.fromkeys(cameras, for_all[-1] if for_all else CALIBRATION) | named
