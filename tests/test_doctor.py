@@ -168,18 +168,6 @@ def test_the_command_prints_it_and_exits_with_one_if_anything_is_to_be_fixed(
     assert "no such folder or ROS bag" in err
 
 
-@pytest.mark.usefixtures("no_image_checks")
-def test_doctor_replaces_its_own_pictures_and_no_others(tmp_path: Path, call: Call) -> None:
-    """Mend, run again: also with another rig; a picture of the user's stays."""
-    given = ("doctor", SAMPLE, "--out", tmp_path / "pictures")
-    assert call(*given)[0] == call(*given)[0] == 0
-    picture = tmp_path / "pictures" / "guess_front_left.png"
-    assert cv2.imread(str(picture)) is not None
-    cv2.imwrite(str(picture), np.zeros((4, 4, 3), np.uint8))
-    code, _, err = call(*given)
-    assert code == 2 and "was not written by calibgraph doctor" in err
-
-
 @pytest.mark.parametrize(("scale", "lift", "word"), [(0.12, 0, "dark"), (0.2, 215, "bright")])
 @pytest.mark.usefixtures("no_image_checks")
 def test_the_brightness_of_images_that_show_too_little_is_named(

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
@@ -16,8 +17,7 @@ _EXIT_CODES = {"OK": 0, "WRONG": 1, "CHANGED": 1, "CANNOT TELL": 3}
 
 def check(
     rig: Annotated[
-        Path,
-        typer.Argument(metavar="RIG", help="The deployed calibration: a result or a rig."),
+        Path, Argument(metavar="RIG", help="The deployed calibration: a result or a rig.")
     ],
     dataset: options.Datasets,
     tolerance_deg: options.ToleranceDeg = 0.5,
@@ -25,8 +25,7 @@ def check(
     frames: options.Frames = None,
     seed: options.Seed = 0,
     page: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.html", help="Show the answer on a page, with pictures."),
+        Path | None, Option(metavar="FILE.html", help="Show the answer on a page, with pictures.")
     ] = None,
     as_json: options.JsonOption = False,
     force: options.Force = False,
@@ -78,14 +77,14 @@ def check(
 def drift(
     results: Annotated[
         list[Path],
-        typer.Argument(
+        Argument(
             metavar="RESULT...",
             help="Results of one rig: their folders, or calibration.yaml files.",
         ),
     ],
     days: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="DAY,DAY,...",
             help="When each was recorded, for the trend: dates like 2026-03-01, or numbers of "
             "days. (default: the order given)",
@@ -94,14 +93,10 @@ def drift(
     tolerance_deg: options.ToleranceDeg = 0.5,
     tolerance_cm: options.ToleranceCm = 10.0,
     own_lenses: Annotated[
-        bool,
-        typer.Option(
-            "--own-lenses", help="Lenses may differ: several vehicles, each with its own."
-        ),
+        bool, Option("--own-lenses", help="Lenses may differ: several vehicles, each with its own.")
     ] = False,
     plot: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.png", help="Draw the deviations, per camera."),
+        Path | None, Option(metavar="FILE.png", help="Draw the deviations, per camera.")
     ] = None,
     as_json: options.JsonOption = False,
     force: options.Force = False,

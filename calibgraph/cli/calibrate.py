@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import (
@@ -61,7 +62,7 @@ def calibrate(
         settings, rare = read_settings(config, estimate=estimate, of=of)
         chosen = matcher_from(
             matcher, weights, seed=settings.seed, all_frames=bool(frames or every_s),
-            of_cmrnext=rare.of_cmrnext, search_deg=search_deg, search_m=search_m,
+            of_cmrnext=rare.of_cmrnext, search_deg=search_deg, search_m=search_m
         )  # fmt: skip
     bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
@@ -84,9 +85,9 @@ def calibrate(
 
 def match(
     dataset: options.Datasets,
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="Table to write, .parquet or .csv.")
-    ] = Path("correspondences.parquet"),
+    out: Annotated[Path, Option(metavar="FILE", help="Table to write, .parquet or .csv.")] = Path(
+        "correspondences.parquet"
+    ),
     rig: options.RigFile = None,
     frames: options.Frames = None,
     every_s: options.EveryS = None,
@@ -113,7 +114,7 @@ def match(
         settings, rare = read_settings(config, seed=seed)
         chosen = matcher_from(
             matcher, weights, seed=settings.seed, all_frames=bool(frames or every_s),
-            of_cmrnext=rare.of_cmrnext, search_deg=search_deg, search_m=search_m,
+            of_cmrnext=rare.of_cmrnext, search_deg=search_deg, search_m=search_m
         )  # fmt: skip
     bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
@@ -126,10 +127,10 @@ def match(
 
 
 def solve(
-    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig with the initial guess.")],
+    rig: Annotated[Path, Argument(metavar="RIG", help="Rig with the initial guess.")],
     correspondences: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             metavar="CORRESPONDENCES",
             help="Table, .parquet or .csv, or a folder of .parquet files; larger than memory too.",
         ),
@@ -137,7 +138,7 @@ def solve(
     out: options.ResultFolder = Path("calibration"),
     terms: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="full|reprojection|priors|stage1",
             help="Terms of the objective. (default: full)",
         ),
@@ -146,14 +147,14 @@ def solve(
     of: options.Of = None,
     camera_matches: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="FILE",
             help="Features that cameras have in common: camera_matches.parquet of a result.",
         ),
     ] = None,
     common_deg: Annotated[
         float | None,
-        typer.Option(
+        Option(
             metavar="DEG",
             min=0,
             help="Error per axis that all frames share, 1 sigma; 0 if none. (default: as the "
@@ -161,19 +162,18 @@ def solve(
         ),
     ] = None,
     common_cm: Annotated[
-        float | None, typer.Option(metavar="CM", min=0, help="Likewise, of the position.")
+        float | None, Option(metavar="CM", min=0, help="Likewise, of the position.")
     ] = None,
     print_graph: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--print-graph",
             callback=options.require_stdout,
             help="Print every factor of the graph whose optimum is the result, in place of tables.",
         ),
     ] = False,
     graph: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.dot", help="Write the graph in Graphviz's language."),
+        Path | None, Option(metavar="FILE.dot", help="Write the graph in Graphviz's language.")
     ] = None,
     config: options.ConfigFile = None,
     as_json: options.JsonOption = False,
@@ -197,7 +197,7 @@ def solve(
     with checked_arguments():
         settings, rare = read_settings(
             config, terms=terms, estimate=estimate, of=of, common_deg=common_deg,
-            common_cm=common_cm,
+            common_cm=common_cm
         )  # fmt: skip
         if print_graph and as_json:
             raise ValueError("--print-graph and --json both print; choose one")

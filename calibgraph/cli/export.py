@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments
@@ -38,32 +39,29 @@ def _list_formats(format: str) -> str:
 
 def export(
     source: Annotated[
-        Path,
-        typer.Argument(metavar="RESULT|RIG", help="Result (its folder or file), or a rig."),
+        Path, Argument(metavar="RESULT|RIG", help="Result (its folder or file), or a rig.")
     ],
     format: Annotated[
         str,
-        typer.Option(
+        Option(
             metavar="FORMAT",
             callback=_list_formats,
             is_eager=True,
             help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
         ),
     ],
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="File to write; of camera_info a folder.")
-    ],
+    out: Annotated[Path, Option(metavar="FILE", help="File to write; of camera_info a folder.")],
     camera: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="Only this camera; may be repeated. (default: all)"),
+        Option(metavar="NAME", help="Only this camera; may be repeated. (default: all)"),
     ] = None,
     lidar_frame: Annotated[
         str | None,
-        typer.Option(metavar="FRAME", help="Frame id of the LiDAR. (default: its name in the rig)"),
+        Option(metavar="FRAME", help="Frame id of the LiDAR. (default: its name in the rig)"),
     ] = None,
     camera_frame: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="TEXT",
             help="Frame id of optical frames; {camera} is the name. (default: the bag's, kept in "
             "the rig, or {camera}_optical_frame)",
@@ -71,14 +69,14 @@ def export(
     ] = None,
     lidar_pose: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar='"X Y Z ROLL PITCH YAW"',
             help="Of autoware: where the LiDAR is mounted, in sensor_kit_base_link, metres and "
             "radians as in URDF. (default: at its origin)",
         ),
     ] = None,
     even_if_failed: Annotated[
-        bool, typer.Option("--even-if-failed", help="Export although the verdict is FAIL.")
+        bool, Option("--even-if-failed", help="Export although the verdict is FAIL.")
     ] = False,
     force: options.Force = False,
 ) -> None:

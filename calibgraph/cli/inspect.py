@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import bag_options_from, checked_arguments
@@ -34,26 +35,25 @@ def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
 
 def report(
     result: Annotated[
-        Path,
-        typer.Argument(metavar="RESULT", help="Result: its folder, or its calibration.yaml."),
+        Path, Argument(metavar="RESULT", help="Result: its folder, or its calibration.yaml.")
     ],
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="FILE.html",
             help="Page to write. (default: report.html in the folder; none with --rerun or --mcap)",
         ),
     ] = None,
     rerun: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.rrd", help="Recording for Rerun: `rerun FILE.rrd` shows it."),
+        Option(metavar="FILE.rrd", help="Recording for Rerun: `rerun FILE.rrd` shows it."),
     ] = None,
     mcap: Annotated[
-        Path | None, typer.Option(metavar="FILE.mcap", help="Recording for Foxglove.")
+        Path | None, Option(metavar="FILE.mcap", help="Recording for Foxglove.")
     ] = None,
     dataset: Annotated[
         list[Path] | None,
-        typer.Option(
+        Option(
             metavar="DATASET",
             help="Where the images and clouds are now, if they have moved; repeat it for several "
             "folders, in the order in which they were calibrated.",
@@ -92,8 +92,8 @@ def report(
 
 
 def evaluate(
-    estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help="Rig to evaluate.")],
-    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="Rig to compare with.")],
+    estimate: Annotated[Path, Argument(metavar="ESTIMATE", help="Rig to evaluate.")],
+    reference: Annotated[Path, Argument(metavar="REFERENCE", help="Rig to compare with.")],
     as_json: options.JsonOption = False,
 ) -> None:
     """Compare an estimate with a reference: the paper's metrics, per camera and per pair.
@@ -115,19 +115,15 @@ def evaluate(
 
 
 def perturb(
-    rig: Annotated[
-        Path, typer.Argument(metavar="RIG", help="Rig to displace, usually a reference.")
-    ],
+    rig: Annotated[Path, Argument(metavar="RIG", help="Rig to displace, usually a reference.")],
     out: Annotated[
-        Path, typer.Option(metavar="FILE.yaml", help="Rig file to write: the displaced guess.")
+        Path, Option(metavar="FILE.yaml", help="Rig file to write: the displaced guess.")
     ],
-    rotation_deg: Annotated[float, typer.Option(min=0, help="Angle, about a random axis.")] = 20.0,
-    translation_m: Annotated[
-        float, typer.Option(min=0, help="Length, in a random direction.")
-    ] = 1.5,
+    rotation_deg: Annotated[float, Option(min=0, help="Angle, about a random axis.")] = 20.0,
+    translation_m: Annotated[float, Option(min=0, help="Length, in a random direction.")] = 1.5,
     seed: options.Seed = 0,
     uniform: Annotated[
-        bool, typer.Option("--uniform", help="Per axis, uniform within +- the values.")
+        bool, Option("--uniform", help="Per axis, uniform within +- the values.")
     ] = False,
     force: options.Force = False,
 ) -> None:
@@ -160,7 +156,7 @@ def doctor(
     config: options.ConfigFile = None,
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="DIR",
             help="Folder for guess_CAMERA.png, the guess on an image of each camera, and the "
             "findings, doctor.json.",

@@ -3,16 +3,16 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.terminal import print_json, terminal
 
 
 def weights(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Weights, .tar or .safetensors.")],
+    file: Annotated[Path, Argument(metavar="FILE", help="Weights, .tar or .safetensors.")],
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Convert to this .safetensors file.")
+        Path | None, Option(metavar="FILE", help="Convert to this .safetensors file.")
     ] = None,
     as_json: options.JsonOption = False,
     force: options.Force = False,

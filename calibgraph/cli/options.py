@@ -7,7 +7,7 @@ from typer import Argument, Option
 
 SHARED = (
     "rig", "frames", "every_s", "topic", "motion", "interval_s", "matcher", "weights",
-    "time_limit_s", "search_deg", "search_m", "config", "estimate", "seed", "as_json", "force",
+    "time_limit_s", "search_deg", "search_m", "config", "estimate", "seed", "as_json", "force"
 )  # fmt: skip
 """Names of the options that mean the same in every command, but where a command describes its own:
 ``docs/commands.md`` lists them once."""
@@ -79,8 +79,7 @@ IntervalS = Annotated[
     ),
 ]
 MatcherName = Annotated[
-    str,
-    Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences."),
+    str, Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences.")
 ]
 Weights = Annotated[
     list[Path] | None,
@@ -119,7 +118,7 @@ SearchM = Annotated[
 ]
 ConfigFile = Annotated[
     Path | None,
-    Option(metavar="FILE", help="Settings, YAML: of the solve, and rare ones of all the rest."),
+    Option(metavar="FILE", help="Settings of the solve, and rare ones of the rest, YAML."),
 ]
 Estimate = Annotated[
     str | None,
@@ -146,9 +145,7 @@ Seed = Annotated[int, Option(min=0, max=_MOST_SEED, help="Seed of everything ran
 SeedOrConfig = Annotated[
     int | None,
     Option(
-        min=0,
-        max=_MOST_SEED,
-        help="Seed of everything random. (default: that of --config, else 0)",
+        min=0, max=_MOST_SEED, help="Seed of everything random. (default: that of --config, else 0)"
     ),
 ]
 ToleranceDeg = Annotated[

@@ -4,7 +4,7 @@ import webbrowser
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import dataset_from
@@ -16,7 +16,7 @@ def pick(
     dataset: options.Datasets,
     out: Annotated[
         Path,
-        typer.Option(
+        Option(
             metavar="DIR",
             help="Folder of the session, which is continued if it is there, and of what it gives: "
             "reference.yaml and picked.parquet.",
@@ -25,12 +25,9 @@ def pick(
     rig: options.RigFile = None,
     frames: options.Frames = None,
     port: Annotated[
-        int,
-        typer.Option(min=0, max=65535, help="Of this machine. (default: any that is free)"),
+        int, Option(min=0, max=65535, help="Of this machine. (default: any that is free)")
     ] = 0,
-    show: Annotated[
-        bool, typer.Option("--show/--no-show", help="Open the page in the browser.")
-    ] = True,
+    show: Annotated[bool, Option("--show/--no-show", help="Open the page in the browser.")] = True,
 ) -> None:
     """Pick a reference by hand: a page on which pixels and LiDAR points are paired.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import bag_options_from, checked_arguments, parse_names
@@ -29,7 +30,7 @@ _SEARCH = "search"
 def rig(
     source: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             metavar="SOURCE...",
             help="A ROS bag; a folder with lidar/ and cameras/NAME/; or files: "
             f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
@@ -37,14 +38,14 @@ def rig(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="FILE.yaml",
             help="Rig file to write. (default: rig.yaml in the folder; of bags and files none)",
         ),
     ] = None,
     mount: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="NAME=WORDS",
             help="How a camera is mounted: front, front-left, left, rear-left, rear, ...; then "
             "NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, "
@@ -54,7 +55,7 @@ def rig(
     ] = None,
     lens: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="[NAME=]HOW",
             help="Of a folder: how the lens of a camera, or of all, is known: calibration; a "
             "horizontal field of view, as '90 deg'; or focal length and size of a pixel, as "
@@ -63,7 +64,7 @@ def rig(
     ] = None,
     dataset: Annotated[
         list[Path] | None,
-        typer.Option(
+        Option(
             metavar="DATASET",
             help="Images and clouds: cameras without words or an extrinsic in a file are searched "
             "for over all headings. Slower, and less sure. May be repeated.",
@@ -71,37 +72,33 @@ def rig(
     ] = None,
     forward: Annotated[
         str,
-        typer.Option(
-            metavar="+x|-x|+y|-y", help="Axis of the LiDAR frame that points ahead; z is up."
-        ),
+        Option(metavar="+x|-x|+y|-y", help="Axis of the LiDAR frame that points ahead; z is up."),
     ] = "+x",
     topic: options.Topic = None,
     rename: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="OLD=NEW",
             help="Another name of a camera, as its folder in the dataset; may be repeated.",
         ),
     ] = None,
     lidar_frame: Annotated[
-        str | None,
-        typer.Option(metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"),
+        str | None, Option(metavar="FRAME", help="The LiDAR's frame. (default: the one named so)")
     ] = None,
     camera_frame: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="NAME=FRAME",
             help="Frame of a camera, where the names differ; may be repeated. A frame with "
             "'optical' in its name is x right, y down, z forward, others are x forward, z up.",
         ),
     ] = None,
     size: Annotated[
-        str | None,
-        typer.Option(metavar="WIDTHxHEIGHT", help="Image size, for files that have none."),
+        str | None, Option(metavar="WIDTHxHEIGHT", help="Image size, for files that have none.")
     ] = None,
     tie_deg: Annotated[
         float | None,
-        typer.Option(
+        Option(
             metavar="DEG",
             min=0.001,
             help="Relative poses are measured, with this sigma per axis; with --tie-m. (default: "
@@ -110,13 +107,11 @@ def rig(
     ] = None,
     tie_m: Annotated[
         float | None,
-        typer.Option(
-            metavar="M", min=1e-5, help="The sigma in translation, per axis. (default: 0.005)"
-        ),
+        Option(metavar="M", min=1e-5, help="The sigma in translation, per axis. (default: 0.005)"),
     ] = None,
     correct: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="[CAMERA=]MISTAKE",
             help="Undo a mistake of the guess, by the name that doctor gives it, as inverse or "
             "camera-flu; of all cameras or of one. May be repeated.",
@@ -161,7 +156,7 @@ def rig(
             parts = _parts(source, rename, lidar_frame, camera_frame)
             made, guess = _rig_of_files(
                 parts, parse_names("--mount", mount), dataset, forward=forward,
-                size_px=_size_px(size), sigmas=sigmas, progress=progress,
+                size_px=_size_px(size), sigmas=sigmas, progress=progress
             )  # fmt: skip
         notes = [f"note: {note}" for note in parts.notes]
     _finish(made, guess, notes, topics, out=out, correct=correct or (), as_json=as_json)

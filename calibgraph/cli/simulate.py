@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments
@@ -23,25 +23,23 @@ _PANEL = "Scenario street"
 def simulate(
     scenario: Annotated[
         str,
-        typer.Argument(
+        Argument(
             metavar="SCENARIO",
             help="street: a dataset of scans and images of a drive along a procedural street. "
             "kitti, walkley, surround, fisheye: a table of correspondences, with the errors of the "
             "paper's matcher (kitti, walkley) or in between.",
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")],
-    frames: Annotated[int, typer.Option(help="Number of frames.")] = 10,
+    out: Annotated[Path, Option(metavar="DIR", help="Folder to write.")],
+    frames: Annotated[int, Option(help="Number of frames.")] = 10,
     rotation_deg: Annotated[
-        float, typer.Option(min=0, help="Rotation error of the guess, rig.yaml.")
+        float, Option(min=0, help="Rotation error of the guess, rig.yaml.")
     ] = 5.0,
-    translation_m: Annotated[
-        float, typer.Option(min=0, help="Translation error of the guess.")
-    ] = 0.3,
+    translation_m: Annotated[float, Option(min=0, help="Translation error of the guess.")] = 0.3,
     seed: options.Seed = 0,
     rig: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="NAME|RIG",
             rich_help_panel=_PANEL,
             help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
@@ -51,7 +49,7 @@ def simulate(
     ] = None,
     beams: Annotated[
         int | None,
-        typer.Option(
+        Option(
             metavar="16|32|64|128",
             rich_help_panel=_PANEL,
             help=f"Of the LiDAR; 32: ahead and to the left only. (default: {BEAMS})",
@@ -59,14 +57,11 @@ def simulate(
     ] = None,
     step_m: Annotated[
         float | None,
-        typer.Option(
-            rich_help_panel=_PANEL,
-            help=f"Mean distance between frames. (default: {STEP_M:g})",
-        ),
+        Option(rich_help_panel=_PANEL, help=f"Mean distance between frames. (default: {STEP_M:g})"),
     ] = None,
     sensor_errors: Annotated[
         float | None,
-        typer.Option(
+        Option(
             rich_help_panel=_PANEL,
             help="Of the LiDAR: 0 for an ideal one, 1 for errors as real ones have them: beam "
             "angles and widths, motion during a turn, ranges on dark surfaces. (default: 0)",
@@ -74,7 +69,7 @@ def simulate(
     ] = None,
     vary_layout: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--vary-layout",
             rich_help_panel=_PANEL,
             help="Draw also the street's width, curves, gardens and heights by the seed; "

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import bag_options_from, checked_arguments, matcher_from
@@ -16,10 +17,10 @@ if TYPE_CHECKING:
 
 
 def track(
-    rig: Annotated[Path, typer.Argument(metavar="RIG", help="Rig with the initial guess.")],
+    rig: Annotated[Path, Argument(metavar="RIG", help="Rig with the initial guess.")],
     source: Annotated[
         list[Path],
-        typer.Argument(
+        Argument(
             metavar="SOURCE...",
             help="Table of correspondences (.parquet, .csv), a growing folder of them, or - for "
             "standard input (a JSON line per frame). With --matcher: dataset folders, KITTI "
@@ -28,23 +29,22 @@ def track(
     ],
     out: Annotated[
         Path,
-        typer.Option(
+        Option(
             metavar="DIR",
             help="Folder for the state, the result and a picture. A state in it is resumed.",
         ),
     ] = Path("tracking"),
-    every: Annotated[int, typer.Option(min=1, help="Take every N-th frame only.")] = 1,
+    every: Annotated[int, Option(min=1, help="Take every N-th frame only.")] = 1,
     follow: Annotated[
-        bool,
-        typer.Option("--follow", help="Wait for new files in the folder, until stopped."),
+        bool, Option("--follow", help="Wait for new files in the folder, until stopped.")
     ] = False,
     matcher: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Match the frames of a dataset: structure or cmrnext."),
+        Option(metavar="NAME", help="Match the frames of a dataset: structure or cmrnext."),
     ] = None,
     estimate: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="offset",
             help="Follow the time offset of each camera: how long after its points an image is "
             "taken. The motion of the LiDAR must be known.",

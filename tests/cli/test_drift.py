@@ -58,20 +58,10 @@ def test_a_wide_error_bar_exits_with_3(call: Call, week: Path) -> None:
     assert err.startswith("CANNOT TELL  drift: does one of the results deviate from the others?\n")
 
 
-def test_the_picture_is_drawn_and_replaces_only_its_own(
-    call: Call, week: Path, tmp_path: Path
-) -> None:
-    given = ("drift", week / "mon", week / "tue", week / "fri", "--plot")
-    for _ in range(2):
-        assert call(*given, tmp_path / "drift.png")[0] == 1
-    picture = Image.open(tmp_path / "drift.png")
-    assert min(picture.size) > 300
-    other = tmp_path / "other.png"
-    picture.save(other)
-    before = other.read_bytes()
-    assert "was not written by calibgraph drift" in error_line(*call(*given, other))
-    assert other.read_bytes() == before
-    assert ".png" in error_line(*call(*given, tmp_path / "drift.txt"))
+def test_the_picture_is_drawn(call: Call, week: Path, tmp_path: Path) -> None:
+    results = (week / day for day in ("mon", "tue", "fri"))
+    assert call("drift", *results, "--plot", tmp_path / "drift.png")[0] == 1
+    assert min(Image.open(tmp_path / "drift.png").size) > 300
 
 
 def test_dates_make_the_trend_one_per_day(call: Call, week: Path) -> None:

@@ -151,7 +151,7 @@ def test_a_result_of_much_metadata_is_replaced_but_no_table_of_others(
         replace(result, correspondences=long, warnings=(warning,)).save(tmp_path)
         assert load_calibration(tmp_path).warnings == (warning,)
     long.save(path)
-    with pytest.raises(FileError, match="was not written by calibgraph"):
+    with pytest.raises(FileError, match="is not the table of"):
         result.save(tmp_path)
     assert load_correspondences(path).metadata == long.metadata
 

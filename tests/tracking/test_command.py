@@ -52,18 +52,6 @@ def test_every_update_is_a_line_of_json(world: World, call: Call, tmp_path: Path
     }
 
 
-def test_the_report_of_a_result_that_is_replaced_does_not_stay(
-    world: World, call: Call, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    code, _, _ = call("solve", world.rig, world.source, "--out", out)
-    (out / "overlay_left.png").write_bytes(b"of the earlier result")
-    assert code != 2 and (out / "report.html").is_file()
-    code, _, err = call("track", world.rig, world.source, "--out", out)
-    assert code == 0, err
-    assert {path.name for path in out.iterdir()} == {"state", "calibration.yaml", "track.png"}
-
-
 @pytest.mark.parametrize("kind", ["lines", "by camera", "csv", "folder"])
 def test_every_source_gives_the_same_lines(
     kind: str, world: World, call: Call, piped: Callable[..., Any], tmp_path: Path

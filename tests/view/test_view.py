@@ -216,19 +216,16 @@ def test_a_missing_package_is_named(
         write(result, tmp_path / "file")
 
 
-def test_the_command_writes_both_and_replaces_only_its_own(
+def test_the_command_writes_both(
     call: Call, result: Calibration, tmp_path: Path
 ) -> None:
     result.save(tmp_path / "result")
     rrd, mcap = tmp_path / "a.rrd", tmp_path / "a.mcap"
-    for _ in range(2):
-        code, _, err = call("view", tmp_path / "result", "--rerun", rrd, "--mcap", mcap)
-        assert code == 0
-        assert f"{rrd}: written; the verdict is {result.verdict.status}\n" in err
+    code, _, err = call("report", tmp_path / "result", "--rerun", rrd, "--mcap", mcap)
+    assert code == 0
+    assert f"{rrd}: written; the verdict is {result.verdict.status}\n" in err
+    assert not (tmp_path / "result" / "report.html").exists()
     assert len(read_mcap(mcap)) == FRAMES * (3 + 4 * len(result.rig.cameras))
-    rrd.write_text("mine")
-    said = error_line(*call("view", tmp_path / "result", "--rerun", rrd))
-    assert "was not written by calibgraph view" in said
-    assert "nothing to write; give --rerun" in error_line(*call("view", tmp_path / "result"))
-    said = error_line(*call("view", tmp_path / "result", "--mcap", tmp_path / "a.bag"))
+    assert "is there already" in error_line(*call("report", tmp_path / "result", "--rerun", rrd))
+    said = error_line(*call("report", tmp_path / "result", "--mcap", tmp_path / "a.bag"))
     assert "must end in .mcap" in said
