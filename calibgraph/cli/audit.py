@@ -3,7 +3,6 @@
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
-from typing import Annotated
 
 import typer
 from typer import Argument, Option
@@ -16,17 +15,16 @@ _EXIT_CODES = {"OK": 0, "WRONG": 1, "CHANGED": 1, "CANNOT TELL": 3}
 
 
 def check(
-    rig: Annotated[
-        Path, Argument(metavar="RIG", help="The deployed calibration: a result or a rig.")
-    ],
+    *,
+    rig: Path = Argument(..., metavar="RIG", help="The deployed calibration: a result or a rig."),
     dataset: options.Datasets,
     tolerance_deg: options.ToleranceDeg = 0.5,
     tolerance_cm: options.ToleranceCm = 10.0,
     frames: options.Frames = None,
     seed: options.Seed = 0,
-    page: Annotated[
-        Path | None, Option(metavar="FILE.html", help="Show the answer on a page, with pictures.")
-    ] = None,
+    page: Path | None = Option(
+        None, metavar="FILE.html", help="Show the answer on a page, with pictures."
+    ),
     as_json: options.JsonOption = False,
     force: options.Force = False,
 ) -> None:
@@ -75,29 +73,23 @@ def check(
 
 
 def drift(
-    results: Annotated[
-        list[Path],
-        Argument(
-            metavar="RESULT...",
-            help="Results of one rig: their folders, or calibration.yaml files.",
-        ),
-    ],
-    days: Annotated[
-        str | None,
-        Option(
-            metavar="DAY,DAY,...",
-            help="When each was recorded, for the trend: dates like 2026-03-01, or numbers of "
-            "days. (default: the order given)",
-        ),
-    ] = None,
+    results: list[Path] = Argument(
+        ...,
+        metavar="RESULT...",
+        help="Results of one rig: their folders, or calibration.yaml files.",
+    ),
+    days: str | None = Option(
+        None,
+        metavar="DAY,DAY,...",
+        help="When each was recorded, for the trend: dates like 2026-03-01, or numbers of "
+        "days. (default: the order given)",
+    ),
     tolerance_deg: options.ToleranceDeg = 0.5,
     tolerance_cm: options.ToleranceCm = 10.0,
-    own_lenses: Annotated[
-        bool, Option("--own-lenses", help="Lenses may differ: several vehicles, each with its own.")
-    ] = False,
-    plot: Annotated[
-        Path | None, Option(metavar="FILE.png", help="Draw the deviations, per camera.")
-    ] = None,
+    own_lenses: bool = Option(
+        False, "--own-lenses", help="Lenses may differ: several vehicles, each with its own."
+    ),
+    plot: Path | None = Option(None, metavar="FILE.png", help="Draw the deviations, per camera."),
     as_json: options.JsonOption = False,
     force: options.Force = False,
 ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 from typer import Argument, Option
@@ -85,8 +85,8 @@ def calibrate(
 
 def match(
     dataset: options.Datasets,
-    out: Annotated[Path, Option(metavar="FILE", help="Table to write, .parquet or .csv.")] = Path(
-        "correspondences.parquet"
+    out: Path = Option(
+        Path("correspondences.parquet"), metavar="FILE", help="Table to write, .parquet or .csv."
     ),
     rig: options.RigFile = None,
     frames: options.Frames = None,
@@ -127,54 +127,42 @@ def match(
 
 
 def solve(
-    rig: Annotated[Path, Argument(metavar="RIG", help="Rig with the initial guess.")],
-    correspondences: Annotated[
-        Path,
-        Argument(
-            metavar="CORRESPONDENCES",
-            help="Table, .parquet or .csv, or a folder of .parquet files; larger than memory too.",
-        ),
-    ],
+    rig: Path = Argument(..., metavar="RIG", help="Rig with the initial guess."),
+    correspondences: Path = Argument(
+        ...,
+        metavar="CORRESPONDENCES",
+        help="Table, .parquet or .csv, or a folder of .parquet files; larger than memory too.",
+    ),
     out: options.ResultFolder = Path("calibration"),
-    terms: Annotated[
-        str | None,
-        Option(
-            metavar="full|reprojection|priors|stage1",
-            help="Terms of the objective. (default: full)",
-        ),
-    ] = None,
+    terms: str | None = Option(
+        None,
+        metavar="full|reprojection|priors|stage1",
+        help="Terms of the objective. (default: full)",
+    ),
     estimate: options.Estimate = None,
     of: options.Of = None,
-    camera_matches: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help="Features that cameras have in common: camera_matches.parquet of a result.",
-        ),
-    ] = None,
-    common_deg: Annotated[
-        float | None,
-        Option(
-            metavar="DEG",
-            min=0,
-            help="Error per axis that all frames share, 1 sigma; 0 if none. (default: as the "
-            "table states)",
-        ),
-    ] = None,
-    common_cm: Annotated[
-        float | None, Option(metavar="CM", min=0, help="Likewise, of the position.")
-    ] = None,
-    print_graph: Annotated[
-        bool,
-        Option(
-            "--print-graph",
-            callback=options.require_stdout,
-            help="Print every factor of the graph whose optimum is the result, in place of tables.",
-        ),
-    ] = False,
-    graph: Annotated[
-        Path | None, Option(metavar="FILE.dot", help="Write the graph in Graphviz's language.")
-    ] = None,
+    camera_matches: Path | None = Option(
+        None,
+        metavar="FILE",
+        help="Features that cameras have in common: camera_matches.parquet of a result.",
+    ),
+    common_deg: float | None = Option(
+        None,
+        metavar="DEG",
+        min=0,
+        help="Error per axis that all frames share, 1 sigma; 0 if none. (default: as the "
+        "table states)",
+    ),
+    common_cm: float | None = Option(None, metavar="CM", min=0, help="Likewise, of the position."),
+    print_graph: bool = Option(
+        False,
+        "--print-graph",
+        callback=options.require_stdout,
+        help="Print every factor of the graph whose optimum is the result, in place of tables.",
+    ),
+    graph: Path | None = Option(
+        None, metavar="FILE.dot", help="Write the graph in Graphviz's language."
+    ),
     config: options.ConfigFile = None,
     as_json: options.JsonOption = False,
     force: options.Force = False,

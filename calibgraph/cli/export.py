@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 from typer import Argument, Option
@@ -38,46 +38,38 @@ def _list_formats(format: str) -> str:
 
 
 def export(
-    source: Annotated[
-        Path, Argument(metavar="RESULT|RIG", help="Result (its folder or file), or a rig.")
-    ],
-    format: Annotated[
-        str,
-        Option(
-            metavar="FORMAT",
-            callback=_list_formats,
-            is_eager=True,
-            help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
-        ),
-    ],
-    out: Annotated[Path, Option(metavar="FILE", help="File to write; of camera_info a folder.")],
-    camera: Annotated[
-        list[str] | None,
-        Option(metavar="NAME", help="Only this camera; may be repeated. (default: all)"),
-    ] = None,
-    lidar_frame: Annotated[
-        str | None,
-        Option(metavar="FRAME", help="Frame id of the LiDAR. (default: its name in the rig)"),
-    ] = None,
-    camera_frame: Annotated[
-        str | None,
-        Option(
-            metavar="TEXT",
-            help="Frame id of optical frames; {camera} is the name. (default: the bag's, kept in "
-            "the rig, or {camera}_optical_frame)",
-        ),
-    ] = None,
-    lidar_pose: Annotated[
-        str | None,
-        Option(
-            metavar='"X Y Z ROLL PITCH YAW"',
-            help="Of autoware: where the LiDAR is mounted, in sensor_kit_base_link, metres and "
-            "radians as in URDF. (default: at its origin)",
-        ),
-    ] = None,
-    even_if_failed: Annotated[
-        bool, Option("--even-if-failed", help="Export although the verdict is FAIL.")
-    ] = False,
+    source: Path = Argument(
+        ..., metavar="RESULT|RIG", help="Result (its folder or file), or a rig."
+    ),
+    format: str = Option(
+        ...,
+        metavar="FORMAT",
+        callback=_list_formats,
+        is_eager=True,
+        help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
+    ),
+    out: Path = Option(..., metavar="FILE", help="File to write; of camera_info a folder."),
+    camera: list[str] | None = Option(
+        None, metavar="NAME", help="Only this camera; may be repeated. (default: all)"
+    ),
+    lidar_frame: str | None = Option(
+        None, metavar="FRAME", help="Frame id of the LiDAR. (default: its name in the rig)"
+    ),
+    camera_frame: str | None = Option(
+        None,
+        metavar="TEXT",
+        help="Frame id of optical frames; {camera} is the name. (default: the bag's, kept in "
+        "the rig, or {camera}_optical_frame)",
+    ),
+    lidar_pose: str | None = Option(
+        None,
+        metavar='"X Y Z ROLL PITCH YAW"',
+        help="Of autoware: where the LiDAR is mounted, in sensor_kit_base_link, metres and "
+        "radians as in URDF. (default: at its origin)",
+    ),
+    even_if_failed: bool = Option(
+        False, "--even-if-failed", help="Export although the verdict is FAIL."
+    ),
     force: options.Force = False,
 ) -> None:
     """Write a calibration in the format of another program, with its direction as a comment."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 from typer import Argument, Option
@@ -34,31 +34,24 @@ def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
 
 
 def report(
-    result: Annotated[
-        Path, Argument(metavar="RESULT", help="Result: its folder, or its calibration.yaml.")
-    ],
-    out: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE.html",
-            help="Page to write. (default: report.html in the folder; none with --rerun or --mcap)",
-        ),
-    ] = None,
-    rerun: Annotated[
-        Path | None,
-        Option(metavar="FILE.rrd", help="Recording for Rerun: `rerun FILE.rrd` shows it."),
-    ] = None,
-    mcap: Annotated[
-        Path | None, Option(metavar="FILE.mcap", help="Recording for Foxglove.")
-    ] = None,
-    dataset: Annotated[
-        list[Path] | None,
-        Option(
-            metavar="DATASET",
-            help="Where the images and clouds are now, if they have moved; repeat it for several "
-            "folders, in the order in which they were calibrated.",
-        ),
-    ] = None,
+    result: Path = Argument(
+        ..., metavar="RESULT", help="Result: its folder, or its calibration.yaml."
+    ),
+    out: Path | None = Option(
+        None,
+        metavar="FILE.html",
+        help="Page to write. (default: report.html in the folder; none with --rerun or --mcap)",
+    ),
+    rerun: Path | None = Option(
+        None, metavar="FILE.rrd", help="Recording for Rerun: `rerun FILE.rrd` shows it."
+    ),
+    mcap: Path | None = Option(None, metavar="FILE.mcap", help="Recording for Foxglove."),
+    dataset: list[Path] | None = Option(
+        None,
+        metavar="DATASET",
+        help="Where the images and clouds are now, if they have moved; repeat it for several "
+        "folders, in the order in which they were calibrated.",
+    ),
     force: options.Force = False,
 ) -> None:
     """Show a result: as one HTML page that opens without a network, or for viewers.
@@ -92,8 +85,8 @@ def report(
 
 
 def evaluate(
-    estimate: Annotated[Path, Argument(metavar="ESTIMATE", help="Rig to evaluate.")],
-    reference: Annotated[Path, Argument(metavar="REFERENCE", help="Rig to compare with.")],
+    estimate: Path = Argument(..., metavar="ESTIMATE", help="Rig to evaluate."),
+    reference: Path = Argument(..., metavar="REFERENCE", help="Rig to compare with."),
     as_json: options.JsonOption = False,
 ) -> None:
     """Compare an estimate with a reference: the paper's metrics, per camera and per pair.
@@ -115,16 +108,12 @@ def evaluate(
 
 
 def perturb(
-    rig: Annotated[Path, Argument(metavar="RIG", help="Rig to displace, usually a reference.")],
-    out: Annotated[
-        Path, Option(metavar="FILE.yaml", help="Rig file to write: the displaced guess.")
-    ],
-    rotation_deg: Annotated[float, Option(min=0, help="Angle, about a random axis.")] = 20.0,
-    translation_m: Annotated[float, Option(min=0, help="Length, in a random direction.")] = 1.5,
+    rig: Path = Argument(..., metavar="RIG", help="Rig to displace, usually a reference."),
+    out: Path = Option(..., metavar="FILE.yaml", help="Rig file to write: the displaced guess."),
+    rotation_deg: float = Option(20.0, min=0, help="Angle, about a random axis."),
+    translation_m: float = Option(1.5, min=0, help="Length, in a random direction."),
     seed: options.Seed = 0,
-    uniform: Annotated[
-        bool, Option("--uniform", help="Per axis, uniform within +- the values.")
-    ] = False,
+    uniform: bool = Option(False, "--uniform", help="Per axis, uniform within +- the values."),
     force: options.Force = False,
 ) -> None:
     """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses."""
@@ -154,14 +143,12 @@ def doctor(
     topic: options.Topic = None,
     motion: options.Motion = None,
     config: options.ConfigFile = None,
-    out: Annotated[
-        Path | None,
-        Option(
-            metavar="DIR",
-            help="Folder for guess_CAMERA.png, the guess on an image of each camera, and the "
-            "findings, doctor.json.",
-        ),
-    ] = None,
+    out: Path | None = Option(
+        None,
+        metavar="DIR",
+        help="Folder for guess_CAMERA.png, the guess on an image of each camera, and the "
+        "findings, doctor.json.",
+    ),
     as_json: options.JsonOption = False,
 ) -> None:
     """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""

@@ -1,7 +1,6 @@
 """The command of the learned matcher: what is in a file of weights."""
 
 from pathlib import Path
-from typing import Annotated
 
 from typer import Argument, Option
 
@@ -10,10 +9,8 @@ from calibgraph.cli.terminal import print_json, terminal
 
 
 def weights(
-    file: Annotated[Path, Argument(metavar="FILE", help="Weights, .tar or .safetensors.")],
-    out: Annotated[
-        Path | None, Option(metavar="FILE", help="Convert to this .safetensors file.")
-    ] = None,
+    file: Path = Argument(..., metavar="FILE", help="Weights, .tar or .safetensors."),
+    out: Path | None = Option(None, metavar="FILE", help="Convert to this .safetensors file."),
     as_json: options.JsonOption = False,
     force: options.Force = False,
 ) -> None:

@@ -2,7 +2,6 @@
 
 import webbrowser
 from pathlib import Path
-from typing import Annotated
 
 from typer import Option
 
@@ -14,20 +13,16 @@ from calibgraph.errors import CalibrationError
 
 def pick(
     dataset: options.Datasets,
-    out: Annotated[
-        Path,
-        Option(
-            metavar="DIR",
-            help="Folder of the session, which is continued if it is there, and of what it gives: "
-            "reference.yaml and picked.parquet.",
-        ),
-    ],
+    out: Path = Option(
+        ...,
+        metavar="DIR",
+        help="Folder of the session, which is continued if it is there, and of what it gives: "
+        "reference.yaml and picked.parquet.",
+    ),
     rig: options.RigFile = None,
     frames: options.Frames = None,
-    port: Annotated[
-        int, Option(min=0, max=65535, help="Of this machine. (default: any that is free)")
-    ] = 0,
-    show: Annotated[bool, Option("--show/--no-show", help="Open the page in the browser.")] = True,
+    port: int = Option(0, min=0, max=65535, help="Of this machine. (default: any that is free)"),
+    show: bool = Option(True, "--show/--no-show", help="Open the page in the browser."),
 ) -> None:
     """Pick a reference by hand: a page on which pixels and LiDAR points are paired.
 

@@ -6,7 +6,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from typer import Argument, Option
@@ -28,95 +28,75 @@ _SEARCH = "search"
 
 
 def rig(
-    source: Annotated[
-        list[str],
-        Argument(
-            metavar="SOURCE...",
-            help="A ROS bag; a folder with lidar/ and cameras/NAME/; or files: "
-            f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE.yaml",
-            help="Rig file to write. (default: rig.yaml in the folder; of bags and files none)",
-        ),
-    ] = None,
-    mount: Annotated[
-        list[str] | None,
-        Option(
-            metavar="NAME=WORDS",
-            help="How a camera is mounted: front, front-left, left, rear-left, rear, ...; then "
-            "NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, "
-            "NUMBER m|cm ahead|behind|left|right|above|below of the LiDAR; or search, in the "
-            "images of --dataset, although a file has an extrinsic. May be repeated.",
-        ),
-    ] = None,
-    lens: Annotated[
-        list[str] | None,
-        Option(
-            metavar="[NAME=]HOW",
-            help="Of a folder: how the lens of a camera, or of all, is known: calibration; a "
-            "horizontal field of view, as '90 deg'; or focal length and size of a pixel, as "
-            "'4 mm 3 um'. May be repeated. (default: asked in a terminal, else calibration)",
-        ),
-    ] = None,
-    dataset: Annotated[
-        list[Path] | None,
-        Option(
-            metavar="DATASET",
-            help="Images and clouds: cameras without words or an extrinsic in a file are searched "
-            "for over all headings. Slower, and less sure. May be repeated.",
-        ),
-    ] = None,
-    forward: Annotated[
-        str,
-        Option(metavar="+x|-x|+y|-y", help="Axis of the LiDAR frame that points ahead; z is up."),
-    ] = "+x",
+    source: list[str] = Argument(
+        ...,
+        metavar="SOURCE...",
+        help="A ROS bag; a folder with lidar/ and cameras/NAME/; or files: "
+        f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
+    ),
+    out: Path | None = Option(
+        None,
+        metavar="FILE.yaml",
+        help="Rig file to write. (default: rig.yaml in the folder; of bags and files none)",
+    ),
+    mount: list[str] | None = Option(
+        None,
+        metavar="NAME=WORDS",
+        help="How a camera is mounted: front, front-left, left, rear-left, rear, ...; then "
+        "NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, "
+        "NUMBER m|cm ahead|behind|left|right|above|below of the LiDAR; or search, in the "
+        "images of --dataset, although a file has an extrinsic. May be repeated.",
+    ),
+    lens: list[str] | None = Option(
+        None,
+        metavar="[NAME=]HOW",
+        help="Of a folder: how the lens of a camera, or of all, is known: calibration; a "
+        "horizontal field of view, as '90 deg'; or focal length and size of a pixel, as "
+        "'4 mm 3 um'. May be repeated. (default: asked in a terminal, else calibration)",
+    ),
+    dataset: list[Path] | None = Option(
+        None,
+        metavar="DATASET",
+        help="Images and clouds: cameras without words or an extrinsic in a file are searched "
+        "for over all headings. Slower, and less sure. May be repeated.",
+    ),
+    forward: str = Option(
+        "+x", metavar="+x|-x|+y|-y", help="Axis of the LiDAR frame that points ahead; z is up."
+    ),
     topic: options.Topic = None,
-    rename: Annotated[
-        list[str] | None,
-        Option(
-            metavar="OLD=NEW",
-            help="Another name of a camera, as its folder in the dataset; may be repeated.",
-        ),
-    ] = None,
-    lidar_frame: Annotated[
-        str | None, Option(metavar="FRAME", help="The LiDAR's frame. (default: the one named so)")
-    ] = None,
-    camera_frame: Annotated[
-        list[str] | None,
-        Option(
-            metavar="NAME=FRAME",
-            help="Frame of a camera, where the names differ; may be repeated. A frame with "
-            "'optical' in its name is x right, y down, z forward, others are x forward, z up.",
-        ),
-    ] = None,
-    size: Annotated[
-        str | None, Option(metavar="WIDTHxHEIGHT", help="Image size, for files that have none.")
-    ] = None,
-    tie_deg: Annotated[
-        float | None,
-        Option(
-            metavar="DEG",
-            min=0.001,
-            help="Relative poses are measured, with this sigma per axis; with --tie-m. (default: "
-            "0.1 of files as Kalibr's; those of a bag are only a guess)",
-        ),
-    ] = None,
-    tie_m: Annotated[
-        float | None,
-        Option(metavar="M", min=1e-5, help="The sigma in translation, per axis. (default: 0.005)"),
-    ] = None,
-    correct: Annotated[
-        list[str] | None,
-        Option(
-            metavar="[CAMERA=]MISTAKE",
-            help="Undo a mistake of the guess, by the name that doctor gives it, as inverse or "
-            "camera-flu; of all cameras or of one. May be repeated.",
-        ),
-    ] = None,
+    rename: list[str] | None = Option(
+        None,
+        metavar="OLD=NEW",
+        help="Another name of a camera, as its folder in the dataset; may be repeated.",
+    ),
+    lidar_frame: str | None = Option(
+        None, metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"
+    ),
+    camera_frame: list[str] | None = Option(
+        None,
+        metavar="NAME=FRAME",
+        help="Frame of a camera, where the names differ; may be repeated. A frame with "
+        "'optical' in its name is x right, y down, z forward, others are x forward, z up.",
+    ),
+    size: str | None = Option(
+        None, metavar="WIDTHxHEIGHT", help="Image size, for files that have none."
+    ),
+    tie_deg: float | None = Option(
+        None,
+        metavar="DEG",
+        min=0.001,
+        help="Relative poses are measured, with this sigma per axis; with --tie-m. (default: "
+        "0.1 of files as Kalibr's; those of a bag are only a guess)",
+    ),
+    tie_m: float | None = Option(
+        None, metavar="M", min=1e-5, help="The sigma in translation, per axis. (default: 0.005)"
+    ),
+    correct: list[str] | None = Option(
+        None,
+        metavar="[CAMERA=]MISTAKE",
+        help="Undo a mistake of the guess, by the name that doctor gives it, as inverse or "
+        "camera-flu; of all cameras or of one. May be repeated.",
+    ),
     as_json: options.JsonOption = False,
     force: options.Force = False,
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from typer import Argument, Option
 
@@ -21,61 +21,48 @@ _PANEL = "Scenario street"
 
 
 def simulate(
-    scenario: Annotated[
-        str,
-        Argument(
-            metavar="SCENARIO",
-            help="street: a dataset of scans and images of a drive along a procedural street. "
-            "kitti, walkley, surround, fisheye: a table of correspondences, with the errors of the "
-            "paper's matcher (kitti, walkley) or in between.",
-        ),
-    ],
-    out: Annotated[Path, Option(metavar="DIR", help="Folder to write.")],
-    frames: Annotated[int, Option(help="Number of frames.")] = 10,
-    rotation_deg: Annotated[
-        float, Option(min=0, help="Rotation error of the guess, rig.yaml.")
-    ] = 5.0,
-    translation_m: Annotated[float, Option(min=0, help="Translation error of the guess.")] = 0.3,
+    scenario: str = Argument(
+        ...,
+        metavar="SCENARIO",
+        help="street: a dataset of scans and images of a drive along a procedural street. "
+        "kitti, walkley, surround, fisheye: a table of correspondences, with the errors of the "
+        "paper's matcher (kitti, walkley) or in between.",
+    ),
+    out: Path = Option(..., metavar="DIR", help="Folder to write."),
+    frames: int = Option(10, help="Number of frames."),
+    rotation_deg: float = Option(5.0, min=0, help="Rotation error of the guess, rig.yaml."),
+    translation_m: float = Option(0.3, min=0, help="Translation error of the guess."),
     seed: options.Seed = 0,
-    rig: Annotated[
-        str | None,
-        Option(
-            metavar="NAME|RIG",
-            rich_help_panel=_PANEL,
-            help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
-            "(two that see more than a half-space), panorama (one that sees all round), sample "
-            f"(three small ones), or a rig file; its extrinsics are the truth. (default: {RIG})",
-        ),
-    ] = None,
-    beams: Annotated[
-        int | None,
-        Option(
-            metavar="16|32|64|128",
-            rich_help_panel=_PANEL,
-            help=f"Of the LiDAR; 32: ahead and to the left only. (default: {BEAMS})",
-        ),
-    ] = None,
-    step_m: Annotated[
-        float | None,
-        Option(rich_help_panel=_PANEL, help=f"Mean distance between frames. (default: {STEP_M:g})"),
-    ] = None,
-    sensor_errors: Annotated[
-        float | None,
-        Option(
-            rich_help_panel=_PANEL,
-            help="Of the LiDAR: 0 for an ideal one, 1 for errors as real ones have them: beam "
-            "angles and widths, motion during a turn, ranges on dark surfaces. (default: 0)",
-        ),
-    ] = None,
-    vary_layout: Annotated[
-        bool,
-        Option(
-            "--vary-layout",
-            rich_help_panel=_PANEL,
-            help="Draw also the street's width, curves, gardens and heights by the seed; "
-            "otherwise all streets are laid out alike.",
-        ),
-    ] = False,
+    rig: str | None = Option(
+        None,
+        metavar="NAME|RIG",
+        rich_help_panel=_PANEL,
+        help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
+        "(two that see more than a half-space), panorama (one that sees all round), sample "
+        f"(three small ones), or a rig file; its extrinsics are the truth. (default: {RIG})",
+    ),
+    beams: int | None = Option(
+        None,
+        metavar="16|32|64|128",
+        rich_help_panel=_PANEL,
+        help=f"Of the LiDAR; 32: ahead and to the left only. (default: {BEAMS})",
+    ),
+    step_m: float | None = Option(
+        None, rich_help_panel=_PANEL, help=f"Mean distance between frames. (default: {STEP_M:g})"
+    ),
+    sensor_errors: float | None = Option(
+        None,
+        rich_help_panel=_PANEL,
+        help="Of the LiDAR: 0 for an ideal one, 1 for errors as real ones have them: beam "
+        "angles and widths, motion during a turn, ranges on dark surfaces. (default: 0)",
+    ),
+    vary_layout: bool = Option(
+        False,
+        "--vary-layout",
+        rich_help_panel=_PANEL,
+        help="Draw also the street's width, curves, gardens and heights by the seed; "
+        "otherwise all streets are laid out alike.",
+    ),
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
     from calibgraph.file_sets import require_own_folder

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from typer import Argument, Option
@@ -17,39 +17,32 @@ if TYPE_CHECKING:
 
 
 def track(
-    rig: Annotated[Path, Argument(metavar="RIG", help="Rig with the initial guess.")],
-    source: Annotated[
-        list[Path],
-        Argument(
-            metavar="SOURCE...",
-            help="Table of correspondences (.parquet, .csv), a growing folder of them, or - for "
-            "standard input (a JSON line per frame). With --matcher: dataset folders, KITTI "
-            "sequences or ROS bags of one rig, as one drive.",
-        ),
-    ],
-    out: Annotated[
-        Path,
-        Option(
-            metavar="DIR",
-            help="Folder for the state, the result and a picture. A state in it is resumed.",
-        ),
-    ] = Path("tracking"),
-    every: Annotated[int, Option(min=1, help="Take every N-th frame only.")] = 1,
-    follow: Annotated[
-        bool, Option("--follow", help="Wait for new files in the folder, until stopped.")
-    ] = False,
-    matcher: Annotated[
-        str | None,
-        Option(metavar="NAME", help="Match the frames of a dataset: structure or cmrnext."),
-    ] = None,
-    estimate: Annotated[
-        str | None,
-        Option(
-            metavar="offset",
-            help="Follow the time offset of each camera: how long after its points an image is "
-            "taken. The motion of the LiDAR must be known.",
-        ),
-    ] = None,
+    rig: Path = Argument(..., metavar="RIG", help="Rig with the initial guess."),
+    source: list[Path] = Argument(
+        ...,
+        metavar="SOURCE...",
+        help="Table of correspondences (.parquet, .csv), a growing folder of them, or - for "
+        "standard input (a JSON line per frame). With --matcher: dataset folders, KITTI "
+        "sequences or ROS bags of one rig, as one drive.",
+    ),
+    out: Path = Option(
+        Path("tracking"),
+        metavar="DIR",
+        help="Folder for the state, the result and a picture. A state in it is resumed.",
+    ),
+    every: int = Option(1, min=1, help="Take every N-th frame only."),
+    follow: bool = Option(
+        False, "--follow", help="Wait for new files in the folder, until stopped."
+    ),
+    matcher: str | None = Option(
+        None, metavar="NAME", help="Match the frames of a dataset: structure or cmrnext."
+    ),
+    estimate: str | None = Option(
+        None,
+        metavar="offset",
+        help="Follow the time offset of each camera: how long after its points an image is "
+        "taken. The motion of the LiDAR must be known.",
+    ),
     interval_s: options.IntervalS = None,
     motion: options.Motion = None,
     weights: options.Weights = None,
