@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import inspect
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -20,7 +21,6 @@ import typer
 
 from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve
-from calibgraph.cli.declaration import declare, help_of
 from calibgraph.cli.export import export
 from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
 from calibgraph.cli.inspect import doctor, evaluate, perturb, report
@@ -73,15 +73,19 @@ def _options(
     """Options before the command; ``--debug`` is read by :func:`main`."""
 
 
+def _help_of(command: Callable[..., None]) -> str:
+    """Its docstring, a line per paragraph."""
+    text = inspect.getdoc(command) or ""
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in text.split("\n\n"))
+
+
 COMMANDS: tuple[Callable[..., None], ...] = (
     calibrate, check, drift, rig, doctor, match, solve, report, evaluate, export, track, pick,
-    simulate, perturb, weights,
+    simulate, perturb, weights, fleet, fleet_model, fleet_report, serve, token,
 )  # fmt: skip
 """In the order of the help."""
 for _command in COMMANDS:
-    app.command(_command.__name__, help=help_of(_command))(_command)
-for _command in (fleet, fleet_model, fleet_report, serve, token):
-    app.command(_command.__name__.replace("_", "-"), help=help_of(_command))(declare(_command))
+    app.command(_command.__name__.replace("_", "-"), help=_help_of(_command))(_command)
 
 
 def main() -> None:

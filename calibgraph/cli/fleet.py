@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
+from typer import Argument, Option
 
 from calibgraph.cli.options import JsonOption
 from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
@@ -20,36 +21,39 @@ if TYPE_CHECKING:
 
 
 def fleet(
-    manifest: str,
-    out: str = "fleet",
-    engine: str = "processes",
-    jobs: Annotated[int | None, typer.Option(min=1)] = None,
-    shard: str | None = None,
-    timeout_s: Annotated[float, typer.Option(min=0.001)] = 3600.0,
-    memory_gb: Annotated[float | None, typer.Option(min=0.1)] = None,
-    fetch_gb: Annotated[float, typer.Option(min=0.0)] = 50.0,
-    allow_missing: bool = False,
-    logs: Annotated[bool, typer.Option("--logs/--no-logs")] = True,
+    manifest: str = Argument(
+        ...,
+        metavar="MANIFEST",
+        help="Table of the vehicles: .parquet, .csv or .yaml, a path or URI. Columns: vehicle, "
+        "recording (folders, or a table of correspondences), rig, settings.",
+    ),
+    out: str = Option("fleet", metavar="URI", help="Folder or URI for the rows."),
+    engine: str = Option(
+        "processes",
+        metavar="NAME[:ADDRESS]",
+        help="Where jobs run: processes (here), ray, ray:ADDRESS, dask or dask:ADDRESS.",
+    ),
+    jobs: int | None = Option(None, min=1, help="Jobs at once. (default: one per core)"),
+    shard: str | None = Option(
+        None,
+        metavar="I/N",
+        help="Only part I of N, from 0; needed in an array of jobs. (default: all)",
+    ),
+    timeout_s: float = Option(3600.0, min=0.001, metavar="SECONDS", help="Longest time of a job."),
+    memory_gb: float | None = Option(
+        None, min=0.1, metavar="GB", help="Most memory of a job. (default: no limit)"
+    ),
+    fetch_gb: float = Option(50.0, min=0.0, metavar="GB", help="Most bytes of a remote recording."),
+    allow_missing: bool = Option(
+        False, "--allow-missing", help="Missing recordings become failed rows."
+    ),
+    logs: bool = Option(True, "--logs/--no-logs", help="Keep a log per vehicle below URI/_logs."),
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate many vehicles, each alone: a row per camera. What is finished is not done again.
 
     Exit 1 if a job failed or a camera's verdict is FAIL. Ctrl-C, a crash or a lost machine loses no
     published row: the same command goes on from there.
-
-    Args:
-        manifest (MANIFEST): Table of the vehicles: .parquet, .csv or .yaml, a path or URI. Columns:
-            vehicle, recording (folders, or a table of correspondences), rig, settings.
-        out (URI): Folder or URI for the rows.
-        engine (NAME[:ADDRESS]): Where jobs run: processes (here), ray, ray:ADDRESS, dask or
-            dask:ADDRESS.
-        jobs: Jobs at once. (default: one per core)
-        shard (I/N): Only part I of N, from 0; needed in an array of jobs. (default: all)
-        timeout_s (SECONDS): Longest time of a job.
-        memory_gb (GB): Most memory of a job. (default: no limit)
-        fetch_gb (GB): Most bytes of a remote recording.
-        allow_missing: Missing recordings become failed rows.
-        logs: Keep a log per vehicle below URI/_logs.
     """
     import os
 
@@ -106,18 +110,20 @@ def _print(summary: Summary, out: str, *, as_json: bool) -> None:
 
 
 def fleet_report(
-    rows: str,
-    out: Path = Path("fleet.html"),
-    before: str | None = None,
-    link: str = "",
+    rows: str = Argument(
+        ..., metavar="URI", help="What calibgraph fleet wrote: a folder or a URI."
+    ),
+    out: Path = Option(Path("fleet.html"), metavar="PAGE", help="Page to write, .html."),
+    before: str | None = Option(
+        None,
+        metavar="URI",
+        help="Earlier rows to compare with. (default: those of a week before the newest)",
+    ),
+    link: str = Option(
+        "", metavar="TEMPLATE", help="Of a vehicle's own report: vehicles/{vehicle}/report.html"
+    ),
 ) -> None:
-    """One page for a whole fleet: which cameras deviate, what changed, how poses are spread.
-
-    Args:
-        out (PAGE): Page to write, .html.
-        before (URI): Earlier rows to compare with. (default: those of a week before the newest)
-        link (TEMPLATE): Of a vehicle's own report: vehicles/{vehicle}/report.html
-    """
+    """One page for a whole fleet: which cameras deviate, what changed, how poses are spread."""
     from calibgraph.files import require_place_for_file
     from calibgraph.fleet.page import write_fleet_report
     from calibgraph.fleet.rows import read_rows
@@ -129,18 +135,20 @@ def fleet_report(
 
 
 def fleet_model(
-    rows: str,
-    out: Path = Path("fleet_model"),
-    rig: list[str] | None = None,
+    rows: str = Argument(
+        ..., metavar="URI", help="What calibgraph fleet wrote: a folder or a URI."
+    ),
+    out: Path = Option(Path("fleet_model"), metavar="DIR", help="Folder to write."),
+    rig: list[str] | None = Option(
+        None,
+        metavar="[MODEL=]RIG",
+        help="A rig of a model of vehicle, for its lenses: a prior for its next vehicle is "
+        "written. Repeat it for further models.",
+    ),
 ) -> None:
     """What a fleet knows: nominal rigs with spreads, improved estimates, priors for new vehicles.
 
     Writes fleet_model.json, estimates.parquet and, with --rig, prior_MODEL.yaml and one per batch.
-
-    Args:
-        out (DIR): Folder to write.
-        rig ([MODEL=]RIG): A rig of a model of vehicle, for its lenses: a prior for its next vehicle
-            is written. Repeat it for further models.
     """
     from calibgraph.file_sets import require_own_folder
     from calibgraph.fleet.model import fit_fleet

@@ -1,9 +1,9 @@
 """The commands of the service: serve, token."""
 
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TypeVar
 
-import typer
+from typer import Argument, Option
 
 from calibgraph.cli.arguments import require_service
 from calibgraph.cli.terminal import print_plain, terminal
@@ -14,58 +14,57 @@ _GB = 10**9
 
 
 def serve(
-    data: Path = Path("calibgraph-service"),
-    host: str = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535)] = 8080,
-    tokens: Path | None = None,
-    host_name: list[str] | None = None,
-    root: list[str] | None = None,
-    database: str | None = None,
-    jobs: Annotated[int | None, typer.Option(min=0)] = None,
-    jobs_per_tenant: Annotated[int | None, typer.Option(min=1)] = None,
-    queue: Annotated[int, typer.Option(min=0)] = 1000,
-    timeout_s: Annotated[float, typer.Option(min=0.001)] = 3600.0,
-    memory_gb: Annotated[float, typer.Option(min=0.1)] = 8.0,
-    upload_gb: Annotated[float, typer.Option(min=0.001)] = 20.0,
-    fetch_gb: Annotated[float, typer.Option(min=0.001)] = 50.0,
-    free_gb: Annotated[float, typer.Option(min=0.0)] = 1.0,
-    keep_days: Annotated[float, typer.Option(min=0.001)] = 30.0,
-    tracker_processes: Annotated[int, typer.Option(min=0)] = 2,
-    trackers: Annotated[int, typer.Option(min=0)] = 200,
-    api_docs: str = "token",
-    grace_s: Annotated[float, typer.Option(min=0.001)] = 10.0,
-    certificate: Path | None = None,
-    key: Path | None = None,
+    data: Path = Option(
+        Path("calibgraph-service"), metavar="DIR", help="Folder for jobs, results and trackers."
+    ),
+    host: str = Option("127.0.0.1", help="Address to listen on."),
+    port: int = Option(8080, min=0, max=65535, help="Port to listen on."),
+    tokens: Path | None = Option(
+        None,
+        metavar="FILE",
+        help="Who may call, see calibgraph token. (default: anyone on this machine)",
+    ),
+    host_name: list[str] | None = Option(
+        None, metavar="NAME", help="Name the server is called by; may be repeated."
+    ),
+    root: list[str] | None = Option(
+        None, metavar="URI", help="Folder that jobs may read from; may be repeated."
+    ),
+    database: str | None = Option(
+        None, metavar="URL", help="postgresql+psycopg://... (default: SQLite in DIR)"
+    ),
+    jobs: int | None = Option(None, min=0, help="Jobs at once. (default: one per core)"),
+    jobs_per_tenant: int | None = Option(
+        None,
+        min=1,
+        metavar="N",
+        help="Jobs at once of one tenant. (default: all but one, if there are several tenants)",
+    ),
+    queue: int = Option(1000, min=0, help="Most jobs of a tenant that wait."),
+    timeout_s: float = Option(3600.0, min=0.001, metavar="SECONDS", help="Longest time of a job."),
+    memory_gb: float = Option(8.0, min=0.1, metavar="GB", help="Most memory of a job."),
+    upload_gb: float = Option(20.0, min=0.001, metavar="GB", help="Largest upload, unpacked too."),
+    fetch_gb: float = Option(
+        50.0, min=0.001, metavar="GB", help="Most bytes of a remote recording."
+    ),
+    free_gb: float = Option(1.0, min=0.0, metavar="GB", help="With less on the disk, refuse jobs."),
+    keep_days: float = Option(30.0, min=0.001, metavar="DAYS", help="How long results are kept."),
+    tracker_processes: int = Option(2, min=0, help="Processes that hold the trackers."),
+    trackers: int = Option(200, min=0, help="Most trackers of a tenant."),
+    api_docs: str = Option(
+        "token",
+        metavar="token|open|off",
+        help="Who may read /docs and /openapi.json: whoever has a token, anyone, no one.",
+    ),
+    grace_s: float = Option(
+        10.0, min=0.001, metavar="SECONDS", help="For running jobs, at the end."
+    ),
+    certificate: Path | None = Option(None, metavar="FILE", help="TLS certificate chain, PEM."),
+    key: Path | None = Option(None, metavar="FILE", help="Its private key."),
 ) -> None:
     """Calibrate, check and track for others, over HTTP, until stopped.
 
     Ctrl-C and SIGTERM lose nothing: jobs that run wait for the next start, as after a crash.
-
-    Args:
-        data (DIR): Folder for jobs, results and trackers.
-        host: Address to listen on.
-        port: Port to listen on.
-        tokens (FILE): Who may call, see calibgraph token. (default: anyone on this machine)
-        host_name (NAME): Name the server is called by; may be repeated.
-        root (URI): Folder that jobs may read from; may be repeated.
-        database (URL): postgresql+psycopg://... (default: SQLite in DIR)
-        jobs: Jobs at once. (default: one per core)
-        jobs_per_tenant (N): Jobs at once of one tenant. (default: all but one, if there are several
-            tenants)
-        queue: Most jobs of a tenant that wait.
-        timeout_s (SECONDS): Longest time of a job.
-        memory_gb (GB): Most memory of a job.
-        upload_gb (GB): Largest upload, unpacked too.
-        fetch_gb (GB): Most bytes of a remote recording.
-        free_gb (GB): With less on the disk, refuse jobs.
-        keep_days (DAYS): How long results are kept.
-        tracker_processes: Processes that hold the trackers.
-        trackers: Most trackers of a tenant.
-        api_docs (token|open|off): Who may read /docs and /openapi.json: whoever has a token,
-            anyone, no one.
-        grace_s (SECONDS): For running jobs, at the end.
-        certificate (FILE): TLS certificate chain, PEM.
-        key (FILE): Its private key.
     """
     require_service()
     from calibgraph.service.app import create_app
@@ -112,17 +111,15 @@ def _announce(url: str, tokens: Path | None) -> None:
 
 
 def token(
-    file: Path,
-    tenant: Annotated[str, typer.Option()],
-    scope: str = "submit",
+    file: Path = Argument(..., metavar="FILE", help="Token file; made if it is not there."),
+    tenant: str = Option(..., metavar="NAME", help="Whose jobs the token sees."),
+    scope: str = Option(
+        "submit",
+        metavar="read|submit|admin",
+        help="Look; ask and cancel too; or all of it, of all tenants.",
+    ),
 ) -> None:
-    """Make a token for the service and print it: the file keeps its hash only.
-
-    Args:
-        file (FILE): Token file; made if it is not there.
-        tenant (NAME): Whose jobs the token sees.
-        scope (read|submit|admin): Look; ask and cancel too; or all of it, of all tenants.
-    """
+    """Make a token for the service and print it: the file keeps its hash only."""
     from calibgraph.service.access import SCOPES, add_token
 
     print(add_token(file, tenant, _one_of(SCOPES, "--scope", scope)))

@@ -33,13 +33,13 @@ calibrate {sample} --config both.yaml | start_from: Input should be 'frame' or '
 calibrate {sample} --config tpu.yaml | device: Input should be 'auto', 'cpu' or 'cuda'
 calibrate bag --topic lidar | expected NAME=/TOPIC
 calibrate bag --config stamps.yaml | stamps: Input should be 'header' or 'record'
-calibrate bag --config sync.yaml | do not meet; set stamps: record
+calibrate bag --config sync.yaml | set stamps: record in --config if the clocks differ
 solve nothing.yaml table.parquet | no such file
 solve rig.yaml half.parquet | cannot be read as Parquet
 solve bad.yaml table.parquet | unknown key
 solve rig.yaml table.parquet --config lambda.yaml | unknown key 'lambda'
 solve rig.yaml table.parquet --config negative.yaml | gate_px
-solve rig.yaml table.parquet --config preset.yaml | preset: Input should be 'auto'
+solve rig.yaml table.parquet --config preset.yaml | preset: Input should be 'kitti', 'walkley'
 solve rig.yaml table.parquet --terms all | terms: Input should be 'stage1'
 solve rig.yaml table.parquet --print-graph --json | both print; choose one
 solve rig.yaml table.parquet --graph graph.png | must end in .dot
@@ -47,13 +47,13 @@ match {sample} --out table.txt | must end in .parquet or .csv
 evaluate nothing.yaml rig.yaml | no such file or folder; name a rig file
 evaluate empty rig.yaml | name a rig file, a result
 evaluate rig.yaml {sample}/reference.yaml | not in the reference
-perturb {sample} --out n.yaml --translation-m inf | translation
-perturb {sample} --out n.yaml --rotation-deg nan | rotation
-perturb {sample} --out {sample} | is a folder
+perturb {sample} --out n.yaml --translation-m inf | a length >= 0 m, found 20.0 deg and inf m
+perturb {sample} --out n.yaml --rotation-deg nan | expected an angle within 0 to 180 deg
+perturb {sample} --out {sample} | must end in .yaml
 export {sample} --out never --format ros | format 'ros'
 export {sample} --out never --format tf2 --camera rear | camera 'rear'
 export {sample} --out never --format autoware --lidar-pose 1,2 | --lidar-pose '1,2': give six
-export {sample} --out never --format autoware --lidar-pose 0,0,0,0,0,90 | roll, pitch, yaw are 0, 0, 90 rad
+export {sample} --out never --format autoware --lidar-pose 0,0,0,0,0,90 | yaw are 0, 0, 90 rad
 export {sample} --out never --format autoware --lidar-pose 0,0,nan,0,0,0 | not finite
 export {sample} --out never --format tf2 --lidar-pose 0,0,0,0,0,0 | autoware only
 export {sample} --out never --format tf2 --camera-frame camera | two are the same

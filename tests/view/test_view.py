@@ -216,9 +216,7 @@ def test_a_missing_package_is_named(
         write(result, tmp_path / "file")
 
 
-def test_the_command_writes_both(
-    call: Call, result: Calibration, tmp_path: Path
-) -> None:
+def test_the_command_writes_both(call: Call, result: Calibration, tmp_path: Path) -> None:
     result.save(tmp_path / "result")
     rrd, mcap = tmp_path / "a.rrd", tmp_path / "a.mcap"
     code, _, err = call("report", tmp_path / "result", "--rerun", rrd, "--mcap", mcap)

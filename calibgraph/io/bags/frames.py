@@ -213,7 +213,7 @@ def _advice(stamps: Mapping[str, TopicStamps], topics: RigTopics, pairs: Mapping
     if len(apart):
         return (
             f"the nearest images of {describe_offsets(worst, apart)}; set stamps: record in "
-            "--config if the clocks differ, or a larger sync_tolerance_s in --config if that is acceptable"
+            "--config if the clocks differ, or a larger sync_tolerance_s if that is acceptable"
         )
     spans = [
         f"{topic} {stamps[topic].stamp_ns[0] / _S:.3f} to {stamps[topic].stamp_ns[-1] / _S:.3f} s"
@@ -221,5 +221,5 @@ def _advice(stamps: Mapping[str, TopicStamps], topics: RigTopics, pairs: Mapping
     ]
     return (
         f"the stamps of {' and of '.join(spans)} do not meet; set stamps: record in --config if "
-        "the clocks differ, or a larger sync_tolerance_s in --config"
+        "the clocks differ, or a larger sync_tolerance_s"
     )
