@@ -72,7 +72,7 @@ def simulate(
     common: dict[str, Any] = {
         "frames": frames, "rotation_deg": rotation_deg, "translation_m": translation_m, "seed": seed
     }  # fmt: skip
-    of_street = {
+    of_street: dict[str, Any] = {
         "rig": rig, "beams": beams, "step_m": step_m, "sensor_errors": sensor_errors,
         "vary_layout": vary_layout or None,
     }  # fmt: skip
