@@ -15,7 +15,7 @@ export PYTHONDONTWRITEBYTECODE :=
 help: ## Show this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-TEST := [test,simulation,learned,ros,ray,dask,view,service,postgres]
+TEST := [test,simulation,learned,ros,fleet,view,service,postgres]
 DOCS := $(TEST:]=,docs])
 
 # One call of pip, and modules are compiled on all cores; those of other versions of Python cannot be.
@@ -70,7 +70,6 @@ docs: $(VENV)/docs ## Build the documentation into build/docs, without a network
 bench: $(VENV)/test ## Compare ratios of processor times with the last release's; measure parts by themselves
 	$(BIN)/python -m benchmarks.speed.gate --against benchmarks/ratios.json
 	$(BIN)/python -m benchmarks.speed.stages data/sample
-	$(BIN)/python -m benchmarks.speed.kernel
 	$(BIN)/python -m benchmarks.speed.solve --frames 10 100 --cameras 2
 	$(BIN)/python -m benchmarks.speed.solve --frames 20 --cameras 12 --matches 500
 	$(BIN)/python -m benchmarks.speed.scaling --rows 1e3 1e5 1e7

@@ -81,11 +81,15 @@ class Entry:
         return Entry(**content, tables=tables)
 
 
-def add_record_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--record`` to the options of a benchmark."""
+def parser_of(description: str | None) -> argparse.ArgumentParser:
+    """The options that every benchmark has: ``--record``."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument(
         "--record", action="store_true", help="append the tables to benchmarks/results"
     )
+    return parser
 
 
 def publish(benchmark: str, tables: Sequence[Table], *, record: bool) -> None:

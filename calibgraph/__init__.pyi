@@ -8,6 +8,9 @@ from .audit import LidarAudit as LidarAudit
 from .audit import Trend as Trend
 from .audit import check as check
 from .audit import drift as drift
+from .audit.fleet_model import FleetModel as FleetModel
+from .audit.fleet_model import fit_fleet as fit_fleet
+from .audit.observations import observe as observe
 from .audit.page import write_audit_report as write_audit_report
 from .doctor import Diagnosis as Diagnosis
 from .doctor import diagnose as diagnose
@@ -16,9 +19,6 @@ from .errors import CorrespondenceError as CorrespondenceError
 from .errors import DatasetError as DatasetError
 from .errors import FileError as FileError
 from .errors import RigError as RigError
-from .fleet.model import FleetModel as FleetModel
-from .fleet.model import fit_fleet as fit_fleet
-from .fleet.observations import observe as observe
 from .fleet.page import write_fleet_report as write_fleet_report
 from .fleet.rows import read_rows as read_rows
 from .fleet.run import run_fleet as run_fleet
@@ -71,8 +71,8 @@ from .model.verdict import Check as Check
 from .model.verdict import Verdict as Verdict
 from .pipeline import calibrate as calibrate
 from .pipeline import solve as solve
+from .simulation.correspondences import MatcherErrors as MatcherErrors
 from .simulation.correspondences import simulate_correspondences as simulate_correspondences
-from .simulation.matcher_errors import MatcherErrors as MatcherErrors
 from .simulation.recording import simulate_street as simulate_street
 from .tracking import DurableCalibrator as DurableCalibrator
 from .tracking import Event as Event

@@ -10,15 +10,18 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.bags import BagOptions, is_bag
+from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.dataset_folders import frames_of_folder
 from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import Frame, hash_source
 from calibgraph.io.rigs import load_rig
+from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.camera_pairs import overlapping_pairs
 from calibgraph.matching.cloud_similarity import find_up
 from calibgraph.matching.frame_choice import choose_frames
 from calibgraph.matching.places import UNKNOWN_UP, find_places
+from calibgraph.matching.same_images import find_same_images
 from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.matching.structure.matcher import MOST_FRAMES
 from calibgraph.model.places import as_groups, describe_places
@@ -97,6 +100,9 @@ def diagnose(
     if data is None:
         return Diagnosis(tuple(findings))
     findings += _describe(data)
+    findings += [Finding("error", line) for line in find_same_images(data, data.rig)]
+    data = hide_burnt_in(data, data.rig)
+    findings += [Finding("warning", line) for line in describe_burnt_in(data)]
     choice = choose_frames(data, data.rig, MOST_FRAMES)
     examined = choice.dataset
     findings += [Finding("note", choice.text)] if choice.text else []
@@ -170,6 +176,7 @@ def _examine_frames(frames: Sequence[Frame], rig: Rig, findings: list[Finding]) 
     for name in rig.cameras:
         text = describe_brightness(name, [e.brightness[name] for e in read if name in e.brightness])
         findings += [Finding("warning", text)] if text else []
+    findings += [Finding("note", line) for line in describe_thinned(e.points for e in read)]
     readable = [f for f, each in zip(frames, read, strict=True) if "" not in each.problems]
     findings += _repeats("cloud", [(f.name, f.cloud_path) for f in readable])
     for name in rig.cameras:
@@ -180,16 +187,17 @@ def _examine_frames(frames: Sequence[Frame], rig: Rig, findings: list[Finding]) 
 
 @dataclass
 class _Examined:
-    """A frame: problems of its cloud ("") and of images, and the mean levels of these."""
+    """A frame: problems of its cloud ("") and of images, its points, and mean levels of images."""
 
     problems: dict[str, str] = field(default_factory=dict)
+    points: int = 0
     brightness: dict[str, float] = field(default_factory=dict)
 
 
 def _examine_frame(frame: Frame, rig: Rig) -> _Examined:
     found = _Examined()
     try:
-        frame.load_cloud()
+        found.points = len(frame.load_cloud())
     except (CalibrationError, OSError) as error:
         found.problems[""] = str(error)
     for name, camera in rig.cameras.items():

@@ -16,7 +16,8 @@ _TIMES_SURFACES = 2  # the second changes results by up to 0.003 deg and 0.2 cm,
 def refine_with_camera_pairs(run: MatchingRun, progress: Progress) -> MatchingRun:
     """Match the cameras with each other, and refine the solution with what they see in common.
 
-    Not the cameras that the matcher did not find: they would spoil the others.
+    Not the cameras that the matcher did not find, nor a pair whose features contradict what it
+    found: they would spoil the others.
 
     Args:
         run: all of its rounds are done.
@@ -38,10 +39,11 @@ def refine_with_camera_pairs(run: MatchingRun, progress: Progress) -> MatchingRu
 def _match_cameras(run: MatchingRun, progress: Progress) -> CameraMatches | None:
     """The matches of the cameras that can overlap; None if there are none."""
     with run.watch("match_cameras"):
-        missed = run.correspondences.findings.missed.keys()
+        findings = run.correspondences.findings
+        missed, other = findings.missed.keys(), findings.contradicted
         cloud = run.dataset.frames[0].load_cloud()
         near = overlapping_pairs(run.solution.solved_rig, cloud)
-        pairs = [pair for pair in near if missed.isdisjoint(pair)]
+        pairs = [(a, b) for a, b in near if missed.isdisjoint((a, b)) and other.get(a) != b]
         if not pairs:
             return None
         rig = run.guess.with_lenses_of(run.solution.solved_rig)  # as far as they are estimated

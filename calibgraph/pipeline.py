@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibgraph.elsewhere import go_on_elsewhere
+from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.camera_matches import CameraMatches
@@ -81,11 +82,14 @@ def calibrate(
         run = refine_with_camera_pairs(run, report)  # what cameras see in common
         with run.watch("hash_inputs"):
             inputs = hash_inputs(run.dataset)
+        thinned = describe_thinned(len(frame.load_cloud()) for frame in run.dataset.frames)
         evidence = go_on_elsewhere(RunEvidence(run, inputs, report))  # where the rounds ended wrong
         run = evidence.run
         with run.watch("checks"):
             checks = assess_run(evidence)
             record = to_metadata(evidence.solution, checks)
+    for line in thinned:
+        _log.warning(line)
     report("done", 1, 1)
     table = run.correspondences
     return replace(
@@ -93,7 +97,7 @@ def calibrate(
         correspondences=table.with_metadata({**table.metadata, **record}),
         frames=tuple(frame.entry() for frame in run.dataset.frames),
         rounds=run.rounds,
-        warnings=run.warnings,
+        warnings=(*run.warnings, *thinned),
         inputs=inputs,
         timings_s=run.watch.seconds,
     )

@@ -15,6 +15,7 @@ from pathlib import Path
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.kept_frames import keep_frames
+from calibgraph.matching.burnt_in import hide_burnt_in
 from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
 from calibgraph.matching.cloud_similarity import find_up
 from calibgraph.matching.frame_choice import FrameChoice, choose_frames, without_copies
@@ -29,6 +30,7 @@ from calibgraph.matching.run import (
     summarize_round,
     with_motion,
 )
+from calibgraph.matching.same_images import require_different_images
 from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
@@ -72,7 +74,7 @@ def match_in_rounds(
     full = find_matcher(matcher, seed=config.seed).with_estimate(config.estimate)
     with watch("choose_frames"):
         choice, guess = _open(dataset, rig, full.most_frames)
-    data = keep_frames(choice.dataset)
+    data = choice.dataset
     _log.info("%d frames, cameras %s", len(data.frames), ", ".join(guess.cameras))
     with watch("inputs"):
         require_known_motion(data, full, config.estimate)
@@ -150,6 +152,9 @@ def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[
     """The frames that the matcher is given, and the initial guess."""
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     guess = rig if rig is not None else data.rig
+    data = keep_frames(data)
+    require_different_images(data, guess)
+    data = keep_frames(hide_burnt_in(data, guess))
     if most_frames is None:
         choice = without_copies(data)
     else:

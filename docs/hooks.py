@@ -13,7 +13,7 @@ from mkdocs.structure.pages import Page
 from tables import PART
 
 ROOT = Path(__file__).resolve().parents[1]
-PICTURES = ("data/overlay.png", "data/track.png")
+PICTURES = ("data/overlay.webp", "data/track.png")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

@@ -10,8 +10,8 @@ from calibgraph.trust.thresholds import LIMITS, THRESHOLDS, Limit
 def thresholds_markdown() -> str:
     """Both tables in Markdown, a line per row."""
     lines = [
-        "| key | question | measured | PASS | FAIL (else WARN) | reason, or the data it is from |",
-        "|---|---|---|---|---|---|",
+        "| key | question | PASS | FAIL (else WARN) | reason, or the data it is from |",
+        "|---|---|---|---|---|",
         *(_line(row) for row in THRESHOLDS),
         "",
         "\\* At the default tolerance of "
@@ -37,5 +37,5 @@ def _line(row: Threshold) -> str:
     fails = "never"
     if is_reachable(row.fail, row.unit, row.direction):
         fails = f"{beyond} {in_unit(row.fail, row.unit, digits=4)}"
-    cells = (f"`{row.key}`", row.question, row.name, passes, fails, row.reason)
+    cells = (f"`{row.key}`", row.question, passes, fails, row.reason)
     return f"| {' | '.join(cells)} |"

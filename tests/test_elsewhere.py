@@ -13,12 +13,11 @@ import pytest
 import calibgraph
 from calibgraph import Config
 from calibgraph.arrays import Array
-from calibgraph.elsewhere import go_on_elsewhere, groups_elsewhere
+from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.verdict import TOLERANCE, WENT_ON, Check
 from calibgraph.progress import no_progress
-from calibgraph.rematch import LastRound, with_cameras_of
 from calibgraph.rounds import match_in_rounds
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.pose_posterior import PosePosterior
@@ -63,11 +62,6 @@ def follow(run: MatchingRun, *posteriors: PosePosterior) -> tuple[RunEvidence, R
         return evidence, go_on_elsewhere(evidence)
 
 
-def test_a_result_that_the_images_do_not_doubt_stays(run: MatchingRun) -> None:
-    before, after = follow(run, told(np.full(6, 0.01), share=0.49))
-    assert after is before
-
-
 def test_rounds_go_on_from_where_the_images_say(run: MatchingRun) -> None:
     away = np.r_[0.0, np.radians(0.6), 0.0, 0.0, 0.0, 0.1]
     wrong = displaced(run, away, z_score=1.0)
@@ -95,21 +89,6 @@ def test_the_time_limit_holds(run: MatchingRun) -> None:
     wrong = replace(displaced(run, away, z_score=1.0), is_late=lambda: True)
     before, after = follow(wrong, told(-away, share=0.9))
     assert after is before
-
-
-def test_without_posteriors_no_camera_is_elsewhere(run: MatchingRun) -> None:
-    """As with terms that have no covariance, and matchers of one's own."""
-    evidence = RunEvidence(run, {})
-    with patch.object(RunEvidence, "_measure_posteriors", return_value={}):
-        assert evidence.solution.tied == [(ONE,)]
-        assert groups_elsewhere(evidence.solution) == []
-
-
-def test_a_camera_that_was_lost_at_the_second_end_is_not_an_error(run: MatchingRun) -> None:
-    findings = replace(run.correspondences.findings, z_score={})
-    again = LastRound(run.correspondences.with_findings(findings), run.solution, run.rounds[-1])
-    kept = with_cameras_of(run, again, {ONE})
-    assert kept.correspondences.findings.z_score == run.correspondences.findings.z_score
 
 
 def test_a_pose_that_the_posterior_chose_is_no_pass() -> None:

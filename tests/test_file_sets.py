@@ -64,14 +64,6 @@ def test_two_sets_are_not_mixed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert texts(tmp_path) == dict.fromkeys(NAMES, "second")
 
 
-def test_the_last_file_is_moved_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    moved = watch_moves(monkeypatch, tmp_path)
-    for text in ("old", "new"):
-        write_all(tmp_path, text)
-        assert (moved[-1].name, {path.name for path in moved}) == (LAST, {*NAMES})
-        moved.clear()
-
-
 def watch_moves(
     monkeypatch: pytest.MonkeyPatch, folder: Path, fails: int = 0, number: int = errno.EPERM
 ) -> list[Path]:
@@ -110,18 +102,6 @@ def test_an_error_between_the_moves_leaves_what_was_there(
 
 def refuse() -> None:
     raise OSError(errno.EPERM, "no hard links")
-
-
-def test_a_folder_without_place_for_a_temporary_one_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path / ".writing-1"))
-
-    monkeypatch.setattr("tempfile.mkdtemp", full)
-    with pytest.raises(OSError, match="cannot be written .No space.*free or mend") as caught:
-        write_all(tmp_path, "new")
-    assert caught.value.filename == str(tmp_path)
 
 
 KILLED = """

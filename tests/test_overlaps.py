@@ -86,13 +86,6 @@ def test_cameras_are_matched_through_the_lenses_that_were_estimated(
     assert pair_error(found.solved_rig, truth)[1] < 1.0
 
 
-def test_cameras_that_were_not_found_are_not_tied(data: Dataset, truth: Rig) -> None:
-    run = matched(data, table_of(truth, missed={PAIR[1]: 5.0}))
-    tied = refine_with_camera_pairs(run, no_progress)
-    assert tied.solution.before_pairs is None
-    assert tied.solution.optimum is run.solution.optimum
-
-
 def test_without_time_terms_or_files_the_run_stays_as_it_is(
     data: Dataset, truth: Rig, tmp_path: Path
 ) -> None:
@@ -106,14 +99,6 @@ def test_without_time_terms_or_files_the_run_stays_as_it_is(
     frames = tuple(replace(frame, image_paths=gone) for frame in data.frames)
     blind = replace(run, dataset=replace(data, frames=frames))
     assert refine_with_camera_pairs(blind, no_progress) is blind
-
-
-def test_a_single_camera_is_untouched(data: Dataset, truth: Rig) -> None:
-    one = Rig(cameras={"left": truth.cameras["left"]})
-    alone = replace(data, rig=one)
-    table = simulate_correspondences(one, frames=6, matches=100)
-    run = match_in_rounds(alone, one, table, progress=no_progress)
-    assert refine_with_camera_pairs(run, no_progress) is run
 
 
 @pytest.mark.usefixtures("no_image_checks")

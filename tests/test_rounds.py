@@ -9,8 +9,6 @@ import pytest
 import calibgraph
 from calibgraph import Config, CorrespondenceError, perturb, rounds, simulate_correspondences
 from calibgraph.model.geometry import pose_difference
-from calibgraph.progress import no_progress
-from calibgraph.rounds import match_in_rounds
 from calibgraph.solver.joint import solve_joint, solve_without_failing
 from tests.conftest import SAMPLE
 from tests.matching.structure.data import with_noise_images
@@ -75,9 +73,3 @@ def test_a_lone_camera_without_enough_matches_was_perhaps_not_found(
         with pytest.raises(CorrespondenceError, match=f"correspondences.*{reason}") as error:
             calibgraph.calibrate(data, rig, table)
         assert bool(missed) == ("not found" in str(error.value))
-
-
-def test_the_time_limit_is_the_first_thing_that_is_looked_at() -> None:
-    """It counts the time that choosing frames takes."""
-    with pytest.raises(ValueError, match="time limit must be positive"):
-        match_in_rounds("nowhere", time_limit_s=0.0, progress=no_progress)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import subprocess
 import sys
@@ -100,13 +99,3 @@ def test_kernels_that_take_all_cores_wait_for_each_other() -> None:
         text=True,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (0, "workqueue\n"), done.stderr
-
-
-def test_the_library_prints_nothing_and_logs(
-    capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.INFO, logger="calibgraph"):
-        solve(RIG, simulate_correspondences(RIG, frames=6, matches=100))
-    assert capfd.readouterr() == ("", "")
-    assert [record.name for record in caplog.records] == ["calibgraph.pipeline"]
-    assert caplog.messages[0].startswith("PASS")

@@ -17,29 +17,20 @@ A kind of check that no case had makes a FAIL by itself from its limit of WARN o
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize, minimize_scalar
+from scipy.optimize import minimize
 from scipy.special import expit, logit
 
 from benchmarks.accuracy import ledger
-from benchmarks.tables import ROOT, add_record_option
+from benchmarks.tables import ROOT, parser_of
 from calibgraph.model.verdict import FAIL_ABOVE
 from calibgraph.trust.probability import STRUCTURE, TABLES, WORST, steps
-from tools.probability_tables import judged
-from tools.verdict_samples import (
-    AMBIGUOUS,
-    SHARE_OFF,
-    Sample,
-    drop,
-    probabilities,
-    samples_of,
-)
+from tools.verdict_samples import AMBIGUOUS, SHARE_OFF, Sample, judged, samples_of
 
 Array = np.ndarray
 
@@ -122,31 +113,13 @@ def _most_probable(
     return complete(found)
 
 
-def with_intercept(model: dict[str, Any], samples: Sequence[Sample]) -> dict[str, Any]:
-    """The same weights with the intercept that suits the samples best."""
-    off = np.array([sample.off for sample in samples])
-    counts = np.where(off, SHARE_OFF / off.mean(), (1 - SHARE_OFF) / (1 - off.mean()))
-
-    def loss(intercept: float) -> float:
-        p = np.clip(probabilities({**model, "intercept": intercept}, samples), 1e-12, 1 - 1e-12)
-        return -float(counts @ np.log(np.where(off, p, 1 - p)))
-
-    found = minimize_scalar(loss, bounds=(-15.0, 0.0), method="bounded").x
-    return {**model, "intercept": round(float(found), 3)}
-
-
 def main() -> None:
     """Fit, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--tune", type=Path, nargs="+", default=[], help="files of verdicts")
     parser.add_argument("--count", type=Path, nargs="+", required=True, help="files of verdicts")
     parser.add_argument("--weights", type=Path, default=FILE, help="judged without --tune")
-    parser.add_argument("--without", default="", help="kinds of checks, left out of everything")
-    parser.add_argument("--keep-weights", action="store_true", help="fit the intercepts alone")
     parser.add_argument("--write", action="store_true", help="the weights into the package")
-    add_record_option(parser)
     options = parser.parse_args()
     sets = {
         name: [record for path in paths for record in ledger.read(path)]
@@ -155,20 +128,12 @@ def main() -> None:
     models, tables, records = {}, [], [record for each in sets.values() for record in each]
     for name, level in ((TABLES, "table"), (STRUCTURE, "data")):
         of_level = {
-            which: [
-                drop(sample, options.without.split(","))
-                for sample in samples_of(r for r in each if r["level"] == level)
-            ]
+            which: samples_of(r for r in each if r["level"] == level)
             for which, each in sets.items()
         }
         clear = [sample for sample in of_level["fitted"] if sample.kind not in AMBIGUOUS]
         present = json.loads(options.weights.read_text("utf-8"))["models"][name]
-        if not clear:
-            models[name] = present
-        else:
-            models[name] = (
-                with_intercept(present, clear) if options.keep_weights else fit(clear, name)
-            )
+        models[name] = fit(clear, name) if clear else present
         for which, samples in of_level.items():
             if samples:
                 tables += judged(f"{name}, {which}", models[name], samples)

@@ -13,7 +13,6 @@ all windows of one weight and with the network's.
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -25,16 +24,14 @@ import numpy as np
 import torch
 
 from benchmarks.accuracy import ledger
-from benchmarks.accuracy.alignment import aligned_rig
-from benchmarks.accuracy.error_bars import pair, wide
 from benchmarks.accuracy.scenes import Folders
-from benchmarks.tables import ROOT, Table, add_record_option, publish
+from benchmarks.tables import ROOT, Table, parser_of, publish
 from calibgraph import Dataset, Rig, load_dataset, simulate_street
 from calibgraph.files import write_text
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import score_windows
-from calibgraph.matching.structure.shift_scores import downscale_log_gray, select_windows
+from calibgraph.matching.structure.shift_scores import select_windows
 from calibgraph.matching.structure.visibility import find_places
 from calibgraph.matching.structure.window_kernels import FEATURES
 from calibgraph.matching.structure.window_weights import (
@@ -45,6 +42,7 @@ from calibgraph.matching.structure.window_weights import (
 )
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.simulation.scan_errors import draw_scan_errors
+from tools.scenes.sensor_streets import aligned_rig, pair, wide
 from tools.scenes.surroundings import SURROUNDINGS
 
 LEVEL = replace(LEVELS[3], weighed=False)
@@ -74,15 +72,12 @@ class Sample:
 
 def main() -> None:
     """Train, write, judge."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--scenes", type=Path, default=ROOT / "out" / "weights")
     parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--write", action="store_true", help="train, and write into the package")
     parser.add_argument("--judge", action="store_true", help="print the table of the recordings")
-    add_record_option(parser)
     options = parser.parse_args()
     if options.write:
         samples = [sample_of(*scene, "rendered") for scene in rendered(options.scenes)]
@@ -116,10 +111,9 @@ def sample_of(dataset: Dataset, rig: Rig, of: str, frames: int = 4) -> Sample:
         cloud = cache.cloud(frame)
         for name in rig.cameras.keys() & frame.image_paths.keys():
             camera = rig.cameras[name]
-            image, scale = downscale_log_gray(
-                cache.image(frame, name=name, camera=camera), camera, LEVEL.step_rad,
-                LEVEL.blur_steps,
-            )  # fmt: skip
+            image, scale = cache.image(frame, name=name, camera=camera).log_gray(
+                camera, LEVEL.step_rad, LEVEL.blur_steps
+            )
             windows = select_windows(cloud, camera, LEVEL, max_windows=MOST[of])
             viewpoint_m = cloud.viewpoint_lidar_m(camera)
             reach = min(REACH, round(LEVEL.reach_rad * camera.lens.pixels_per_rad * scale.max()))

@@ -15,8 +15,7 @@ An axis is significant, as the audit itself decides it, where its deviation is b
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,16 +23,29 @@ from pathlib import Path
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from benchmarks.accuracy import ledger
-from benchmarks.accuracy.audit_data import ONE_RIG, RECORDINGS, Sources, ring
-from benchmarks.accuracy.audit_tables import report
 from benchmarks.accuracy.ledger import Key, Record
-from benchmarks.tables import ROOT, add_record_option
-from calibgraph import Audit, CalibrationError, CameraAudit, Rig, check
+from benchmarks.accuracy.scenes import GUESS_DEG, GUESS_M, Folders
+from benchmarks.tables import Table
+from calibgraph import (
+    Audit,
+    CalibrationError,
+    CameraAudit,
+    Dataset,
+    Rig,
+    calibrate,
+    check,
+    load_dataset,
+    load_rig,
+    perturb,
+)
+from calibgraph.audit.judgement import CAMERA_AXES
 from calibgraph.audit.result import by_unit
-from calibgraph.audit.significance import tail_of_axis
+from calibgraph.audit.significance import FALSE_ALARM_RATE, POWER, tail_of_axis
+from calibgraph.simulation.scan_errors import draw_scan_errors
+from tools.scenes.sensor_streets import ALIGNMENT, RIGS, aligned_rig, mean_poses, render
 
 Array = NDArray[np.float64]
 
@@ -42,13 +54,87 @@ TIMES = (0.5, 0.75, 1.0, 1.25, 1.5)
 UNITS = ("deg",) * 3 + ("cm",) * 3
 PER_UNIT = np.repeat([np.pi / 180, 0.01], 3)  # rad or m
 
+RECORDINGS = ("00", "05", "06", "07", "08", "05+06+07+08", "kitti_raw_0005")
+ONE_RIG = ("05", "06", "07", "08")
+"""Of one rig: the result of each is also taken for what is deployed when another is audited."""
+ENOUGH = ("00", "05", "kitti_raw_0005")
+"""Of enough frames for an answer, and not longer than needed."""
+
+DISPLACED_SCENES = 24
+STREETS, FRAMES, STEP_M = 3, 2, 8.0
+SENSOR_ERRORS = 1.0
+_SEED = 4000
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Where recordings are, and where streets are or will be.
+
+    Attributes:
+        recordings: their folder.
+        scenes: a folder per scene, ``scene_0``, ``scene_1``, ...
+    """
+
+    recordings: Path
+    scenes: Path
+
+    def load(self, name: str) -> tuple[Dataset, Rig]:
+        """Data by name, and the right rig; a scene is rendered if it is not there yet.
+
+        Of a scene cameras are at their alignments: where their LiDAR, which errs, sees them.
+        """
+        if not name.startswith("scene_"):
+            return Folders(self.recordings, None).load(name)
+        streets = self.render(int(name.removeprefix("scene_")))
+        aligned = mean_poses([load_rig(street / ALIGNMENT).T_camera_lidar for street in streets])
+        return load_dataset(streets), load_rig(streets[0] / "reference.yaml").moved_to(aligned)
+
+    def render(self, number: int) -> list[Path]:
+        """Folders of the streets through which one sensor drove, each a place of its own."""
+        _, make_rig, beams = RIGS[number % len(RIGS)]
+        rng, folders = np.random.default_rng([8, number]), []
+        errors = draw_scan_errors(beams, SENSOR_ERRORS, rng)
+        for street in range(STREETS):
+            folders.append(self.scenes / f"scene_{number}" / f"street_{street}")
+            if (folders[-1] / ALIGNMENT).exists():
+                continue
+            seed = _SEED + STREETS * number + street
+            render(folders[-1], make_rig(), beams, errors, frames=FRAMES, step_m=STEP_M, seed=seed)
+            truth = load_rig(folders[-1] / "reference.yaml")
+            aligned = aligned_rig(truth, truth, folders[-1], beams, errors)
+            aligned.save(folders[-1] / ALIGNMENT)
+        return folders
+
+    def result(self, name: str) -> Rig:
+        """The rig as ``calibrate`` finds it from a recording."""
+        path = self.scenes / f"result_{name}.yaml"
+        if not path.exists():
+            data, truth = self.load(name)
+            guess = perturb(truth, rotation_deg=GUESS_DEG, translation_m=GUESS_M, seed=0)
+            calibrate(data, guess).rig.save(path)
+        return load_rig(path)
+
+
+def ring() -> list[str]:
+    """Data to displace, to go round in: three scenes, one recording, and so on; of odd length."""
+    names = []
+    for number in range(DISPLACED_SCENES):
+        names.append(f"scene_{number}")
+        if number % 3 == 2:
+            names.append(ENOUGH[number // 3 % len(ENOUGH)])
+    return names[:-1]
+
+
 Stated = Mapping[tuple[str, str], Array]
 """(6,) smallest detectable changes [rad, m] of a camera, by data and camera."""
 
 
 def main() -> None:
     """Audit what is right, then what is displaced; print the tables."""
-    options = parse_options()
+    parser = ledger.case_parser(__doc__, "audit")
+    parser.add_argument("--scenes", type=int, default=48, help="right ones, a sensor each")
+    parser.add_argument("--repeats", type=int, default=3, help="of each axis and size of a camera")
+    options = parser.parse_args()
     sources = Sources(options.realdata, options.out.with_suffix(""))
     if options.summary is not None:
         records = ledger.read(options.summary)
@@ -59,21 +145,6 @@ def main() -> None:
         cases = displaced_cases(ring(), options.repeats)
         records = ledger.run(cases, work, out=options.out, jobs=options.jobs)
     ledger.publish_cases("accuracy.audit", report(records), records, record=options.record)
-
-
-def parse_options() -> argparse.Namespace:
-    """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scenes", type=int, default=48, help="right ones, a sensor each")
-    parser.add_argument("--repeats", type=int, default=3, help="of each axis and size of a camera")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "audit.jsonl")
-    parser.add_argument("--summary", type=Path, help="print the tables of a file, run nothing")
-    add_record_option(parser)
-    return parser.parse_args()
 
 
 def right_cases(scenes: int) -> list[Key]:
@@ -214,6 +285,144 @@ def _is_trusted(camera: CameraAudit) -> bool:
     """Whether the status is by the axes: with a doubt, CANNOT TELL has that for its reason."""
     by_axes = camera.reason.startswith("may be beyond the tolerance")
     return camera.sigma is not None and (camera.status != "CANNOT TELL" or by_axes)
+
+
+AXES = [
+    f"{name} [{unit}]" for name, unit in zip(CAMERA_AXES, ["deg"] * 3 + ["cm"] * 3, strict=True)
+]
+STATUSES = ("OK", "CANNOT TELL", "WRONG")
+
+
+def report(records: Sequence[Record]) -> list[Table]:
+    """All tables."""
+    done = [record for record in records if "cameras" in record]
+    right, camera, lidar, multiple = (
+        [record for record in done if record["level"] == level]
+        for level in ("right", "camera", "LiDAR", "detectable")
+    )
+    steps = by_size_of_axis(camera, lambda record: record["size"])
+    times = by_size_of_axis(multiple, lambda record: float(record["kind"].split(":")[1]))
+    columns = ("axis", "displaced by", "measured", "significant", "expected by the error bar")
+    title = "One camera displaced by multiples of the stated smallest detectable change"
+    return [
+        nothing_displaced(right), false_alarms(right),
+        by_size("One camera displaced", camera, _own),
+        Table("One camera displaced: its axis is significant", columns, tuple(steps)),
+        Table(f"{title} (at 1: stated {POWER:.0%})", columns, tuple(times)),
+        by_size("The LiDAR displaced", lidar, _all),
+    ]  # fmt: skip
+
+
+def _all(record: Record) -> list[Record]:
+    return [*record["cameras"].values()]
+
+
+def _own(record: Record) -> list[Record]:
+    return [record["cameras"][record["of"]]]
+
+
+def _trusted(cameras: Sequence[Record]) -> list[Record]:
+    return [camera for camera in cameras if camera["trusted"]]
+
+
+def _both(camera: Record, name: str) -> Array:
+    """(6,) a quantity in degrees and centimetres."""
+    return np.array([*camera[f"{name}_deg"], *camera[f"{name}_cm"]])
+
+
+def nothing_displaced(records: Sequence[Record]) -> Table:
+    """A row per kind of what is deployed: alarms, and deviations beside their sigmas."""
+    groups: dict[str, list[Record]] = {}
+    for record in records:
+        groups.setdefault(record["kind"].split(" of ")[0], []).append(record)
+    rows = []
+    for group, own in sorted(groups.items()):
+        cameras = [camera for record in own for camera in _all(record)]
+        rigs = [trusted for record in own if (trusted := _trusted(_all(record)))]
+        trusted = _trusted(cameras)
+        alarmed = sum(any(sum(c["significant"]) for c in rig) for rig in rigs)
+        axes = sum(sum(camera["significant"]) for camera in trusted)
+        ratios = [_both(c, "deviation") / _both(c, "sigma") for c in trusted] or [np.nan]
+        rows.append((
+            group, str(len(own)), str(len(rigs)), str(alarmed), str(len(trusted)),
+            f"{axes} of {6 * len(trusted)}", f"{np.sqrt(np.mean(np.square(ratios))):.2f}",
+            f"{np.max(np.abs(ratios)):.2f}",
+            *(str(sum(c["status"] == status for c in cameras)) for status in STATUSES),
+        ))  # fmt: skip
+    columns = (
+        "what is deployed", "rigs", "measured", "with a significant axis", "cameras measured",
+        "significant axes", "deviation over sigma, rms", "largest",
+        *(f"cameras {status}" for status in STATUSES),
+    )  # fmt: skip
+    stated = f"stated: {FALSE_ALARM_RATE:.1%} of rigs have a significant axis"
+    return Table(f"Nothing displaced ({stated})", columns, tuple(rows))
+
+
+def false_alarms(records: Sequence[Record]) -> Table:
+    """A row per significant axis where nothing is displaced."""
+    rows = [
+        (record["data"], record["kind"], name, AXES[axis],
+         *(f"{_both(camera, of)[axis]:+.2f}" for of in ("deviation", "sigma")), camera["status"])
+        for record in records for name, camera in record["cameras"].items() if camera["trusted"]
+        for axis in np.flatnonzero(camera["significant"])
+    ]  # fmt: skip
+    columns = ("data", "deployed", "camera", "axis", "deviation", "sigma", "status")
+    return Table("Nothing displaced: significant axes", columns, tuple(rows))
+
+
+def by_size(
+    title: str, records: Sequence[Record], moved: Callable[[Record], list[Record]]
+) -> Table:
+    """A row per size of a displacement; ``moved``: which cameras of an audit moved."""
+    rows = []
+    for unit, axes in (("deg", range(3)), ("cm", range(3, 6))):
+        of_unit = [record for record in records if record["axis"] in axes]
+        for size in sorted({abs(round(record["size"], 6)) for record in of_unit}):
+            own = [record for record in of_unit if abs(abs(record["size"]) - size) < 1e-6]
+            rows.append((f"{size:g} {unit}", *_row_of_size(own, moved)))
+    columns = (
+        "displaced by", "audits", "measured", "an axis significant", "WRONG", "culprit alone named",
+        "CANNOT TELL", "OK", "others OK", "others WRONG",
+    )  # fmt: skip
+    return Table(title, columns, tuple(rows))
+
+
+def _row_of_size(own: Sequence[Record], moved: Callable[[Record], list[Record]]) -> tuple[str, ...]:
+    """The worst status counts of the cameras that moved."""
+    measured = [record for record in own if len(_trusted(moved(record))) == len(moved(record))]
+    significant = sum(any(sum(c["significant"]) for c in moved(record)) for record in measured)
+    worst = [max((c["status"] for c in moved(record)), key=STATUSES.index) for record in own]
+    others = [camera for record in own for name, camera in record["cameras"].items()
+              if moved is _own and name != record["of"]]  # fmt: skip
+    named = sum(record["wrong"] == [record["of"]] for record in own)
+    return (
+        str(len(own)), str(len(measured)), str(significant), str(worst.count("WRONG")), str(named),
+        str(worst.count("CANNOT TELL")), str(worst.count("OK")),
+        *(f"{sum(c['status'] == status for c in others)} of {len(others)}" if others else ""
+          for status in ("OK", "WRONG")),
+    )  # fmt: skip
+
+
+def by_size_of_axis(
+    records: Sequence[Record], size_of: Callable[[Record], float]
+) -> Iterator[tuple[str, ...]]:
+    """Per axis and size: how often the displaced axis was significant, and is expected to be."""
+    groups = [(name.split(" [")[0], (axis,)) for axis, name in enumerate(AXES)]
+    for name, axes in (*groups, ("all rotations", range(3)), ("all positions", range(3, 6))):
+        own = [record for record in records if record["axis"] in axes]
+        for size in sorted({abs(round(size_of(record), 6)) for record in own}):
+            cameras = [
+                (record["axis"], abs(record["size"]), camera)
+                for record in own if abs(round(size_of(record), 6)) == size
+                for camera in _trusted(_own(record))
+            ]  # fmt: skip
+            chances = []
+            for axis, moved, camera in cameras:
+                limit, sigma = (_both(camera, of)[axis] for of in ("limit", "sigma"))
+                chances.append(ndtr((moved - limit) / sigma) + ndtr((-moved - limit) / sigma))
+            found = sum(camera["significant"][axis] for axis, _, camera in cameras)
+            expected = f"{np.mean(chances):.0%}" if chances else ""
+            yield name, f"{size:g}", str(len(cameras)), str(found), expected
 
 
 if __name__ == "__main__":

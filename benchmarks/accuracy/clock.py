@@ -10,21 +10,14 @@ image goes with its own cloud, or with the one before it, which makes it 100 ms 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.accuracy.lens import (
-    Drawn,
-    errors_of,
-    nees_of,
-    simulated,
-    sizes_of,
-)
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.accuracy.lens import Drawn, cells_of, errors_of, nees_of, simulated
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import Config, Dataset, calibrate, evaluate, load_dataset, perturb
 from calibgraph.solver.joint import solve_joint
 from factors import Clock
@@ -66,34 +59,22 @@ def draw(part: str, clock: Clock, seed: int) -> Drawn:
 
 def main() -> None:
     """Draw, solve, and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--draws", type=int, default=30)
     parser.add_argument("--data", nargs="*", type=Path, default=[], help="recordings at 10 Hz")
-    add_record_option(parser)
     options = parser.parse_args()
     tables = []
     if options.draws:
-        rows = tuple(row_of(*case, options.draws) for case in CASES)
+        rows = tuple(
+            (part, f"{1e3 * offset_s:g}", f"{1e3 * readout_s:g}",
+             *cells_of([draw(part, Clock(offset_s, readout_s), s) for s in range(options.draws)]))
+            for part, offset_s, readout_s in CASES
+        )  # fmt: skip
         tables.append(Table(f"{options.draws} draws, medians of 2 cameras", COLUMNS, rows))
     if options.data:
         recorded = tuple(row for folder in options.data for row in rows_of(folder))
         tables.append(Table("Recordings, the worst camera", RECORDED, recorded))
     publish("accuracy.clock", tables, record=options.record)
-
-
-def row_of(part: str, offset_s: float, readout_s: float, draws: int) -> tuple[str, ...]:
-    """One case over all draws."""
-    found = [draw(part, Clock(offset_s, readout_s), seed) for seed in range(draws)]
-    cells = [cell for when in ("before", "after") for cell in sizes_of(found, when)]
-    nees = np.mean([value for one in found for value in one.nees]) / 6
-    off, sigmas = (
-        np.concatenate([getattr(one, key) for one in found]) for key in ("off", "sigmas")
-    )
-    clock = (np.median(np.abs(off)), np.median(sigmas), np.mean((off / sigmas) ** 2))
-    times = (f"{1e3 * offset_s:g}", f"{1e3 * readout_s:g}")
-    return (part, *times, *cells, f"{nees:.2f}", *(f"{value:.2g}" for value in clock))
 
 
 def rows_of(folder: Path) -> Iterator[tuple[str, ...]]:

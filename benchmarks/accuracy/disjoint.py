@@ -13,11 +13,9 @@ covariances is of how results repeat, and its squared error should be 1.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +24,7 @@ from scipy.stats import chi2
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import Folders
-from benchmarks.tables import ROOT, Table, add_record_option
+from benchmarks.tables import Table
 from calibgraph import Calibration, calibrate, perturb
 from calibgraph.model.geometry import pose_rows, twist_between
 from calibgraph.solver.joint import solve_joint
@@ -63,65 +61,41 @@ class Estimate:
 
 def main() -> None:
     """Run cases, print the table."""
-    options = parse_options()
+    names: Callable[[str], list[str]] = lambda text: [*filter(None, text.split(","))]  # noqa: E731
+    parser = ledger.case_parser(__doc__, "disjoint")
+    parser.add_argument("--halves", type=names, default=["kitti_places", "00", "05+06+07+08"])
+    parser.add_argument("--pairs", type=names, default=["05/06", "05/07", "06/08", "07/08"])
+    parser.add_argument("--draws", type=int, default=6, help="of halves")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
+    options = parser.parse_args()
     halves = [
         Key(HALVES, "random", name, seed)
         for seed in range(options.first, options.first + options.draws)
         for name in options.halves
     ]
     pairs = [Key(PAIRS, "each", pair, options.first) for pair in options.pairs]
-    runs = Runs(Folders(options.realdata, None))
-    records = ledger.records_of(options, [*halves, *pairs], runs)
+    work = partial(run_case, folders=Folders(options.realdata, None))
+    records = ledger.records_of(options, [*halves, *pairs], work)
     ledger.publish_cases("accuracy.disjoint", [report(records)], records, record=options.record)
 
 
-def parse_options() -> argparse.Namespace:
-    """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    names: Callable[[str], list[str]] = lambda text: [*filter(None, text.split(","))]  # noqa: E731
-    parser.add_argument("--halves", type=names, default=["kitti_places", "00", "05+06+07+08"])
-    parser.add_argument("--pairs", type=names, default=["05/06", "05/07", "06/08", "07/08"])
-    parser.add_argument("--draws", type=int, default=6, help="of halves")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "disjoint.jsonl")
-    parser.add_argument("--summary", type=Path, help="print the table of a file, run nothing")
-    add_record_option(parser)
-    return parser.parse_args()
-
-
-@dataclass(frozen=True)
-class Runs:
-    """Calibrates both parts of a case."""
-
-    folders: Folders
-
-    def __call__(self, case: Key) -> Record:
-        """The differences of all cameras that both parts have."""
-        if case.level == HALVES:
-            first, second = (_half_of(self.folders, case.data, case.seed, k) for k in range(2))
-        else:
-            first, second = (_whole(self.folders, name, case.seed) for name in case.data.split("/"))
-        both = [name for name in first if name in second]
-        return {"cameras": {name: difference(first[name], second[name]) for name in both}}
-
-
-def _half_of(folders: Folders, name: str, seed: int, which: int) -> dict[str, Estimate]:
-    data, _ = folders.load(name)
-    return _calibrate(folders, name, seed, rows=split(len(data.frames), seed)[which])
+def run_case(case: Key, folders: Folders) -> Record:
+    """The differences of all cameras that both parts have."""
+    if case.level == HALVES:
+        count = len(folders.load(case.data)[0].frames)
+        parts = [(case.data, tuple(rows)) for rows in split(count, case.seed)]
+    else:
+        parts = [(name, None) for name in case.data.split("/")]
+    first, second = (calibrated(folders, name, case.seed, rows) for name, rows in parts)
+    both = [name for name in first if name in second]
+    return {"cameras": {name: difference(first[name], second[name]) for name in both}}
 
 
 @cache  # a recording is in several pairs
-def _whole(folders: Folders, name: str, seed: int) -> dict[str, Estimate]:
-    return _calibrate(folders, name, seed)
-
-
-def _calibrate(
-    folders: Folders, name: str, seed: int, rows: Sequence[int] | None = None
+def calibrated(
+    folders: Folders, name: str, seed: int, rows: tuple[int, ...] | None
 ) -> dict[str, Estimate]:
+    """The results of some frames, or of all."""
     data, truth = folders.load(name)
     frames = [data.frames[i] for i in (range(len(data.frames)) if rows is None else rows)]
     guess = perturb(truth, rotation_deg=START_DEG, translation_m=START_M, seed=seed, uniform=True)

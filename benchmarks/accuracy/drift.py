@@ -14,7 +14,6 @@ that whatever is significant is CHANGED. Three kinds of recordings:
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -22,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.accuracy.uncertainty import ERRORS, draw_shared, state_shared
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import Calibration, Drift, drift, simulate_correspondences, solve
 from calibgraph.audit.judgement import CAMERA_AXES
 from tests.draws.places import displaced, stereo
@@ -61,12 +60,9 @@ class Found:
 
 def main() -> None:
     """Fill the pools, count, and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--pool", type=int, default=150)
     parser.add_argument("--calls", type=int, default=500)
-    add_record_option(parser)
     options = parser.parse_args()
     pools = {kind: fill_pool(kind, options.pool) for kind in KINDS}
     tables = [false_alarms(pools, options.calls)]

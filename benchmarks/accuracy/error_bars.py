@@ -16,72 +16,56 @@ NEES is the squared error in the metric of its covariance; its mean over 6 shoul
 
 from __future__ import annotations
 
-import argparse
-import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from argparse import ArgumentParser
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import gtsam
 import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.accuracy import ledger
-from benchmarks.accuracy.alignment import ALIGNMENT, aligned_rig
 from benchmarks.accuracy.ledger import Key, Record
-from benchmarks.accuracy.streets import CHANGES, FRAMES, Found, load_streets, solve_streets
-from benchmarks.tables import ROOT, Table, add_record_option
+from benchmarks.tables import ROOT, Table
 from calibgraph import (
-    Camera,
-    Intrinsics,
+    Config,
+    Correspondences,
+    RelativePose,
     Rig,
     calibrate,
+    load_camera_matches,
+    load_correspondences,
     load_dataset,
+    load_rig,
     perturb,
-    simulate_street,
 )
-from calibgraph.simulation.rigs import rig_of
+from calibgraph.model.camera_matches import CameraMatches, concatenate_camera_matches
+from calibgraph.model.correspondences import concatenate
+from calibgraph.model.error_components import error_components
+from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
+from calibgraph.pipeline import to_calibration
 from calibgraph.simulation.scan_errors import draw_scan_errors
+from calibgraph.solver.joint import solve_joint
+from calibgraph.trust.assess import assess
+from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.image_record import RunChecks
 from tools.scenes.lens_errors import draw_lens_errors
+from tools.scenes.sensor_streets import ALIGNMENT, RIGS, aligned_rig, mean_poses, render
 
 STREETS = 5
 _FURTHER = 100_000  # seeds of more streets than that
 STEP_M = 4.0
 GUESS_DEG, GUESS_M = 1.0, 0.1
-FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-
-
-def pair() -> Rig:
-    """KITTI's stereo pair, of half the size."""
-    lens = Intrinsics(fx=359.4, fy=359.4, cx=303.6, cy=92.6)
-    places = {"left": (0.27, 0.06, -0.08), "right": (0.27, -0.48, -0.08)}
-    return Rig(cameras={n: _camera(620, 188, lens, xyz, 0.9) for n, xyz in places.items()})
-
-
-def wide() -> Rig:
-    """Two cameras of 93 degrees, half to the left and half to the right."""
-    lens = Intrinsics(fx=303.0, fy=303.0, cx=319.5, cy=199.5)
-    views = {"left": ((0.3, 0.2, -0.2), 35.0), "right": ((0.3, -0.2, -0.2), -35.0)}
-    return Rig(cameras={n: _camera(640, 400, lens, *view) for n, view in views.items()})
-
-
-def _camera(
-    width: int, height: int, lens: Intrinsics, xyz_m: tuple[float, ...], yaw_deg: float
-) -> Camera:
-    turn, (sine, cosine) = np.eye(3), (np.sin(np.radians(yaw_deg)), np.cos(np.radians(yaw_deg)))
-    turn[:2, :2] = [[cosine, sine], [-sine, cosine]]
-    T = np.eye(4)
-    T[:3, :3] = FORWARD @ turn
-    T[:3, 3] = -T[:3, :3] @ xyz_m
-    return Camera(width_px=width, height_px=height, intrinsics_px=lens, T_camera_lidar=T)
-
-
-RIGS = (("pair", pair, 64), ("sample", partial(rig_of, "sample"), 64),
-        ("wide", wide, 64), ("sector", partial(rig_of, "sample"), 32))  # fmt: skip
+FRAMES = 3  # of a street
 
 
 def main() -> None:
     """Render, calibrate, keep a line of each."""
-    arguments = parse_options()
+    parser = group_parser(__doc__, "error_bars", [100, 180])
+    parser.add_argument("--streets", type=int, default=STREETS, help="of each sensor")
+    arguments = parser.parse_args()
     first, last = arguments.groups
     cases = [
         Key("scene", RIGS[group % len(RIGS)][0], f"{arguments.size:g}", seed)
@@ -90,30 +74,19 @@ def main() -> None:
     ]
     work = partial(run_case, scenes=arguments.scenes)
     records = ledger.records_of(arguments, cases, work)
-    tables = [
-        report(records),
-        report_places(records, arguments.scenes),
-        report_changes(records, arguments.scenes),
-    ]
+    tables = [report(records), *report_together(records, arguments.scenes)]
     ledger.publish_cases("accuracy.error_bars", tables, records, record=arguments.record)
 
 
-def parse_options() -> argparse.Namespace:
-    """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def group_parser(description: str | None, name: str, groups: list[int]) -> ArgumentParser:
+    """The options of benchmarks whose cases are groups of rendered streets."""
+    parser = ledger.case_parser(description, name)
     parser.add_argument("--scenes", type=Path, default=ROOT / "out" / "error_bars")
     parser.add_argument(
-        "--groups", type=lambda text: [int(n) for n in text.split(":")], default=[100, 180]
+        "--groups", type=lambda text: [int(n) for n in text.split(":")], default=groups
     )
     parser.add_argument("--size", type=float, default=2.0, help="of the errors; one folder each")
-    parser.add_argument("--streets", type=int, default=STREETS, help="of each sensor")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "error_bars.jsonl")
-    parser.add_argument("--summary", type=Path, help="print the tables of a file, run no scene")
-    add_record_option(parser)
-    return parser.parse_args()
+    return parser
 
 
 def seeds_of(group: int, streets: int) -> list[int]:
@@ -144,11 +117,7 @@ def render_street(
     _, make_rig, beams = RIGS[group % len(RIGS)]
     truth, errors = make_rig(), draw_scan_errors(beams, size, np.random.default_rng([7, group]))
     if not (folder / "rig.yaml").exists():
-        shutil.rmtree(folder, ignore_errors=True)
-        simulate_street(
-            folder, truth, beams=beams, frames=frames, step_m=step_m, seed=seed,
-            sensor_errors=errors, vary_layout=True,
-        )  # fmt: skip
+        render(folder, truth, beams, errors, frames=frames, step_m=step_m, seed=seed)
     stated = draw_lens_errors(truth, size / 2, np.random.default_rng([13, group]))  # of all streets
     aligned = aligned_rig(truth, stated, folder, beams, errors)
     aligned.save(folder / ALIGNMENT)
@@ -173,6 +142,132 @@ def run_case(case: Key, scenes: Path) -> Record:
             "z_score": dict(result.correspondences.findings.z_score),
             "probability": {n: v.error_probability and v.error_probability.probability
                             for n, v in result.camera_verdicts.items()}}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Found:
+    """The error of one camera, with its verdict, or of one next to the one before it."""
+
+    of: str
+    nees_over_6: float
+    degrees: float
+    centimetres: float
+    status: str = ""
+
+
+@dataclass(frozen=True)
+class Streets:
+    """What is solved together.
+
+    Attributes:
+        truth: the rig as it is.
+        aligned: per camera, the mean of the streets' alignments.
+        start: the rig to start from, with relative poses if any are known.
+        table: of all streets, with places.
+        matches: of pairs of cameras; None without any.
+    """
+
+    truth: Rig
+    aligned: dict[str, np.ndarray]
+    start: Rig
+    table: Correspondences
+    matches: CameraMatches | None
+
+
+def load_streets(folders: Sequence[Path]) -> Streets:
+    """The tables of some streets of one sensor."""
+    truth, tables, pairs, places = load_rig(folders[0] / "reference.yaml"), [], [], []
+    for number, folder in enumerate(folders):
+        table, add = load_correspondences(folder / "correspondences.parquet"), number * FRAMES
+        tables.append(replace(table, frame=table.frame + add))
+        places.append(list(range(add, add + FRAMES)))
+        if (folder / "camera_matches.parquet").is_file():
+            matches = load_camera_matches(folder / "camera_matches.parquet")
+            pairs.append(replace(matches, frame=matches.frame + add))
+    joined = concatenate(tables)
+    stated = asdict(error_components().matchers["structure"])  # also where tables are older
+    joined = replace(joined, metadata={**joined.metadata, **stated, "places": places})
+    matches = concatenate_camera_matches(pairs) if pairs else None
+    aligned = mean_poses([load_rig(folder / ALIGNMENT).T_camera_lidar for folder in folders])
+    return Streets(truth, aligned, load_rig(folders[0] / "result.yaml"), joined, matches)
+
+
+def solve_streets(streets: Streets) -> Iterator[Found]:
+    """Of each camera, and of each next to the one before it."""
+    truth = streets.truth
+    solved = solve_joint(
+        streets.start, streets.table, Config(stage1="rig", learnt_weights=False),
+        camera_matches=streets.matches,
+    )  # fmt: skip
+    evidence = Evidence(solved, guess=streets.start)
+    checks = RunChecks(assess(evidence), unseen=evidence.cameras)
+    verdicts = to_calibration(evidence, checks).camera_verdicts
+    statuses = {name: verdict.status for name, verdict in verdicts.items()}
+    joint, mount = solved.covariance, solved.marginals.mount
+    assert joint is not None and mount.covariance is not None
+    errors, T = [], mount.T_camera_lidar
+    for place, name in enumerate(T):
+        errors.append(twist_between(T[name], truth.cameras[name].T_camera_lidar))
+        rows = slice(6 * place, 6 * place + 6)
+        error = twist_between(solved.T_camera_lidar[name], streets.aligned[name])
+        yield replace(_found("camera", error, joint[rows, rows]), status=statuses[name])
+        if place:
+            T_b_a = relative_transform(T[name], T[list(T)[place - 1]])
+            between = errors[place] - gtsam.Pose3(T_b_a).AdjointMap() @ errors[place - 1]
+            of_pair = relative_covariance(mount.covariance, place - 1, place, T_b_a)
+            yield _found("pair", between, of_pair)
+
+
+def _found(of: str, error: np.ndarray, covariance: np.ndarray) -> Found:
+    nees = float(error @ np.linalg.solve(covariance, error))
+    degrees, metres = (float(np.linalg.norm(part)) for part in (error[:3], error[3:]))
+    return Found(of, nees / 6, float(np.degrees(degrees)), 100 * metres)
+
+
+def without_pairs(streets: Streets, rng: np.random.Generator) -> Streets:
+    """What cameras see in common is not used."""
+    return replace(streets, matches=None)
+
+
+def tied(streets: Streets, rng: np.random.Generator) -> Streets:
+    """The relative pose of the first two cameras is measured, to 0.02 deg and 0.3 cm."""
+    sigmas = {"rotation_sigma_rad": np.radians(0.02), "translation_sigma_m": 0.003}
+    a, b = list(streets.truth.cameras)[:2]
+    T = streets.truth.T_camera_lidar
+    error = np.repeat([*sigmas.values()], 3) * rng.standard_normal(6)
+    measured = relative_transform(T[a], T[b]) @ gtsam.Pose3.Expmap(error).matrix()
+    pose = RelativePose(a=a, b=b, T_a_b=measured, **sigmas)
+    start = streets.start.model_copy(update={"relative_poses": (pose,)})
+    return replace(streets, start=start, matches=None)
+
+
+def few_frames(streets: Streets, rng: np.random.Generator, *, count: int) -> Streets:
+    """The first camera has matches in so many frames alone."""
+    table, first = streets.table, next(iter(streets.truth.cameras))
+    own = table.camera_index == table.cameras.index(first)
+    kept = table.select(~own | (table.frame < count))
+    return replace(streets, table=kept, matches=None)
+
+
+def repeated(streets: Streets, rng: np.random.Generator) -> Streets:
+    """The frames of the first street ten times, as if they were of other places."""
+    first = streets.table.select(streets.table.frame < FRAMES)
+    more = [replace(first, frame=first.frame + 1000 * copy) for copy in range(1, 10)]
+    table = replace(concatenate([streets.table, *more]), metadata=streets.table.metadata)
+    return replace(streets, table=table)
+
+
+CHANGES: dict[str, Callable[[Streets, np.random.Generator], Streets]] = {
+    "as they are": lambda streets, rng: streets,
+    "without pairs": without_pairs,
+    "tied by 0.02 deg 0.3 cm": tied,
+    "first camera without matches, tied": lambda streets, rng: tied(
+        few_frames(streets, rng, count=0), rng
+    ),
+    "1 frame of the first camera": partial(few_frames, count=1),
+    "3 frames of the first camera": partial(few_frames, count=3),
+    "first street 10 times": repeated,
+}
 
 
 COLUMNS = (
@@ -207,36 +302,26 @@ def _calibration(nees_over_6: Iterable[float]) -> tuple[str, str]:
     return f"{values.mean():.2f}", f"{np.mean(6 * values < chi2.ppf(0.95, 6)):.1%}"
 
 
-def report_places(records: Sequence[Record], scenes: Path) -> Table:
-    """A row per number of places and size of the errors: cameras and pairs."""
-    found: dict[tuple[int, str, str], list[Found]] = {}
+def report_together(records: Sequence[Record], scenes: Path) -> list[Table]:
+    """A row per number of places and size of the errors, and per change of five places."""
+    places: dict[tuple[int, str, str], list[Found]] = {}
+    changes: dict[tuple[str, str, str], list[Found]] = {}
     for size, folders in streets_of_groups(records, scenes):
-        for places in (1, 2, STREETS, 10, 20):
-            for start in range(0, len(folders) - places + 1, places):
-                for what in solve_streets(load_streets(folders[start : start + places])):
-                    found.setdefault((places, size, what.of), []).append(what)
-    rows = [
-        (str(places), size, of, *_cells(values))
-        for (places, size, of), values in sorted(found.items())
-    ]
-    columns = ("places", "size", "of", *_CELLS)
-    return Table("Streets of one sensor solved together", columns, tuple(rows))
-
-
-def report_changes(records: Sequence[Record], scenes: Path) -> Table:
-    """A row per change and size of the errors: five places."""
-    found: dict[tuple[str, str, str], list[Found]] = {}
-    for size, folders in streets_of_groups(records, scenes):
-        if len(folders) < STREETS:
-            continue
-        streets = load_streets(folders[:STREETS])
-        for name, change in CHANGES.items():
+        for count in (1, 2, STREETS, 10, 20):
+            for start in range(0, len(folders) - count + 1, count):
+                for what in solve_streets(load_streets(folders[start : start + count])):
+                    places.setdefault((count, size, what.of), []).append(what)
+        for name, change in CHANGES.items() if len(folders) >= STREETS else ():
             rng = np.random.default_rng([11, int(folders[0].name.split("_")[1])])
-            for what in solve_streets(change(streets, rng)):
-                found.setdefault((name, size, what.of), []).append(what)
-    rows = [(*key, *_cells(values)) for key, values in found.items()]
-    columns = ("five places", "size", "of", *_CELLS)
-    return Table("Streets of one sensor solved together, changed", columns, tuple(rows))
+            for what in solve_streets(change(load_streets(folders[:STREETS]), rng)):
+                changes.setdefault((name, size, what.of), []).append(what)
+    title = "Streets of one sensor solved together"
+    return [
+        Table(title, ("places", "size", "of", *_CELLS),
+              tuple((*map(str, key), *_cells(found)) for key, found in sorted(places.items()))),
+        Table(f"{title}, changed", ("five places", "size", "of", *_CELLS),
+              tuple((*key, *_cells(found)) for key, found in changes.items())),
+    ]  # fmt: skip
 
 
 _CELLS = (

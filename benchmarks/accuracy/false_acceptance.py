@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import OTHER, Folders, with_images
-from benchmarks.tables import ROOT, Table, add_record_option
+from benchmarks.tables import Table
 from calibgraph import Dataset, StructureMatcher, calibrate, perturb
 from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE
 from calibgraph.progress import no_progress
@@ -35,7 +35,13 @@ SEQUENCES = tuple(name for name in OTHER if "+" not in name)
 
 def main() -> None:
     """Run cases, print the table."""
-    arguments = parse_options()
+    parser = ledger.case_parser(__doc__, "false_acceptance")
+    parser.add_argument("--scenes", type=Path, help="folder of rendered scenes, scene_N each")
+    parser.add_argument("--recordings", action="store_true", help="KITTI's sequences")
+    parser.add_argument("--starts", type=int, default=5, help="other clouds and guesses per scene")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first")
+    parser.add_argument("--whole", action="store_true", help="calibrate where one is accepted")
+    arguments = parser.parse_args()
     folders = Folders(arguments.realdata, arguments.scenes)
     cases = [
         Key("wrong clouds", kind, data, seed)
@@ -49,24 +55,6 @@ def main() -> None:
     )
     for record in records:
         print(record.get("crash", ""), end="")
-
-
-def parse_options() -> argparse.Namespace:
-    """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scenes", type=Path, help="folder of rendered scenes, scene_N each")
-    parser.add_argument("--recordings", action="store_true", help="KITTI's sequences")
-    parser.add_argument("--starts", type=int, default=5, help="other clouds and guesses per scene")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first")
-    parser.add_argument("--whole", action="store_true", help="calibrate where one is accepted")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "false_acceptance.jsonl")
-    parser.add_argument("--summary", type=Path, help="print the table of a file, run nothing")
-    add_record_option(parser)
-    return parser.parse_args()
 
 
 def _sources(arguments: argparse.Namespace, folders: Folders, seed: int) -> list[tuple[str, str]]:

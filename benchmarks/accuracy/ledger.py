@@ -24,7 +24,7 @@ import numpy as np
 
 import calibgraph
 import factors
-from benchmarks.tables import ROOT, Table, publish
+from benchmarks.tables import ROOT, Table, parser_of, publish
 from calibgraph import Calibration, CalibrationError, Rig, evaluate
 from calibgraph.model.geometry import twist_between
 
@@ -63,6 +63,17 @@ def read(path: Path) -> list[Record]:
 def key_of(record: Record) -> Key:
     """The case of a line."""
     return Key(*(record[name] for name in Key.__dataclass_fields__))
+
+
+def case_parser(description: str | None, name: str) -> argparse.ArgumentParser:
+    """The options of a benchmark whose cases are in a file of this name."""
+    parser = parser_of(description)
+    add = parser.add_argument
+    add("--jobs", type=int, default=1, help="processes; 1 to measure time")
+    add("--realdata", type=Path, default=REALDATA, help="folder of the recordings")
+    add("--out", type=Path, default=ROOT / "out" / f"{name}.jsonl", help="a line per case")
+    add("--summary", type=Path, help="print the tables of a file, run nothing")
+    return parser
 
 
 def records_of(

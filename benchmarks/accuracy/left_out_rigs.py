@@ -13,9 +13,7 @@ Stated regions should hold the share of the results that they state.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +22,7 @@ from scipy.stats import chi2
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Record
-from benchmarks.tables import Table, add_record_option
+from benchmarks.tables import Table, parser_of
 
 Array = NDArray[np.float64]
 
@@ -35,31 +33,10 @@ REGIONS = (0.5, 0.8, 0.95)
 PARTS = (slice(0, 3), slice(3, 6))
 
 
-@dataclass(frozen=True, eq=False)
-class Errors:
-    """The results of one rig.
-
-    Attributes:
-        parts: (n, 2) squared errors of rotation and position in their covariances, over 3.
-        whole: (n,) of both, over 6.
-    """
-
-    parts: Array
-    whole: Array
-
-    @property
-    def sizes(self) -> Array:
-        """(2,) of rotation and position."""
-        return self.parts.mean(axis=0)
-
-
 def main() -> None:
     """Read records, print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("records", type=Path, nargs="+", help="files of other benchmarks")
-    add_record_option(parser)
     options = parser.parse_args()
     records = [record for path in options.records for record in ledger.read(path)]
     found = errors_of(records)
@@ -67,17 +44,14 @@ def main() -> None:
     ledger.publish_cases("accuracy.left_out_rigs", tables, records, record=options.record)
 
 
-def errors_of(records: Iterable[Record]) -> dict[str, Errors]:
-    """Per rig, the errors of its cameras."""
+def errors_of(records: Iterable[Record]) -> dict[str, Array]:
+    """Per rig (n, 3): squared errors of rotation, position and both, over their axes."""
     groups: dict[str, list[Array]] = {}
     for record in records:
         for camera in record.get("cameras", {}).values():
             if record["kind"].startswith(("good", *RIGS)) and _found(camera):
                 groups.setdefault(rig_of(record), []).append(_squared(camera))
-    return {
-        rig: Errors(np.array(rows)[:, :2], np.array(rows)[:, 2])
-        for rig, rows in sorted(groups.items())
-    }
+    return {rig: np.array(rows) for rig, rows in sorted(groups.items())}
 
 
 def rig_of(record: Record) -> str:
@@ -105,16 +79,14 @@ def _squared(camera: Record) -> Array:
     ])  # fmt: skip
 
 
-def left_out(found: Mapping[str, Errors]) -> Table:
+def left_out(found: Mapping[str, Array]) -> Table:
     """A row per rig: its error size, the others' size, and what the latter adds to log density."""
-    rows = []
+    rows, sizes = [], {rig: own[:, :2].mean(axis=0) for rig, own in found.items()}
     for rig, own in found.items():
-        others = np.exp(np.mean([np.log(e.sizes) for r, e in found.items() if r != rig], axis=0))
-        rows.append(
-            (rig, str(len(own.whole)), f"{own.whole.mean():.2f}",
-             *(f"{value:.2f}" for value in (*own.sizes, *others)),
-             f"{gained(own.parts, others):+.2f}")
-        )  # fmt: skip
+        others = np.exp(np.mean([np.log(size) for r, size in sizes.items() if r != rig], axis=0))
+        values = (own[:, 2].mean(), *sizes[rig], *others)
+        rows.append((rig, str(len(own)), *(f"{value:.2f}" for value in values),
+                     f"{gained(own[:, :2], others):+.2f}"))  # fmt: skip
     return Table(
         "Squared errors in their covariances, and with the sizes of the other rigs",
         ("rig", "results", "over 6", "rotation, over 3", "position, over 3",
@@ -133,21 +105,15 @@ def gained(parts: Array, sizes: Array) -> float:
     return float(np.mean(1.5 * (parts * (1 - 1 / sizes) - np.log(sizes)).sum(axis=1)))
 
 
-def reliability(found: Mapping[str, Errors]) -> Table:
+def reliability(found: Mapping[str, Array]) -> Table:
     """A row per rig: the share of its results inside the regions that error bars state."""
     limits = [chi2.ppf(share, 6) / 6 for share in REGIONS]
     rows = [
-        (rig, str(len(own.whole)), *_inside(own.whole, limits)) for rig, own in found.items()
-    ]  # fmt: skip
-    return Table(
-        "Results inside the regions that error bars state",
-        ("rig", "results", *(f"{share:.0%}" for share in REGIONS)),
-        tuple(rows),
-    )
-
-
-def _inside(values: Array, limits: Sequence[float]) -> tuple[str, ...]:
-    return tuple(f"{np.mean(values <= limit):.0%}" for limit in limits)
+        (rig, str(len(own)), *(f"{np.mean(own[:, 2] <= limit):.0%}" for limit in limits))
+        for rig, own in found.items()
+    ]
+    columns = ("rig", "results", *(f"{share:.0%}" for share in REGIONS))
+    return Table("Results inside the regions that error bars state", columns, tuple(rows))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ mean over 6 should be 1. ``z^2`` is the mean square of the lens' errors in their
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -18,19 +17,14 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.tables import Table, add_record_option, publish
-from calibgraph import (
-    Config,
-    Correspondences,
-    MatcherErrors,
-    Rig,
-    simulate_correspondences,
-)
+from benchmarks.tables import Table, parser_of, publish
+from calibgraph import Camera, Config, Correspondences, MatcherErrors, Rig, simulate_correspondences
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import twist_between
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.solution import Solution
+from factors.free_lens import COEFFICIENT_NUMBERS
 from tests.draws.lenses import put_lens_error
 
 Array = NDArray[np.float64]
@@ -110,40 +104,47 @@ def nees_of(found: Solution, errors: list[Array]) -> list[float]:
     return [float(e @ np.linalg.solve(own, e)) for e, own in zip(errors, blocks, strict=True)]
 
 
+def values_of(camera: Camera) -> dict[str, float]:
+    """Parameters of a lens and a clock, as results name them."""
+    k, packed = camera.intrinsics_px, camera.lens.packed
+    numbers = COEFFICIENT_NUMBERS[camera.lens.kind]
+    return {
+        "focal": float(np.sqrt(k.fx * k.fy)), "aspect": k.fx / k.fy, "centre_x": k.cx,
+        "centre_y": k.cy,
+        "offset": camera.time_offset_s or 0.0, "readout": camera.readout_s or 0.0,
+        **{name: float(packed[4 + number]) for name, number in numbers.items()},
+    }  # fmt: skip
+
+
 def _lens_errors(found: Solution, truth: Rig, part: str) -> Iterator[tuple[float, float]]:
     """Error and sigma of the parameter that was spoilt, of all with ``lens``."""
     for name, parameters in found.lens.items():
-        camera = truth.cameras[name]
-        k, distortion = camera.intrinsics_px, [*camera.distortion, *[0.0] * 4]
-        right = {"focal": float(np.sqrt(k.fx * k.fy)), "centre_x": k.cx, "centre_y": k.cy}
-        right |= dict(zip(("k1", "k2", "p1", "p2"), distortion, strict=False))
+        right = values_of(truth.cameras[name])
         for one in parameters[: None if part == "lens" else 1]:
             yield one.value - right[one.name], one.sigma
 
 
 def main() -> None:
     """Draw, solve, and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--draws", type=int, default=30)
-    add_record_option(parser)
     options = parser.parse_args()
-    rows = tuple(row_of(part, error, options.draws) for part, error in CASES)
+    seeds = range(options.draws)
+    rows = tuple((part, f"{error:g}", *cells_of([draw(part, error, seed) for seed in seeds]))
+                 for part, error in CASES)  # fmt: skip
     table = Table(f"{options.draws} draws, medians of 2 cameras", COLUMNS, rows)
     publish("accuracy.lens", [table], record=options.record)
 
 
-def row_of(part: str, error: float, draws: int) -> tuple[str, ...]:
-    """One case over all draws."""
-    found = [draw(part, error, seed) for seed in range(draws)]
+def cells_of(found: list[Drawn]) -> tuple[str, ...]:
+    """Of all draws: errors before and after, NEES, and how far the estimates are off."""
     cells = [cell for when in ("before", "after") for cell in sizes_of(found, when)]
     nees = np.mean([value for one in found for value in one.nees]) / 6
     off, sigmas = (
         np.concatenate([getattr(one, key) for one in found]) for key in ("off", "sigmas")
     )
     lens = (np.median(np.abs(off)), np.median(sigmas), np.mean((off / sigmas) ** 2))
-    return (part, f"{error:g}", *cells, f"{nees:.2f}", *(f"{value:.2g}" for value in lens))
+    return (*cells, f"{nees:.2f}", *(f"{value:.2g}" for value in lens))
 
 
 def sizes_of(found: list[Drawn], when: str) -> tuple[str, str]:

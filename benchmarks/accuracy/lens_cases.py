@@ -12,22 +12,22 @@ reference. Cases are kept in ``--out``, a line each; a stopped run continues.
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.lens import values_of
 from benchmarks.accuracy.scenes import Folders
-from benchmarks.tables import ROOT, Table, add_record_option
+from benchmarks.accuracy.verdicts import STATUSES, class_of
+from benchmarks.tables import Table
 from calibgraph import Calibration, Config, Dataset, Rig, calibrate, evaluate, load_dataset, perturb
 from calibgraph.model.geometry import twist_between
 from calibgraph.model.rig import Camera
-from factors.free_lens import COEFFICIENT_NUMBERS
 from tests.draws.lenses import put_lens_error
 
 KITTI = ("05", "06", "07", "08", "06+07+08")
@@ -41,7 +41,7 @@ OTHER_RIGS = (
 DRIVES = ("00", "05", "06", "07", "08", "kitti_raw_0005")
 DISTORTED = ("vlp16_distorted", "opencalib_a", "acfr_vlp16_fisheye")
 INTERVAL_S, START_DEG, START_M, SEED = 0.1, 1.0, 0.1, 1
-FAR_SIGMAS, OFF_DEG, OFF_CM = 3.0, 0.5, 10.0
+FAR_SIGMAS = 3.0
 WIDE_SIGMA = 0.3  # of radial coefficients, where nothing is known of them
 FIXED = "fixed"
 
@@ -137,7 +137,7 @@ def _to_record(result: Calibration, truth: Rig) -> Record:
     record = ledger.to_record(result, truth)
     corners_px = evaluate(result.rig, truth).lens_px
     for name, camera in record["cameras"].items():
-        right = _values_of(truth.cameras[name])
+        right = values_of(truth.cameras[name])
         camera["corners_px"] = corners_px.get(name, 0.0)
         camera["lens"] = [
             {
@@ -151,18 +151,6 @@ def _to_record(result: Calibration, truth: Rig) -> Record:
     return record
 
 
-def _values_of(camera: Camera) -> dict[str, float]:
-    """Parameters of a lens and a clock, as results name them."""
-    k, packed = camera.intrinsics_px, camera.lens.packed
-    numbers = COEFFICIENT_NUMBERS[camera.lens.kind]
-    return {
-        "focal": float(np.sqrt(k.fx * k.fy)), "aspect": k.fx / k.fy, "centre_x": k.cx,
-        "centre_y": k.cy,
-        "offset": camera.time_offset_s or 0.0, "readout": camera.readout_s or 0.0,
-        **{name: float(packed[4 + number]) for name, number in numbers.items()},
-    }  # fmt: skip
-
-
 def _moved(before: Calibration, after: Calibration, name: str) -> float | None:
     """Root mean square over six axes of a camera's step, in the error bar without the estimate."""
     covariance = before.covariance[name]
@@ -174,26 +162,21 @@ def _moved(before: Calibration, after: Calibration, name: str) -> float | None:
 
 def report_spoilt(records: Sequence[Record]) -> list[Table]:
     """Verdicts by what was wrong, and a row per case."""
-    columns = (
-        "wrong", "estimated", "cases", "off: PASS", "WARN", "FAIL", "right: PASS", "WARN", "FAIL",
-        "median [deg]", "[cm]", "z^2 of the lens",
-    )  # fmt: skip
+    heads = [(off, status) for off in (True, False) for status in STATUSES]
     rows = []
     for kind in dict.fromkeys(record["kind"] for record in records):
         cameras = [c for r in records if r["kind"] == kind for c in r.get("cameras", {}).values()]
-        if not cameras:
-            continue
-        part, error, how = kind.split()
-        counts = {(off, status): 0 for off in (True, False) for status in ("PASS", "WARN", "FAIL")}
-        for camera in cameras:
-            counts[_is_off(camera), camera["status"]] += 1
-        squares = [one["z"] ** 2 for camera in cameras for one in camera["lens"]]
-        rows.append((
-            f"{part} {error}", "no" if how == FIXED else how, str(len(cameras)),
-            *map(str, counts.values()),
-            *(f"{np.median([c[f'error_{u}'] for c in cameras]):.2f}" for u in ("deg", "cm")),
-            f"{np.mean(squares):.2f}" if squares else "-",
-        ))  # fmt: skip
+        if cameras:
+            counts = Counter((class_of(camera) == "off", camera["status"]) for camera in cameras)
+            squares = [one["z"] ** 2 for camera in cameras for one in camera["lens"]]
+            rows.append((
+                kind, str(len(cameras)), *(str(counts[head]) for head in heads),
+                *(f"{np.median([c[f'error_{u}'] for c in cameras]):.2f}" for u in ("deg", "cm")),
+                f"{np.mean(squares):.2f}" if squares else "-",
+            ))  # fmt: skip
+    columns = ("wrong, estimated", "cases",
+               *(f"{'off' if off else 'right'}: {status}" for off, status in heads),
+               "median [deg]", "[cm]", "z^2 of the lens")  # fmt: skip
     return [Table("Spoilt lenses: cameras", columns, tuple(rows)), _details(records)]
 
 
@@ -203,23 +186,21 @@ def report_right(records: Sequence[Record]) -> list[Table]:
         "estimated", "recording", "parameters", f"beyond {FAR_SIGMAS:g} prior sigmas", "largest",
         "moved, largest [sigma]", "verdicts before", "after", "time ratio",
     )  # fmt: skip
-    rows, total, far = [], 0, 0
+    rows, every = [], list[float]()
     for record in records:
-        cameras = record.get("cameras")
-        if not cameras:
-            rows.append((record["kind"], record["data"], "refused or crashed", *[""] * 6))
-            continue
+        cameras = record.get("cameras", {}).values()
         left = [abs(one["value"] - one["prior"]) / one["prior_sigma"]
-                for camera in cameras.values() for one in camera["lens"]]  # fmt: skip
-        beyond = sum(z > FAR_SIGMAS for z in left)
-        total, far = total + len(left), far + beyond
-        moved = [c["moved_sigmas"] for c in cameras.values() if c["moved_sigmas"] is not None]
+                for camera in cameras for one in camera["lens"]]  # fmt: skip
+        moved = [c["moved_sigmas"] for c in cameras if c["moved_sigmas"] is not None]
+        verdicts = (Counter(camera[key] for camera in cameras) for key in ("before", "status"))
         rows.append((
-            record["kind"], record["data"], str(len(left)), str(beyond),
+            record["kind"], record["data"], str(len(left)), str(sum(z > FAR_SIGMAS for z in left)),
             f"{max(left, default=0):.2f}", f"{max(moved, default=np.nan):.2f}",
-            _counted(cameras, "before"), _counted(cameras, "status"), f"{record['cpu_ratio']:.2f}",
+            *(", ".join(f"{n} {status}" for status, n in sorted(found.items())) or "refused"
+              for found in verdicts), f"{record.get('cpu_ratio', np.nan):.2f}",
         ))  # fmt: skip
-    rows.append(("all", "", str(total), str(far), *[""] * 5))
+        every += left
+    rows.append(("all", "", str(len(every)), str(sum(z > FAR_SIGMAS for z in every)), *[""] * 5))
     return [Table("Nothing wrong", columns, tuple(rows))]
 
 
@@ -235,11 +216,8 @@ def _details(records: Sequence[Record]) -> Table:
         for record in records
         for name, camera in record.get("cameras", {}).items()
     ]  # fmt: skip
-    rows += [
-        (r["data"], r["kind"], "refused or crashed", *[""] * 6)
-        for r in records
-        if "cameras" not in r
-    ]
+    rows += [(r["data"], r["kind"], "refused or crashed", *[""] * 6)
+             for r in records if "cameras" not in r]  # fmt: skip
     return Table("Cameras", columns, tuple(rows))
 
 
@@ -251,15 +229,6 @@ def _farthest(camera: Record) -> tuple[str, str]:
     return f"{one['name']} {error:+.3g}: {one['z']:+.1f}", f"{one['sigma']:.2g}"
 
 
-def _is_off(camera: Record) -> bool:
-    return bool(camera["error_deg"] > OFF_DEG or camera["error_cm"] > OFF_CM)
-
-
-def _counted(cameras: Mapping[str, Record], key: str) -> str:
-    found = [camera[key] for camera in cameras.values()]
-    return ", ".join(f"{found.count(s)} {s}" for s in ("PASS", "WARN", "FAIL") if s in found)
-
-
 REPORTS = {
     "spoilt": report_spoilt,
     "right": report_right,
@@ -269,17 +238,10 @@ REPORTS = {
 
 def main() -> None:
     """Run the cases that are left, and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ledger.case_parser(__doc__, "lens_cases")
     parser.add_argument("--sets", nargs="+", choices=[*REPORTS], default=[*REPORTS])
     parser.add_argument("--data", type=lambda text: text.split(","), default=[], help="only these")
     parser.add_argument("--kind", help="only cases of this kind, as 'focal 0.03 fixed'")
-    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "lens_cases.jsonl")
-    parser.add_argument("--summary", type=Path, help="print the tables of a file, run no case")
-    add_record_option(parser)
     options = parser.parse_args()
     chosen = [
         case for case in cases(options.sets, options.data) if options.kind in (None, case.kind)

@@ -13,118 +13,20 @@ Scenes are rendered once.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
-import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from calibgraph import Config, Dataset, Rig, calibrate, dataset_from_arrays, perturb
-from calibgraph.model.geometry import relative_transform, twist_between
-from calibgraph.simulation.cameras import CameraRays, Imaging, camera_rays, trace_light
-from calibgraph.simulation.lidar import lidar_of, ring_gains, scan
-from calibgraph.simulation.recording import build_drive
-from calibgraph.simulation.rigs import rig_of
-from calibgraph.simulation.scan_errors import ScanErrors
-from calibgraph.simulation.world import World
-from factors import Clock
-from tests.draws.clocks import draw_twists
+from benchmarks.accuracy.lens import values_of
+from benchmarks.tables import parser_of
+from calibgraph import Config, Rig, calibrate, perturb
+from calibgraph.model.geometry import twist_between
 from tests.draws.lenses import put_lens_error
-
-FRAMES, STEP_M, STRIP_PX = 5, 15.0, 16
-ERRORS = ScanErrors(beam_mrad=2.0, dark_m=0.02)
-WRONG = (
-    ("offset",), ("focal",), ("readout",), ("centre",), ("offset", "readout"), ("distortion",),
-    ("offset", "focal"), ("focal", "centre", "distortion"),
-)  # fmt: skip
-"""What is wrong, by the number of the rig."""
-RANGES = {
-    "focal": (0.003, 0.05), "centre": (3.0, 30.0), "distortion": (0.01, 0.1),
-    "offset": (0.005, 0.1), "readout": (0.003, 0.03),
-}  # fmt: skip
-NAMES = {"focal": "focal", "centre": "centre_x", "distortion": "k1"}
-
-Array = NDArray[np.float64]
-
-
-def draw_wrong(seed: int) -> dict[str, float]:
-    """What is wrong by how much."""
-    rng = np.random.default_rng([seed, 5])
-    sizes = {name: float(np.exp(rng.uniform(*np.log(RANGES[name])))) for name in RANGES}
-    signs = {name: 1.0 if name == "readout" else float(rng.choice([-1, 1])) for name in RANGES}
-    return {name: signs[name] * sizes[name] for name in WRONG[seed % len(WRONG)]}
-
-
-def truth_of(seed: int) -> Rig:
-    """A camera like KITTI's, and when it takes its images."""
-    rig, wrong = rig_of("kitti"), draw_wrong(seed)
-    name, camera = next(iter(rig.cameras.items()))
-    times = {"time_offset_s": wrong.get("offset", 0.0), "readout_s": wrong.get("readout", 0.0)}
-    return Rig(cameras={name: camera.model_copy(update=times)})
-
-
-def load_drive(folder: Path, seed: int) -> Dataset:
-    """The drive of a rig; rendered if it is not there."""
-    path, truth = folder / f"{seed}.npz", truth_of(seed)
-    if not path.is_file():
-        np.savez(path, **render_drive(truth, seed))
-    with np.load(path) as kept:
-        clouds = [kept[f"cloud_{n}"] for n in range(FRAMES)]
-        images = {name: [*kept["images"]] for name in truth.cameras}
-        return dataset_from_arrays(truth, clouds, images, twists_per_s=kept["twists"])
-
-
-def render_drive(truth: Rig, seed: int) -> dict[str, NDArray[Any]]:
-    """Clouds, images and twists of a drive."""
-    drive = build_drive(frames=FRAMES, step_m=STEP_M, seed=seed, vary_layout=True)
-    lidar, camera = replace(lidar_of(64), errors=ERRORS), next(iter(truth.cameras.values()))
-    twists = draw_twists(FRAMES, np.random.default_rng([seed, 6]))
-    if seed // len(WRONG) % 2:
-        twists *= 0.1
-        twists[:, 3] = 10.0 * (
-            1.0 + 0.03 * np.random.default_rng([seed, 7]).standard_normal(FRAMES)
-        )
-    gains, rays = ring_gains(lidar, np.random.default_rng([seed, 2])), camera_rays(camera)
-    clock = Clock(camera.time_offset_s or 0.0, camera.readout_s or 0.0, camera.height_px)
-    images, made = [], {}
-    for frame, T_world_lidar in enumerate(drive.T_world_lidar):
-        rng = np.random.default_rng([seed, 3, frame])
-        made[f"cloud_{frame}"] = scan(drive.world, lidar, gains, T_world_lidar, rng=rng)
-        poses = _poses(T_world_lidar, camera.T_camera_lidar, clock, twists[frame])
-        images.append(render_rolling(drive.world, rays, poses, rng))
-    return {**made, "images": np.array(images), "twists": twists}
-
-
-def _poses(
-    T_world_lidar: Array, T_camera_lidar: Array, clock: Clock, twist: Array
-) -> Iterator[Array]:
-    """T_world_camera of each strip of rows."""
-    for row in range(0, clock.height_px, STRIP_PX):
-        middle = row + (min(STRIP_PX, clock.height_px - row) - 1) / 2
-        step = gtsam.Pose3.Expmap(twist * clock.times_s(np.array([middle]))[0]).matrix()
-        yield relative_transform(T_world_lidar @ step, T_camera_lidar)
-
-
-def render_rolling(
-    world: World, rays: CameraRays, poses: Iterator[Array], rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """An image whose strips of rows are taken from poses of their own."""
-    imaging, strips = Imaging(), []
-    for number, T_world_camera in enumerate(poses):
-        rows = slice(number * STRIP_PX, (number + 1) * STRIP_PX)
-        some = CameraRays(rays.directions[rows], rays.blind[rows], rays.pixel_rad)
-        strips.append(trace_light(world, some, T_world_camera))
-    linear = cv2.GaussianBlur(np.concatenate(strips), (0, 0), imaging.blur_px)
-    noise = imaging.noise * rng.standard_normal(linear.shape, np.float32)
-    image = (np.exp(rng.normal(0, imaging.exposure_spread)) * linear) ** (1 / 2.2) + noise
-    return np.asarray(255 * image.clip(0, 1) + 0.5, np.uint8)
+from tools.scenes.rolling_drives import WRONG, draw_wrong, load_drive, truth_of
 
 
 def wrong_rig(truth: Rig, wrong: dict[str, float]) -> Rig:
@@ -154,7 +56,7 @@ def run(seed: int, folder: Path) -> Iterator[dict[str, Any]]:
         for name, camera in truth.cameras.items():
             error = twist_between(result.rig.T_camera_lidar[name], camera.T_camera_lidar)
             covariance, verdict = result.covariance[name], result.camera_verdicts[name]
-            right = _right(truth, name)
+            right = values_of(camera)
             yield {
                 "seed": seed, "case": case, "wrong": wrong, "cpu_s": round(seconds, 1),
                 "deg": float(np.degrees(np.linalg.norm(error[:3]))),
@@ -171,20 +73,9 @@ def run(seed: int, folder: Path) -> Iterator[dict[str, Any]]:
             }  # fmt: skip
 
 
-def _right(truth: Rig, name: str) -> dict[str, float]:
-    camera = truth.cameras[name]
-    k = camera.intrinsics_px
-    zero = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
-    times = {"offset": camera.time_offset_s or 0.0, "readout": camera.readout_s or 0.0}
-    focal = float(np.sqrt(k.fx * k.fy))
-    return {"focal": focal, "centre_x": k.cx, "centre_y": k.cy, **zero, **times}
-
-
 def main() -> None:
     """Render, calibrate, and write a line per result."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--scenes", type=Path, required=True)
     parser.add_argument("--rigs", default="0:64")
     parser.add_argument("--out", type=Path)

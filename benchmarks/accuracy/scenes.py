@@ -1,4 +1,4 @@
-"""Recorded and simulated data, and ways to change their images and clouds, for ``data_cases``."""
+"""Recorded and simulated data, and ways to change their images and clouds, for ``cases``."""
 
 from __future__ import annotations
 

@@ -13,7 +13,6 @@ error over the variance of each axis (1 is expected).
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections import Counter
 from collections.abc import Callable
@@ -28,8 +27,8 @@ import numpy as np
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import Folders, Scene, with_clouds, with_images
-from benchmarks.tables import ROOT, Table, add_record_option
-from calibgraph import Camera, Dataset, Frame, calibrate, evaluate, perturb
+from benchmarks.tables import Table
+from calibgraph import Dataset, Frame, calibrate, evaluate, perturb
 
 SUCCESS_DEG, SUCCESS_CM = 0.5, 15.0
 STATUSES = ("PASS", "WARN", "FAIL")
@@ -38,7 +37,15 @@ BEAM_DEG = 0.4  # about the spacing of 64 beams over 26 degrees
 
 def main() -> None:
     """Run cases, print the table."""
-    arguments = parse_options()
+    words: Callable[[str], list[str]] = lambda text: text.split(",")  # noqa: E731
+    parser = ledger.case_parser(__doc__, "search")
+    parser.add_argument("--data", type=words, default=["00", "00+01", "05", "05+06+07+08"])
+    parser.add_argument("--within", type=words, default=["20/1.5", "10/0.5", "5/0.3", "2/0.2"])
+    parser.add_argument("--kinds", type=words, default=["good"], help=", ".join(KINDS))
+    parser.add_argument("--starts", type=int, default=20, help="draws per case")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
+    parser.add_argument("--cameras", action="store_true", help="a row per camera, too")
+    arguments = parser.parse_args()
     cases = [
         Key(within, kind, data, seed)
         for seed in range(arguments.first, arguments.first + arguments.starts)
@@ -52,26 +59,6 @@ def main() -> None:
     ledger.publish_cases("accuracy.search", tables, records, record=arguments.record)
     for record in records:
         print(record.get("crash", ""), end="")
-
-
-def parse_options() -> argparse.Namespace:
-    """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    words: Callable[[str], list[str]] = lambda text: text.split(",")  # noqa: E731
-    parser.add_argument("--data", type=words, default=["00", "00+01", "05", "05+06+07+08"])
-    parser.add_argument("--within", type=words, default=["20/1.5", "10/0.5", "5/0.3", "2/0.2"])
-    parser.add_argument("--kinds", type=words, default=["good"], help=", ".join(KINDS))
-    parser.add_argument("--starts", type=int, default=20, help="draws per case")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
-    parser.add_argument("--jobs", type=int, default=1, help="1 to measure time")
-    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "search.jsonl")
-    parser.add_argument("--summary", type=Path, help="print the table of a file, run nothing")
-    parser.add_argument("--cameras", action="store_true", help="a row per camera, too")
-    add_record_option(parser)
-    return parser.parse_args()
 
 
 def run_case(case: Key, folders: Folders) -> Record:
@@ -97,28 +84,16 @@ def run_case(case: Key, folders: Folders) -> Record:
     }
 
 
-def _good(scene: Scene) -> Dataset:
-    return scene.data
-
-
 def _few(scene: Scene, frames: int) -> Dataset:
     """So many frames, from one that the seed chooses."""
     first = scene.seed % (len(scene.data.frames) - frames + 1)
     return replace(scene.data, frames=scene.data.frames[first : first + frames])
 
 
-def _no_intensity(scene: Scene) -> Dataset:
-    return with_clouds(scene, lambda cloud: cloud[:, :3])
-
-
-def _half_beams(scene: Scene) -> Dataset:
+def _half_beams(cloud: Any) -> Any:
     """Every other band of elevation as wide as the spacing of the beams."""
-
-    def every_other(cloud: Any) -> Any:
-        elevation = np.degrees(np.arctan2(cloud[:, 2], np.hypot(cloud[:, 0], cloud[:, 1])))
-        return cloud[np.floor(elevation / BEAM_DEG) % 2 == 0]
-
-    return with_clouds(scene, every_other)
+    elevation = np.degrees(np.arctan2(cloud[:, 2], np.hypot(cloud[:, 0], cloud[:, 1])))
+    return cloud[np.floor(elevation / BEAM_DEG) % 2 == 0]
 
 
 def _changed(
@@ -129,31 +104,27 @@ def _changed(
     def paths(index: int, frame: Frame) -> dict[str, Path]:
         found = dict(frame.image_paths)
         for name in filter(chosen, frame.image_paths):
-            camera: Camera = scene.truth.cameras[name]
             found[name] = scene.scratch / f"{name}_{frame.index:06d}.png"
-            cv2.imwrite(str(found[name]), change(frame.load_image(name, camera)))
+            image = frame.load_image(name, scene.truth.cameras[name])
+            cv2.imwrite(str(found[name]), change(image))
         return found
 
     return with_images(scene.data, paths)
 
 
-def _dark(image: Any) -> Any:
-    return (image * 0.15).astype(np.uint8)
-
-
 def _over_exposed(image: Any) -> Any:
     """So bright that 10 % more of the image is white."""
-    level = np.quantile(image[image < 255], 0.9)  # noqa: PLR2004
+    level = np.quantile(image[image < 255], 0.9)
     return np.clip(image * (255.0 / level), 0, 255).astype(np.uint8)
 
 
 KINDS: dict[str, Callable[[Scene], Dataset]] = {
-    "good": _good,
+    "good": lambda scene: scene.data,
     "one_frame": partial(_few, frames=1),
     "two_frames": partial(_few, frames=2),
-    "no_intensity": _no_intensity,
-    "half_beams": _half_beams,
-    "dark": partial(_changed, change=_dark),
+    "no_intensity": partial(with_clouds, change=lambda cloud: cloud[:, :3]),
+    "half_beams": partial(with_clouds, change=_half_beams),
+    "dark": partial(_changed, change=lambda image: (image * 0.15).astype(np.uint8)),
     "blurred": partial(_changed, change=lambda image: cv2.GaussianBlur(image, (0, 0), 2.0)),
     "over_exposed": partial(_changed, change=_over_exposed),
     "covered": partial(

@@ -11,7 +11,6 @@ A result is right within 0.3 degrees and 7 cm of its alignment, and off beyond 0
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -21,20 +20,20 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import ledger
-from benchmarks.accuracy.alignment import mean_poses
-from benchmarks.accuracy.data_cases import KINDS
+from benchmarks.accuracy.cases import DATA
 from benchmarks.accuracy.error_bars import (
     OFF,
-    RIGS,
     STATUSES,
     STREETS,
+    group_parser,
     render_street,
     seeds_of,
 )
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import Folders, Scene
-from benchmarks.tables import ROOT, Table, add_record_option
+from benchmarks.tables import Table
 from calibgraph import calibrate, load_dataset
+from tools.scenes.sensor_streets import RIGS, mean_poses
 
 LONGER, CLOSER_M = 6, 1.5  # frames of the street that is alone, and their distance
 _ALONE = 300_000  # seeds of such streets
@@ -50,7 +49,7 @@ KINDS_IN_ORDER = (GOOD, ONE, *WRONG)
 
 def main() -> None:
     """Run cases, print the tables."""
-    options = parse_options()
+    options = group_parser(__doc__, "street_verdicts", [116, 163]).parse_args()
     cases = [
         Key("streets", kind, f"{options.size:g}", group)
         for group in range(*options.groups)
@@ -59,23 +58,6 @@ def main() -> None:
     records = ledger.records_of(options, cases, partial(run_case, scenes=options.scenes))
     tables = [report(records), report_checks(records)]
     ledger.publish_cases("accuracy.street_verdicts", tables, records, record=options.record)
-
-
-def parse_options() -> argparse.Namespace:
-    """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scenes", type=Path, default=ROOT / "out" / "error_bars")
-    parser.add_argument(
-        "--groups", type=lambda text: [int(n) for n in text.split(":")], default=[116, 163]
-    )
-    parser.add_argument("--size", type=float, default=2.0, help="of the errors; one folder each")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "street_verdicts.jsonl")
-    parser.add_argument("--summary", type=Path, help="print the tables of a file, run nothing")
-    add_record_option(parser)
-    return parser.parse_args()
 
 
 def run_case(case: Key, scenes: Path) -> Record:
@@ -90,7 +72,7 @@ def run_case(case: Key, scenes: Path) -> Record:
         rigs = [rendered(*each) for each in zip(folders, [group] * STREETS, seeds, strict=True)]
     stated = rigs[0][0]
     truth = stated.moved_to(mean_poses([aligned.T_camera_lidar for _, aligned in rigs]))
-    spoil = KINDS[GOOD if case.kind == ONE else case.kind]
+    spoil = DATA[GOOD if case.kind == ONE else case.kind]
     with tempfile.TemporaryDirectory() as scratch:
         name, data = RIGS[group % len(RIGS)][0], load_dataset(folders, stated)
         scene = Scene(name, data, stated, Folders(None, None), Path(scratch), group)
@@ -131,14 +113,8 @@ def _cells(name: str, records: Sequence[Record]) -> tuple[str, ...]:
     refused = sum("refusal" in record for record in records)
     counts = [str(found[which, status]) for which in CLASSES for status in STATUSES]
     places = _median(record["places"] for record in done)
-    return (
-        name,
-        str(len(records)),
-        str(refused),
-        f"{places:g}",
-        *(f"{v:.2f}" for v in sizes),
-        *counts,
-    )
+    errors = (f"{v:.2f}" for v in sizes)
+    return (name, str(len(records)), str(refused), f"{places:g}", *errors, *counts)
 
 
 def _median(values: Iterable[float]) -> float:

@@ -2,7 +2,7 @@
 
     python -m benchmarks.accuracy.tracked_places [--draws 200] [--cases circling ...]
 
-Errors are drawn from the error model, as in ``place_draws``, 2 cameras. A vehicle stands, creeps,
+Errors are drawn from the error model, 2 cameras. A vehicle stands, creeps,
 drives on, or circles one block; each drive has 60 frames, which name their places. NEES is the
 squared error in the metric of its covariance; its mean over 6 should be 1. Moves and drifts that
 are reported are false: nothing moves.
@@ -16,9 +16,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.accuracy.place_draws import parse_options
 from benchmarks.accuracy.uncertainty import calibration
-from benchmarks.tables import Table, publish
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import Config, IncrementalCalibrator
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
@@ -40,7 +39,11 @@ COLUMNS = ("case", "error of", "mean NEES / 6", "in the 95 % region", "error [de
 
 def main() -> None:
     """Draw, track, and print one table."""
-    options = parse_options(__doc__, [*CASES])
+    parser = parser_of(__doc__)
+    parser.add_argument("--draws", type=int, default=200)
+    parser.add_argument("--matches", type=int, default=100)
+    parser.add_argument("--cases", nargs="+", default=[*CASES], choices=[*CASES])
+    options = parser.parse_args()
     rows = [row for case in options.cases for row in rows_of(case, options.draws, options.matches)]
     title = f"{options.draws} draws, 60 frames, {options.matches} matches each"
     publish("accuracy.tracked_places", [Table(title, COLUMNS, tuple(rows))], record=options.record)

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import (
     Config,
     Correspondences,
@@ -59,23 +59,15 @@ COLUMNS = ("error of", "covariance", "mean NEES / 6", "in the 95 % region")
 
 def main() -> None:
     """Draw, solve, and print one table."""
-    options = parse_options()
-    table = awkward_cases(options) if options.awkward else both_covariances(options)
-    publish("accuracy.uncertainty", [table], record=options.record)
-
-
-def parse_options() -> argparse.Namespace:
-    """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--matches", type=int, default=100)
     parser.add_argument("--awkward", action="store_true", help="few frames, copies, tied cameras")
     parser.add_argument("--cases", nargs="+", default=[*CASES], choices=[*CASES])
-    add_record_option(parser)
-    return parser.parse_args()
+    options = parser.parse_args()
+    table = awkward_cases(options) if options.awkward else both_covariances(options)
+    publish("accuracy.uncertainty", [table], record=options.record)
 
 
 def both_covariances(options: argparse.Namespace) -> Table:
@@ -109,12 +101,9 @@ def draw(frames: int, matches: int, seed: int) -> Iterator[tuple[str, str, float
 def nees_of(solved: Solution, truth: Rig, joint: Array | None) -> Iterator[tuple[str, float]]:
     """Error of what, its NEES."""
     assert joint is not None
-    errors = np.concatenate(
-        [
-            twist_between(T, truth.cameras[name].T_camera_lidar)
-            for name, T in solved.T_camera_lidar.items()
-        ]
-    )
+    right = truth.T_camera_lidar
+    each = [twist_between(T, right[name]) for name, T in solved.T_camera_lidar.items()]
+    errors = np.concatenate(each)
     for what, error, covariance in parts(solved, errors, joint):
         yield what, float(error @ np.linalg.solve(covariance, error))
 
@@ -214,21 +203,16 @@ def copied(drawn: Drawn, rng: Rng, *, noise_px: float = 0.0, named: bool = False
 MATCHERS = {"half": ERRORS, "fifth": FIFTH, "shared": FIFTH}
 _SHARE, _STATED, _ONE = ("half", "fifth"), ("half", "shared"), ("half",)
 CASES: dict[str, tuple[Change, tuple[str, ...]]] = {
-    "1 frame of left": (partial(left_frames, count=1), _SHARE),
-    "2 frames of left": (partial(left_frames, count=2), _SHARE),
-    "3 frames of left": (partial(left_frames, count=3), _SHARE),
-    "5 frames of left": (partial(left_frames, count=5), _SHARE),
-    "10 frames of left": (partial(left_frames, count=10), _SHARE),
-    "30 frames of left": (partial(left_frames, count=30), _SHARE),
-    "right tied alone, 2.9 deg 30 cm": (partial(tied_alone, deg=2.9, cm=30.0), _STATED),
-    "right tied alone, 0.1 deg 1 cm": (partial(tied_alone, deg=0.1, cm=1.0), _STATED),
-    "matches and tied, 2.9 deg 30 cm": (partial(tied, deg=2.9, cm=30.0), _STATED),
-    "matches and tied, 0.1 deg 1 cm": (partial(tied, deg=0.1, cm=1.0), _STATED),
+    **{f"{count} frame{'s' * (count > 1)} of left": (partial(left_frames, count=count), _SHARE)
+       for count in (1, 2, 3, 5, 10, 30)},
+    **{f"{name}, {deg} deg {cm} cm": (partial(change, deg=deg, cm=cm), _STATED)
+       for name, change in (("right tied alone", tied_alone), ("matches and tied", tied))
+       for deg, cm in ((2.9, 30), (0.1, 1))},
     "3 frames of both": (partial(first_frames, count=COPIED), _ONE),
     "10 copies": (copied, _ONE),
     "10 copies, 0.1 px of noise, named": (partial(copied, noise_px=0.1, named=True), _ONE),
     "10 copies, 0.1 px of noise": (partial(copied, noise_px=0.1), _ONE),
-}
+}  # fmt: skip
 """Per case, what is done to a full table, and whose errors are drawn."""
 
 

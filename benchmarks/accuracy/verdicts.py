@@ -24,16 +24,24 @@ import argparse
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 
-from benchmarks.accuracy import data_cases, ledger, table_cases
-from benchmarks.accuracy.data_cases import data_for, data_problem
+from benchmarks.accuracy import ledger
+from benchmarks.accuracy.cases import (
+    DATA,
+    TABLES,
+    UNDETECTABLE,
+    data_for,
+    data_problem,
+    rig_for,
+    table_problem,
+)
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import MOTORWAY, Folders
-from benchmarks.accuracy.table_cases import UNDETECTABLE, rig_for, table_problem
-from benchmarks.tables import ROOT, Table, add_record_option
+from benchmarks.tables import ROOT, Table
 
 SCENES = ROOT / "out" / "scenes"
 OFF_DEG, OFF_CM = 0.5, 10.0
@@ -41,26 +49,15 @@ RIGHT_DEG, RIGHT_CM = 0.15, 4.0
 FIRST_SEED = {"tune": 0, "count": 1000}
 STATUSES = ("PASS", "WARN", "FAIL")
 CLASSES = ("off", "between", "right")
-GOOD_KINDS = ("good",)
 
 
 def main() -> None:
     """Run cases, print the summary."""
     options = parse_options()
-    if options.summary is not None:
-        records = [record for path in options.summary for record in ledger.read(path)]
-    else:
-        folders = Folders(
-            options.realdata if options.realdata.is_dir() else None,
-            options.scenes if options.scenes.is_dir() else None,
-        )
-        cases = [
-            case
-            for case in cases_of(options, folders)
-            if options.kinds is None or case.kind in options.kinds
-        ]
-        work = partial(run_case, folders=folders)
-        records = ledger.run(cases, work, out=options.out, jobs=options.jobs)
+    there = (path if path.is_dir() else None for path in (options.realdata, options.scenes))
+    folders = Folders(*there)
+    cases = [case for case in cases_of(options, folders) if case.kind in options.kinds]
+    records = ledger.records_of(options, cases, partial(run_case, folders=folders))
     counted = [record for record in records if record["kind"] not in options.uncounted]
     tables = [summary(records, counted), figures(counted)]
     ledger.publish_cases("accuracy.verdicts", tables, records, record=options.record)
@@ -69,36 +66,21 @@ def main() -> None:
 
 def parse_options() -> argparse.Namespace:
     """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    known = sorted({*table_cases.KINDS, *data_cases.KINDS})
-    parser.add_argument("--set", choices=FIRST_SEED, default="tune")
-    parser.add_argument("--tables", type=int, default=0, help="cases per kind of table")
-    parser.add_argument("--data", type=int, default=0, help="cases per kind of images and clouds")
-    parser.add_argument("--first", type=int, default=0, help="number of the first case of a kind")
-    parser.add_argument("--kinds", type=_names, help=", ".join(known))
-    parser.add_argument(
-        "--uncounted",
-        type=_names,
-        default=(*UNDETECTABLE, *data_cases.UNDETECTABLE),
-        help="left out of the sums",
-    )
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--realdata", type=Path, default=ledger.REALDATA)
-    parser.add_argument("--scenes", type=Path, default=SCENES, help="folder of scene_0, ...")
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "verdicts.jsonl")
-    parser.add_argument("--summary", type=Path, nargs="+", help="summarise files, run nothing")
-    add_record_option(parser)
+    known, parser = sorted({*TABLES, *DATA}), ledger.case_parser(__doc__, "verdicts")
+    names: Callable[[str], tuple[str, ...]] = lambda text: tuple(text.split(","))  # noqa: E731
+    add = parser.add_argument
+    add("--set", choices=FIRST_SEED, default="tune")
+    add("--tables", type=int, default=0, help="cases per kind of table")
+    add("--data", type=int, default=0, help="cases per kind of images and clouds")
+    add("--first", type=int, default=0, help="number of the first case of a kind")
+    add("--kinds", type=names, default=known, help=", ".join(known))
+    add("--uncounted", type=names, default=UNDETECTABLE, help="left out of the sums")
+    add("--scenes", type=Path, default=SCENES, help="folder of scene_0, ...")
     arguments = parser.parse_args()
-    unknown = {*(arguments.kinds or ())} - {*known}
+    unknown = {*arguments.kinds} - {*known}
     if unknown:
         parser.error(f"unknown kinds {', '.join(sorted(unknown))}; known: {', '.join(known)}")
     return arguments
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(text.split(","))
 
 
 def cases_of(arguments: argparse.Namespace, folders: Folders) -> Iterator[Key]:
@@ -107,10 +89,10 @@ def cases_of(arguments: argparse.Namespace, folders: Folders) -> Iterator[Key]:
     names = folders.names(arguments.set)
     for seed in range(first, first + max(arguments.tables, arguments.data)):
         if seed < first + arguments.tables:
-            for kind in table_cases.KINDS:
+            for kind in TABLES:
                 yield Key("table", kind, rig_for(kind, seed), seed)
         if seed < first + arguments.data:
-            for kind in data_cases.KINDS:
+            for kind in DATA:
                 name = data_for(kind, names, seed)
                 missing = name is None or (name == MOTORWAY and not folders.realdata)
                 if not missing:
@@ -169,7 +151,7 @@ def cells(name: str, group: list[Record]) -> tuple[str, ...]:
 
 
 def _order(record: Record) -> tuple[str, int]:
-    kinds = [*(table_cases if record["level"] == "table" else data_cases).KINDS]
+    kinds = [*(TABLES if record["level"] == "table" else DATA)]
     return record["level"], kinds.index(record["kind"])
 
 
@@ -178,66 +160,45 @@ def figures(counted: list[Record]) -> Table:
     found = Counter(cameras_of(counted))
     off, right = (sum(found[which, s] for s in STATUSES) for which in ("off", "right"))
     wrong_cases = [r for r in counted if any(which == "off" for which, _ in cameras_of([r]))]
-    refused_good = sum("refusal" in r for r in counted if r["kind"] in GOOD_KINDS)
+    refused_good = sum("refusal" in r for r in counted if r["kind"] == "good")
     calm = found["right", "PASS"] + found["right", "WARN"]
     off_by = f"off by more than {OFF_DEG} deg or {OFF_CM:g} cm"
-    return Table(
-        "Wrong verdicts",
-        ("", "share"),
-        (
-            (f"PASS, of results {off_by}", share(found["off", "PASS"], off)),
-            (f"PASS, of cases with a result {off_by}",
-             share(len(_passed(counted)), len(wrong_cases))),
-            (f"PASS or WARN, of results within {RIGHT_DEG} deg and {RIGHT_CM:g} cm and good cases "
-             "that were refused", share(calm, right + refused_good)),
-            *((f"cannot_tell, of WARN of results that are {which}", _unsure(counted, which))
-              for which in ("off", "right")),
-        ),
-    )  # fmt: skip
-
-
-def _unsure(counted: list[Record], which: str) -> str:
-    """Of the results of a class that WARN, those for lack of data."""
-    warned = [
-        camera.get("cannot_tell", False)
-        for record in counted
-        for camera in record.get("cameras", {}).values()
-        if (class_of(camera), camera["status"]) == (which, "WARN")
+    within = f"within {RIGHT_DEG} deg and {RIGHT_CM:g} cm and good cases that were refused"
+    rows = [
+        (f"PASS, of results {off_by}", share(found["off", "PASS"], off)),
+        (f"PASS, of cases with a result {off_by}", share(len(_passed(counted)), len(wrong_cases))),
+        (f"PASS or WARN, of results {within}", share(calm, right + refused_good)),
     ]
-    return share(sum(warned), len(warned))
+    for which in ("off", "right"):
+        cameras = [c for r in counted for c in r.get("cameras", {}).values()]
+        warned = [c.get("cannot_tell", False) for c in cameras
+                  if (class_of(c), c["status"]) == (which, "WARN")]  # fmt: skip
+        what = f"cannot_tell, of WARN of results that are {which}"
+        rows.append((what, share(sum(warned), len(warned))))
+    return Table("Wrong verdicts", ("", "share"), tuple(rows))
 
 
-def remarks(records: list[Record], counted: list[Record]) -> list[str]:
+def remarks(records: list[Record], counted: list[Record]) -> Iterator[str]:
     """Cases that PASS although off, reasons of refusals, and crashes."""
+    for record in _passed(counted):
+        wrong = {
+            name: f"{camera['error_deg']:.2f} deg {camera['error_cm']:.1f} cm"
+            for name, camera in record["cameras"].items()
+            if class_of(camera) == "off" and camera["status"] == "PASS"
+        }
+        yield f"PASS but off: {' '.join(map(str, astuple(ledger.key_of(record))))}: {wrong}"
     refusals = Counter(
-        (r["level"], r["kind"], _masked(r["refusal"])) for r in records if "refusal" in r
-    )
+        (r["level"], r["kind"], re.sub(r"[0-9.]+", "#", r["refusal"])[:120])
+        for r in records if "refusal" in r
+    )  # fmt: skip
     crashes = Counter(r["crash"].strip().splitlines()[-1] for r in records if "crash" in r)
-    return [
-        *(f"PASS but off: {_line(record)}" for record in _passed(counted)),
-        *(f"refused, {n}: {' '.join(what)}" for what, n in refusals.items()),
-        *(f"CRASHED, {n}: {what}" for what, n in crashes.items()),
-    ]
+    yield from (f"refused, {n}: {' '.join(what)}" for what, n in refusals.items())
+    yield from (f"CRASHED, {n}: {what}" for what, n in crashes.items())
 
 
 def _passed(counted: list[Record]) -> list[Record]:
     """Cases with a camera that PASSes although off."""
     return [r for r in counted if ("off", "PASS") in {*cameras_of([r])}]
-
-
-def _masked(text: str) -> str:
-    """A message without its numbers, so that equal ones can be counted, and not too long."""
-    return re.sub(r"[0-9.]+", "#", text)[:120]
-
-
-def _line(record: Record) -> str:
-    wrong = {
-        name: f"{camera['error_deg']:.2f} deg {camera['error_cm']:.1f} cm"
-        for name, camera in record["cameras"].items()
-        if class_of(camera) == "off" and camera["status"] == "PASS"
-    }
-    key = ledger.key_of(record)
-    return f"{key.level} {key.kind} {key.data} {key.seed}: {wrong}"
 
 
 def share(part: int, whole: int) -> str:

@@ -12,17 +12,16 @@ one camera of one batch by 0.5 degrees in the middle of the year.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from benchmarks.tables import Table, add_record_option, publish
-from calibgraph.fleet.findings import Finding, find_changes
-from calibgraph.fleet.model import FleetModel, fit_fleet
-from calibgraph.fleet.observations import observe
+from benchmarks.tables import Table, parser_of, publish
+from calibgraph.audit.findings import Finding, find_changes
+from calibgraph.audit.fleet_model import FleetModel, fit_fleet
+from calibgraph.audit.observations import observe
 from calibgraph.model.geometry import twists_between
 from tests.draws.fleets import Fleet, errors_of, simulate_fleet
 
@@ -45,10 +44,9 @@ class Sums:
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = parser_of(__doc__)
     parser.add_argument("--fleets", type=int, default=10)
     parser.add_argument("--vehicles", type=int, default=500)
-    add_record_option(parser)
     options = parser.parse_args()
     sums, begun = Sums(), time.perf_counter()
     for seed in range(options.fleets):

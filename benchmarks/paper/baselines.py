@@ -1,9 +1,8 @@
-"""What our method is compared with: the paper's solver, one camera at a time, and a bound."""
+"""What our method is compared with: the solver that the paper publishes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
@@ -16,12 +15,8 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert, relative_transform, to_T_lidar_camera
 from calibgraph.model.rig import Rig
-from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import CameraBlock, camera_blocks
-from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.objective import Objective, Transforms
-from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread
-from calibgraph.solver.stage1 import Stage1
+from calibgraph.solver.objective import Transforms
 
 Array = NDArray[np.float64]
 
@@ -63,12 +58,9 @@ def paper_solve(
 
 
 def _minimize_pass(
-    blocks: Mapping[str, CameraBlock],
-    start: Transforms,
-    T_hat: Transforms,
-    config: Config,
+    blocks: Mapping[str, CameraBlock], start: Transforms, T_hat: Transforms, config: Config,
     terms: Terms,
-) -> Transforms:
+) -> Transforms:  # fmt: skip
     def residuals(T: Transforms) -> Array:
         rows = [_weighted_residuals(block, T[name]) for name, block in blocks.items()]
         return np.concatenate([*rows, np.empty((0, 2))])
@@ -110,12 +102,9 @@ def _log(T: Array) -> Array:
 
 
 def minimize_trf(
-    residuals: Callable[[Transforms], Array],
-    priors: Callable[[Transforms], Array],
-    start: Transforms,
-    *,
-    scale_px: float,
-) -> Transforms:
+    residuals: Callable[[Transforms], Array], priors: Callable[[Transforms], Array],
+    start: Transforms, *, scale_px: float,
+) -> Transforms:  # fmt: skip
     """Minimize sum rho(|r_k|^2) + sum priors^2 by SciPy's TRF, as in "Implementation Details".
 
     Axis-angle and translation per camera, tolerances of 1e-6, at most 2000 evaluations, a Jacobian
@@ -163,71 +152,3 @@ def _unpack(names: list[str], x: Array) -> Transforms:
         T[name][:3, :3] = Rotation.from_rotvec(six[:3]).as_matrix()
         T[name][:3, 3] = six[3:]
     return T
-
-
-def per_camera_adjustment(
-    rig: Rig, table: Correspondences, config: Config, *, pairwise: Stage1 | None = None
-) -> Transforms:
-    """Bundle adjustment of each camera alone: the two passes with its reprojection term only.
-
-    Args:
-        rig: lenses and the guess; its relative poses are not used.
-        table: correspondences.
-        config: with the scales of the loss and the gate.
-        pairwise: Stage 1 of all cameras; computed if None.
-    """
-    T_camera_lidar: Transforms = {}
-    for name, camera in rig.cameras.items():
-        alone = Rig(lidar=rig.lidar, cameras={name: camera})
-        own = table.of_camera(name)
-        solution = solve_joint(alone, own, config, "reprojection", pairwise=pairwise)
-        T_camera_lidar |= solution.T_camera_lidar
-    return T_camera_lidar
-
-
-def oracle_solve(rig: Rig, table: Correspondences, truth: Transforms, config: Config) -> Transforms:
-    """An approximate bound: the reprojection term with weights computed from the truth.
-
-    Every frame of a camera is weighted by the inverse mean square error of its matches: that of
-    their noise, plus that of the frame's own optimum in units of a single match. Both are measured
-    at the true extrinsics. The fit starts there; loss and gate follow the residuals' spread, as
-    with ``auto``. Weights cannot remove an error that is common to all frames; frames whose own
-    errors happen to compensate for it then get too much weight.
-
-    Args:
-        rig: lenses, and the order of the cameras.
-        table: preprocessed correspondences.
-        truth: (4, 4) true T_camera_lidar per camera.
-        config: settings; those of the preset ``auto``, say.
-    """
-    blocks = {
-        name: block.with_weights(oracle_weights(block, truth[name]))
-        for name, block in camera_blocks(rig, table, config).items()
-    }
-    alone = Rig(lidar=rig.lidar, cameras=rig.cameras)
-    objective = Objective(alone, blocks, {}, config, "reprojection")
-    rough, scales = objective.minimize_with_scale(truth)
-    return objective.without_outliers(rough, scales).minimize(rough, scales).T_camera_lidar
-
-
-def oracle_weights(matches: CameraBlock, T_camera_lidar: Array) -> Array:
-    """(n,) a weight per match, equal within a frame and at most 1.
-
-    It is 1 / (s^2 + b^T H^-1 b / 6), with the spread s of the frame's residuals and the squared
-    error b^T H^-1 b of its own optimum (one Gauss-Newton step from the truth). With independent
-    noise alone the second term is s^2 on average.
-
-    Args:
-        matches: of one camera.
-        T_camera_lidar: (4, 4) the truth.
-    """
-    weights = []
-    for edge in pairwise(matches.frame_edges):
-        part = matches.select(np.arange(*edge))
-        spread = robust_spread(BlockResiduals.at(T_camera_lidar, part).sizes[1])
-        block = replace(part.block, scale=CAUCHY_SCALE_SIGMAS * max(spread, part.least_spread))
-        sums = block.sums(to_T_lidar_camera(T_camera_lidar))
-        squared_error = sums.gradient @ np.linalg.pinv(sums.hessian, hermitian=True) @ sums.gradient
-        weights.append(1 / (spread**2 + squared_error / _DIMENSIONS + part.least_spread**2))
-    each = np.repeat(weights, np.diff(matches.frame_edges))
-    return np.asarray(each / each.max())

@@ -1,4 +1,4 @@
-"""The experiment's report as Markdown, JSON and a plot."""
+"""The experiment's report as Markdown and JSON, beside the numbers that the paper publishes."""
 
 from __future__ import annotations
 
@@ -6,28 +6,24 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from benchmarks.paper.draws import HEADLINE, STAGE1, TRF_TERMS
 from benchmarks.paper.experiment import (
     IMPROVEMENT,
     REPROJECTION,
     ROTATION,
     TRANSLATION,
     Block,
-    Interval,
     Report,
     Row,
 )
-from benchmarks.paper.methods import HEADLINE
-from benchmarks.paper.published import AXES, PAIR, published
 from benchmarks.tables import Table
 from calibgraph.report.as_json import finite
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
+AXES = (TRANSLATION, ROTATION, "x_cm", "y_cm", "z_cm", "roll_deg", "pitch_deg", "yaw_deg")
 _HEADS = {
     TRANSLATION: "E_t [cm]", ROTATION: "E_R [deg]", "x_cm": "x [cm]", "y_cm": "y [cm]",
     "z_cm": "z [cm]", "roll_deg": "roll [deg]", "pitch_deg": "pitch [deg]",
@@ -44,24 +40,47 @@ on its own data, which is not this data. All rows have the same correspondences 
 * "per-camera BA": each camera alone, reprojection term only, the paper's scales, our solver.
 * "relative pose known": the relative pose of neighbouring cameras is given, within 1 mrad and 2 mm
   per axis.
-* "oracle weights": every frame of a camera is weighted by its inverse mean square error, computed
-  from the simulation's truth: an approximate bound of what weights can achieve. It is not strict
-  where an error is common to all frames: frames whose own errors compensate for it get too much
-  weight.
 """
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-_MIN_SHOWN = 1e-4  # deg or cm: zero on a logarithmic axis
-_COLUMN_IN, _ROW_IN, _NAMES_IN = 3.3, 0.27, 2.6
+_REPROJECTION, _PRIORS, _FULL = TRF_TERMS
+PUBLISHED: dict[tuple[str, str, int], tuple[tuple[float, ...], ...]] = {
+    ("kitti", STAGE1, 10): ((1.14, 0.002), (5.99, 0.001), (5.04, 0.001), (1.09, 0.52)),
+    ("kitti", _REPROJECTION, 10): ((), (), (4.37, 0.035), (0.72, 0.43)),
+    ("kitti", _PRIORS, 10): ((), (), (4.18, 0.178), (2.19, 0.56)),
+    ("kitti", _FULL, 10): ((1.19, 0.043), (5.17, 0.030), (4.11, 0.033), (0.67, 0.41)),
+    ("kitti", STAGE1, 100): ((2.63, 0.187), (6.23, 0.137), (3.56, 0.206), (2.57, 0.65)),
+    ("kitti", _REPROJECTION, 100): ((), (), (4.46, 0.040), (0.77, 0.54)),
+    ("kitti", _PRIORS, 100): ((), (), (4.18, 0.178), (2.19, 0.56)),
+    ("kitti", _FULL, 100): ((0.89, 0.038), (4.97, 0.030), (4.16, 0.037), (0.71, 0.50)),
+    ("walkley", STAGE1, 10): ((150.9, 0.91), (41.6, 0.63), (117.1, 1.08), ()),
+    ("walkley", _REPROJECTION, 10): ((60.2, 1.06), (24.3, 0.50), (47.8, 1.06), ()),
+    ("walkley", _PRIORS, 10): ((133.7, 0.80), (35.5, 0.56), (100.9, 1.06), ()),
+    ("walkley", _FULL, 10): ((54.2, 0.95), (21.9, 0.45), (43.1, 0.95), ()),
+    ("walkley", STAGE1, 100): ((87.2, 1.09), (108.6, 1.66), (87.0, 1.06), ()),
+    ("walkley", _REPROJECTION, 100): ((25.7, 0.825), (3.57, 0.230), (23.9, 0.914), ()),
+    ("walkley", _PRIORS, 100): ((75.6, 0.9), (93.2, 1.5), (76.5, 0.9), ()),
+    ("walkley", _FULL, 100): ((22.6, 0.726), (3.14, 0.203), (21.0, 0.804), ()),
+}
+"""The paper's tables 2 to 4, single runs without intervals, per data, row and N: E_t [cm] and E_R
+[deg] of both cameras and between them, and the reprojection errors of both [px]."""
+PAIR = 2
+
+
+def published(data: str, row: str, frames: int, which: int) -> dict[str, float]:
+    """The paper's numbers by metric of the first or second camera or PAIR; empty without any."""
+    known = PUBLISHED.get((data, row, frames), ())
+    if which >= len(known) or which > PAIR:
+        return {}
+    found = dict(zip((TRANSLATION, ROTATION), known[which], strict=False))
+    return found | ({REPROJECTION: known[3][which]} if which < PAIR and known[3] else {})
 
 
 def write_report(report: Report, folder: Path) -> list[Path]:
-    """Write ``paper.md``, ``paper.json`` and ``paper.png``; returns their paths."""
-    written = [folder / f"paper.{kind}" for kind in ("md", "json", "png")]
+    """Write ``paper.md`` and ``paper.json``; returns their paths."""
+    written = [folder / f"paper.{kind}" for kind in ("md", "json")]
     folder.mkdir(parents=True, exist_ok=True)
     written[0].write_text(markdown(report), "utf-8")
     content = finite(json.loads(json.dumps(to_mapping(report))))
     written[1].write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf-8")
-    _plot(report, written[2])
     return written
 
 
@@ -72,8 +91,7 @@ def worst_cameras(block: Block) -> Table:
         (name, *_worst(row, ROTATION, 3), *_worst(row, TRANSLATION, 2), str(row.failed or ""))
         for name, row in block.rows.items()
     )
-    title = f"{block.frames} frames, {block.draws} draws, against {block.reference}"
-    return Table(title, heads, tuple(rows))
+    return Table(f"{block.frames} frames, {block.draws} draws", heads, tuple(rows))
 
 
 def _worst(row: Row, metric: str, digits: int) -> list[str]:
@@ -81,166 +99,67 @@ def _worst(row: Row, metric: str, digits: int) -> list[str]:
     found = [metrics[metric] for name, metrics in row.numbers.items() if "->" not in name]
     if not found:
         return ["-", "-"]
-    worst = max(found, key=lambda interval: interval.median)
-    return [f"{worst.median:.{digits}f}", f"{worst.high:.{digits}f}"]
+    _, median, high = max(found, key=lambda interval: interval[1])
+    return [f"{median:.{digits}f}", f"{high:.{digits}f}"]
 
 
 def to_mapping(report: Report) -> dict[str, Any]:
     """As plain values; times in their own key, so that the rest only depends on the seed."""
     content = asdict(report)
     content["seconds"] = [
-        {"frames": b.frames, **{row: r.seconds for row, r in b.rows.items()}} for b in report.blocks
+        {"frames": block["frames"], **{n: row.pop("seconds") for n, row in block["rows"].items()}}
+        for block in content["blocks"]
     ]
-    for block in content["blocks"]:
-        for row in block["rows"].values():
-            del row["seconds"]
     return content
 
 
 def markdown(report: Report) -> str:
     """The paper's two tables: errors per camera; between cameras and of reprojection."""
-    parts = [f"# {report.data}", _heading(report), _NOTES]
+    settings = f"Settings of the paper's rows: preset {report.preset}. Seed {report.seed}."
+    parts = [f"# {report.data}", settings, _NOTES]
     for block in report.blocks:
-        parts.append(f"## N = {block.frames}, against: {block.reference} ({block.draws} draws)")
-        for index, camera in enumerate(_cameras(block)):
-            parts.append(f"### {camera}")
-            parts.append("\n".join(_camera_table(report, block, camera, index)))
-        parts.append("### Between cameras, and reprojection")
-        parts.append("\n".join(_consistency_table(report, block)))
+        parts.append(f"## N = {block.frames} ({block.draws} draws)")
+        names = next((list(row.numbers) for row in block.rows.values() if row.numbers), [])
+        cameras, pairs = ([n for n in names if ("->" in n) == pair] for pair in (False, True))
+        for index, camera in enumerate(cameras):
+            columns = [(camera, m) for m in AXES]
+            theirs = [(index, m) for m in (TRANSLATION, ROTATION)]
+            parts += [f"### {camera}", "\n".join(_table(report, block, columns, theirs))]
+        columns = [(pair, m) for pair in pairs for m in (ROTATION, TRANSLATION)]
+        columns += [(camera, m) for camera in cameras for m in (REPROJECTION, IMPROVEMENT)]
+        theirs = [(PAIR, ROTATION), (PAIR, TRANSLATION), (0, REPROJECTION), (1, REPROJECTION)]
+        parts += ["### Between cameras, and reprojection",
+                  "\n".join(_table(report, block, columns, theirs))]  # fmt: skip
     return "\n\n".join(parts) + "\n"
 
 
-def _heading(report: Report) -> str:
-    return f"Settings of the paper's rows: preset {report.preset}. Seed {report.seed}."
-
-
-def _camera_table(report: Report, block: Block, camera: str, index: int) -> Iterator[str]:
-    heads = ["method", *(_HEADS[m] for m in AXES), "paper E_t", "paper E_R", "failed", "s"]
-    yield from _head(heads)
+def _table(
+    report: Report, block: Block, ours: Sequence[tuple[str, str]], theirs: Sequence[tuple[int, str]]
+) -> Iterator[str]:
+    where = ("first", "second", "between")
+    heads = ["method", *(f"{name}: {_HEADS[m]}" for name, m in ours),
+             *(f"paper {where[c] if c < len(where) else ''} {_HEADS[m]}" for c, m in theirs),
+             "failed", "s"]  # fmt: skip
+    yield f"| {' | '.join(heads)} |\n|" + "---|" * len(heads)
     for name, row in block.rows.items():
-        theirs = published(report.published_as, name, block.frames, index)
-        yield _line([
-            _name(name),
-            *(_cell(row, camera, m) for m in AXES),
-            *(_number(theirs.get(m)) for m in (TRANSLATION, ROTATION)),
-            f"{row.failed} of {block.draws}" if row.failed else "",
-            f"{row.seconds:.2f}",
-        ])  # fmt: skip
-
-
-def _consistency_table(report: Report, block: Block) -> Iterator[str]:
-    cameras, pairs = _cameras(block), _pairs(block)
-    columns = [(pair, m) for pair in pairs for m in (ROTATION, TRANSLATION)]
-    columns += [(camera, m) for camera in cameras for m in (REPROJECTION, IMPROVEMENT)]
-    heads = [f"{name}: {_HEADS[m]}" for name, m in columns]
-    theirs: list[tuple[int | str, str]] = [(PAIR, ROTATION), (PAIR, TRANSLATION)] * bool(pairs)
-    theirs += [(index, REPROJECTION) for index in range(min(2, len(cameras)))]
-    paper = [f"paper {'between' if c == PAIR else cameras[int(c)]} {_HEADS[m]}" for c, m in theirs]
-    yield from _head(["method", *heads, *paper])
-    for name, row in block.rows.items():
-        values = [published(report.published_as, name, block.frames, c).get(m) for c, m in theirs]
-        cells = (_cell(row, camera, m) for camera, m in columns)
-        yield _line([_name(name), *cells, *(_number(value) for value in values)])
-
-
-def _head(heads: Sequence[str]) -> Iterator[str]:
-    yield _line(heads)
-    yield "|" + "---|" * len(heads)
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def _name(row: str) -> str:
-    return f"**{row}**" if row == HEADLINE else row
+        paper = (published(report.published_as, name, block.frames, c).get(m) for c, m in theirs)
+        failed = f"{row.failed} of {block.draws}" if row.failed else ""
+        cells = [f"**{name}**" if name == HEADLINE else name, *(_cell(row, *at) for at in ours),
+                 *("" if v is None else _number(v) for v in paper), failed,
+                 f"{row.seconds:.2f}"]  # fmt: skip
+        yield f"| {' | '.join(cells)} |"
 
 
 def _cell(row: Row, name: str, metric: str) -> str:
     if name not in row.numbers:
         return "failed"
-    values = row.numbers[name].get(metric)
-    if values is None or np.isnan(values.median):
+    low, median, high = row.numbers[name].get(metric, (np.nan,) * 3)
+    if np.isnan(median):
         return "-"
-    return f"{_number(values.median)} ({_number(values.low)} to {_number(values.high)})"
+    return f"{_number(median)} ({_number(low)} to {_number(high)})"
 
 
-def _number(value: float | None) -> str:
-    """Three digits, as the paper writes numbers; empty for None."""
-    if value is None:
-        return ""
-    digits = 3 if abs(value) < 1 else 2 if abs(value) < 10 else 1  # noqa: PLR2004 - digits
+def _number(value: float) -> str:
+    """Three digits, as the paper writes numbers."""
+    digits = 3 if abs(value) < 1 else 2 if abs(value) < 10 else 1
     return f"{round(value, digits) + 0.0:.{digits}f}"  # no negative zero
-
-
-def _cameras(block: Block) -> list[str]:
-    return [name for name in _names(block) if "->" not in name]
-
-
-def _pairs(block: Block) -> list[str]:
-    return [name for name in _names(block) if "->" in name]
-
-
-def _names(block: Block) -> list[str]:
-    """Cameras and pairs, from the first row that did not always fail."""
-    return next((list(row.numbers) for row in block.rows.values() if row.numbers), [])
-
-
-def _plot(report: Report, path: Path) -> None:
-    """E_t and E_R per camera, a line per method, a colour per N; against the first reference."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    first = report.blocks[0].reference
-    blocks = [block for block in report.blocks if block.reference == first]
-    cameras, rows = _cameras(blocks[0]), list(blocks[0].rows)
-    columns = max(1, len(cameras))
-    width, height = _NAMES_IN + _COLUMN_IN * columns, 2 * (_ROW_IN * len(rows) + 0.8)
-    figure = Figure(figsize=(width, height), dpi=120, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(2, columns, squeeze=False, sharey=True)
-    for column, camera in enumerate(cameras):
-        for line, metric in enumerate((TRANSLATION, ROTATION)):
-            _draw_panel(grid[line, column], blocks, (camera, metric), rows)
-        grid[0, column].set_title(camera, fontsize=10)
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(blocks), frameon=False)
-    figure.savefig(path, format="png")
-
-
-def _draw_panel(
-    axes: Axes, blocks: Sequence[Block], what: tuple[str, str], rows: Sequence[str]
-) -> None:
-    """One panel: medians with their intervals."""
-    camera, metric = what
-    for index, block in enumerate(blocks):
-        shift = 0.16 * (index - (len(blocks) - 1) / 2)
-        places: list[tuple[float, Interval]] = [
-            (line + shift, row.numbers[camera][metric])
-            for line, row in enumerate(block.rows.values())
-            if camera in row.numbers
-        ]
-        middle = np.array([max(i.median, _MIN_SHOWN) for _, i in places])
-        ends = np.array([[max(i.low, _MIN_SHOWN), max(i.high, _MIN_SHOWN)] for _, i in places])
-        spread = np.abs(ends.reshape(-1, 2).T - middle)
-        axes.errorbar(
-            middle, [place for place, _ in places], xerr=spread, fmt="o", markersize=4, capsize=2,
-            color=_COLOURS[index % len(_COLOURS)], label=f"N = {block.frames}",
-        )  # fmt: skip
-    axes.set_xlabel(f"{_HEADS[metric]}, median and 90 % of the draws")
-    _set_scales(axes, rows)
-
-
-def _set_scales(axes: Axes, rows: Sequence[str]) -> None:
-    """Plain numbers on the logarithmic x axis, the names of the methods on the other."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.tick_params(axis="x", labelsize=8)
-    axes.set_yticks(range(len(rows)), rows, fontsize=8)
-    axes.set_ylim(len(rows) - 0.5, -0.5)
-    axes.grid(color="0.9", linewidth=0.8)
-    axes.set_axisbelow(True)

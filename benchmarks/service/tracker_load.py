@@ -1,28 +1,37 @@
-"""Frames to many trackers at a rate."""
+"""Frames to many trackers at a rate: what is lost, how long it takes, processor time and memory.
+
+    python -m benchmarks.service.tracker_load [--trackers 200] [--hz 10] [--seconds 300]
+
+Each tracker gets a frame every 1 / hz seconds; a frame counts when it is acknowledged. Before, the
+processor time of a frame, of trackers that send without a pause. Clients and server share cores.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import secrets
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import httpx
 import numpy as np
 
 from benchmarks.service.server import Server
-from benchmarks.tables import Table
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import Correspondences, MatcherErrors, Rig, perturb, simulate_correspondences
 from calibgraph.arrays import Array
 from calibgraph.simulation.rigs import rig_of
+from calibgraph.yaml_text import yaml_text
 
 _FRAMES = 20
 _MATCHES = 20
 _MOST_AT_ONCE = 10  # frames: a robot that has waited for long drops older ones
 BEFORE = 30  # frames, after which a tracker has started
 CASES = ((1, 1, 100), (1, 10, 200), (20, 1, 50), (20, 10, 100), (200, 1, 10), (200, 10, 50))
-_LINES = {"Content-Type": "application/x-ndjson"}
 
 
 @dataclass
@@ -71,7 +80,7 @@ async def _measure_cost(
     async def send(place: str, first: int, end: int) -> None:
         for at in range(first, end, together):
             content = "\n".join(lines[at : min(at + together, end)])
-            answer = await http.post(f"{place}/frames", content=content, headers=_LINES)
+            answer = await http.post(place, content=content)
             answer.raise_for_status()
 
     limits = httpx.Limits(max_connections=None, max_keepalive_connections=trackers)
@@ -138,8 +147,10 @@ _COLUMNS = ("u_px", "v_px", "x_m", "y_m", "z_m")
 
 
 async def _begin(http: httpx.AsyncClient, rig: Rig) -> str:
-    answer = await http.post("/v1/trackers", json={"rig": rig.model_dump(mode="json")})
-    return str(answer.raise_for_status().headers["location"])
+    place = f"/v1/trackers/{secrets.token_hex(8)}"
+    content = yaml_text(rig.model_dump(mode="json"))
+    (await http.put(place, content=content)).raise_for_status()
+    return place
 
 
 async def _drive(
@@ -159,7 +170,7 @@ async def _drive(
             json.dumps({"frame": i, "cameras": bodies[i % _FRAMES]}) for i in range(frame, due)
         ]
         begun = time.perf_counter()
-        answer = await http.post(f"{place}/frames", content="\n".join(lines), headers=_LINES)
+        answer = await http.post(place, content="\n".join(lines))
         if answer.is_success:
             counts.seconds.append(time.perf_counter() - begun)
             counts.frames += len(answer.json()["updates"])
@@ -176,7 +187,7 @@ async def _watch(server: Server, counts: Counts) -> None:
 
 
 async def _last_frame(http: httpx.AsyncClient, place: str) -> int:
-    answer = await http.get(f"{place}/state")
+    answer = await http.get(place)
     return int(answer.raise_for_status().json()["frame"])
 
 
@@ -196,3 +207,26 @@ def _table(counts: Counts, lost: int, trackers: int, hz: float, wall_s: float) -
         ("largest worker MB, the same", f"{first[1]:.0f}, {last[1]:.0f}"),
     )
     return Table(f"{trackers} trackers at {hz:g} Hz, {wall_s:.0f} s", ("what", "found"), rows)
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--trackers", type=int, default=200)
+    parser.add_argument("--hz", type=float, default=10.0)
+    parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--port", type=int, default=8395)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        server = Server(Path(temporary) / "data", options.port)
+        server.start()
+        try:
+            tables = [measure_costs(server)]
+            tables.append(track(server, options.trackers, options.hz, options.seconds))
+        finally:
+            server.stop()
+    publish("service.tracker_load", tables, record=options.record)
+
+
+if __name__ == "__main__":
+    main()

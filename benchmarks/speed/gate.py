@@ -13,38 +13,49 @@ GTSAM factor per correspondence, a copy of memory as large as the table.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import inspect
 import json
 import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 
 from benchmarks.speed.incremental import GUESS, frames
-from benchmarks.speed.kernel import MATRIX, ONE_THREAD, matcher_calls
 from benchmarks.speed.solvers import Problem, solve_gtsam_python, solve_ours_once, solve_trf_once
 from benchmarks.tables import ROOT, Table
 from calibgraph import (
+    Dataset,
     IncrementalCalibrator,
     Rig,
+    StructureMatcher,
     calibrate,
     load_correspondences,
     load_dataset,
+    perturb,
     solve,
 )
+from calibgraph.matching.structure import correlation_maps, shift_scores
 from calibgraph.parallel import THREADS_VARIABLE
+from calibgraph.progress import no_progress
 from calibgraph.tracking import warm_up_tracker
 
 RELEASE = ROOT / "benchmarks" / "ratios.json"
 SAMPLE = ROOT / "data" / "sample"
 WORST = 1.25
 _TRIES = 3  # of a ratio that fails
+MATRIX = 1024  # rows of the square matrices
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+FAR_DEG, FAR_M = 15.0, 1.0  # of a guess that is not accepted, so that a search begins
 _ENVIRONMENT = {**ONE_THREAD, "NUMBA_NUM_THREADS": "1", THREADS_VARIABLE: "1"}
 _FRAMES, _CAMERAS = 2, 2  # of the sample, that are calibrated
 _UPDATES = 40  # of a tracker
@@ -137,6 +148,69 @@ def kernel() -> Pair:
 
     unit = work / (times * MATRIX**3)
     return Pair("window scores / sgemm, per multiply-add", run, _sgemm(times), 5, unit)
+
+
+class _EnoughError(Exception):
+    """The search has made its call."""
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """One call of the matcher's kernel, with its arguments by the names of its parameters."""
+
+    arguments: dict[str, Any]
+
+    def run(self) -> None:
+        """Call the kernel again; it adds to the same grids."""
+        shift_scores.score_windows(*self.arguments.values())
+
+    def multiply_adds(self) -> int:
+        """Multiply-adds by the definition of the score, however it is computed.
+
+        For each point and shift inside the image a product with depth, intensity, one, itself, and
+        with both trends where these are not zero.
+        """
+        a = self.arguments
+        size = np.array(a["grids"].shape[:0:-1])  # columns, rows
+        image = np.array(a["image"].shape[::-1])
+        low, high = a["places"].min(axis=1), a["places"].max(axis=1)
+        first = np.maximum(a["origin"], -low)
+        shifts = np.maximum(0, np.minimum(a["origin"] + size, image - high) - first).prod(axis=1)
+        products = 4 + 2 * np.any(a["basis"][:, :, 2:], axis=(1, 2))
+        return int(np.sum(a["counts"] * shifts * products))
+
+
+def matcher_calls(dataset: Dataset) -> list[Call]:
+    """The kernel's calls for one camera and frame: by the search, and in each round."""
+    name = next(iter(dataset.rig.cameras))
+    rig, one = Rig(cameras={name: dataset.rig.cameras[name]}), dataset.select("0")
+    matcher, calls = StructureMatcher(), list[Call]()
+    far = perturb(rig, rotation_deg=FAR_DEG, translation_m=FAR_M)
+    with recorded(correlation_maps, calls, stop=True), contextlib.suppress(_EnoughError):
+        matcher.locate(one, far, out_of_time=lambda: False, progress=no_progress)
+    for index in range(matcher.rounds):
+        with recorded(shift_scores, calls):
+            matcher.match(one, rig, round_index=index, progress=no_progress)
+    return calls
+
+
+@contextmanager
+def recorded(module: Any, calls: list[Call], *, stop: bool = False) -> Iterator[None]:
+    """Record the calls of the kernel that a module makes; with ``stop``, none goes on."""
+    kernel = module.score_windows
+    signature = inspect.signature(getattr(kernel, "py_func", kernel))
+
+    def record(*arguments: Any) -> None:
+        calls.append(Call(dict(signature.bind(*arguments).arguments)))
+        if stop:
+            raise _EnoughError
+        kernel(*arguments)
+
+    module.score_windows = record
+    try:
+        yield
+    finally:
+        module.score_windows = kernel
 
 
 def solve_of(problem: Problem, size: str, *, times: int, pairs: int) -> Pair:

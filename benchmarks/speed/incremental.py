@@ -8,7 +8,6 @@ per camera and frame and keeps them all; it does one pass per frame, ours does t
 
 from __future__ import annotations
 
-import argparse
 import gc
 import os
 import time
@@ -19,8 +18,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from benchmarks.accuracy.drives import camera
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import IncrementalCalibrator, MatcherErrors, Rig, perturb, solve
 from calibgraph.graph.objective import pose_key, prior_graph
 from calibgraph.model.config import Config
@@ -32,10 +30,9 @@ from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from calibgraph.tracking import warm_up_tracker
 from factors import block_factor
 from tests.draws.drives import simulate_drive
+from tools.scenes.drives import camera
 
-RIG = Rig(
-    cameras={"left": camera((0.3, 0.1, -0.1), 0), "right": camera((0.3, -0.4, -0.1), 0)},
-)
+RIG = Rig(cameras={"left": camera((0.3, 0.1, -0.1), 0), "right": camera((0.3, -0.4, -0.1), 0)})
 GUESS = perturb(RIG, rotation_deg=1.0, translation_m=0.1, seed=0)
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
 POOL = 400
@@ -148,11 +145,8 @@ def measure_batch(count: int) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, default=20_000, help="at least 150")
-    add_record_option(parser)
     options = parser.parse_args()
     ours, updates = measure_ours(options.frames)
     plain = measure_plain_isam2(min(options.frames, PLAIN_AT[-1]))

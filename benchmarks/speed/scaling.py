@@ -1,12 +1,11 @@
-"""Time and memory from 10^3 to 10^8 correspondences: tables streamed from disk, and one pass.
+"""Time and memory from 10^3 to 10^8 correspondences: tables streamed from disk.
 
-    python -m benchmarks.speed.scaling [--rows 1e3 ... 1e8] [--kept 1e3 ... 1e7] [--folder DIR]
+    python -m benchmarks.speed.scaling [--rows 1e3 ... 1e8] [--folder DIR]
 
-First table: Parquet tables of a dense matcher (2 cameras, frames of up to 50,000 matches each,
+Parquet tables of a dense matcher (2 cameras, frames of up to 50,000 matches each,
 float32) are written to --folder and solved there, each in a process of its own, whose peak resident
 memory is measured; 10^8 rows take 3.6 GB on disk until they are solved. Up to --whole-up-to rows,
-the table is also loaded whole. Second table: one pass (H, b and c) over correspondences in memory,
-beside the time in which the memory delivers their bytes (40 each).
+the table is also loaded whole.
 """
 
 from __future__ import annotations
@@ -18,17 +17,15 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from pyarrow import parquet
 
-from benchmarks.tables import ROOT, Table, add_record_option, publish
+from benchmarks.tables import ROOT, Table, parser_of, publish
 from calibgraph import (
     Correspondences,
     MatcherErrors,
@@ -37,11 +34,8 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
-from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.simulation.rigs import rig_of
-from factors import ProjectionBlock
 
-Array = NDArray[Any]
 Row = dict[str, Any]
 
 RIG = "kitti"
@@ -49,10 +43,7 @@ MATCHES = 50_000  # of one camera in one frame
 FRAMES = 5  # at least
 DRAWN_FRAMES = 10  # repeated with other noise
 ERRORS = MatcherErrors(noise_px=0.7, frame_noise_px=0.3, outlier_share=0.15)
-MEMORY_BYTES = 400_000_000  # more than any cache holds
-BYTES = 40  # of a correspondence: x y z u v
 WARM_UP_MATCHES = 100
-TURNS, IN_A_ROW = 12, 4
 
 
 def main() -> None:
@@ -61,31 +52,20 @@ def main() -> None:
     if options.child is not None:
         print(json.dumps(measure_solve(options.child, whole=options.whole)))
         return
-    tables = [table_cells(row) for row in measure_tables(options)]
-    passes = [pass_cells(measure_pass(int(count))) for count in options.kept]
-    publish(
-        "speed.scaling",
-        [
-            Table("Tables solved from disk", TABLE_COLUMNS, tuple(tables)),
-            Table("One pass, per correspondence", PASS_COLUMNS, tuple(passes)),
-        ],
-        record=options.record,
-    )
+    rows = tuple(table_cells(row) for row in measure_tables(options))
+    table = Table("Tables solved from disk", TABLE_COLUMNS, rows)
+    publish("speed.scaling", [table], record=options.record)
 
 
 def parse_options() -> argparse.Namespace:
     """The options."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     every = [10.0**k for k in range(3, 9)]
     parser.add_argument("--rows", type=float, nargs="*", default=every, help="of the tables")
-    parser.add_argument("--kept", type=float, nargs="*", default=every[:-1], help="in memory")
     parser.add_argument("--whole-up-to", type=float, default=1e7, metavar="ROWS")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--whole", action="store_true", help=argparse.SUPPRESS)
-    add_record_option(parser)
     return parser.parse_args()
 
 
@@ -162,60 +142,6 @@ def measure_solve(path: Path, *, whole: bool) -> Row:
     }
 
 
-def measure_pass(count: int) -> Row:
-    """Nanoseconds per correspondence of a pass, and of reading its bytes; one and all threads."""
-    camera = next(iter(rig_of(RIG).cameras.values()))
-    block = block_in_memory(count)
-    T_lidar_camera = to_T_lidar_camera(camera.T_camera_lidar)
-    memory = np.ones(MEMORY_BYTES // 8)
-    threads = numba.config.NUMBA_NUM_THREADS
-    row: Row = {"correspondences": count, "threads": threads}
-    for name, used in (("one", 1), ("all", threads)):
-        numba.set_num_threads(used)
-        read, passed = shortest(
-            lambda: _sum(memory), lambda: block.sums(T_lidar_camera), count=count
-        )
-        read *= count / (memory.nbytes / BYTES)
-        row |= {f"read_{name}_ns": read, f"pass_{name}_ns": passed}
-    numba.set_num_threads(threads)
-    return row
-
-
-def block_in_memory(count: int) -> ProjectionBlock:
-    """A block of ``count`` correspondences, at most 100,000 of them different."""
-    rig = rig_of(RIG)
-    name = next(iter(rig.cameras))
-    few = simulate_correspondences(
-        rig, frames=1, matches=min(count, 100_000), errors=ERRORS
-    ).of_camera(name)
-    rows = np.arange(count) % len(few)
-    return ProjectionBlock(
-        rig.cameras[name].lens, few.points_lidar_m[rows], few.pixels_px[rows], scale=4.0
-    )
-
-
-def shortest(*runs: Callable[[], object], count: int) -> list[float]:
-    """The shortest time of each function, run in turns, in nanoseconds per correspondence.
-
-    Each runs several times in a row: the passes of a solve also find in the caches what fits there.
-    """
-    times = np.full(len(runs), np.inf)
-    for index in list(range(len(runs))) * TURNS:  # the first turn compiles
-        for _ in range(IN_A_ROW):
-            begun = time.perf_counter()
-            runs[index]()
-            times[index] = min(times[index], time.perf_counter() - begun)
-    return [float(t / count * 1e9) for t in times]
-
-
-@numba.njit(parallel=True, fastmath=True)
-def _sum(values: Array) -> float:
-    total = 0.0
-    for index in numba.prange(len(values)):
-        total += values[index]
-    return total
-
-
 TABLE_COLUMNS = (
     "rows", "file [MB]", "table", "read and filter [s]", "solve and checks [s]", "peak [MB]",
     "kept by the grid",
@@ -228,21 +154,6 @@ def table_cells(row: Row) -> tuple[str, ...]:
         str(row["rows"]), f"{row['file_mb']:.1f}", "whole" if row["whole"] else "streamed",
         f"{row['read_s']:.2f}", f"{row['rest_s']:.2f}", f"{row['peak_mb']:.0f}", str(row["kept"]),
     )  # fmt: skip
-
-
-PASS_COLUMNS = (
-    "in memory", "one thread: pass [ns]", "memory [ns]", "ratio", "all threads: pass [ns]",
-    "memory [ns]", "ratio",
-)  # fmt: skip
-
-
-def pass_cells(row: Row) -> tuple[str, ...]:
-    """A row of the second table: nanoseconds per correspondence."""
-    cells = [str(row["correspondences"])]
-    for name in ("one", "all"):
-        ours, read = row[f"pass_{name}_ns"], row[f"read_{name}_ns"]
-        cells += [f"{ours:.2f}", f"{read:.2f}", f"{ours / read:.1f}"]
-    return tuple(cells)
 
 
 if __name__ == "__main__":

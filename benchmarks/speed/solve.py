@@ -24,21 +24,22 @@ of as many passes, and to our whole call. Ours is the shortest of several runs.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.speed.ceres import compile_program, solve_ceres, why_not
+from benchmarks.speed.ceres import CeresRun, compile_program, solve_ceres, why_not
 from benchmarks.speed.solvers import (
     MATCHES,
     Passes,
     Problem,
+    Transforms,
     solve_gtsam_cpp,
     solve_gtsam_python,
     solve_ours,
@@ -46,7 +47,7 @@ from benchmarks.speed.solvers import (
     solve_trf,
     solve_trf_once,
 )
-from benchmarks.tables import Table, add_record_option, publish
+from benchmarks.tables import Table, parser_of, publish
 from calibgraph import solve
 
 JACOBIAN_BYTES = 3e9  # of TRF, which keeps a few of them
@@ -55,6 +56,10 @@ FACTORS = 600_000  # more separate factors than these take gigabytes
 PYTHON_FACTORS = 60_000
 WARM_UP = (10, 2)  # frames and cameras of the solve that compiles
 CALL, BOTH, FIRST = "whole call", "2 passes", "pass 1"
+COLUMNS = (
+    "solver", "what", "frames", "cameras", "correspondences", "wall [s]", "CPU [s]",
+    "CPU ratio to ours", "to our whole call", "cost, pass 1", "cost, pass 2",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,183 +69,93 @@ class Solver:
     Attributes:
         name: in the table.
         what: ``whole call``, ``2 passes`` or ``pass 1``.
-        run: returns what it found (None for a whole call), wall and processor seconds.
+        run: returns what it found, nothing for a whole call; with its own times for Ceres.
         fits: whether its memory does.
+        repeats: the shortest of so many runs counts.
     """
 
     name: str
     what: str
-    run: Callable[[], tuple[Passes | None, float, float]]
+    run: Callable[[], Passes | CeresRun | None]
     fits: bool = True
+    repeats: int = 1
+
+    def timed(self) -> tuple[Passes | None, float, float]:
+        """What it found, wall and processor seconds."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        found = self.run()
+        if isinstance(found, CeresRun):
+            return found.passes, found.wall_s, found.cpu_s
+        return found, time.perf_counter() - wall, time.process_time() - cpu
 
 
-@dataclass(frozen=True)
-class Timed:
-    """One solver on one problem.
-
-    Attributes:
-        solver, what: which.
-        frames, cameras, correspondences: of the problem.
-        wall_s, cpu_s: shortest of several runs.
-        ratio: of processor time to ours, of as many passes.
-        ratio_to_call: to our whole call.
-        cost_1: the objective after the first pass; None for a whole call.
-        cost_2: after the second, over the correspondences within the gate; None without one.
-    """
-
-    solver: str
-    what: str
-    frames: int
-    cameras: int
-    correspondences: int
-    wall_s: float
-    cpu_s: float
-    ratio: float
-    ratio_to_call: float
-    cost_1: float | None = None
-    cost_2: float | None = None
-
-    def cells(self) -> tuple[str, ...]:
-        """The row of the table."""
-        costs = ("" if cost is None else f"{cost:.4f}" for cost in (self.cost_1, self.cost_2))
-        return (
-            self.solver, self.what, str(self.frames), str(self.cameras), str(self.correspondences),
-            f"{self.wall_s:.4f}", f"{self.cpu_s:.4f}", f"{self.ratio:.1f}",
-            f"{self.ratio_to_call:.2f}", *costs,
-        )  # fmt: skip
-
-
-COLUMNS = (
-    "solver", "what", "frames", "cameras", "correspondences", "wall [s]", "CPU [s]",
-    "CPU ratio to ours", "to our whole call", "cost, pass 1", "cost, pass 2",
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Case:
-    """A problem, our solution of it, and the problem without its outliers."""
-
-    size: tuple[int, int, int]
-    problem: Problem
-    ours: Passes
-    inliers: Problem
-
-    @staticmethod
-    def draw(frames: int, cameras: int, matches: int) -> Case:
-        """The problem of a size."""
-        problem = Problem.draw(frames, cameras, matches)
-        ours = solve_ours(problem)
-        inliers = problem.without_outliers(ours.first)
-        return Case((frames, cameras, len(problem.table)), problem, ours, inliers)
-
-    def solvers(self, ceres: Path | None) -> list[Solver]:
-        """All implementations, ours first."""
-        problem, (_, cameras, count) = self.problem, self.size
-        jacobian_fits = 16 * count * 6 * cameras < JACOBIAN_BYTES  # two rows per correspondence
-        trf = partial(solve_trf, problem, self.inliers)
-        found = [
-            Solver("calibgraph", CALL, timed(partial(_solve_as_called, problem))),
-            Solver("calibgraph", BOTH, timed(partial(solve_ours, problem))),
-            Solver("calibgraph", FIRST, timed(partial(solve_ours_once, problem))),
-            Solver("SciPy TRF", BOTH, timed(trf), jacobian_fits),
-            Solver("SciPy TRF", FIRST, timed(partial(solve_trf_once, problem)), jacobian_fits),
-        ]
-        if ceres is not None:
-            found.append(Solver("Ceres", BOTH, partial(self._run_ceres, ceres),
-                                count <= CERES_ROWS))  # fmt: skip
-        for name, run, most in (
-            ("GTSAM, C++ factor each", solve_gtsam_cpp, FACTORS),
-            ("GTSAM, Python factor each", solve_gtsam_python, PYTHON_FACTORS),
-        ):
-            found.append(Solver(name, FIRST, timed(partial(run, problem)), count <= most))
-        return found
-
-    def _run_ceres(self, program: Path) -> tuple[Passes, float, float]:
-        run = solve_ceres(program, self.problem, self.ours.first)
-        return run.passes, run.wall_s, run.cpu_s
+def solvers(problem: Problem, inliers: Problem, gate_at: Transforms, ceres: Path | None
+            ) -> Iterator[Solver]:  # fmt: skip
+    """All implementations, ours first."""
+    cameras, count = len(problem.rows), len(problem.table)
+    jacobian_fits = 16 * count * 6 * cameras < JACOBIAN_BYTES  # two rows per correspondence
+    many = int(np.clip(4e6 / count, 3, 30))
+    yield Solver("calibgraph", CALL, partial(_solve_as_called, problem), repeats=3)
+    yield Solver("calibgraph", BOTH, partial(solve_ours, problem), repeats=many)
+    yield Solver("calibgraph", FIRST, partial(solve_ours_once, problem), repeats=many)
+    yield Solver("SciPy TRF", BOTH, partial(solve_trf, problem, inliers), jacobian_fits)
+    yield Solver("SciPy TRF", FIRST, partial(solve_trf_once, problem), jacobian_fits)
+    if ceres is not None:
+        run = partial(solve_ceres, ceres, problem, gate_at)
+        yield Solver("Ceres", BOTH, run, count <= CERES_ROWS)
+    run_cpp, run_python = (partial(f, problem) for f in (solve_gtsam_cpp, solve_gtsam_python))
+    yield Solver("GTSAM, C++ factor each", FIRST, run_cpp, count <= FACTORS)
+    yield Solver("GTSAM, Python factor each", FIRST, run_python, count <= PYTHON_FACTORS)
 
 
 def _solve_as_called(problem: Problem) -> None:
     solve(problem.rig, problem.table)
 
 
-def timed(
-    run: Callable[[], Passes | None],
-) -> Callable[[], tuple[Passes | None, float, float]]:
-    """A function that also returns wall and processor seconds."""
-
-    def run_timed() -> tuple[Passes | None, float, float]:
-        wall, cpu = time.perf_counter(), time.process_time()
-        found = run()
-        return found, time.perf_counter() - wall, time.process_time() - cpu
-
-    return run_timed
+Done = dict[tuple[str, str], tuple[float, float]]
+"""By solver and what: the work of its largest problem so far, and its wall time."""
 
 
-@dataclass
-class Bench:
-    """All runs so far, to extrapolate how long the next would take."""
-
-    longest_s: float
-    ceres: Path | None
-    rows: list[Timed] = field(default_factory=list)
-
-    def compare(self, frames: int, cameras: int, matches: int) -> None:
-        """Time every solver on one problem."""
-        case = Case.draw(frames, cameras, matches)
-        base: dict[str, float] = {}
-        for solver in case.solvers(self.ceres):
-            expected = self._expected(solver, case.size)
-            if solver.fits and expected < self.longest_s:
-                self._time(solver, case, base)
-            else:
-                why = f"would take about {expected:.0f} s" if solver.fits else "too large"
-                size = f"{frames} frames, {cameras} cameras"
-                print(f"{solver.name}, {solver.what}, {size}: not run, {why}", flush=True)
-
-    def _expected(self, solver: Solver, size: tuple[int, int, int]) -> float:
-        """Seconds that a solver would take, from its largest problem so far."""
-        done = [(_work(solver.name, (r.frames, r.cameras, r.correspondences)), r.wall_s)
-                for r in self.rows if (r.solver, r.what) == (solver.name, solver.what)]  # fmt: skip
-        work, seconds = max(done, default=(1, 0.0))
-        return seconds * _work(solver.name, size) / work
-
-    def _time(self, solver: Solver, case: Case, base: dict[str, float]) -> None:
-        """Run, print and keep; our times go into ``base``, by what."""
-        wall_s, cpu_s = np.inf, np.inf
-        for _ in range(_repeats(solver, case.size[2])):
-            found, wall, cpu = solver.run()
+def compare(size: tuple[int, int, int], ceres: Path | None, longest_s: float, done: Done
+            ) -> Iterator[tuple[str, ...]]:  # fmt: skip
+    """Time every solver on a problem of so many frames, cameras and matches: a row each."""
+    problem = Problem.draw(*size)
+    ours = solve_ours(problem)
+    inliers = problem.without_outliers(ours.first)
+    base: dict[str, float] = {}
+    for solver in solvers(problem, inliers, ours.first, ceres):
+        key, count = (solver.name, solver.what), len(problem.table)
+        work = count * (size[1] if "TRF" in solver.name else 1)  # its Jacobian grows with cameras
+        before, seconds = done.get(key, (1.0, 0.0))
+        expected = seconds * work / before
+        if not solver.fits or expected >= longest_s:
+            why = f"would take about {expected:.0f} s" if solver.fits else "too large"
+            where = f"{size[0]} frames, {size[1]} cameras"
+            print(f"{solver.name}, {solver.what}, {where}: not run, {why}", flush=True)
+            continue
+        wall_s, cpu_s, found = np.inf, np.inf, None
+        for _ in range(solver.repeats):
+            found, wall, cpu = solver.timed()
             wall_s, cpu_s = min(wall_s, wall), min(cpu_s, cpu)
-        ours = base.setdefault(solver.what, cpu_s)
-        first = None if found is None else case.problem.cost(found.first)
-        second = None if found is None or found.second is None else case.inliers.cost(found.second)
-        ratios = cpu_s / ours, cpu_s / base.get(CALL, np.nan)
-        row = Timed(solver.name, solver.what, *case.size, wall_s, cpu_s, *ratios, first, second)
-        self.rows.append(row)
-        print(", ".join(row.cells()), flush=True)
-
-
-def _repeats(solver: Solver, count: int) -> int:
-    if solver.name != "calibgraph":
-        return 1
-    return 3 if solver.what == CALL else int(np.clip(4e6 / count, 3, 30))
-
-
-def _work(solver: str, size: tuple[int, int, int]) -> int:
-    """What a solver's time is proportional to; TRF's Jacobian also grows with the cameras."""
-    return size[2] * size[1] if "TRF" in solver else size[2]
+        done[key] = max(done.get(key, (0.0, 0.0)), (work, wall_s))
+        ratio, to_call = cpu_s / base.setdefault(solver.what, cpu_s), cpu_s / base.get(CALL, np.nan)
+        costs = [] if found is None else [problem.cost(found.first)]
+        costs += [inliers.cost(found.second)] if found is not None and found.second else []
+        row = (
+            *key, str(size[0]), str(size[1]), str(count), f"{wall_s:.4f}", f"{cpu_s:.4f}",
+            f"{ratio:.1f}", f"{to_call:.2f}", *([f"{cost:.4f}" for cost in costs] + ["", ""])[:2],
+        )  # fmt: skip
+        print(", ".join(row), flush=True)
+        yield row
 
 
 def main() -> None:
     """Time all solvers on problems of all sizes."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, nargs="+", default=[10, 100, 1000])
     parser.add_argument("--cameras", type=int, nargs="+", default=[2, 12])
     parser.add_argument("--matches", type=int, default=MATCHES)
     parser.add_argument("--longest-s", type=float, default=300.0)
-    add_record_option(parser)
     options = parser.parse_args()
     warm_up = Problem.draw(*WARM_UP)
     solve_ours(warm_up)
@@ -249,11 +164,13 @@ def main() -> None:
         missing = why_not()
         if missing:
             print(f"Ceres: left out, {missing}", flush=True)
-        bench = Bench(options.longest_s, None if missing else compile_program(Path(folder)))
-        for cameras in options.cameras:
-            for frames in options.frames:
-                bench.compare(frames, cameras, options.matches)
-    table = Table("Solves of one objective", COLUMNS, tuple(row.cells() for row in bench.rows))
+        ceres, done = None if missing else compile_program(Path(folder)), Done()
+        rows = [
+            row
+            for cameras, frames in product(options.cameras, options.frames)
+            for row in compare((frames, cameras, options.matches), ceres, options.longest_s, done)
+        ]
+    table = Table("Solves of one objective", COLUMNS, tuple(rows))
     publish("speed.solve", [table], record=options.record)
 
 

@@ -1,6 +1,6 @@
 """Where the time of a calibration goes: wall and processor seconds per stage, and peak memory.
 
-    python -m benchmarks.speed.stages DATASET [--json]       # calibrate with all frames, and report
+    python -m benchmarks.speed.stages DATASET       # calibrate with all frames, and report
 
 The command `calibgraph calibrate` runs in this process, from its imports to the written report.
 Nothing of the measured program is changed. A thread looks every few milliseconds at the stacks of
@@ -11,25 +11,21 @@ to their own clocks; so is the wall time, of which a stage that runs beside othe
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import gc
-import json
 import resource
-import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from types import FrameType, TracebackType
 
 import numpy as np
 
-from benchmarks.tables import ROOT, Table
+from benchmarks.tables import Table, parser_of, publish
 
 INTERVAL_S = 0.005
 _ALONE_S = 10.0  # far longer than a sample takes
@@ -59,25 +55,6 @@ WORK = (
 STAGES = (*_ALWAYS, *WORK, OTHER)
 """In the order of a calibration. A stage is where the innermost function of a thread's stack that
 belongs to one is; but all that the checks or the report call is theirs."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """What a calibration took.
-
-    Attributes:
-        wall_s, cpu_s: from the imports to the report.
-        peak_mb: largest resident memory.
-        stages_wall_s, stages_cpu_s: the same seconds by stage.
-        verdict: of the rig, or the error.
-    """
-
-    wall_s: float
-    cpu_s: float
-    peak_mb: float
-    stages_wall_s: dict[str, float] = field(default_factory=dict)
-    stages_cpu_s: dict[str, float] = field(default_factory=dict)
-    verdict: str = ""
 
 
 class StageSampler:
@@ -194,29 +171,6 @@ def _stages_of(file: str, function: str) -> tuple[str, str]:
     return [*inner, OTHER][0], [*outer, OTHER][0]
 
 
-def run_in_process(dataset: Path) -> Run:
-    """Calibrate a dataset in a process of its own; a failed one has no times."""
-    command = [sys.executable, "-m", "benchmarks.speed.stages", str(dataset), "--json"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        unsaid = [f"ended with {done.returncode}"]
-        return Run(np.nan, np.nan, np.nan, verdict=(done.stderr.splitlines() or unsaid)[-1])
-    return Run(**json.loads(done.stdout))
-
-
-def run_here(dataset: Path) -> Run:
-    """Calibrate a dataset in this process; errors of the command end it."""
-    with tempfile.TemporaryDirectory() as out:
-        with StageSampler() as sampler, contextlib.redirect_stdout(sys.stderr):
-            _calibrate(dataset, out)
-        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-        from calibgraph import load_calibration
-
-        verdict = load_calibration(out).verdict.status
-    wall_s, cpu_s = sampler.wall_s, sampler.cpu_s
-    return Run(sum(wall_s.values()), sum(cpu_s.values()), peak_mb, wall_s, cpu_s, verdict)
-
-
 def _calibrate(dataset: Path, out: str) -> None:
     from calibgraph.cli.app import main as calibgraph
 
@@ -228,27 +182,27 @@ def _calibrate(dataset: Path, out: str) -> None:
             raise
 
 
-def stages_table(run: Run) -> Table:
-    """The stages of one calibration."""
-    rows = [(stage, run.stages_wall_s[stage], run.stages_cpu_s[stage]) for stage in STAGES]
-    cells = [
-        (stage, f"{wall_s:.2f}", f"{cpu_s:.2f}", f"{cpu_s / run.cpu_s:.0%}")
-        for stage, wall_s, cpu_s in (*rows, ("all", run.wall_s, run.cpu_s))
-    ]
-    title = f"{run.verdict}, {run.peak_mb:.0f} MB at most"
-    return Table(title, ("stage", "wall [s]", "CPU [s]", "share"), tuple(cells))
-
-
 def main() -> None:
-    """Print the stages of one calibration."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """Calibrate in this process, and print the stages; errors of the command end it."""
+    parser = parser_of(__doc__)
     parser.add_argument("dataset", type=Path)
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    run = run_here(options.dataset)
-    print(json.dumps(asdict(run)) if options.json else stages_table(run).text())
+    with tempfile.TemporaryDirectory() as out:
+        with StageSampler() as sampler, contextlib.redirect_stdout(sys.stderr):
+            _calibrate(options.dataset, out)
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        from calibgraph import load_calibration
+
+        verdict = load_calibration(out).verdict.status
+    both = sampler.wall_s, sampler.cpu_s
+    wall_s, cpu_s = ({**seconds, "all": sum(seconds.values())} for seconds in both)
+    rows = [
+        (stage, f"{wall_s[stage]:.2f}", f"{used:.2f}", f"{used / cpu_s['all']:.0%}")
+        for stage, used in cpu_s.items()
+    ]
+    table = Table(f"{verdict}, {peak_mb:.0f} MB at most", ("stage", "wall [s]", "CPU [s]", "share"),
+                  tuple(rows))  # fmt: skip
+    publish("speed.stages", [table], record=options.record)
 
 
 if __name__ == "__main__":

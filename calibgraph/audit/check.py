@@ -21,10 +21,12 @@ from calibgraph.files import load_model
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.frame import hash_source
 from calibgraph.io.kept_frames import keep_frames
+from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.frame_choice import CANDIDATES, without_copies
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
+from calibgraph.matching.same_images import require_different_images
 from calibgraph.model.config import Config, Reported
 from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 from calibgraph.model.rig import Rig
@@ -99,7 +101,7 @@ def check(
     deployed = rig.model_copy(update={"relative_poses": ()})
     with watch("choose_frames"):
         data = _open(dataset, deployed, full)
-    matching = Matching(keep_frames(data), deployed, full, Config(seed=seed), report)
+    matching = Matching(data, deployed, full, Config(seed=seed), report)
     try:
         run = match_from_deployed(matching, watch)
         with watch("places"):
@@ -116,7 +118,8 @@ def check(
         lidar = None
     finally:
         full.release()
-    middle, sources = data.frames[len(data.frames) // 2], tuple(map(str, data.folders))
+    middle = data.frames[len(data.frames) // 2].with_burnt_in({})  # as it was recorded
+    sources = tuple(map(str, data.folders))
     return Audit(
         cameras, lidar, deployed, middle, sources,
         tolerance_deg, tolerance_cm, len(data.frames), watch.seconds, package_versions(),
@@ -126,7 +129,11 @@ def check(
 def _open(dataset: Datasets, deployed: Rig, matcher: FullMatcher) -> Dataset:
     """The frames that the matcher is given, without copies, which are logged."""
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, deployed)
-    most = matcher.most_frames
+    data, most = keep_frames(data), matcher.most_frames
+    require_different_images(data, deployed)
+    data = keep_frames(hide_burnt_in(data, deployed))
+    for line in describe_burnt_in(data):
+        _log.warning(line)
     choice = without_copies(data if most is None else data.spread_out(CANDIDATES * most))
     if choice.copies:
         _log.warning(describe_copies(choice.copies))

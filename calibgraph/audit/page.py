@@ -1,9 +1,8 @@
 """The page of an audit: is the deployed calibration still right?
 
-Per camera: numbers, charts, the cloud on an image.
+Per camera: numbers, the cloud on an image.
 """
 
-import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,9 +10,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from calibgraph.audit.judgement import CAMERA_AXES
 from calibgraph.audit.result import Audit, CameraAudit, twist_cells
-from calibgraph.audit.significance import DISPLAY
 from calibgraph.errors import CalibrationError
 from calibgraph.files import write_text
 from calibgraph.model.calibration import FRAMES_SENTENCE
@@ -97,90 +94,6 @@ def _detectable(audit: Audit) -> str:
     return " ".join(sentences)
 
 
-_MIDDLE, _HALF = 179.0, 105.0
-"""Of a chart's axis, in units of the drawing, 380 wide: about its pixels on a phone."""
-_MARGIN = 1.08  # of the axis beyond the largest value
-_MOST_TICKS = 2  # on each side
-
-
-@dataclass(frozen=True)
-class Bar:
-    """An axis of a camera in degrees or centimetres; sigma and detectable are NaN if unknown.
-
-    The style is ``within``, ``beyond`` the tolerance, or ``unsure`` where the data cannot tell.
-    """
-
-    name: str
-    deviation: float
-    sigma: float
-    detectable: float
-    style: str
-
-    @property
-    def has_error(self) -> bool:
-        """Whether its error is known."""
-        return math.isfinite(self.sigma)
-
-    @property
-    def text(self) -> str:
-        """The deviation and its sigma."""
-        return f"{self.deviation:+z.2f}" + f" \u00b1 {self.sigma:.2f}" * self.has_error
-
-
-@dataclass(frozen=True)
-class Chart:
-    """The rotations or the translations of a camera, three bars, and what is tolerated."""
-
-    title: str
-    bars: tuple[Bar, ...]
-    tolerance: float
-
-    @property
-    def reach(self) -> float:
-        """The value at the ends of the axis."""
-        ends = [abs(bar.deviation) + np.nan_to_num(bar.sigma) for bar in self.bars]
-        limits = [bar.detectable for bar in self.bars]
-        return _MARGIN * float(np.nanmax([*ends, *limits, self.tolerance]))
-
-    def x(self, value: float) -> float:
-        """Where a value is in the drawing."""
-        return _MIDDLE + _HALF * value / self.reach
-
-    @property
-    def ticks(self) -> list[float]:
-        """Marks at round numbers, at most two on each side of the middle."""
-        smallest = self.reach / (_MOST_TICKS + 1)
-        decade = 10.0 ** math.floor(math.log10(smallest))
-        step = next(decade * m for m in (1, 2, 5, 10) if decade * m > smallest)
-        most = int(self.reach / step)
-        return [k * step for k in range(-most, most + 1)]
-
-
-def charts_of(camera: CameraAudit, tolerance_deg: float, tolerance_cm: float) -> tuple[Chart, ...]:
-    """The rotations and the translations of a camera; none where nothing was measured."""
-    if camera.deviation is None:
-        return ()
-    twists = (camera.deviation, camera.sigma, camera.detectable)
-    rows = np.stack([np.full(6, np.nan) if t is None else t * DISPLAY for t in twists], axis=1)
-    parts = (
-        (slice(0, 3), "rotation", "deg", tolerance_deg),
-        (slice(3, 6), "translation", "cm", tolerance_cm),
-    )
-    charts = []
-    for part, word, unit, tolerance in parts:
-        total = float(np.linalg.norm(rows[part, 0]))
-        style = "beyond" if total > tolerance else "within"
-        style = "unsure" if camera.status == "CANNOT TELL" else style
-        bars = (
-            Bar(name, deviation, sigma, detectable, style)
-            for name, (deviation, sigma, detectable) in zip(
-                CAMERA_AXES[part], rows[part].tolist(), strict=True
-            )
-        )
-        charts.append(Chart(f"{word} [{unit}], {total:.2f} in all", tuple(bars), tolerance))
-    return tuple(charts)
-
-
 @dataclass(frozen=True)
 class Pictures:
     """A cloud on an image of one camera, as data URIs.
@@ -201,7 +114,6 @@ class Section:
     """One camera's values for the template.
 
     Attributes:
-        charts: rotations and translations; none where nothing was measured.
         pictures: None if they cannot be drawn.
         deployed, measured: the camera; None if nothing was measured.
     """
@@ -209,7 +121,6 @@ class Section:
     name: str
     anchor: str
     audit: CameraAudit
-    charts: tuple[Chart, ...]
     pictures: Pictures | None
     deployed: Camera
     measured: Camera | None
@@ -226,7 +137,6 @@ def camera_sections(audit: Audit) -> tuple[list[Section], str | None]:
                 name=name,
                 anchor=f"camera-{number}",
                 audit=camera,
-                charts=charts_of(camera, audit.tolerance_deg, audit.tolerance_cm),
                 pictures=pictures.get(name),
                 deployed=deployed,
                 measured=measured_camera(deployed, camera),

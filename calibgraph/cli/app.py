@@ -22,12 +22,12 @@ import typer
 from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve
 from calibgraph.cli.export import export
-from calibgraph.cli.fleet import fleet, fleet_model, fleet_report
+from calibgraph.cli.fleet import fleet
 from calibgraph.cli.inspect import doctor, evaluate, perturb, report
 from calibgraph.cli.learned import weights
 from calibgraph.cli.pick import pick
 from calibgraph.cli.rig import rig
-from calibgraph.cli.serve import serve, token
+from calibgraph.cli.serve import serve
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
 
@@ -81,7 +81,7 @@ def _help_of(command: Callable[..., None]) -> str:
 
 COMMANDS: tuple[Callable[..., None], ...] = (
     calibrate, check, drift, rig, doctor, match, solve, report, evaluate, export, track, pick,
-    simulate, perturb, weights, fleet, fleet_model, fleet_report, serve, token,
+    simulate, perturb, weights, fleet, serve,
 )  # fmt: skip
 """In the order of the help."""
 for _command in COMMANDS:

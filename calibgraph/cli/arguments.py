@@ -159,6 +159,8 @@ def require_service() -> None:
     """Check that the server's packages are there."""
     from calibgraph.errors import needs_extra
 
-    with needs_extra("service", "the server needs fastapi and uvicorn"):
+    with needs_extra("service", "the server needs fastapi, hypercorn and others"):
         import fastapi  # noqa: F401
-        import uvicorn  # noqa: F401
+        import hypercorn  # noqa: F401
+        import python_multipart  # noqa: F401
+        import sqlalchemy  # noqa: F401

@@ -89,9 +89,7 @@ def drift(
     own_lenses: bool = Option(
         False, "--own-lenses", help="Lenses may differ: several vehicles, each with its own."
     ),
-    plot: Path | None = Option(None, metavar="FILE.png", help="Draw the deviations, per camera."),
     as_json: options.JsonOption = False,
-    force: options.Force = False,
 ) -> None:
     """Which of several results of one rig deviates? Exit 0: none, 1: one CHANGED, 3: cannot tell.
 
@@ -99,10 +97,6 @@ def drift(
     several days, or of several vehicles. One false alarm in 100 calls.
     """
     from calibgraph.audit import drift
-    from calibgraph.files import require_new_file
-
-    if plot is not None:
-        require_new_file(plot, ".png", force=force)
 
     with checked_arguments():
         found = drift(
@@ -112,10 +106,6 @@ def drift(
             tolerance_cm=tolerance_cm,
             own_lenses=own_lenses,
         )
-    if plot is not None:
-        from calibgraph.audit.drift_plot import draw_drift
-
-        draw_drift(found, plot)
     if as_json:
         from calibgraph.audit import drift_summary
 
@@ -124,7 +114,7 @@ def drift(
         from calibgraph.cli.audit_tables import print_drift
 
         print_drift(terminal(), found)
-        print_plain(terminal(), f"{plot}: written" if plot is not None else "nothing was written")
+        print_plain(terminal(), "nothing was written")
     raise typer.Exit(_EXIT_CODES[found.status])
 
 

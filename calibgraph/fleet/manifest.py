@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,9 @@ import pyarrow as pa
 from pyarrow import csv, parquet
 from pydantic import BaseModel, ConfigDict, Field
 
-from calibgraph.errors import FileError
+from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import checked_model
-from calibgraph.fleet.rows import SCHEMA, bucket_of
+from calibgraph.fleet.rows import SCHEMA
 from calibgraph.fleet.uris import fingerprint, in_arrow, join, read_bytes
 from calibgraph.model.config import Config, Terms, config_from
 from calibgraph.yaml_text import parse_yaml
@@ -77,11 +77,6 @@ class Job:
         return self.vehicle, self.recording
 
     @property
-    def bucket(self) -> int:
-        """See :func:`calibgraph.fleet.rows.bucket_of`."""
-        return bucket_of(self.vehicle)
-
-    @property
     def is_table(self) -> bool:
         """Whether the input is a table of correspondences."""
         return is_table(self.recordings[0])
@@ -103,7 +98,7 @@ class Manifest:
 
 
 def load_manifest(uri: str) -> Manifest:
-    """Read a manifest: Parquet, CSV or YAML; relative paths in it start at its folder."""
+    """Read a manifest, Parquet or CSV; relative paths in it start at its folder."""
     table = _read(uri)
     for name, count in Counter(table.column_names).items():
         if count > 1:
@@ -119,15 +114,20 @@ def load_manifest(uri: str) -> Manifest:
             raise FileError(uri, f"column {name!r} is one of the results' own; rename it")
     if not len(table):
         raise FileError(uri, "holds no rows; write a vehicle and its recording into each")
-    given = [table[name].to_pylist() if name in table.column_names else [None] * len(table)
-             for name in _OWN]  # fmt: skip
-    folder, files = uri.rpartition("/")[0], dict[str, Any]()
-    jobs = tuple(
-        _job(_Place(uri, row), folder, files, **dict(zip(_OWN, cells, strict=True)))
-        for row, cells in enumerate(zip(*given, strict=True))
-    )
-    _require_different(uri, jobs)
-    return Manifest(uri, jobs, table.drop_columns([n for n in _OWN if n in table.column_names]))
+    folder, seen, jobs = uri.rpartition("/")[0], dict[tuple[str, str], int](), []
+    cells = table.select([name for name in _OWN if name in table.column_names])
+    for row, given in enumerate(cells.to_pylist()):
+        try:
+            job = _job(row, folder, **{**dict.fromkeys(_OWN), **given})
+        except (ValueError, CalibrationError) as error:
+            raise FileError(uri, f"row {row}: {error}") from error
+        if (first := seen.setdefault(job.key, row)) != row:
+            raise FileError(
+                uri, f"row {row}: vehicle {job.vehicle!r} with this recording is in row {first} "
+                "too; remove one"
+            )  # fmt: skip
+        jobs.append(job)
+    return Manifest(uri, tuple(jobs), table.drop_columns(cells.column_names))
 
 
 def _read(uri: str) -> pa.Table:
@@ -144,118 +144,53 @@ def _read(uri: str) -> pa.Table:
                 strings_can_be_null=True,
             )
             return csv.read_csv(in_arrow(content), convert_options=strings)
-        if suffix in (".yaml", ".yml"):
-            return _from_yaml(uri, content)
     except (pa.ArrowException, UnicodeDecodeError, OverflowError) as error:
         raise FileError(uri, f"cannot be read as {suffix[1:]} ({error})") from error
-    raise FileError(uri, "the name of a manifest must end in .parquet, .csv or .yaml")
+    raise FileError(uri, "the name of a manifest must end in .parquet or .csv")
 
 
-def _from_yaml(uri: str, content: bytes) -> pa.Table:
-    """The table under the key ``vehicles``."""
-    rows = parse_yaml(content.decode(), uri).get("vehicles")
-    if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
-        raise FileError(uri, "expected the key 'vehicles' with a list of mappings, one per vehicle")
-    columns = dict.fromkeys(str(name) for row in rows for name in row)
-    cells = {name: [row.get(name) for row in rows] for name in columns}
-    for name in set(cells) & {"recording", "settings"}:  # lists and mappings, beside texts
-        cells[name] = [json.dumps(cell) if isinstance(cell, (list, dict)) else cell
-                       for cell in cells[name]]  # fmt: skip
-    return pa.table(cells)
+def _job(row: int, folder: str, *, vehicle: Any, recording: Any, rig: Any, settings: Any) -> Job:
+    """A row's job.
 
-
-@dataclass(frozen=True)
-class _Place:
-    """A row of a manifest, in messages."""
-
-    uri: str
-    row: int
-
-    def error(self, message: str) -> FileError:
-        return FileError(self.uri, f"row {self.row}: {message}")
-
-
-def _job(
-    place: _Place, folder: str, files: dict[str, Any], *, vehicle: Any, recording: Any, rig: Any,
-    settings: Any,
-) -> Job:  # fmt: skip
-    """A row's job; ``files`` keeps the settings' files that were read."""
+    Raises:
+        ValueError, FileError: naming the cell that is wrong, or the file of settings.
+    """
     if not isinstance(vehicle, str) or not vehicle:
-        raise place.error(f"vehicle {vehicle!r}: expected a name; give the column as text")
+        raise ValueError(f"vehicle {vehicle!r}: expected a name; give the column as text")
     if not vehicle.isprintable():
-        raise place.error(f"vehicle {vehicle!r}: has control characters; rename it")
-    recordings = tuple(join(folder, uri) for uri in _recordings(place, recording))
-    if is_table(recordings[0]):
-        if len(recordings) > 1:
-            raise place.error(f"vehicle {vehicle!r}: several tables; write them into one file")
-        if not rig:
-            raise place.error(f"vehicle {vehicle!r}: a table of correspondences needs a 'rig'")
-    if rig is not None and not isinstance(rig, str):
-        raise place.error(f"rig {rig!r}: expected a path or URI")
-    return Job(
-        vehicle=vehicle,
-        recordings=recordings,
-        rig=join(folder, rig) if rig else None,
-        settings=_settings(place, folder, files, settings),
-        row=place.row,
-    )
-
-
-def _recordings(place: _Place, cell: Any) -> Sequence[str]:
-    """The URIs in a cell: a list, its JSON, or texts between separators."""
-    found = cell
-    if isinstance(cell, str):
-        found = _json(place, cell) if cell.startswith("[") else cell.split(SEPARATOR)
-        found = [text.strip() if isinstance(text, str) else text for text in found]
+        raise ValueError(f"vehicle {vehicle!r}: has control characters; rename it")
+    found = recording.split(SEPARATOR) if isinstance(recording, str) else recording
     if not isinstance(found, list) or not found or not all(u and isinstance(u, str) for u in found):
-        raise place.error(f"recording {cell!r}: expected a path or URI, or several between ;")
-    return found
+        raise ValueError(f"recording {recording!r}: expected a path or URI, or several between ;")
+    recordings = tuple(join(folder, uri.strip()) for uri in found)
+    if is_table(recordings[0]) and len(recordings) > 1:
+        raise ValueError(f"vehicle {vehicle!r}: several tables; write them into one file")
+    if is_table(recordings[0]) and not rig:
+        raise ValueError(f"vehicle {vehicle!r}: a table of correspondences needs a 'rig'")
+    if rig is not None and not isinstance(rig, str):
+        raise ValueError(f"rig {rig!r}: expected a path or URI")
+    place = join(folder, rig) if rig else None
+    return Job(vehicle, recordings, place, _settings(folder, settings), row)
 
 
-def _json(place: _Place, text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError as error:
-        raise place.error(f"{text!r} is no JSON ({error})") from error
-
-
-def _settings(place: _Place, folder: str, files: dict[str, Any], cell: Any) -> Settings:
+def _settings(folder: str, cell: Any) -> Settings:
     """Settings from a mapping, its text, or the URI of a YAML file."""
-    if not cell:
-        return Settings()
-    if isinstance(cell, str) and not cell.lstrip().startswith("{"):
-        uri = join(folder, cell)
-        if uri not in files:
-            files[uri] = _checked_settings(parse_yaml(_text(uri), uri), uri)
-        found: Settings = files[uri]
-        return found
-    where = f"{place.uri}: row {place.row}: settings"
-    content = parse_yaml(cell, where) if isinstance(cell, str) else cell
-    if isinstance(content, Mapping):  # a struct of Arrow has null for what a row leaves out
-        content = {name: value for name, value in content.items() if value is not None}
-        return _checked_settings(content, where)
-    raise place.error(f"settings {cell!r}: expected a mapping, or the URI of a YAML file")
-
-
-def _text(uri: str) -> str:
+    if isinstance(cell, Mapping):  # a struct of Arrow has null for what a row leaves out
+        given = {name: value for name, value in cell.items() if value is not None}
+        return _checked(given, "settings")
+    if cell and not isinstance(cell, str):
+        raise ValueError(f"settings {cell!r}: expected a mapping, or the URI of a YAML file")
+    if not cell or cell.lstrip().startswith("{"):
+        return _checked(parse_yaml(cell or "{}", "settings"), "settings")
+    uri = join(folder, cell)
     try:
-        return read_bytes(uri, _MOST_SETTINGS_BYTES).decode()
+        text = read_bytes(uri, _MOST_SETTINGS_BYTES).decode()
     except UnicodeDecodeError as error:
         raise FileError(uri, f"is not a text file ({error.reason})") from error
+    return _checked(parse_yaml(text, uri), uri)
 
 
-def _checked_settings(content: dict[str, Any], where: str) -> Settings:
+def _checked(content: Mapping[str, Any], where: str) -> Settings:
     matching = {name: value for name, value in content.items() if name in _MATCHING}
     config = {name: value for name, value in content.items() if name not in _MATCHING}
     return checked_model(Settings, {**matching, "config": config_from(config, where)}, where)
-
-
-def _require_different(uri: str, jobs: Sequence[Job]) -> None:
-    seen: dict[tuple[str, str], int] = {}
-    for job in jobs:
-        first = seen.setdefault((job.vehicle, job.recording), job.row)
-        if first != job.row:
-            raise FileError(
-                uri, f"row {job.row}: vehicle {job.vehicle!r} with this recording is in row "
-                f"{first} too; remove one"
-            )  # fmt: skip

@@ -1,17 +1,15 @@
 """What a worker gets and what it returns: a job with its limits, and the job's outcome."""
 
+import json
 import traceback
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from calibgraph.errors import CalibrationError
 from calibgraph.fleet.manifest import Job
-from calibgraph.model.config import Reported
-from calibgraph.model.versions import version_of
+from calibgraph.model.versions import package_versions, version_of
 
-ErrorKind = Literal[
-    "bad input", "io", "out of memory", "timeout", "worker died", "internal error"
-]  # fmt: skip
+ErrorKind = Literal["bad input", "io", "out of memory", "timeout", "worker died", "internal error"]
 
 
 def describe_failure(error: Exception) -> tuple[ErrorKind, str]:
@@ -25,17 +23,6 @@ def describe_failure(error: Exception) -> tuple[ErrorKind, str]:
     if isinstance(error, OSError):
         return "io", str(error)
     return "internal error", f"{type(error).__name__}: {error}"
-
-
-RETRIES: dict[ErrorKind, int] = {
-    "bad input": 0,
-    "io": 3,
-    "out of memory": 0,
-    "timeout": 1,
-    "worker died": 3,
-    "internal error": 0,
-}
-"""How often a job is tried again in one run. A later run tries all failures again but bad input."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +42,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Task:
-    """One try of a job, made by this release of the package."""
+    """A job as it is sent to a worker by this release of the package."""
 
     job: Job
     limits: Limits
@@ -63,32 +50,21 @@ class Task:
 
 
 @dataclass(frozen=True)
-class CameraResult:
-    """The result of one camera, as its row holds it."""
-
-    camera: str
-    verdict: str
-    cannot_tell: bool
-    probability_off: float | None
-    reasons: tuple[str, ...]
-    T_camera_lidar: tuple[float, ...]
-    covariance: tuple[float, ...] | None
-    actions: tuple[str, ...] = ()
-    of: Reported = "alignment"
-
-
-@dataclass(frozen=True)
 class Outcome:
-    """How a try ended; without versions its process died."""
+    """How a job ended: the cells of a row per camera, or an error."""
 
-    cameras: tuple[CameraResult, ...] = ()
+    cameras: tuple[dict[str, Any], ...] = ()
     error_kind: ErrorKind | None = None
     error: str | None = None
     seconds: float = 0.0
-    versions: str = ""
     log: str = ""
 
 
 def release() -> str:
     """The version of this package."""
     return version_of("calibgraph")
+
+
+def versions_text() -> str:
+    """The versions that results depend on, as JSON."""
+    return json.dumps(package_versions())

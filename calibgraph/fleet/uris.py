@@ -2,13 +2,12 @@
 
 import hashlib
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
-from calibgraph.errors import CalibrationError, FileError
+from calibgraph.errors import CalibrationError, FileError, needs_extra
 from calibgraph.files import sha256
 
 _CHANGES = (
@@ -24,8 +23,8 @@ def locate(uri: str) -> tuple[Any, str]:
     Raises:
         FileError: if there is no such kind of URI, or its package is not installed.
     """
-    import fsspec
-
+    with needs_extra("fleet", "files at URIs need fsspec"):
+        import fsspec
     try:
         filesystem, path = fsspec.core.url_to_fs(uri)
     except (ImportError, ValueError, OSError) as error:
@@ -87,34 +86,24 @@ def fingerprint(uri: str) -> str:
 
     Of the contents of local files; of the ETag, size and time of remote ones, which needs one
     listing and no byte of them.
+
+    Raises:
+        FileNotFoundError: if nothing is there.
     """
     filesystem, path = locate(uri)
-    digest = hashlib.sha256()
-    entries = _local_entries(Path(path)) if is_local(filesystem) else _entries(filesystem, path)
-    try:
-        for name, state in entries:
-            digest.update(json.dumps([name, state]).encode())
-    except FileNotFoundError:
-        raise FileNotFoundError(uri) from None
-    return digest.hexdigest()
-
-
-def _local_entries(path: Path) -> Iterator[tuple[str, str]]:
-    if not path.exists():
-        raise FileNotFoundError(path)
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    for file in files:
-        yield file.relative_to(path).as_posix(), sha256(file)
-
-
-def _entries(filesystem: Any, path: str) -> Iterator[tuple[str, str]]:
-    found = filesystem.find(path, detail=True)
-    if not found:
-        raise FileNotFoundError(path)
+    if not filesystem.exists(path):
+        raise FileNotFoundError(uri)
+    digest, is_here = hashlib.sha256(), is_local(filesystem)
+    found = {path: filesystem.info(path)} if filesystem.isfile(path) else filesystem.find(
+        path, detail=True
+    )  # fmt: skip
     for name in sorted(found):
-        info = found[name]
-        state = {key: str(info[key]) for key in _CHANGES if info.get(key) is not None}
-        yield name.removeprefix(path), json.dumps(state, sort_keys=True)
+        state: Any = {key: str(found[name][key]) for key in _CHANGES if key in found[name]}
+        if is_here and not Path(name).is_file():
+            continue  # a pipe, or a link to nothing
+        state = sha256(Path(name)) if is_here else state
+        digest.update(json.dumps([name.removeprefix(path), state], sort_keys=True).encode())
+    return digest.hexdigest()
 
 
 def fetch(uri: str, folder: Path, most_bytes: float) -> Path:
@@ -122,6 +111,8 @@ def fetch(uri: str, folder: Path, most_bytes: float) -> Path:
     filesystem, path = locate(uri)
     if is_local(filesystem):
         return Path(path)
+    if not filesystem.exists(path):
+        raise FileError(uri, "nothing is there; check the address")
     size = sum(filesystem.du(path, total=False).values())
     if size > most_bytes:
         raise FileError(

@@ -15,6 +15,8 @@ from calibgraph.guessing.mounting import GRAMMAR, Mounting, check_forward, parse
 from calibgraph.io.dataset import load_dataset
 from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.formats.rig_import import RigParts, read_rig_parts
+from calibgraph.matching.burnt_in import hide_burnt_in
+from calibgraph.matching.same_images import require_different_images
 from calibgraph.matching.structure.matcher import MAX_SEARCH_DEG, MAX_SEARCH_M
 from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Rig
@@ -143,6 +145,8 @@ def guess_rig(
     found: dict[str, FoundCamera] = {}
     if unknown and data is not None:
         dataset = load_dataset(data, rig)
+        require_different_images(dataset, rig)
+        dataset = hide_burnt_in(dataset, rig)
         found = search_headings(dataset, rig, unknown, forward=axis, seed=seed, progress=progress)
         _require_found(found)
     rig = rig.moved_to({name: one.T_camera_lidar for name, one in found.items()})

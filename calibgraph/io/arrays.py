@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import DatasetError, FileError
-from calibgraph.io.clouds import check_points, cloud_of_array, describe_cloud, with_intensity
+from calibgraph.io.clouds import (
+    check_points,
+    cloud_of_array,
+    describe_cloud,
+    thin_cloud,
+    with_intensity,
+)
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.io.point_fields import RawCloud
@@ -35,11 +41,10 @@ class ArrayFrame(Frame):
         return self.twist
 
     def load_cloud(self) -> NDArray[np.float32]:
-        """(n, 4) x y z [m], intensity."""
-        return self.cloud
+        """(n, 4) x y z [m], intensity; thinned."""
+        return thin_cloud(self.cloud)
 
-    def load_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
-        """(height, width, 3) image, BGR."""
+    def _decode_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
         return self.images[name]
 
     def hashes(self) -> dict[str, str]:

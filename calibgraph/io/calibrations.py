@@ -143,6 +143,7 @@ class _FrameEntry(BaseModel):
     cloud: str
     images: dict[str, str]
     motion: _Motion | None = None
+    cloud_columns: tuple[str, ...] | None = None
 
 
 class _JointOfLens(BaseModel):

@@ -4,7 +4,7 @@ import threading
 import tokenize
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,9 @@ from calibgraph.io.point_fields import RawCloud, choose_fields, make_cloud, raw_
 from calibgraph.model.correspondences import MAX_COORDINATE
 
 MAX_CLOUD_BYTES = 2 * 2**30
+MOST_POINTS = 400_000
+"""Of a cloud that is used: larger ones, which join many scans, take minutes and gigabytes more and
+are no more accurate."""
 
 _PARSER = threading.Lock()
 """numpy reads headers by Python's parser, which in 3.11 raises SystemError if another thread parses
@@ -39,7 +42,9 @@ _XYZ, _XYZI = 3, 4
 _MOST_COLUMNS = 64
 
 
-def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np.float32]:
+def load_cloud(
+    path: Path | str, motion: ScanMotion | None = None, columns: Sequence[str] | None = None
+) -> NDArray[np.float32]:
     """Read a cloud.
 
     Args:
@@ -47,6 +52,7 @@ def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np
             nuScenes), .pcd, .ply, or a .feather of Argoverse 2; or the address of a message in a
             bag.
         motion: for which points of a bag's message are corrected; None for none.
+        columns: names of those of a .bin; told by its content if None.
 
     Returns:
         (n, 4) x y z [m] in the LiDAR frame and the intensity as the file has it, NaN where it has
@@ -59,15 +65,36 @@ def load_cloud(path: Path | str, motion: ScanMotion | None = None) -> NDArray[np
     path = Path(path)
     if path.suffix == MESSAGE_SUFFIX:
         return with_intensity(load_bag_cloud(path, motion))
-    return with_intensity(check_points(read_cloud(path).points, path))
+    return with_intensity(check_points(read_cloud(path, columns).points, path))
 
 
-def read_cloud(path: Path) -> RawCloud:
+def thin_cloud(cloud: NDArray[np.float32]) -> NDArray[np.float32]:
+    """At most ``MOST_POINTS`` of a cloud's points, drawn at random, the same each time."""
+    if len(cloud) <= MOST_POINTS:
+        return cloud
+    drawn = np.random.default_rng(0).choice(len(cloud), MOST_POINTS, replace=False)
+    return cloud[np.sort(drawn)]
+
+
+def describe_thinned(sizes: Iterable[int]) -> list[str]:
+    """A line if clouds of these sizes have been thinned."""
+    full = [size >= MOST_POINTS for size in sizes]
+    if not any(full):
+        return []
+    return [
+        f"{sum(full)} of {len(full)} clouds have {MOST_POINTS:,} points or more: "
+        f"{MOST_POINTS:,} of each, drawn at random, are used"
+    ]
+
+
+def read_cloud(path: Path, columns: Sequence[str] | None = None) -> RawCloud:
     """All points of a file, and the names of its fields."""
     if require_file(path).stat().st_size > MAX_CLOUD_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for one cloud")
     if path.suffix.lower() not in _READERS:
         raise FileError(path, f"unknown cloud format; known are {', '.join(CLOUD_SUFFIXES)}")
+    if path.suffix.lower() == ".bin":
+        return read_bin(path, columns)
     return _READERS[path.suffix.lower()](path)
 
 
@@ -197,14 +224,14 @@ _COST = "the error bars become about twice as wide without; record it, or name i
 """Measured on data/sample: 1.8 to 2.8 times the error bars without it, with half of the matches."""
 
 
-def read_cloud_notes(path: Path) -> list[str]:
+def read_cloud_notes(path: Path, columns: Sequence[str] | None = None) -> list[str]:
     """Notes about a file, or about a message in a bag; none if it cannot be read."""
     try:
         if path.suffix == MESSAGE_SUFFIX:
             fields = tuple(each.name for each in read_message(path)[1].fields)
             cloud = RawCloud(load_bag_cloud(path), fields)
         else:
-            cloud = read_cloud(path)
+            cloud = read_cloud(path, columns)
             cloud = cloud._replace(points=check_points(cloud.points, path))
     except (CalibrationError, OSError):  # which is named where the frame is read
         return []

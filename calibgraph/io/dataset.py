@@ -151,7 +151,9 @@ def load_dataset(
     if data.recorded == data.frames:
         data = replace(data, recorded=())
     data = data if frames is None else _complete(data.select(frames))
-    of_clouds = (note for each in data.frames[:1] for note in read_cloud_notes(each.cloud_path))
+    of_clouds = (
+        note for each in data.frames[:1] for note in read_cloud_notes(each.cloud_path, each.columns)
+    )
     return replace(data, notes=(*of_clouds, *data.notes))
 
 
@@ -185,7 +187,13 @@ def _with_folder(
     """The dataset with the frames of a folder; of complete ones where names are stamps."""
     start, cameras = _next_index(data), data.rig.cameras.keys()
     found = tuple(
-        Frame(start + number, prefix + files.stem, files.cloud, files.images)
+        Frame(
+            start + number,
+            prefix + files.stem,
+            files.cloud,
+            files.images,
+            columns=data.rig.cloud_columns,
+        )
         for number, files in enumerate(of_folder.files)
         if not of_folder.pairing or cameras <= files.images.keys()
     )

@@ -1,7 +1,7 @@
 """A frame: one cloud and the images taken with it; the cloud as recorded, or without motion."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -14,7 +14,8 @@ from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.files import sha256
 from calibgraph.io.bags import MESSAGE_SUFFIX, hash_message
-from calibgraph.io.clouds import load_cloud
+from calibgraph.io.burnt_in import BurntIn
+from calibgraph.io.clouds import load_cloud, thin_cloud
 from calibgraph.io.frame_files import stamp_ns_in_name
 from calibgraph.io.images import load_image
 from calibgraph.io.motion import (
@@ -30,6 +31,7 @@ from calibgraph.model.rig import Camera
 _MOST_M_S = 100.0  # of a vehicle
 _MOTION = "motion"
 """The key of an entry's :class:`ScanMotion`, if its cloud is corrected."""
+_COLUMNS = "cloud_columns"
 
 
 class Sized(Protocol):
@@ -55,6 +57,8 @@ class Frame:
         image_paths: the image's file or address in a bag, per camera that has one.
         find_motion: computes the motion during the scan, for which the cloud is then corrected.
         find_twist: computes (6,) the twist of the LiDAR where the cloud is as recorded.
+        burnt_in: per camera, what its images are filled at when they are loaded.
+        columns: names of those of a .bin cloud, if the rig states them.
 
     The motion and the twist are computed once, when they are needed.
     """
@@ -65,6 +69,8 @@ class Frame:
     image_paths: dict[str, Path]
     find_motion: Callable[[], ScanMotion] | None = field(default=None, kw_only=True)
     find_twist: Callable[[], Array] | None = field(default=None, kw_only=True)
+    burnt_in: Mapping[str, BurntIn] = field(default_factory=dict, kw_only=True, compare=False)
+    columns: tuple[str, ...] | None = field(default=None, kw_only=True)
 
     @cached_property
     def motion(self) -> ScanMotion | None:
@@ -88,12 +94,20 @@ class Frame:
         """(4, 4) of the LiDAR in a frame fixed to the ground; None if no poses are given."""
         return None if self.motion is None else self.motion.T_world_lidar
 
+    def with_burnt_in(self, found: Mapping[str, BurntIn]) -> "Frame":
+        """The frame whose images are filled where something is burnt in."""
+        return replace(self, burnt_in=found)
+
     def load_cloud(self) -> NDArray[np.float32]:
-        """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`."""
-        return load_cloud(self.cloud_path, self.motion)
+        """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`; thinned."""
+        return thin_cloud(load_cloud(self.cloud_path, self.motion, self.columns))
 
     def load_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width, 3) image, BGR; see :func:`calibgraph.io.images.load_image`."""
+        image, burnt_in = self._decode_image(name, camera), self.burnt_in.get(name)
+        return image if burnt_in is None else burnt_in.fill(image)
+
+    def _decode_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
         return load_image(self.image_paths[name], camera)
 
     def load_gray(self, name: str, camera: Camera) -> NDArray[np.uint8]:
@@ -116,12 +130,14 @@ class Frame:
 
     def entry(self) -> dict[str, Any]:
         """The frame's number, files and motion if it is known, as a result keeps them."""
-        files = {
+        files: dict[str, Any] = {
             "frame": self.index,
             "name": self.name,
             "cloud": str(self.cloud_path),
             "images": {name: str(path) for name, path in self.image_paths.items()},
         }
+        if self.columns is not None:
+            files[_COLUMNS] = list(self.columns)
         motion = self.motion
         if self.find_twist is not None:
             motion = ScanMotion(tuple(np.asarray(self.twist_per_s).tolist()), 0.0)
@@ -204,17 +220,16 @@ def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
     """The frame that a result's entry names, its cloud corrected as it was."""
     images = {name: Path(path) for name, path in entry["images"].items()}
     files = entry["frame"], entry["name"], Path(entry["cloud"]), images
-    motion = entry.get(_MOTION)
+    motion, columns = entry.get(_MOTION), entry.get(_COLUMNS)
     if motion is None:
-        return Frame(*files)
+        return Frame(*files, columns=columns)
     found = ScanMotion.of_entry(motion)
-    return Frame(*files, find_motion=lambda: found)
+    return Frame(*files, find_motion=lambda: found, columns=columns)
 
 
 def load_entry_cloud(entry: Mapping[str, Any]) -> NDArray[np.float32]:
     """(n, 4) the cloud that a result's entry of a frame names, corrected as it was."""
-    motion = entry.get(_MOTION)
-    return load_cloud(entry["cloud"], None if motion is None else ScanMotion.of_entry(motion))
+    return frame_of_entry(entry).load_cloud()
 
 
 def twist_of_entry(entry: Mapping[str, Any]) -> Array | None:

@@ -24,7 +24,7 @@ _WAYS_OUT = {
     ),
     ".drc": "is not read: write it as .ply (`draco_decoder -i {0} -o {1}.ply`)",
     ".gz": _PACKED.format("gunzip {0}"),
-    **dict.fromkeys((".zst", ".zstd"), _PACKED.format("zstd -d {0}")),
+    **dict.fromkeys((".zst", ".zstd"), _PACKED.format("unzstd {0}")),
     ".bz2": _PACKED.format("bunzip2 {0}"),
     ".xz": _PACKED.format("unxz {0}"),
     ".lz4": _PACKED.format("unlz4 {0}"),

@@ -1,12 +1,13 @@
 """Frames whose files are decoded once, though several parts of a calibration read them."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.io.burnt_in import BurntIn
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Derived, Frame
 from calibgraph.io.motion import ScanMotion
@@ -52,6 +53,10 @@ class KeptFrame(Frame):
         """(6,) of the LiDAR."""
         return self.frame.twist_per_s if self.twist is None else self.twist
 
+    def with_burnt_in(self, found: Mapping[str, BurntIn]) -> Frame:
+        """The frame that was kept, whose images are filled: what was derived of them is not."""
+        return self.frame.with_burnt_in(found)
+
     def load_cloud(self) -> Cloud:
         """(n, 4) x y z [m], intensity."""
         return self.derive("cloud", lambda: mmap_copy(self.frame.load_cloud()))
@@ -96,7 +101,7 @@ def keep_frames(data: Dataset) -> Dataset:
     frames = (
         KeptFrame(
             each.index, each.name, each.cloud_path, each.image_paths,
-            frame=each, kept=kept, common=common,
+            frame=each, burnt_in=each.burnt_in, kept=kept, common=common,
         )
         for each in data.frames
     )  # fmt: skip

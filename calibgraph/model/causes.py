@@ -96,7 +96,11 @@ CAUSES: dict[str, Cause] = {
         "cameras that contradict each other",
         "Check the intrinsics and guesses of both cameras, and that their images are of one "
         "instant and not swapped.",
-        {"pair_agreement": ""},
+        {"pair_agreement": "",
+         "contradiction": "Look whether both images have a text, a logo or a part of the vehicle "
+         "at the same pixels, and record without it; else check both lenses and guesses.",
+         "one_pose": "Look whether both cameras have the images of one device; if they are mounted "
+         "so, state it in relative_poses."},
     ),
     "priors": Cause(
         "priors and relative poses",

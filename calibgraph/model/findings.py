@@ -16,7 +16,9 @@ from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.yaml_text import describe_value
 
 _OF_ONE_SEARCH = ("found", "missed", "chance")
-_PER_CAMERA = ("z_score", *_OF_ONE_SEARCH, "start_dependence", "memorization", "failed_share")
+_PER_CAMERA = (
+    "z_score", *_OF_ONE_SEARCH, "contradicted", "start_dependence", "memorization", "failed_share"
+)  # fmt: skip
 _FORMER_KEYS = {"contrast": "z_score", "recall": "memorization"}
 IMAGES = "calibgraph_images"
 """Key of what the images said of a result; its content is of ``calibgraph.trust.image_record``."""
@@ -59,6 +61,7 @@ class MatcherFindings:
         missed: best z-score of the search where it did not find the camera: the camera fails.
         chance: probability that a search with nothing to find ends at as high a z-score; of a
             search in one to three frames alone, which measures it (0 to 1).
+        contradicted: by camera that the search found, the camera whose features place it elsewhere.
         stage1: ``rig`` if the matches of a single frame determine no pose, else ``pnp``.
         range_rotation_deg, range_translation_m: how far from the guess it searches, per axis; None
             if unknown.
@@ -82,6 +85,7 @@ class MatcherFindings:
     found: Mapping[str, _Finite] = field(default_factory=dict)
     missed: Mapping[str, _Finite] = field(default_factory=dict)
     chance: Mapping[str, _Finite] = field(default_factory=dict)
+    contradicted: Mapping[str, str] = field(default_factory=dict)
     stage1: Literal["pnp", "rig"] = "pnp"
     range_rotation_deg: Annotated[float | None, _number(0, 180)] = None
     range_translation_m: Annotated[float | None, _number(0, 100)] = None

@@ -278,6 +278,15 @@ class Rig(_Model):
     lidar: str = "lidar"
     cameras: Annotated[dict[CameraName, Camera], Field(min_length=1)]
     relative_poses: tuple[RelativePose, ...] = ()
+    cloud_columns: tuple[str, ...] | None = None
+    """Names of the float32 columns of .bin clouds, such as x, y, z, intensity, ring."""
+
+    @model_serializer(mode="wrap")
+    def _without_absent_columns(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content: dict[str, Any] = serialize(self)
+        if self.cloud_columns is None:
+            content.pop("cloud_columns", None)
+        return content
 
     @model_validator(mode="after")
     def _relative_poses_name_cameras(self) -> Self:

@@ -1,4 +1,1 @@
-"""Calibrations over HTTP: jobs, trackers and pages for people.
-
-Routes and what they call raise ``Problem`` to refuse a request, with its status and one line.
-"""
+"""Calibrations over HTTP; routes refuse a request by a ``Problem``, with its status and a line."""

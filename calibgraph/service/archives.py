@@ -12,8 +12,6 @@ MOST_FILES = 100_000
 MOST_RATIO = 100
 """Clouds and images of sensors pack to a third at best; zeros to a thousandth."""
 _ANY_RATIO_BYTES = 10**8
-_MOST_NOTES = 20
-_CHUNK = 2**20
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}"
 _LAYOUT = re.compile(
     rf"(?:rig\.yaml|calib\.txt|times\.txt|metadata\.yaml|{_NAME}\.(?:db3|mcap)"
@@ -31,36 +29,39 @@ _JUNK = re.compile(
 
 _BAGS = {b"#ROSBAG V2.0": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
 _ZIP = b"PK\x03\x04"
-_TABLES = {b"PAR1": ".parquet"}
 
 
-def open_upload(path: Path, most_bytes: int) -> Path:
-    """The recording in an upload, by its first bytes: a bag or the unpacked folder, in its place.
+def open_upload(upload: Path, target: Path, most_bytes: int) -> Path:
+    """The recording in an upload, by its first bytes: linked, or unpacked into a folder.
+
+    Args:
+        upload: the file, which stays as it is.
+        target: of the folder, or of the bag without its suffix.
+        most_bytes: of all unpacked files.
 
     Raises:
         FileError: if it is neither, or an archive holds something else, or too much.
     """
-    with path.open("rb") as file:
+    with upload.open("rb") as file:
         head = file.read(16)
     for mark, suffix in _BAGS.items():
         if head.startswith(mark):
-            return path.rename(path.with_name(path.name + suffix))
+            bag = target.with_name(target.name + suffix)
+            bag.hardlink_to(upload)
+            return bag
     if not head.startswith(_ZIP):
-        raise FileError(path.name, "is no .zip of a dataset folder, and no bag (.bag, .mcap, .db3)")
-    packed = path.rename(path.with_name(path.name + ".packed"))
+        raise FileError(target, "is no .zip of a dataset folder, and no bag (.bag, .mcap, .db3)")
     try:
-        _unpack(packed, path, most_bytes)
+        _unpack(upload, target, most_bytes)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
-        raise FileError(path.name, f"cannot be unpacked ({error}); make the .zip again") from error
-    packed.unlink()
-    return path
+        raise FileError(target, f"cannot be unpacked ({error}); make the .zip again") from error
+    return target
 
 
 def table_suffix(path: Path) -> str:
     """The suffix of an uploaded table by its first bytes: Parquet, else CSV."""
     with path.open("rb") as file:
-        head = file.read(4)
-    return _TABLES.get(head, ".csv")
+        return ".parquet" if file.read(4) == b"PAR1" else ".csv"
 
 
 def _unpack(packed: Path, folder: Path, most_bytes: int) -> None:
@@ -78,7 +79,7 @@ def _unpack(packed: Path, folder: Path, most_bytes: int) -> None:
             path = folder / target
             path.parent.mkdir(parents=True, exist_ok=True)
             with archive.open(name) as source, path.open("xb") as file:
-                shutil.copyfileobj(source, file, _CHUNK)
+                shutil.copyfileobj(source, file, 2**20)
 
 
 def _targets(names: list[str], where: str) -> dict[str, str]:
@@ -92,10 +93,9 @@ def _targets(names: list[str], where: str) -> dict[str, str]:
     for target in left_out:
         if _DATA.match(target) or len(left_out) == len(targets):
             raise _unexpected(target, where)
-    for target in left_out[:_MOST_NOTES]:
-        print(f"{where}: {ascii(target[:100])} is no part of a dataset and is left out")
-    if len(left_out) > _MOST_NOTES:
-        print(f"{where}: {len(left_out)} files are left out in all")
+    if left_out:
+        named = ", ".join(ascii(target[:100]) for target in left_out[:20])
+        print(f"{where}: {len(left_out)} files are no part of a dataset, and left out: {named}")
     kept = {name: target for name, target in targets.items() if _LAYOUT.fullmatch(target)}
     if len({name.lower() for name in names}) < len(names):
         raise FileError(where, "holds a name twice")
@@ -112,16 +112,10 @@ def _top_folder(names: list[str]) -> str:
 
 
 def _require_size(size: int, packed: int, where: str, most_bytes: int) -> None:
-    if size > most_bytes:
-        raise FileError(
-            where, f"holds {size} bytes when unpacked, expected up to {most_bytes}; send less"
-        )
-    if size > max(_ANY_RATIO_BYTES, MOST_RATIO * packed):
-        raise FileError(
-            where,
-            f"{packed} bytes stand for {size} when unpacked, over {MOST_RATIO} times as many; "
-            "send a recording of a sensor",
-        )
+    most = min(most_bytes, max(_ANY_RATIO_BYTES, MOST_RATIO * packed))
+    if size > most:
+        why = f"{packed} bytes stand for {size} when unpacked, expected up to {most}"
+        raise FileError(where, f"{why}; send a recording of a sensor, or less of it")
 
 
 def _unexpected(name: str, where: str) -> FileError:

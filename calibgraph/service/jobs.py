@@ -1,44 +1,53 @@
-"""The table of jobs: nothing that was acknowledged is lost, whatever ends the server."""
+"""The table of jobs, in SQLite or another database: nothing that was acknowledged is lost."""
 
-import secrets
 import time
-from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, Literal
 
 import sqlalchemy as sa
 from sqlalchemy import func, select
-from sqlalchemy.exc import IntegrityError
-from sqlalchemy.orm import Mapped, mapped_column, sessionmaker
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, sessionmaker
 
+from calibgraph.errors import CalibrationError
 from calibgraph.fleet.task import ErrorKind
-from calibgraph.service.access import Caller
-from calibgraph.service.database import NUMBER, Base
-from calibgraph.service.requests import Job, JobKind
+from calibgraph.service.job_requests import Job, JobKind, JobOutcome
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 FINISHED: tuple[JobState, ...] = ("succeeded", "failed", "cancelled")
-MOST_STARTS = 20
+MOST_STARTS = 5
 """A job during which the process or the server ended so often is not started again."""
+
+DATABASE = "service.sqlite"
+_WAIT_S = 30.0
+_NUMBER = sa.Integer().with_variant(sa.BigInteger, "postgresql")
+
+
+class Base(DeclarativeBase):
+    """What all tables have in common."""
+
+
+class Owner(Base):
+    """Whose the database is: of one data folder."""
+
+    __tablename__ = "calibgraph_owner"
+
+    id: Mapped[str] = mapped_column(sa.String(64), primary_key=True)
 
 
 class JobRecord(Base):
     """A job; times are seconds since 1970, None if not yet."""
 
-    __tablename__ = "jobs"
-    __table_args__ = (
-        sa.UniqueConstraint("tenant", "idempotency_key"),
-        sa.Index("jobs_by_state", "state", "tenant", "number"),
-        sa.Index("jobs_by_tenant", "tenant", "number"),
-    )
+    __tablename__ = "calibgraph_jobs"
+    __table_args__ = (sa.Index("calibgraph_jobs_by_state", "state", "number"),)
 
-    number: Mapped[int] = mapped_column(NUMBER, primary_key=True)
+    number: Mapped[int] = mapped_column(_NUMBER, primary_key=True)
     id: Mapped[str] = mapped_column(sa.String(64), unique=True)
-    tenant: Mapped[str] = mapped_column(sa.String(64))
     kind: Mapped[JobKind] = mapped_column(sa.String(16))
     state: Mapped[JobState] = mapped_column(sa.String(16))
-    request: Mapped[str] = mapped_column(sa.Text, deferred=True)
-    digest: Mapped[str] = mapped_column(sa.String(64), deferred=True)
-    idempotency_key: Mapped[str | None] = mapped_column(sa.String(255))
+    request: Mapped[str] = mapped_column(sa.Text)
+    name: Mapped[str] = mapped_column(sa.Text)
+    note: Mapped[str] = mapped_column(sa.Text)
     created_s: Mapped[float]
     started_s: Mapped[float | None]
     finished_s: Mapped[float | None]
@@ -47,25 +56,6 @@ class JobRecord(Base):
     cannot_tell: Mapped[bool | None]
     error_kind: Mapped[ErrorKind | None] = mapped_column(sa.String(16))
     error: Mapped[str | None] = mapped_column(sa.Text)
-    name: Mapped[str | None] = mapped_column(sa.String(100))
-    note: Mapped[str | None] = mapped_column(sa.Text)
-
-    @property
-    def title(self) -> str:
-        """Its name, else its kind and id."""
-        return self.name or f"{self.kind} {self.id[:8]}"
-
-    @property
-    def result(self) -> str:
-        """The verdict of its result, else its state."""
-        return self.verdict or self.state
-
-    @property
-    def took_s(self) -> float | None:
-        """How long it ran; None if it has not ended."""
-        if self.started_s is None or self.finished_s is None:
-            return None
-        return self.finished_s - self.started_s
 
     @property
     def is_finished(self) -> bool:
@@ -73,20 +63,41 @@ class JobRecord(Base):
         return self.state in FINISHED
 
 
-_BY_TENANT = select(JobRecord.tenant).group_by(JobRecord.tenant)
-_RUNNING = _BY_TENANT.add_columns(func.count()).where(JobRecord.state == "running")
-_WAIT_LONGEST = _BY_TENANT.add_columns(func.min(JobRecord.number)).where(
-    JobRecord.state == "queued"
-)
+def open_database(folder: Path, url: str | None, owner: str) -> sa.Engine:
+    """The database of a server: SQLite in its folder without a URL; it belongs to one owner.
+
+    Raises:
+        CalibrationError: if it cannot be opened, or is another server's.
+    """
+    where = "the database" if url else str(folder / DATABASE)
+    try:
+        engine = _engine(folder, url)
+        Base.metadata.create_all(engine)
+        with Session(engine) as session, session.begin():
+            found = session.scalar(select(Owner.id))
+            if found is None:
+                session.add(Owner(id=owner))
+    except (SQLAlchemyError, ImportError) as error:
+        why = str(getattr(error, "orig", None) or error).split("\n")[0]
+        raise CalibrationError(f"{where}: cannot be opened ({why}); check --database") from error
+    if found not in (None, owner):
+        raise CalibrationError(f"{where}: belongs to another --data folder; take another database")
+    return engine
 
 
-def new_id() -> str:
-    """128 random bits."""
-    return secrets.token_hex(16)
+def _engine(folder: Path, url: str | None) -> sa.Engine:
+    if url is not None and not url.startswith("sqlite"):
+        return sa.create_engine(url, pool_pre_ping=True)
+    engine = sa.create_engine(
+        url or f"sqlite:///{folder / DATABASE}", connect_args={"timeout": _WAIT_S}, pool_size=20
+    )
 
+    @sa.event.listens_for(engine, "connect")
+    def _prepare(connection: Any, _: object) -> None:
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("PRAGMA synchronous=FULL")  # what is acknowledged is on disk
 
-class OtherRequestError(Exception):
-    """An idempotency key that was given with another request before."""
+    return engine
 
 
 class JobTable:
@@ -94,117 +105,57 @@ class JobTable:
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine, self._sessions = engine, sessionmaker(engine, expire_on_commit=False)
-        self._last_start: dict[str, int] = {}  # of each tenant, in the order of all starts
 
-    def add(self, id: str, tenant: str, job: Job, digest: str, *, key: str | None) -> JobRecord:
-        """Add a job; it is durable when this returns. A known idempotency key returns its job."""
+    def add(self, id: str, job: Job) -> JobRecord:
+        """Add a job; it is durable when this returns."""
         record = JobRecord(
-            id=id, tenant=tenant, kind=job.kind, state="queued", request=job.model_dump_json(),
-            digest=digest, idempotency_key=key, created_s=time.time(), starts=0, name=job.name,
-            note=job.note,
+            id=id, kind=job.kind, state="queued", request=job.model_dump_json(), name=job.name,
+            note=job.note, created_s=time.time(), starts=0,
         )  # fmt: skip
-        try:
-            with self._sessions.begin() as session:
-                session.add(record)
-        except IntegrityError:
-            known = self.known(tenant, key, digest)
-            if known is None:
-                raise
-            return known
+        with self._sessions.begin() as session:
+            session.add(record)
         return record
 
-    def known(self, tenant: str, key: str | None, digest: str | None = None) -> JobRecord | None:
-        """The job that a request with an idempotency key made before."""
-        if key is None:
-            return None
+    def get(self, id: str) -> JobRecord | None:
+        """A job; None if there is none."""
         with self._sessions() as session:
-            query = select(JobRecord).filter_by(tenant=tenant, idempotency_key=key)
-            found = session.scalar(query)
-            if found is not None and digest is not None and found.digest != digest:
-                raise OtherRequestError
-        return found
+            return session.scalar(select(JobRecord).filter_by(id=id))
 
-    def get(self, id: str, caller: Caller | None = None) -> JobRecord | None:
-        """A job; None if there is none that the caller sees."""
-        with self._sessions() as session:
-            found = session.scalar(select(JobRecord).filter_by(id=id))
-        sees = found is None or caller is None or caller.sees(found.tenant)
-        return found if sees else None
-
-    def request(self, id: str) -> Job:
-        """What a job was asked for."""
-        with self._sessions() as session:
-            text = session.scalars(select(JobRecord.request).filter_by(id=id)).one()
-        return Job.model_validate_json(text)
-
-    def newest(self, caller: Caller, most: int, before: int | None = None) -> list[JobRecord]:
-        """The newest jobs that a caller sees, before a number."""
+    def newest(self, most: int, before: int | None = None) -> list[JobRecord]:
+        """The newest jobs, before a number."""
         query = select(JobRecord).order_by(JobRecord.number.desc()).limit(most)
-        if caller.scope != "admin":
-            query = query.filter_by(tenant=caller.tenant)
         if before is not None:
             query = query.where(JobRecord.number < before)
         with self._sessions() as session:
             return [*session.scalars(query)]
 
-    def count(self, state: JobState, tenant: str | None = None) -> int:
-        """How many jobs, of all tenants or of one, are in a state."""
-        query = select(func.count(JobRecord.number)).where(JobRecord.state == state)
-        if tenant is not None:
-            query = query.where(JobRecord.tenant == tenant)
-        with self._sessions() as session:
-            return session.scalar(query) or 0
-
-    def start_next(self, most_running: int | None = None) -> JobRecord | None:
-        """Take the next job; None if there is none. One thread at a time.
-
-        Tenants take turns: first those with the fewest jobs that run, of these the one whose last
-        start is the longest ago. Of a tenant the job that has waited longest is next.
-        """
-        while (number := self._next(most_running)) is not None:
-            start = (
-                sa.update(JobRecord)
-                .where((JobRecord.number == number) & (JobRecord.state == "queued"))
-                .values(state="running", started_s=time.time(), starts=JobRecord.starts + 1)
-                .returning(JobRecord)
-                .execution_options(synchronize_session=False)
-            )
-            with self._sessions.begin() as session:
-                record = session.scalar(start)
-            if record is not None:  # it was not cancelled meanwhile
-                starts = max(self._last_start.values(), default=0)
-                self._last_start[record.tenant] = starts + 1
-                return record
-        return None
-
-    def _next(self, most_running: int | None) -> int | None:
-        """The number of the next job."""
+    def counts(self) -> dict[JobState, int]:
+        """How many jobs are in each state."""
+        query = select(JobRecord.state, func.count()).group_by(JobRecord.state)
         with self._engine.connect() as connection:
-            running = {each: count for each, count in connection.execute(_RUNNING)}
-            waiting = [(each, number) for each, number in connection.execute(_WAIT_LONGEST)]
-        turns = [
-            (running.get(each, 0), self._last_start.get(each, 0), number)
-            for each, number in waiting
-            if most_running is None or running.get(each, 0) < most_running
-        ]
-        return min(turns)[-1] if turns else None
+            return {state: count for state, count in connection.execute(query)}
 
-    def finish(
-        self,
-        id: str,
-        state: JobState,
-        *,
-        verdict: str | None = None,
-        cannot_tell: bool | None = None,
-        error_kind: ErrorKind | None = None,
-        error: str | None = None,
-    ) -> bool:
-        """Give a running job its final state; False if it has one."""
+    def start_next(self) -> JobRecord | None:
+        """Take the job that has waited longest; None if there is none. One thread at a time."""
+        first = select(func.min(JobRecord.number)).where(JobRecord.state == "queued")
+        start = (
+            sa.update(JobRecord)
+            .where((JobRecord.number == first.scalar_subquery()) & (JobRecord.state == "queued"))
+            .values(state="running", started_s=time.time(), starts=JobRecord.starts + 1)
+            .returning(JobRecord)
+            .execution_options(synchronize_session=False)
+        )
+        with self._sessions.begin() as session:
+            return session.scalar(start)
+
+    def finish(self, id: str, outcome: JobOutcome) -> None:
+        """Give a running job its final state, unless it was cancelled."""
         values = {
-            "state": state, "verdict": verdict, "cannot_tell": cannot_tell,
-            "error_kind": error_kind, "error": error, "finished_s": time.time(),
+            "state": "succeeded" if outcome.error_kind is None else "failed",
+            "verdict": outcome.verdict, "cannot_tell": outcome.cannot_tell,
+            "error_kind": outcome.error_kind, "error": outcome.error, "finished_s": time.time(),
         }  # fmt: skip
-        return self._change(_is(id, "running"), values) > 0
+        self._change(_is(id, "running"), values)
 
     def cancel(self, id: str) -> bool:
         """Cancel a job; False if it is finished."""
@@ -222,24 +173,17 @@ class JobTable:
         )  # fmt: skip
         return self._change(which, {"state": "queued", "started_s": None})
 
-    def finished_before(self, time_s: float) -> list[str]:
-        """Ids of the jobs that ended before a time."""
-        ended = JobRecord.state.in_(FINISHED) & (JobRecord.finished_s < time_s)
-        with self._sessions() as session:
-            return [*session.scalars(select(JobRecord.id).where(ended))]
-
-    def remove(self, ids: Iterable[str]) -> None:
-        """Forget jobs."""
-        with self._sessions.begin() as session:
-            for id in ids:
-                session.execute(sa.delete(JobRecord).filter_by(id=id))
+    def remove_finished(self, before_s: float) -> list[str]:
+        """Forget the jobs that ended before a time; their ids."""
+        ended = JobRecord.state.in_(FINISHED) & (JobRecord.finished_s < before_s)
+        with self._engine.begin() as connection:
+            return [*connection.scalars(sa.delete(JobRecord).where(ended).returning(JobRecord.id))]
 
     def states(self) -> dict[str, JobState]:
         """The states of all jobs, by their ids."""
-        with self._sessions() as session:
-            return {
-                id: state for id, state in session.execute(select(JobRecord.id, JobRecord.state))
-            }
+        with self._engine.connect() as connection:
+            query = select(JobRecord.id, JobRecord.state)
+            return {id: state for id, state in connection.execute(query)}
 
     def _change(self, where: sa.ColumnElement[bool], values: dict[str, Any]) -> int:
         with self._engine.begin() as connection:

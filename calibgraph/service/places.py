@@ -7,8 +7,6 @@ from urllib.parse import unquote
 from calibgraph.errors import FileError
 from calibgraph.fleet.uris import is_local, locate
 
-_SHOWN = 200
-
 
 @dataclass(frozen=True)
 class Root:
@@ -17,10 +15,10 @@ class Root:
     protocol: str
     path: str
 
-    def holds(self, protocol: str, path: str) -> bool:
-        """Whether a path is this folder, or in it."""
-        same = protocol == self.protocol
-        return same and (path == self.path or path.startswith(f"{self.path.rstrip('/')}/"))
+    def holds(self, place: "Root") -> bool:
+        """Whether a place is this folder, or in it."""
+        same = place.protocol == self.protocol
+        return same and f"{place.path}/".startswith(f"{self.path.rstrip('/')}/")
 
 
 def open_roots(uris: tuple[str, ...]) -> tuple[Root, ...]:
@@ -29,10 +27,9 @@ def open_roots(uris: tuple[str, ...]) -> tuple[Root, ...]:
     Raises:
         FileError: if one is no URI that can be read, or a local folder that is not there.
     """
-    for uri in uris:
-        if not uri:
-            raise FileError("--root", "is empty; name a folder, or leave it out")
-    return tuple(Root(*_place(uri)) for uri in uris)
+    if "" in uris:
+        raise FileError("--root", "is empty; name a folder, or leave it out")
+    return tuple(_place(uri) for uri in uris)
 
 
 def require_inside(uri: str, roots: tuple[Root, ...]) -> None:
@@ -41,8 +38,7 @@ def require_inside(uri: str, roots: tuple[Root, ...]) -> None:
     Raises:
         FileError: if not. The message is the same whether or not anything is there.
     """
-    shown = uri[:_SHOWN]
-    outside = FileError(shown, "is not inside the folders that this server reads from")
+    outside = FileError(uri[:200], "is not inside the folders that this server reads from")
     if "::" in uri or not uri.isprintable() or ".." in unquote(uri).split("/"):
         raise outside
     if not any(uri.startswith(f"{root.protocol}:") for root in roots) and "://" in uri:
@@ -51,17 +47,16 @@ def require_inside(uri: str, roots: tuple[Root, ...]) -> None:
         place = _place(uri)
     except (FileError, ValueError):
         raise outside from None
-    if not any(root.holds(*place) for root in roots):
+    if not any(root.holds(place) for root in roots):
         raise outside
 
 
-def _place(uri: str) -> tuple[str, str]:
-    """The protocol and the path of a URI."""
+def _place(uri: str) -> Root:
+    """The place of a URI."""
     filesystem, path = locate(uri)
     if is_local(filesystem):
         try:
-            return "file", str(Path(path).resolve(strict=True))
+            return Root("file", str(Path(path).resolve(strict=True)))
         except (OSError, RuntimeError) as error:
             raise FileError(uri, "no such file or folder; check the path") from error
-    protocol = uri.partition("://")[0]
-    return protocol, path.rstrip("/")
+    return Root(uri.partition("://")[0], path.rstrip("/"))

@@ -1,13 +1,17 @@
-"""What every request passes: the host it names, the page it comes from; strict headers back."""
+"""What every request passes: its host and origin, its token, the size and time of its body."""
 
+import asyncio
 import time
-from collections.abc import Callable
-from urllib.parse import urlsplit
+from collections import Counter
+from urllib.parse import SplitResult, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from calibgraph.service.problems import problem_response
+from calibgraph.service.access import Scope as TokenScope
+from calibgraph.service.access import Tokens, require_scope
+from calibgraph.service.problems import Problem, problem_response
+from calibgraph.service.settings import Settings
 
 STRICT_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; object-src 'none'; base-uri 'none'; "
@@ -22,79 +26,125 @@ STRICT_HEADERS = {
 }
 """Of every answer that does not set its own."""
 
-LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
-_SAFE = ("GET", "HEAD", "OPTIONS")
-_LONGEST_PATH = 2048
+DOCS_POLICY = (
+    "default-src 'none'; connect-src 'self'; img-src data: https://fastapi.tiangolo.com; "
+    "script-src 'unsafe-inline' https://cdn.jsdelivr.net; frame-ancestors 'none'; "
+    "style-src 'unsafe-inline' https://cdn.jsdelivr.net"
+)
+"""Of /docs, FastAPI's own page, which loads Swagger UI from there."""
 
-Observe = Callable[[str, str, int, float], None]
-"""Called with the method, the route, the status and the seconds of each request."""
+LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
+UPLOADS = "/v1/jobs/"
+"""Paths that take recordings; other bodies are small."""
+
+BODY_S, BODY_BYTES_PER_S = 20.0, 500.0
+"""A body has so many seconds, and one more for so many bytes that have arrived."""
+
+UNREAD_S = 1.0
+"""For the rest of a body that was answered before its end; then the connection ends."""
+
+_SAFE = ("GET", "HEAD", "OPTIONS")
 
 
 class RequestGuard:
-    """Checks requests before any route, and adds headers to all answers.
+    """Checks requests before any route, adds headers to all answers, counts them by status.
 
     A page of another site that a browser shows could otherwise call a server without tokens: its
     name is then not one of ours, or its ``Origin`` is another one.
     """
 
-    def __init__(self, app: ASGIApp, hosts: tuple[str, ...], observe: Observe) -> None:
-        self._app, self._hosts, self._observe = app, hosts, observe
+    def __init__(
+        self, app: ASGIApp, settings: Settings, tokens: Tokens | None, answers: Counter[int]
+    ) -> None:
+        self._app, self._settings, self._tokens, self._answers = app, settings, tokens, answers
+        self._hosts = tuple(name.lower() for name in settings.hosts)
+        if not settings.hosts and settings.tokens is None:
+            self._hosts = LOCAL_NAMES
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        start, status = time.perf_counter(), [500]
+
+        path = scope["path"]
+        settings, is_upload = self._settings, path.startswith(UPLOADS)
+        body = _Body(receive, settings.recording_bytes if is_upload else settings.body_bytes)
+        rest: asyncio.Task[None] | None = None
 
         async def send_with_headers(message: Message) -> None:
+            nonlocal rest
             if message["type"] == "http.response.start":
-                status[0] = message["status"]
+                rest = asyncio.create_task(body.drop())  # who still sends can read the answer
+                await asyncio.wait([rest], timeout=UNREAD_S)
+                self._answers[message["status"]] += 1
                 headers = MutableHeaders(scope=message)
-                for name, value in STRICT_HEADERS.items():
+                own = {"Connection": "close"} if not rest.done() else {}
+                own |= {"Content-Security-Policy": DOCS_POLICY} if path == "/docs" else {}
+                for name, value in (STRICT_HEADERS | own).items():
                     headers.setdefault(name, value)
             await send(message)
 
         try:
-            refusal = self._refusal(scope)
-            if refusal is None:
-                await self._app(scope, receive, send_with_headers)
-            else:
-                await problem_response(*refusal)(scope, receive, send_with_headers)
+            self._require_ours(scope, body.most_bytes)
+            await self._app(scope, body.receive, send_with_headers)
+        except Problem as problem:
+            await problem_response(problem)(scope, receive, send_with_headers)
         finally:
-            seconds = time.perf_counter() - start
-            self._observe(scope["method"], _route_of(scope), status[0], seconds)
+            if rest is not None:
+                rest.cancel()
 
-    def _refusal(self, scope: Scope) -> tuple[int, str] | None:
+    def _require_ours(self, scope: Scope, most_bytes: int) -> None:
         headers = Headers(scope=scope)
-        host = headers.get("host", "")
-        if self._hosts and _name_of(host) not in self._hosts:
-            return 400, "the server is not called by this name; give it with --host-name"
-        origin = headers.get("origin")
-        if scope["method"] not in _SAFE and origin is not None and not _is_of(origin, host):
-            return 403, "the request comes from a page of another site"
-        if len(scope["path"]) > _LONGEST_PATH:
-            return 414, f"the path is longer than {_LONGEST_PATH} characters"
-        return None
+        host, origin = headers.get("host", ""), headers.get("origin")
+        if self._hosts and _split(f"//{host}").hostname not in self._hosts:
+            raise Problem(400, "the server is not called by this name; give it with --host-name")
+        is_foreign = origin is not None and _split(origin).netloc.lower() != host.lower()
+        if scope["method"] not in _SAFE and is_foreign:
+            raise Problem(403, "the request comes from a page of another site")
+        if scope["path"] != "/healthz":
+            needed: TokenScope = "read" if scope["method"] in _SAFE else "submit"
+            require_scope(self._tokens, headers.get("authorization", ""), needed)
+        length = headers.get("content-length", "0")
+        if not length.isdecimal() or int(length) > most_bytes:
+            raise _too_large(most_bytes)
 
 
-def _name_of(host: str) -> str:
-    """The name in a Host header, without its port."""
+class _Body:
+    """A body as it arrives, which ends in a problem if it is too large or too slow."""
+
+    def __init__(self, receive: Receive, most_bytes: int) -> None:
+        self._receive, self.most_bytes = receive, most_bytes
+        self._start_s, self._bytes, self._is_whole = time.monotonic(), 0, False
+
+    async def receive(self) -> Message:
+        if self._is_whole:  # what follows is the end of the connection
+            return await self._receive()
+        end_s = self._start_s + BODY_S + self._bytes / BODY_BYTES_PER_S
+        try:
+            async with asyncio.timeout(max(0.0, end_s - time.monotonic())):
+                message = await self._receive()
+        except TimeoutError:
+            raise Problem(408, f"the body stopped after {self._bytes} bytes") from None
+        self._bytes += len(message.get("body", b""))
+        self._is_whole = not message.get("more_body", False)
+        if self._bytes > self.most_bytes:
+            raise _too_large(self.most_bytes)
+        return message
+
+    async def drop(self) -> None:
+        """Take what is left, unread: hypercorn waits for ever for room in its queue."""
+        while not self._is_whole:
+            message = await self._receive()
+            self._is_whole = not message.get("more_body", False)
+
+
+def _too_large(most_bytes: int) -> Problem:
+    return Problem(413, f"the body is larger than {most_bytes} bytes; send less")
+
+
+def _split(url: str) -> SplitResult:
     try:
-        return urlsplit(f"//{host}").hostname or ""
+        return urlsplit(url)
     except ValueError:
-        return ""
-
-
-def _is_of(origin: str, host: str) -> bool:
-    """Whether a page that calls is one of this server's."""
-    try:
-        return urlsplit(origin).netloc.lower() == host.lower()
-    except ValueError:
-        return False
-
-
-def _route_of(scope: Scope) -> str:
-    """The route's pattern: the paths themselves, with their ids, would be too many to count."""
-    route = scope.get("route")
-    return str(getattr(route, "path", "other"))
+        return urlsplit("")

@@ -1,52 +1,44 @@
 """What the routes of a server share."""
 
-from typing import Annotated
+import shutil
+from collections import Counter
 
-from fastapi import Depends, Request
+from fastapi import Request
 
 from calibgraph.errors import CalibrationError
-from calibgraph.service.database import TrackerTable, open_database
-from calibgraph.service.folders import DataFolder, remove_folder
-from calibgraph.service.jobs import JobTable
-from calibgraph.service.metrics import Metrics
+from calibgraph.service.access import load_tokens
+from calibgraph.service.data_folder import DataFolder
+from calibgraph.service.job_requests import Job
+from calibgraph.service.jobs import JobRecord, JobTable, open_database
 from calibgraph.service.places import open_roots
 from calibgraph.service.problems import Problem
-from calibgraph.service.room import Room
 from calibgraph.service.runner import Runner
-from calibgraph.service.settings import MAX_BODIES_BYTES, Settings
+from calibgraph.service.settings import Settings
 from calibgraph.service.trackers import Trackers
-
-_RETRY_AFTER = {"Retry-After": "5"}
 
 
 class Service:
     """The parts of a server.
 
     Raises:
-        CalibrationError: if the data folder, the database or a root cannot be used.
+        CalibrationError: if the token file, the data folder, the database or a root cannot be used.
     """
 
-    def __init__(self, settings: Settings, metrics: Metrics) -> None:
-        self.settings, self.metrics, self.is_stopping = settings, metrics, False
+    def __init__(self, settings: Settings) -> None:
+        self.settings, self.is_stopping = settings, False
+        self.answers: Counter[int] = Counter()  # by status
+        self.tokens = None if settings.tokens is None else load_tokens(settings.tokens)
         self.roots, self.folder = open_roots(settings.roots), DataFolder(settings.data)
         try:
-            engine = open_database(self.folder.path, settings.database, self.folder.owner)
+            self.engine = open_database(self.folder.path, settings.database, self.folder.owner)
         except CalibrationError:
             self.folder.close()
             raise
-        self.engine, self.jobs, self.tracker_table = engine, JobTable(engine), TrackerTable(engine)
-        self.runner = Runner(self.jobs, self.folder, settings, self.roots, metrics=metrics)
-        self.trackers = Trackers(self.folder, settings)
-        self.disk = Room(self.folder.free_bytes, settings.free_bytes, 507)
-        self.memory = Room(lambda: MAX_BODIES_BYTES - self.memory.arrived_bytes, 0, 429)
-
-    def start(self) -> None:
-        """Remove what an earlier server left, and begin to run jobs, in the event loop."""
-        known = self.tracker_table.ids()
-        for left in self.folder.trackers.iterdir():
-            if left.name not in known:  # a server was killed while it made or removed it
-                remove_folder(left)
-        self.runner.start()
+        self.jobs = JobTable(self.engine)
+        self.runner = Runner(self.jobs, self.folder, settings, self.roots)
+        self.trackers = Trackers(
+            self.folder.trackers, settings.tracker_processes, settings.memory_bytes
+        )
 
     def begin_stop(self) -> None:
         """Accept nothing more, and let those go who wait."""
@@ -61,22 +53,29 @@ class Service:
         self.engine.dispose()
         self.folder.close()
 
-    def require_room(self) -> None:
-        """Check that something new can be taken in.
-
-        Raises:
-            Problem: if the server stops, its disk is full, or its queue is.
-        """
+    def require_room(self, size: int) -> None:
+        """Refuse a body of so many bytes if there is no room: it is on the disk twice at first."""
         if self.is_stopping:
-            raise Problem(503, "the server is being stopped; try again soon", _RETRY_AFTER)
-        if self.folder.free_bytes() < self.settings.free_bytes:
-            raise Problem(507, "the server's disk is almost full; try again later")
+            raise Problem(503, "the server is being stopped; try again soon")
+        if shutil.disk_usage(self.folder.path).free - 2 * size < self.settings.free_bytes:
+            self.runner.remove_expired()
+            raise Problem(507, "the server's disk has no room for it; try again later")
+
+    def add(self, id: str, job: Job) -> JobRecord:
+        """Add a job whose folder is in its place; it is durable when this returns."""
+        self.runner.remove_expired()
+        try:
+            waiting = self.jobs.counts().get("queued", 0)
+            if waiting >= self.settings.most_queued:
+                raise Problem(429, f"{waiting} jobs wait already; try again later")
+            record = self.jobs.add(id, job)
+        except BaseException:
+            shutil.rmtree(self.folder.of_job(id), ignore_errors=True)
+            raise
+        self.runner.added.set()
+        return record
 
 
-async def _service(request: Request) -> Service:
-    service: Service = request.app.state.service
-    return service
-
-
-State = Annotated[Service, Depends(_service)]
-"""A parameter of routes: the parts of the server."""
+async def service_of(request: Request) -> Service:
+    """The parts of the server that a request is for."""
+    return request.app.state.service  # type: ignore[no-any-return]

@@ -1,179 +1,91 @@
-"""Trackers in their process: frames in, durable updates out."""
-
-from __future__ import annotations
+"""Trackers in their process: bytes of frames in, durable updates out."""
 
 import gc
-import io
 import json
 import shutil
 import sys
-import threading
-from collections import OrderedDict
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from calibgraph.child_process import Note, answer_requests, memory_limit
-from calibgraph.errors import CalibrationError
-from calibgraph.files import checked_model, write_text
-from calibgraph.service.open_tracker import HISTORY, OpenTracker, take_frames
-from calibgraph.service.tracker_request import Refusal, TrackerRequest
-from calibgraph.yaml_text import parse_yaml
+from calibgraph.child_process import answer_requests, memory_limit
+from calibgraph.files import sync_folder, write_bytes, write_text
+from calibgraph.fleet.task import describe_failure
+from calibgraph.io.rigs import load_rig
+from calibgraph.model.config import config_from
+from calibgraph.report.as_json import finite, result_summary
+from calibgraph.tracking import DurableCalibrator, Update, update_all, warm_up_tracker
+from calibgraph.tracking.frame_group import in_groups
+from calibgraph.tracking.offsets import require_offset_alone
+from calibgraph.tracking.stream_lines import frames_of_lines
+from calibgraph.tracking.streams import Refused
+from calibgraph.tracking.update import json_lines
 
-RIG, CONFIG, STATE = "rig.yaml", "config.json", "state"
-
-_MOST_OPEN = 256
-_THREADS = 8  # most of an update's time it waits for the disk
-_COLLECT_AFTER = 10_000  # new objects: what an update makes is freed without the collector
-
-
-@dataclass
-class _Trackers:
-    """The trackers of this process; those used last are in memory."""
-
-    held: OrderedDict[str, OpenTracker] = field(default_factory=OrderedDict)
-    locks: dict[str, threading.Lock] = field(default_factory=dict)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def answer(self, request: TrackerRequest) -> Any:
-        with self.lock:
-            lock = self.locks.setdefault(request.folder, threading.Lock())
-        with lock:
-            try:
-                return self._act(request)
-            except MemoryError:
-                self._drop(request.folder)
-                return Refusal(413, "not enough memory; send fewer frames at once")
-            except (CalibrationError, ValueError) as error:
-                if request.action == "frames":  # it may be in the middle of an update
-                    self._drop(request.folder)
-                return Refusal(422, _without_path(str(error), request.folder))
-            except OSError as error:  # a write failed: the state on disk is what counts
-                self._drop(request.folder)
-                return Refusal(507, f"the state cannot be written ({error.strerror or 'disk'})")
-
-    def _act(self, request: TrackerRequest) -> Any:
-        if request.action == "create":
-            _create(request)
-            return _state(self._opened(request.folder))
-        if request.action == "frames":
-            return take_frames(self._opened(request.folder), request)
-        if request.action == "state":
-            return _state(self._opened(request.folder))
-        if request.action == "plot":
-            return _plot(self._opened(request.folder))
-        if request.action == "remove":
-            self._drop(request.folder)
-            shutil.rmtree(request.folder, ignore_errors=True)
-        return None
-
-    def _opened(self, folder: str) -> OpenTracker:
-        with self.lock:
-            tracker = self.held.get(folder)
-            if tracker is not None:
-                self.held.move_to_end(folder)
-                return tracker
-        tracker = _open(Path(folder))
-        with self.lock:
-            self.held[folder] = tracker
-            oldest = next(iter(self.held)) if len(self.held) > _MOST_OPEN else None
-            # One that is in use now is left for the next time.
-            if oldest is not None and self.locks[oldest].acquire(blocking=False):
-                self.held.pop(oldest).close()
-                self.locks[oldest].release()
-        return tracker
-
-    def _drop(self, folder: str) -> None:
-        with self.lock:
-            tracker = self.held.pop(folder, None)
-        if tracker is not None:
-            tracker.abandon()
-
-    def close(self) -> None:
-        for tracker in self.held.values():
-            tracker.close()
-        self.held.clear()
+Held = dict[Path, DurableCalibrator]
 
 
-def _without_path(text: str, folder: str) -> str:
-    return text.replace(f"{folder}/", "").replace(folder, "the tracker")
+def answer(held: Held, request: tuple[str, Path, bytes, str]) -> tuple[int, str]:
+    """Answer a method, folder, body and settings; after an error the state on disk counts."""
+    method, folder, body, config = request
+    rig, settings = folder / "rig.yaml", folder / "config.json"
+    is_gone = not rig.exists()
+    if is_gone != (method == "PUT"):
+        return (404, "no such tracker") if is_gone else (409, "there is one; remove it first")
+    try:
+        if method == "PUT":
+            shutil.rmtree(folder, ignore_errors=True)  # of one that was removed in part
+            folder.mkdir(mode=0o700)
+            write_text(settings, config)
+            write_bytes(rig, body)
+            sync_folder(folder.parent)
+        if method != "DELETE":
+            if folder not in held:
+                given = config_from(json.loads(settings.read_text()), "config")
+                require_offset_alone(given)
+                held[folder] = DurableCalibrator(folder / "state", load_rig(rig), given)
+            if method == "POST":
+                return 200, _take_frames(held[folder], body)
+            tracker = held[folder].tracker
+            state = {"frame": tracker.frame, **result_summary(tracker.calibration(), [])}
+            return 200, json.dumps(finite(state))
+        is_gone, status, text = True, 200, "null"
+    except Exception as error:
+        kind, text = describe_failure(error)
+        text = text.replace(f"{folder}/", "").replace(str(folder), "the tracker")
+        status = {"bad input": 422, "out of memory": 413, "io": 507}.get(kind, 500)
+    if folder in held:
+        held.pop(folder).abandon()
+    if is_gone:
+        rig.unlink(missing_ok=True)  # without it there is no tracker
+        shutil.rmtree(folder, ignore_errors=True)
+    return status, text
 
 
-def _create(request: TrackerRequest) -> None:
-    """Check the rig and the settings, and write them down."""
-    from calibgraph.files import read_text
-    from calibgraph.model.config import config_from
-    from calibgraph.model.rig import Rig
-    from calibgraph.tracking.offsets import require_offset_alone
-
-    folder = Path(request.folder)
-    text = request.body.decode("utf-8")
-    checked_model(Rig, parse_yaml(text, RIG), RIG)
-    require_offset_alone(config_from(json.loads(request.config), "config"))
-    write_text(folder / CONFIG, request.config)
-    write_text(folder / RIG, text)
-    read_text(folder / RIG)
-
-
-def _open(folder: Path) -> OpenTracker:
-    from calibgraph.io.rigs import load_rig
-    from calibgraph.model.config import config_from
-    from calibgraph.tracking.durable import DurableCalibrator
-    from calibgraph.tracking.history import History
-
-    config = config_from(json.loads((folder / CONFIG).read_text("utf-8")), "config")
-    calibrator = DurableCalibrator(folder / STATE, load_rig(folder / RIG), config)
-    tracker = OpenTracker(folder, calibrator, History.load(folder / HISTORY))
-    known = {json.dumps(event) for event in tracker.events()}
-    for update in calibrator.repeated:  # the process ended before they may have been noted
-        tracker.note_events(update, known)
-    return tracker
-
-
-def _state(tracker: OpenTracker) -> dict[str, Any]:
-    """The last estimate, as ``--json`` prints results, and the last events."""
-    from calibgraph.report.as_json import finite, result_summary
-
-    summary = result_summary(tracker.calibrator.tracker.calibration(), [])
-    return {
-        "frame": tracker.calibrator.tracker.frame,
-        "verdict": summary["verdict"],
-        "cannot_tell": summary["cannot_tell"],
-        "reasons": summary["reasons"],
-        "summary": finite(summary["summary"]),
-        "cameras": finite(summary["cameras"]),
-        "events": tracker.events(),
-    }
-
-
-def _plot(tracker: OpenTracker) -> bytes:
-    """The extrinsics against time, PNG."""
-    held = io.BytesIO()
-    tracker.history.figure().savefig(held, format="png")
-    return held.getvalue()
-
-
-def main() -> None:
-    """The process: lists of requests to trackers, each list at once."""
-    from calibgraph.tracking.preload import warm_up_tracker
-
-    warm_up_tracker()
-    gc.freeze()  # what is loaded by now stays: each full collection would visit it
-    gc.set_threshold(_COLLECT_AFTER)
-    trackers, pool = _Trackers(), ThreadPoolExecutor(_THREADS)
-
-    def answer(requests: list[TrackerRequest], note: Note) -> None:
-        """Note each answer, with its place in the list, as soon as it is there."""
-        asked = {pool.submit(trackers.answer, request): i for i, request in enumerate(requests)}
-        for future in as_completed(asked):
-            note((asked[future], future.result()))
-        if any(request.action == "close all" for request in requests):
-            trackers.close()
-
-    with memory_limit(int(sys.argv[2])):
-        answer_requests(answer)
+def _take_frames(calibrator: DurableCalibrator, body: bytes) -> str:
+    """Take in frames, ten by one write; one with a motion of no vehicle refuses all of them."""
+    items = [*frames_of_lines([body], "frames")]
+    updates, refused, known = list[Update](), list[str](), 0
+    for item in items:  # slower frames look right, and are not
+        if isinstance(item, Refused) and item.by_motion:
+            raise ValueError(f"{item.message}; none of these frames was taken in")
+    for group in in_groups(items, 10):
+        if isinstance(group, Refused):
+            refused.append(group.message)
+            continue
+        last = calibrator.tracker.frame
+        new = [one for one in group if last is None or one.frame > last]
+        known += len(group) - len(new)
+        with calibrator.in_one_write():
+            for found in update_all(calibrator, new):
+                if isinstance(found, Refused):
+                    refused.append(found.message)
+                else:
+                    updates += found
+    lines = ", ".join(json_lines(updates))
+    return f'{{"updates": [{lines}], "known": {known}, "refused": {json.dumps(refused)}}}'
 
 
 if __name__ == "__main__":
-    main()
+    warm_up_tracker()
+    gc.freeze()  # what is loaded by now stays: each full collection would visit it
+    held_trackers: Held = {}
+    with memory_limit(int(sys.argv[2])):
+        answer_requests(lambda request, _: answer(held_trackers, request))

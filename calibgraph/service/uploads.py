@@ -1,171 +1,113 @@
-"""Uploads, written to disk as they arrive; their limits hold while they do."""
+"""A request for a job: its form is read and checked, put on disk, and only then acknowledged."""
 
-from __future__ import annotations
-
-import hashlib
-import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import secrets
+import shutil
+from collections.abc import AsyncGenerator
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
 
 from fastapi import Request
-from python_multipart import MultipartParser
-from python_multipart.exceptions import MultipartParseError
-from python_multipart.multipart import parse_options_header
+from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import FormData, UploadFile
+from starlette.formparsers import MultiPartException, MultiPartParser
 
+from calibgraph.files import describe
+from calibgraph.service.data_folder import INPUT, LOG, DataFolder
+from calibgraph.service.job_requests import (
+    MAX_RECORDINGS,
+    PARTS,
+    RECORDING,
+    SETTINGS_OF,
+    TEXTS,
+    Job,
+    JobKind,
+    recording_name,
+)
+from calibgraph.service.places import Root, require_inside
 from calibgraph.service.problems import Problem
 
-if TYPE_CHECKING:
-    from python_multipart.multipart import MultipartCallbacks
-
 MOST_TEXT_BYTES = 10**6
-MOST_PARTS = 110
-_MOST_HEADER_BYTES = 4096
 
 
-@dataclass(frozen=True)
-class Upload:
-    """The parts of a form: its texts in order, the names of its files, the SHA-256 of all."""
+class _Form(MultiPartParser):
+    """A form of which is known whether it is whole: a part that breaks off is left out silently."""
 
-    texts: tuple[tuple[str, str], ...]
-    files: tuple[str, ...]
-    digest: str
+    is_whole = False
 
-
-@dataclass
-class _Part:
-    name: str = ""
-    is_file: bool = False
-    header: bytearray = field(default_factory=bytearray)
-    disposition: bytes = b""
-    text: bytearray = field(default_factory=bytearray)
-    file: BinaryIO | None = None
-    target: str = ""
+    def on_end(self) -> None:
+        self.is_whole = True
 
 
-class FormReader:
-    """Reads a form: files into a folder, the second of a name ``a`` as ``a_1``, if allowed."""
+async def receive_job(
+    request: Request, kind: JobKind, folder: DataFolder, roots: tuple[Root, ...]
+) -> tuple[str, Job]:
+    """Read the form of a job, which is on disk then; its id, which names its folder, and it."""
+    if not request.headers.get("content-type", "").startswith("multipart/form-data"):
+        raise Problem(415, "send a form: multipart/form-data")
 
-    def __init__(self, folder: Path, allowed: Mapping[str, int]) -> None:
-        self._folder, self._allowed = folder, allowed
-        self._part = _Part()
-        self._texts: list[tuple[str, str]] = []
-        self._files: list[str] = []
-        self._counts: dict[str, int] = {}
-        self._digest = hashlib.sha256()
-        self._is_whole = False
-        self._parts = 0
+    async def chunks() -> AsyncGenerator[bytes]:
+        async for chunk in request.stream():
+            yield chunk
+        if not parser.is_whole:
+            raise MultiPartException("it breaks off; send it again")
 
-    async def read(self, request: Request, arrive: Callable[[int], None]) -> Upload:
-        """Read the form in a body; ``arrive`` gets the size of each piece before it is written.
+    parser = _Form(
+        request.headers, chunks(), max_files=MAX_RECORDINGS + 2,
+        max_fields=MAX_RECORDINGS + 5, max_part_size=MOST_TEXT_BYTES,
+    )  # fmt: skip
+    try:
+        form = await parser.parse()
+    except (MultiPartException, LookupError) as error:
+        raise Problem(400, f"the form cannot be read ({error})") from error
+    try:
+        return await run_in_threadpool(_keep, form, kind, folder, roots)
+    finally:
+        await form.close()
 
-        Raises:
-            Problem: if it is malformed, or has a file that is not allowed.
-        """
-        _, options = parse_options_header(request.headers.get("content-type", ""))
-        boundary = options.get(b"boundary", b"")
-        if not boundary or len(boundary) > 70:  # noqa: PLR2004 - RFC 2046
-            raise Problem(400, "the Content-Type has no boundary, or one that is too long")
-        try:
-            parser = MultipartParser(boundary, self._callbacks())
-            async for chunk in request.stream():
-                arrive(len(chunk))
-                if chunk:
-                    await run_in_threadpool(parser.write, chunk)  # it writes to disk
-            parser.finalize()
-        except MultipartParseError as error:
-            raise Problem(400, f"the form cannot be read ({error})") from error
-        finally:
-            self._close()
-        if not self._is_whole:
-            raise Problem(400, "the form breaks off; send it again")
-        return Upload(tuple(self._texts), tuple(self._files), self._digest.hexdigest())
 
-    def _callbacks(self) -> MultipartCallbacks:
-        return {
-            "on_part_begin": self._on_part_begin,
-            "on_header_field": self._on_header_field,
-            "on_header_value": self._on_header_value,
-            "on_header_end": self._on_header_end,
-            "on_headers_finished": self._on_headers_finished,
-            "on_part_data": self._on_part_data,
-            "on_part_end": self._on_part_end,
-            "on_end": self._on_end,
-        }
+def _keep(
+    form: FormData, kind: JobKind, folder: DataFolder, roots: tuple[Root, ...]
+) -> tuple[str, Job]:
+    """Write the files of a form into the folder of a new job."""
+    id = secrets.token_hex(16)
+    arriving = folder.arriving / id
+    (arriving / INPUT).mkdir(parents=True, mode=0o700)
+    try:
+        job = _job_of(form, kind, arriving / INPUT)
+        for uri in job.uris.values():
+            require_inside(uri, roots)
+        (arriving / LOG).touch()
+        folder.keep(arriving)
+    finally:
+        shutil.rmtree(arriving, ignore_errors=True)
+    return id, job
 
-    def _on_part_begin(self) -> None:
-        self._part = _Part()
-        self._parts += 1
-        if self._parts > MOST_PARTS:
-            raise Problem(413, f"the form has over {MOST_PARTS} parts")
 
-    def _on_header_field(self, data: bytes, start: int, end: int) -> None:
-        self._add_header(data[start:end])
-
-    def _on_header_value(self, data: bytes, start: int, end: int) -> None:
-        if b":" not in self._part.header:
-            self._add_header(b":")
-        self._add_header(data[start:end])
-
-    def _add_header(self, data: bytes) -> None:
-        self._part.header += data
-        if len(self._part.header) > _MOST_HEADER_BYTES:
-            raise Problem(400, "a part of the form has a header that is too long")
-
-    def _on_header_end(self) -> None:
-        name, _, value = bytes(self._part.header).partition(b":")
-        if name.strip().lower() == b"content-disposition":
-            self._part.disposition = value
-        self._part.header.clear()
-
-    def _on_headers_finished(self) -> None:
-        part = self._part
-        _, options = parse_options_header(part.disposition)
-        part.name = options.get(b"name", b"").decode(errors="replace")
-        part.is_file = bool(options.get(b"filename"))  # empty: a page's field without a file
-        self._digest.update(f"\0{part.is_file} {part.name!r}\0".encode())
-        if not part.is_file:
-            return
-        count = self._counts.get(part.name, 0)
-        if count >= self._allowed.get(part.name, 0):
-            known = ", ".join(self._allowed)
-            raise Problem(
-                422, f"a file for {part.name[:60]!r} is not expected here; expected: {known}"
-            )
-        self._counts[part.name] = count + 1
-        part.target = f"{part.name}_{count}" if count else part.name
-        part.file = (self._folder / part.target).open("xb")
-
-    def _on_part_data(self, data: bytes, start: int, end: int) -> None:
-        chunk = data[start:end]
-        self._digest.update(chunk)
-        if self._part.file is not None:
-            self._part.file.write(chunk)
-            return
-        self._part.text += chunk
-        if len(self._part.text) > MOST_TEXT_BYTES:
-            raise Problem(413, f"a field of the form has over {MOST_TEXT_BYTES} bytes")
-
-    def _on_part_end(self) -> None:
-        part = self._part
-        if part.file is not None:
-            self._close()
-            self._files.append(part.target)
-            return
-        try:
-            self._texts.append((part.name, part.text.decode()))
-        except UnicodeDecodeError as error:
-            raise Problem(422, f"the field {part.name[:60]!r} is not UTF-8") from error
-
-    def _on_end(self) -> None:
-        self._is_whole = True
-
-    def _close(self) -> None:
-        """Put the file of the part on disk."""
-        file, self._part.file = self._part.file, None
-        if file is not None:
-            file.flush()
-            os.fsync(file.fileno())
-            file.close()
+def _job_of(form: FormData, kind: JobKind, folder: Path) -> Job:
+    """The job of a form; files are written, texts are URIs, settings or words for people."""
+    uris, texts, counts = dict[str, str](), dict[str, str](), dict[str, int]()
+    for name, value in form.multi_items():
+        if name in TEXTS and isinstance(value, str):
+            texts[name] = value
+            continue
+        if name not in PARTS[kind]:
+            known = ", ".join((*PARTS[kind], *TEXTS))
+            raise Problem(422, f"unknown field {name[:60]!r}; known are {known}")
+        count = counts[name] = counts.get(name, 0) + 1
+        if count > (MAX_RECORDINGS if name == RECORDING else 1):
+            raise Problem(422, f"{name!r} is given {count} times")
+        target = recording_name(count - 1) if name == RECORDING else name
+        if isinstance(value, UploadFile):
+            with (folder / target).open("xb") as file:
+                shutil.copyfileobj(value.file, file, 2**20)
+        else:
+            uris[target] = value
+    for name, is_required in PARTS[kind].items():
+        if is_required and name not in counts:
+            raise Problem(422, f"{name!r} is missing; add it as a file, or a field with its URI")
+    try:
+        settings = SETTINGS_OF[kind].model_validate_json(texts.pop("settings", "") or "{}")
+        recordings, kept = counts.get(RECORDING, 0), settings.model_dump(mode="json")
+        return Job(kind=kind, uris=uris, recordings=recordings, settings=kept, **texts)
+    except ValidationError as error:
+        raise Problem(422, describe(error)) from error

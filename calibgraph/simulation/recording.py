@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.file_sets import written_together
-from calibgraph.files import (
-    require_place_for_folder,
-    write_atomically,
-    write_bytes,
-)
+from calibgraph.files import require_place_for_folder, write_atomically, write_bytes
 from calibgraph.io.rigs import REFERENCE_FILE, RIG_FILE
 from calibgraph.model.geometry import relative_transform
 from calibgraph.model.perturbation import perturb

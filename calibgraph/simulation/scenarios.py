@@ -9,8 +9,11 @@ from calibgraph.files import require_place_for_folder
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.perturbation import perturb
 from calibgraph.model.rig import Rig
-from calibgraph.simulation.correspondences import simulate_correspondences
-from calibgraph.simulation.matcher_errors import MatcherErrors, PoseSpread
+from calibgraph.simulation.correspondences import (
+    MatcherErrors,
+    PoseSpread,
+    simulate_correspondences,
+)
 from calibgraph.simulation.rigs import rig_of
 
 MAX_FRAMES = 10_000

@@ -14,7 +14,9 @@ from types import FrameType
 from calibgraph.errors import CalibrationError, DatasetError, FileError
 from calibgraph.io.bags import BagOptions
 from calibgraph.io.dataset import load_dataset
+from calibgraph.matching.burnt_in import hide_burnt_in
 from calibgraph.matching.protocol import Matcher, to_full_matcher
+from calibgraph.matching.same_images import require_different_images
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.clock import OF_IMAGES, require_motion
 from calibgraph.model.config import Config
@@ -166,7 +168,8 @@ def _drive(settings: Tracking, matcher: Matcher, source: Sequence[Path]) -> Data
     known = data.frames[0].twist_per_s is not None
     require_motion(settings.config.estimate, is_known=known, how=OF_IMAGES)
     full = to_full_matcher(matcher)
-    data = replace(data, frames=data.frames[:: settings.every])
+    require_different_images(data, settings.rig)
+    data = hide_burnt_in(replace(data, frames=data.frames[:: settings.every]), settings.rig)
     return DatasetDrive(data, full, settings.config.changed(stage1=full.stage1))
 
 

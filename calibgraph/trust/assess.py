@@ -28,7 +28,7 @@ from calibgraph.trust.inputs import describe_brightness
 from calibgraph.trust.intrinsics import intrinsics_checks
 from calibgraph.trust.lens_parameter import advise_together
 from calibgraph.trust.matcher_checks import matcher_checks
-from calibgraph.trust.pair_agreement import pair_agreement_checks
+from calibgraph.trust.pair_agreement import one_pose_checks, pair_agreement_checks
 from calibgraph.trust.place_checks import place_checks
 from calibgraph.trust.rematch_checks import (
     going_on_checks,
@@ -57,6 +57,7 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     flat_evidence_checks,       # do the images leave the pose more open than the matches?
     estimate_checks,            # residuals, sigmas, relative poses, halves, counts, convergence
     pair_agreement_checks,      # do two cameras' images agree with the correspondences?
+    one_pose_checks,            # have two cameras one device's images?
     matcher_checks,             # findings of the matcher: search, learned shares, z-score
     competing_solution_checks,  # do the left-out matches agree on another extrinsic?
     outlier_frame_checks,       # how many frames were left out?

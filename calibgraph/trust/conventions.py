@@ -239,8 +239,7 @@ class _Trial:
         frames, cameras = {}, {}
         for name in lost:
             seen, camera = self.frames[name], self.guess.cameras[name]
-            grays = [np.ascontiguousarray(gray[:, ::-1]) for gray in seen.grays]
-            frames[name] = replace(seen, grays=grays)
+            frames[name] = replace(seen, grays=[gray.mirrored() for gray in seen.grays])
             k = camera.intrinsics_px
             k = k.model_copy(update={"cx": camera.width_px - 1 - k.cx})
             cameras[name] = camera.model_copy(update={"intrinsics_px": k})

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
+from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import LEVELS, Level
 from calibgraph.matching.structure.shift_scores import (
     ShiftScores,
@@ -20,8 +18,8 @@ from calibgraph.matching.structure.shift_scores import (
 )
 from calibgraph.model.rig import Camera
 
-Images = Sequence[NDArray[np.uint8]]
-"""Gray images of one camera, (height, width) each, one per frame."""
+Images = Sequence[PreparedImage]
+"""Images of one camera, one per frame."""
 
 MAX_WINDOWS, SHARING_FRAMES = (
     10_000,
@@ -39,8 +37,8 @@ class FrameScorer:
         self._pool = pool
         self._cache = cache_of(frames, FrameCache())
 
-    def load_images(self, name: str, camera: Camera) -> list[NDArray[np.uint8]]:
-        """Gray images of a camera, one per frame."""
+    def load_images(self, name: str, camera: Camera) -> list[PreparedImage]:
+        """Images of a camera, one per frame."""
         load = partial(self._cache.image, name=name, camera=camera)
         return list(self._pool.map(load, self.frames))
 
@@ -57,7 +55,7 @@ class FrameScorer:
         return concatenate_scores([each for each in scores if each is not None])
 
     def _score_frame(
-        self, gray: NDArray[np.uint8], frame: Frame, *, camera: Camera, level: Level, offset: int
+        self, image: PreparedImage, frame: Frame, *, camera: Camera, level: Level, offset: int
     ) -> ShiftScores | None:
         other = self.dataset.neighbour(frame, offset) if offset else frame
         if other is None:
@@ -65,5 +63,5 @@ class FrameScorer:
         most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
         cloud, twist = self._cache.cloud(other), other.twist_per_s
         return score_frame(
-            gray, cloud, camera, level, frame=frame.index, max_windows=most, twist_per_s=twist
+            image, cloud, camera, level, frame=frame.index, max_windows=most, twist_per_s=twist
         )

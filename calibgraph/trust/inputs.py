@@ -14,6 +14,7 @@ from calibgraph.errors import DatasetError
 from calibgraph.io.bags import scan_duration_s
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
+from calibgraph.matching.burnt_in import describe_burnt_in
 from calibgraph.model.clock import OF_IMAGES, unused_times
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Camera, Rig
@@ -167,7 +168,8 @@ def check_inputs(data: Dataset, rig: Rig, *, at_guess: bool = True) -> tuple[str
     doubts += motion_doubts(data)
     for text in doubts:
         _log.warning(text)
-    return (*unused_times(rig, is_known=known, how=OF_IMAGES), *doubts)
+    known_times = unused_times(rig, is_known=known, how=OF_IMAGES)
+    return (*known_times, *doubts, *describe_burnt_in(data))
 
 
 def _check_at_guess(data: Dataset, rig: Rig) -> list[str]:

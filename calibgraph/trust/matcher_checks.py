@@ -106,8 +106,21 @@ def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:
         return [Check("search", "FAIL", text, missed)]
     if found is not None:
         text = f"z-score {found:.1f} of image and cloud where the rounds began"
-        return [Check("search", "PASS", text, found)]
+        return [Check("search", "PASS", text, found), *_contradiction(findings, camera)]
     return []
+
+
+def _contradiction(findings: MatcherFindings, camera: str) -> list[Check]:
+    """That what two cameras see in common places them where neither image accepts its pose."""
+    other = findings.contradicted.get(camera)
+    if other is None:
+        return []
+    text = (
+        f"its image and cloud agree at its pose, but features that it has in common with {other} "
+        "place the two cameras elsewhere: do both images show the same thing that is no part of "
+        "the scene, as a text, a logo or a part of the vehicle? Else one of the two is wrong"
+    )
+    return [Check(f"features in common with {other}", "WARN", text, kind="contradiction")]
 
 
 def _share_checks(findings: MatcherFindings, camera: str) -> list[Check]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from calibgraph.model.verdict import Check
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.thresholds import threshold
+
+ONE_POSE_DEG, ONE_POSE_CM = 0.1, 1.0
+"""Housings do not fit closer; two results of one device's images end as near."""
 
 BLAME_SIGMAS = 1.0
 """Factor by which one camera of a pair must disagree more with its other neighbours than the other
@@ -68,6 +72,33 @@ def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
         name: [check_agreement(one, name, found) for one in found if name in (one.a, one.b)]
         for name in own.cameras
     }
+
+
+def one_pose_checks(evidence: Evidence) -> dict[str, list[Check]]:
+    """Cameras that end at one pose, unless the rig ties them there: have they one device's images?
+
+    Nothing else in a result shows it: images have the pose of the device that took them.
+    """
+    rig, checks = evidence.solution.rig, dict[str, list[Check]]()
+    T = evidence.solution.T_camera_lidar
+    tied = {frozenset((one.a, one.b)) for one in rig.relative_poses if _is_one_pose(one.T_a_b)}
+    for a, b in combinations(T, 2):
+        if not _is_one_pose(relative_transform(T[a], T[b])) or {a, b} in tied:
+            continue
+        degrees, centimetres = pose_difference(T[a], T[b])
+        text = (
+            f"{a} and {b} end {degrees:.2g} deg, {centimetres:.2g} cm from each other: have they "
+            "the images of one device? If they are mounted so, state it in relative_poses"
+        )
+        for name in (a, b):
+            check = Check("cameras at one pose", "WARN", text, kind="one_pose")
+            checks.setdefault(name, []).append(check)
+    return checks
+
+
+def _is_one_pose(T_a_b: Array) -> bool:
+    degrees, centimetres = pose_difference(T_a_b, np.eye(4))
+    return degrees <= ONE_POSE_DEG and centimetres <= ONE_POSE_CM
 
 
 def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairAgreement]) -> Check:

@@ -7,11 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 import calibgraph
 from calibgraph import Audit, CameraAudit, LidarAudit
-from calibgraph.audit.page import charts_of, measured_camera
+from calibgraph.audit.page import measured_camera
 from calibgraph.model.geometry import twist_between
 from tests.audit.deployed import TRUTH
 from tests.conftest import ROOT, SAMPLE
@@ -47,8 +46,6 @@ def test_a_wrong_camera_is_shown_beside_what_was_measured(tmp_path: Path) -> Non
     assert '<strong class="big">WRONG</strong>' in text
     assert "No. front_left is not where the calibration has it." in text
     assert "Fasten what is loose, and calibrate again" in text
-    assert text.count("<svg") == 4
-    assert text.count('class="beyond" x=') == 3  # the axes of one turn
     for name in ("front_left", "front_right"):
         assert f'alt="{name} deployed, coloured by distance"' in text
         assert f'alt="{name} measured, coloured by distance"' in text
@@ -57,14 +54,12 @@ def test_a_wrong_camera_is_shown_beside_what_was_measured(tmp_path: Path) -> Non
     assert "1.50 s" in text and "<td>2.0</td>" in text
 
 
-def test_what_to_record_is_named_and_no_error_bar_is_drawn(tmp_path: Path) -> None:
+def test_what_to_record_is_named(tmp_path: Path) -> None:
     text = page_of(audit_with(FEW, FEW, NOTHING), tmp_path)
     assert "<b>front_left, front_right</b>: too few frames: record at least 5" in text
     assert "This recording cannot tell for front_left, front_right, left." in text
     assert "record again" in text
     assert "Unknown for front_left, front_right, left." in text
-    assert 'class="error"' not in text and 'class="detectable"' not in text
-    assert text.count("<svg") == 4
     assert "deployed; nothing was measured" in text
     assert text.count("data:image/jpeg") == 5
 
@@ -130,30 +125,13 @@ def test_the_measured_camera_deviates_as_was_measured() -> None:
     assert measured_camera(deployed, NOTHING) is None
 
 
-@pytest.mark.parametrize("tolerance", [1e-3, 0.5, 7.0, 300.0])
-def test_bars_are_to_scale_and_inside_the_axis(tolerance: float) -> None:
-    for chart in charts_of(WRONG, tolerance, tolerance):
-        half = chart.x(tolerance) - chart.x(0)
-        unit = 180 / np.pi if chart.title.startswith("rotation") else 100.0
-        rows = DEVIATION[:3] if chart.title.startswith("rotation") else DEVIATION[3:]
-        for bar, value in zip(chart.bars, rows * unit, strict=True):
-            assert chart.x(bar.deviation) - chart.x(0) == pytest.approx(value * half / tolerance)
-            assert bar.has_error
-            ends = (bar.deviation - bar.sigma, bar.deviation + bar.sigma, bar.detectable)
-            assert all(chart.x(-chart.reach) < chart.x(end) < chart.x(chart.reach) for end in ends)
-        assert 3 <= len(chart.ticks) <= 5
-        assert max(chart.ticks) <= chart.reach
-        assert chart.x(-chart.reach) == pytest.approx(74) and chart.x(chart.reach) == 284
-    assert charts_of(NOTHING, tolerance, tolerance) == ()
-
-
 def test_a_browser_shows_it_without_errors_and_without_a_network(tmp_path: Path) -> None:
     page_of(audit_with(WRONG, FEW, RIGHT), tmp_path)
     rendering = render(tmp_path / "check.html", tmp_path)
     assert (rendering.errors, rendering.requests) == ([], [])
     red = (rendering.picture[:400, :60] == (0x20, 0x00, 0xB0)).all(axis=2)  # BGR: WRONG
     assert red.sum() > 500
-    assert rendering.picture[600:].std() > 20  # not blank: charts and overlays
+    assert rendering.picture[600:].std() > 20  # not blank: overlays
 
 
 def test_the_template_is_part_of_the_package() -> None:

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.accuracy import audit_data
-from benchmarks.accuracy.alignment import ALIGNMENT
-from benchmarks.accuracy.audit_data import STREETS, Sources
-from benchmarks.accuracy.error_bars import RIGS
+from benchmarks.accuracy import audit
+from benchmarks.accuracy.audit import STREETS, Sources
+from tools.scenes.sensor_streets import ALIGNMENT, RIGS
 
 
 def test_cameras_of_a_scene_are_at_the_mean_alignment_of_its_streets(
@@ -25,7 +24,7 @@ def test_cameras_of_a_scene_are_at_the_mean_alignment_of_its_streets(
         moved = np.eye(4)
         moved[1, 3] = 0.01 * (street + 1)  # 1, 2 and 3 cm
         mounts.moved_to({**mounts.T_camera_lidar, name: moved @ T}).save(folder / ALIGNMENT)
-    monkeypatch.setattr(audit_data, "load_dataset", list)
+    monkeypatch.setattr(audit, "load_dataset", list)
 
     streets, rig = Sources(tmp_path, tmp_path).load("scene_0")
 

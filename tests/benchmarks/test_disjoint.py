@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
 
 from benchmarks.accuracy import disjoint
-from benchmarks.accuracy.disjoint import (
-    Estimate,
-    Runs,
-    difference,
-    repeat_covariances,
-    report,
-    split,
-)
+from benchmarks.accuracy.disjoint import Estimate, difference, repeat_covariances, report, split
 from benchmarks.accuracy.ledger import Key, Record
-from benchmarks.accuracy.scenes import Folders
 from calibgraph import Rig, solve
 from tests.trust.conftest import simulated
 
@@ -56,39 +47,6 @@ def test_right_error_bars_give_one_and_95_percent() -> None:
     assert float(found["without what all share"]) == pytest.approx(1, abs=0.05)
     assert float(found["of these in the 95 % region"].rstrip("%")) == pytest.approx(95, abs=2)
     assert found["both PASS"] == str(draws)
-
-
-def test_sizes_are_those_of_the_difference() -> None:
-    bar = np.diag([1e-6] * 6)
-    turned = moved(np.array([0.0, np.radians(0.3), 0.0, 0.0, 0.0, 0.0]))
-    found = difference(Estimate(np.eye(4), bar, "PASS", bar), Estimate(turned, bar, "WARN", bar))
-    assert found["difference_deg"] == pytest.approx(0.3)
-    assert found["difference_cm"] == pytest.approx(0)
-    assert found["normalised_squared"] == pytest.approx(np.radians(0.3) ** 2 / 2e-6 / 6)
-    assert found["repeated_squared"] == found["normalised_squared"]
-
-
-def test_a_recording_of_several_pairs_is_calibrated_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    called: list[str] = []
-
-    def calibrated(folders: Folders, name: str, seed: int) -> dict[str, Estimate]:
-        called.append(name)
-        bar = np.diag([1e-6] * 6)
-        cameras = ("left", "right") if name == "05" else ("left",)
-        return {camera: Estimate(np.eye(4), bar, "PASS", bar) for camera in cameras}
-
-    monkeypatch.setattr(disjoint, "_calibrate", calibrated)
-    disjoint._whole.cache_clear()
-    runs = Runs(Folders(Path("nowhere"), None))
-    records = [
-        {**asdict(case), **runs(case)}
-        for case in (Key("recordings", "each", pair, 0) for pair in ("05/06", "05/07"))
-    ]
-    assert called == ["05", "06", "07"]
-    assert [[*record["cameras"]] for record in records] == [["left"], ["left"]]
-    assert [row[0] for row in report(records).rows] == [
-        "recordings of 05/06", "recordings of 05/07", "all",
-    ]  # fmt: skip
 
 
 def test_repeats_lack_what_all_places_share(pair: Rig) -> None:

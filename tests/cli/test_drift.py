@@ -1,4 +1,4 @@
-"""drift: its exit codes, table, JSON and picture."""
+"""drift: its exit codes, table and JSON."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from tests.audit.drifting import draw, template, twist
 from tests.cli.conftest import error_line
@@ -56,12 +55,6 @@ def test_a_wide_error_bar_exits_with_3(call: Call, week: Path) -> None:
     code, _, err = call("drift", week / "mon", week / "fog")
     assert code == 3
     assert err.startswith("CANNOT TELL  drift: does one of the results deviate from the others?\n")
-
-
-def test_the_picture_is_drawn(call: Call, week: Path, tmp_path: Path) -> None:
-    results = (week / day for day in ("mon", "tue", "fri"))
-    assert call("drift", *results, "--plot", tmp_path / "drift.png")[0] == 1
-    assert min(Image.open(tmp_path / "drift.png").size) > 300
 
 
 def test_dates_make_the_trend_one_per_day(call: Call, week: Path) -> None:

@@ -6,8 +6,7 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from calibgraph.fleet.child import Child
-from calibgraph.fleet.execute import execute
+from calibgraph.fleet.job import execute
 from calibgraph.fleet.rows import read_rows
 from calibgraph.fleet.task import Outcome, Task
 from tests.cli.conftest import error_line
@@ -15,16 +14,16 @@ from tests.conftest import Call
 from tests.draws.fleets import write_fleet
 
 
-def run_here(_: Child, task: Task) -> Outcome:
+def run_here(task: Task) -> Outcome:
     with TemporaryDirectory() as folder:
         return execute(task, Path(folder))
 
 
-def test_a_manifest_becomes_rows_and_a_second_call_does_nothing(
+def test_a_manifest_becomes_rows_and_a_page_and_a_second_call_does_nothing(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In this process: tests/fleet has the processes."""
-    monkeypatch.setattr(Child, "run", run_here)
+    monkeypatch.setattr("calibgraph.fleet.run.run_job", run_here)
     manifest, out = str(write_fleet(tmp_path / "in", 2)), str(tmp_path / "out")
     code, printed, _ = call("fleet", manifest, "--out", out, "--jobs", 1, "--json")
     assert code == 0
@@ -34,11 +33,14 @@ def test_a_manifest_becomes_rows_and_a_second_call_does_nothing(
     code, _, err = call("fleet", manifest, "--out", out)
     assert code == 0
     assert "2 jobs, 2 finished before; cameras: 4 PASS, 0 WARN, 0 FAIL" in err
+    assert "2 vehicles, 4 cameras measured; 0 cameras of 0 vehicles stand apart" in err
+    for name in ("fleet.html", "fleet_model.json", "estimates.parquet"):
+        assert (Path(out) / name).is_file()
 
 
 def test_failed_jobs_exit_1(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Child, "run", lambda *_: Outcome(error_kind="bad input", error="empty"))
-    (tmp_path / "drive").mkdir()
+    failed = Outcome(error_kind="bad input", error="empty")
+    monkeypatch.setattr("calibgraph.fleet.run.run_job", lambda _: failed)
     (tmp_path / "fleet.csv").write_text("vehicle,recording\na,drive\n")
     code, _, err = call("fleet", str(tmp_path / "fleet.csv"), "--out", str(tmp_path / "out"))
     assert code == 1
@@ -49,10 +51,9 @@ def test_failed_jobs_exit_1(call: Call, tmp_path: Path, monkeypatch: pytest.Monk
     ("text", "options", "message"),
     [
         ("vehicle\na\n", [], "column 'recording' is missing"),
-        ("vehicle,recording\na,none\n", [], "row 0: "),
-        ("vehicle,recording\na,.\n", ["--engine", "spark"], "--engine spark: known are"),
-        ("vehicle,recording\na,.\n", ["--shard", "8/8"], "shard 8/8: expected"),
-        ("vehicle,recording\na,xy://b\n", [], "row 0: xy://b: cannot be opened"),
+        ("vehicle,recording\na,b;\n", [], "row 0: recording 'b;': expected"),
+        ("vehicle,recording\na,.\n", ["--dask", "nonsense://x"], "--dask nonsense://x: no sched"),
+        ("vehicle,recording\na,.\n", ["--dask", "tcp://x:1", "--jobs", "2"], "--jobs is of this"),
     ],
 )
 def test_wrong_input_is_one_line_and_writes_nothing(

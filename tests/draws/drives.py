@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.simulation.correspondences import matchers_of
-from calibgraph.simulation.matcher_errors import MatcherErrors
+from calibgraph.simulation.correspondences import MatcherErrors, matchers_of
 
 Rng = np.random.Generator
 

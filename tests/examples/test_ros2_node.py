@@ -14,7 +14,7 @@ import calibgraph
 from calibgraph import Calibration, Dataset, Verdict, load_dataset, load_rig
 from examples.ros2_node import Calibrator, Recording, fill_transform, matrix_of
 from tests.conftest import SAMPLE
-from tests.io.bags.writing import START_NS, Messages, Stamped, sample_messages
+from tests.io.bags.writing import Messages, Stamped, sample_messages
 
 MAKE = Messages("mcap")
 S = 1_000_000_000
@@ -76,29 +76,6 @@ def test_the_frames_are_those_of_the_folder(calibrator: Calibrator) -> None:
         for name, camera in folder.rig.cameras.items():
             pixels = (each.load_image(name, camera) for each in (one, two))
             np.testing.assert_array_equal(*pixels)
-
-
-def test_a_frame_too_soon_after_the_last_is_left_out() -> None:
-    recording = Recording(every_s=2.0, frames=3)
-    pixels = np.zeros((4, 6, 3), np.uint8)
-    cloud = np.ones(5, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
-    for second in (0, 1, 2, 3, 5, 7):
-        stamp_ns = START_NS + second * S
-        image = MAKE.image(pixels + second, "bgr8", stamp_ns)
-        recording.add(MAKE.cloud(cloud, stamp_ns), {"front": image})
-    assert [image[0, 0, 0] for image in recording.images["front"]] == [0, 2, 5]
-
-
-def test_a_message_that_cannot_be_read_is_logged(
-    calibrator: Calibrator, caplog: pytest.LogCaptureFixture
-) -> None:
-    calibrator.recording.frames, calibrator.cameras = 7, ["front"]
-    image = MAKE.image(np.zeros((4, 6), np.uint8), "mono8", START_NS)
-    image.encoding = "strange"
-    points = np.ones(5, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
-    calibrator.receive_frame(MAKE.cloud(points, START_NS + 90 * S), image)
-    assert "image encoding 'strange' is unknown" in caplog.text
-    assert len(calibrator.recording.clouds) == 6
 
 
 def test_a_published_pose_has_the_lidar_as_its_parent() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from factors import ProjectionBlock, to_runs
-from tests.factors.blocks import LENSES, TRUTH, poses, with_loss, world
+from tests.factors.blocks import LENSES, poses, with_loss, world
 
 EDGES = np.array([0, 300, 300, 900, 1000])
 
@@ -68,14 +68,3 @@ def test_norms_are_those_of_the_residuals_and_infinite_behind_the_camera(lens: s
             np.testing.assert_allclose(
                 found[projectable], 0.5 * expected[projectable], rtol=1e-12, atol=1e-12
             )
-
-
-def test_error_and_jacobian_are_the_root_of_the_sums() -> None:
-    for block in blocks("pinhole"):
-        scaled = block.rescale(scale=2.0, sigma=0.7)
-        error, jacobian = scaled.error_and_jacobian(TRUTH)
-        sums = scaled.sums(TRUTH)
-        np.testing.assert_allclose(
-            jacobian.T @ jacobian, sums.hessian, atol=1e-12 * sums.hessian.max()
-        )
-        np.testing.assert_allclose(error @ error, sums.cost, rtol=1e-12)

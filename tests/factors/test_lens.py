@@ -51,13 +51,6 @@ def test_fisheye_agrees_with_opencv() -> None:
     np.testing.assert_allclose(pixels, expected[:, 0], rtol=0, atol=1e-9)
 
 
-def test_a_point_by_hand() -> None:
-    # x / z = 0.5, y / z = -0.25: u = 718 / 2 + 607, v = -710 / 4 + 185.
-    pixels, valid = LENSES["radtan0"].project([[2.0, -1.0, 4.0]])
-    np.testing.assert_allclose(pixels, [[966.0, 7.5]])
-    assert valid.all()
-
-
 @pytest.mark.parametrize("name", LENSES)
 def test_jacobian_agrees_with_finite_differences(name: str) -> None:
     lens = LENSES[name]

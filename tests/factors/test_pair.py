@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import FrozenInstanceError
 from itertools import pairwise
 
 import gtsam
@@ -121,37 +120,6 @@ def test_a_block_equals_its_separate_factors(kind: str, loss: str, lenses: str) 
     assert np.abs((hessian - expected)[:, :12] / np.outer(units, units)[:, :12]).max() < 1e-9
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_pair_sums_are_those_of_the_factor(kind: str) -> None:
-    features, values = Features(LENSES["mixed"], 80), near_truth()
-    block = features.block(kind).rescale(scale=2.0, sigma=0.7)
-    sums = pair_sums(block, values.atPose3(A), values.atPose3(B))
-    graph = gtsam.NonlinearFactorGraph()
-    graph.add(pair_block_factor(A, B, block))
-    error, hessian = linearized(graph, values)
-    assert sums.cost == pytest.approx(2 * error, rel=1e-12)
-    units = np.sqrt(np.diag(sums.hessian))
-    assert np.abs((hessian[:12, :12] - sums.hessian) / np.outer(units, units)).max() < 1e-9
-    assert np.abs((hessian[:12, 12] + sums.gradient) / units).max() < 1e-9 * error
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_gradient_is_that_of_the_error(kind: str) -> None:
-    """Central differences of the robust error, over both poses."""
-    block, values = Features(LENSES["mixed"], 60).block(kind), near_truth()
-    poses = values.atPose3(A), values.atPose3(B)
-    sums, step = pair_sums(block, *poses), 1e-5
-    for i in range(12):
-        costs = []
-        for sign in (1, -1):
-            moved = list(poses)
-            moved[i // 6] = poses[i // 6].retract(sign * step * np.eye(6)[i % 6])
-            costs.append(pair_sums(block, *moved).cost)
-        # Half the cost has the gradient b; a unit of the Hessian bounds the truncation.
-        difference = (costs[0] - costs[1]) / (4 * step)
-        assert difference == pytest.approx(sums.gradient[i], abs=1e-5 * sums.hessian[i, i] ** 0.5)
-
-
 @pytest.mark.parametrize("scale", [1e-7, 1.0], ids=["near identity", "large angles"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_jacobians_against_differences(kind: str, scale: float) -> None:
@@ -255,18 +223,3 @@ BAD: dict[str, Callable[[Features], object]] = {
 def test_wrong_blocks_are_refused(make: Callable[[Features], object]) -> None:
     with pytest.raises(ValueError, match=r"expected|unknown|positive|no ray"):
         make(Features(LENSES["pinhole"], 10))
-
-
-@pytest.mark.parametrize("kind", ["surface", "epipolar"])
-def test_blocks_are_immutable_and_parts_of_them_add_up(kind: str) -> None:
-    features = Features(LENSES["mixed"], 30)
-    block = features.block(kind)
-    with pytest.raises(FrozenInstanceError):
-        block.scale = 1.0
-    with pytest.raises(ValueError, match="read-only"):
-        block.pixels_b_px[0] = 0.0
-    parts = [block.select(np.arange(30) < 11), block.select(np.arange(11, 30))]
-    whole = pair_sums(block, T_LIDAR_A, T_LIDAR_B)
-    sums = [pair_sums(part, T_LIDAR_A, T_LIDAR_B) for part in parts]
-    assert whole.cost == pytest.approx(sums[0].cost + sums[1].cost, rel=1e-12)
-    assert np.allclose(whole.hessian, sums[0].hessian + sums[1].hessian, rtol=1e-9, atol=1e-6)

@@ -23,14 +23,6 @@ def test_rays_project_to_their_pixels(lens: Lens) -> None:
     assert np.abs(lens.project(rays)[0] - pixels).max() < 1e-9
 
 
-def test_rays_beyond_90_degrees_are_found() -> None:
-    angle = np.radians([89.0, 93.0, 95.0])
-    rays = np.column_stack([np.sin(angle), np.zeros(3), np.cos(angle)])
-    found, valid = unproject(WIDE, WIDE.project(rays)[0])
-    assert valid.all()
-    assert np.abs(found - rays).max() < 1e-12
-
-
 def test_pixels_outside_the_lens_have_no_ray() -> None:
     folded = Lens.pinhole(fx=700.0, fy=700.0, cx=600.0, cy=200.0, distortion=(-0.4, 0.0, 0.0, 0.0))
     _, valid = unproject(folded, np.array([[600.0, 200.0], [3000.0, 200.0], [np.nan, 0.0]]))

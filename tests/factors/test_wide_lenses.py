@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import gtsam
 import numpy as np
 import pytest
@@ -53,20 +52,6 @@ def test_the_unified_model_equals_its_formula_wherever_it_sees(xi: float) -> Non
     np.testing.assert_allclose(pixels[valid], expected, rtol=1e-12, atol=1e-9)
     if xi > 0.5:  # it sees behind itself
         assert (points[valid, 2] < 0).sum() > 200
-
-
-@pytest.mark.parametrize("mirror", [0.0, 1.6])
-def test_the_unified_model_is_a_pinhole_that_sees_the_unit_sphere(mirror: float) -> None:
-    """OpenCV projects the points of the sphere, moved by the mirror's parameter."""
-    points = points_all_round()
-    pixels, valid = unified_lens(mirror).project(points)
-    on_sphere = points / np.linalg.norm(points, axis=1, keepdims=True) + [0, 0, mirror]
-    expected, _ = cv2.projectPoints(
-        on_sphere[valid], np.zeros(3), np.zeros(3),
-        np.array([[K["fx"], 0, K["cx"]], [0, K["fy"], K["cy"]], [0, 0, 1]]), np.array(DISTORTION),
-    )  # fmt: skip
-    np.testing.assert_allclose(pixels[valid], expected[:, 0], rtol=1e-12, atol=1e-9)
-    assert valid.any() and valid[points[:, 2] < 0].any() == (mirror > 0)
 
 
 def test_a_panorama_equals_longitude_and_latitude() -> None:

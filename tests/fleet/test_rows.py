@@ -41,18 +41,6 @@ def test_columns_that_only_some_rows_have_are_null_in_the_others(tmp_path: Path)
     assert by_vehicle == {"a": None, "a-2": "2026-03"}
 
 
-def test_rows_of_before_the_distinction_of_warnings_are_kept_beside_new_ones(
-    tmp_path: Path,
-) -> None:
-    place = SCHEMA.get_field_index("cannot_tell")
-    earlier = rows("a").replace_schema_metadata(None).drop_columns(["cannot_tell"])
-    store = RowStore(str(tmp_path))
-    store.publish(earlier)
-    store.publish(rows("a", camera="left").set_column(place, "cannot_tell", pa.array([True])))
-    store.publish(rows("b"))
-    assert set(read_rows(str(tmp_path)).column_names) == set(SCHEMA.names)
-
-
 def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / f"bucket={bucket_of('a'):02x}" / "rows.parquet"
     path.parent.mkdir()
@@ -100,21 +88,3 @@ def test_a_reader_finds_whole_rows_while_they_are_replaced(tmp_path: Path) -> No
         stop.set()
         writer.join()
     assert lengths == [1] * 200
-
-
-def test_no_row_is_lost_when_several_write_one_bucket(tmp_path: Path) -> None:
-    """Each of a name of its own in the same bucket, while another holds the rows read before."""
-    names = [name for name in map(str, range(20_000)) if bucket_of(name) == 0][:40]
-    assert len(names) == 40
-
-    def publish(own: list[str]) -> None:
-        store = RowStore(str(tmp_path))
-        for name in own:
-            store.publish(rows(name))
-
-    writers = [threading.Thread(target=publish, args=(names[part::4],)) for part in range(4)]
-    for writer in writers:
-        writer.start()
-    for writer in writers:
-        writer.join()
-    assert sorted(read_rows(str(tmp_path))["vehicle"].to_pylist()) == sorted(names)

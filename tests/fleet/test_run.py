@@ -1,194 +1,226 @@
+"""Runs of a manifest, on threads and on Dask: what befalls one job is one row."""
+
 from __future__ import annotations
 
+import json
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pyarrow as pa
+import psutil
 import pytest
 
 from calibgraph import load_correspondences, load_rig, solve
 from calibgraph.errors import CalibrationError, FileError
-from calibgraph.fleet.engines import ProcessEngine
-from calibgraph.fleet.rows import read_rows
-from calibgraph.fleet.run import Summary, run_fleet
-from calibgraph.fleet.task import RETRIES, Limits, Outcome, Task
+from calibgraph.fleet.job import run_job
+from calibgraph.fleet.manifest import load_manifest
+from calibgraph.fleet.rows import RowStore, read_rows
+from calibgraph.fleet.run import Summary, dask_executor, run_fleet, thread_executor
+from calibgraph.fleet.task import Limits, Task, release
 from tests.draws.fleets import write_fleet
 
 POISON = Path(__file__).parent / "poison"
-GOOD, ILL, BROKEN = "car-00001", ("segfault", "hungry", "endless", "bug"), "broken"
+GOOD = ("car-00000", "car-00001", "car-00002")
+ILL = {
+    "killed": "worker died",
+    "hungry": "out of memory",
+    "endless": "timeout",
+    "bug": "internal error",
+    "broken": "bad input",
+}
 # 3 GB: a child's libraries reserve under 1 GB, the hungry one takes 8 GB.
-LIMITS = Limits(timeout_s=15.0, memory_bytes=3 * 10**9)  # a good job takes 1 s on an idle machine
+LIMITS = Limits(timeout_s=20.0, memory_bytes=3 * 10**9)  # a good job takes 1 s on an idle machine
 
 
-@dataclass(frozen=True)
-class Fleet:
-    folder: Path
-    manifest: str
-    out: str
-    summary: Summary
-    starts: Counter[str]
-
-    @property
-    def rows(self) -> dict[tuple[str, str], dict[str, object]]:
-        rows = read_rows(self.out).to_pylist()
-        found = {(row["vehicle"], row["camera"]): row for row in rows}
-        assert len(found) == len(rows)
-        return found
-
-
-def count_starts(folder: Path) -> Counter[str]:
-    return Counter({path.name: path.read_text().count("start") for path in folder.iterdir()})
+@contextmanager
+def executor_of(kind: str) -> Iterator[Any]:
+    """Two at a time: threads, or a local Dask cluster."""
+    if kind == "threads":
+        with thread_executor(2) as executor:
+            yield executor
+        return
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        ) as cluster,
+        dask_executor(cluster.scheduler_address) as executor,
+    ):
+        yield executor
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _fewer_retries() -> Iterator[None]:
-    """Each retry of a dead process starts another, which takes a second."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(RETRIES, "worker died", 1)
-        yield
+def rows_of(out: str, *, seconds: bool = False) -> dict[tuple[str, str], dict[str, Any]]:
+    """Rows by vehicle and camera, each there once."""
+    rows = read_rows(out).to_pylist()
+    found = {(row["vehicle"], row["camera"]): row for row in rows}
+    assert len(found) == len(rows)
+    for row in [] if seconds else rows:
+        del row["seconds"]
+    return found
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
-    """A good vehicle, four whose process comes to grief, and one with a broken table."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three good vehicles in fleet.csv; those and one of each ill in ill.csv."""
     folder = tmp_path_factory.mktemp("fleet")
-    manifest = write_fleet(folder / "in", 2)
-    header, _, good = manifest.read_text().splitlines(keepends=True)
-    text = header + good
-    for number, name in enumerate((*ILL, BROKEN)):
-        shutil.copy(folder / "in" / f"{GOOD}.parquet", folder / "in" / f"{name}.parquet")
-        text += f'"{name}","{name}.parquet","nominal.yaml","{number}",7\n'
-    (folder / "in" / f"{BROKEN}.parquet").write_bytes(b"PAR1 and no more")
-    manifest.write_text(text)
-    (folder / "starts").mkdir()
-    (folder / "here" / "calibgraph").mkdir(parents=True)
-    (folder / "here" / "calibgraph" / "__init__.py").write_text("raise ImportError('another one')")
-    out = str(folder / "out")
+    text = write_fleet(folder, len(GOOD)).read_text()
+    for name in ILL:
+        shutil.copy(folder / f"{GOOD[0]}.parquet", folder / f"{name}.parquet")
+        text += f'"{name}","{name}.parquet","nominal.yaml","1",7\n'
+    (folder / "broken.parquet").write_bytes(b"PAR1 and no more")
+    (folder / "ill.csv").write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def alone(folder: Path) -> dict[tuple[str, str], dict[str, Any]]:
+    """The rows of the good vehicles when nothing befalls the others."""
+    run_fleet(str(folder / "fleet.csv"), str(folder / "alone"), limits=LIMITS)
+    return rows_of(str(folder / "alone"))
+
+
+@dataclass(frozen=True)
+class Run:
+    kind: str
+    manifest: str
+    out: str
+    summary: Summary
+
+
+@pytest.fixture(scope="module", params=["threads", pytest.param("dask", marks=pytest.mark.slow)])
+def run(request: pytest.FixtureRequest, folder: Path) -> Run:
+    """The manifest with all ills, in a folder whose package is not taken for the installed one."""
+    here = folder / request.param / "calibgraph"
+    here.mkdir(parents=True)
+    (here / "__init__.py").write_text("raise ImportError('another one')")
+    manifest, out = str(folder / "ill.csv"), str(folder / request.param / "out")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(POISON), prepend=":")
-        patch.setenv("COUNT_STARTS", str(folder / "starts"))
-        patch.chdir(folder / "here")  # a package there is not taken for the installed one
-        summary = run_fleet(str(manifest), out, limits=LIMITS, slots=2)
-    return Fleet(folder, str(manifest), out, summary, count_starts(folder / "starts"))
+        patch.chdir(here.parent)
+        with executor_of(request.param) as executor:
+            summary = run_fleet(manifest, out, executor=executor, limits=LIMITS)
+    return Run(request.param, manifest, out, summary)
 
 
-def test_poison_stops_no_other_vehicle_and_becomes_rows(fleet: Fleet) -> None:
-    rows = fleet.rows
-    good = {(GOOD, camera) for camera in ("image_2", "image_3")}
-    assert set(rows) == good | {(name, "") for name in (*ILL, BROKEN)}
-    kinds = {name: rows[name, ""]["error_kind"] for name in (*ILL, BROKEN)}
-    assert kinds == {
-        "segfault": "worker died",
-        "hungry": "out of memory",
-        "endless": "timeout",
-        "bug": "internal error",
-        "broken": "bad input",
-    }
-    assert "ended by SIGSEGV" in str(rows["segfault", ""]["error"])
-    assert "is it complete? write it again" in str(rows[BROKEN, ""]["error"])
-    assert fleet.summary.failures == Counter(kinds.values())
+@pytest.mark.filterwarnings("default")
+def test_each_ill_is_one_failed_row_and_all_others_are_as_without_it(
+    run: Run, alone: dict[tuple[str, str], dict[str, Any]]
+) -> None:
+    rows = rows_of(run.out)
+    failed = {vehicle: row["error_kind"] for (vehicle, camera), row in rows.items() if not camera}
+    assert failed == ILL
+    assert run.summary.failures == Counter(ILL.values())
+    assert "ended by SIGKILL; was the memory enough?" in rows["killed", ""]["error"]
+    assert "is it complete? write it again" in rows["broken", ""]["error"]
+    assert {key: row for key, row in rows.items() if key[1]} == alone
+    (log,) = (Path(run.out) / "_logs").glob("bug-*.log")
+    assert "KeyError" in log.read_text()
+    assert not children()
 
 
-def test_each_kind_of_failure_is_tried_as_often_as_its_limit(fleet: Fleet) -> None:
-    kinds = {name: fleet.rows[name, ""]["error_kind"] for name in (*ILL, BROKEN)}
-    expected = {name: 1 + RETRIES[kind] for name, kind in kinds.items()}  # type: ignore[index]
-    assert fleet.starts == {GOOD: 1, **expected}
-    assert fleet.summary.retries == sum(expected.values()) - len(expected)
+@pytest.mark.filterwarnings("default")
+def test_the_next_run_does_what_may_succeed_now_and_nothing_else(run: Run) -> None:
+    before = rows_of(run.out, seconds=True)
+    with executor_of(run.kind) as executor:
+        summary = run_fleet(run.manifest, run.out, executor=executor, limits=LIMITS)
+    assert (summary.skipped, summary.failures) == (len(GOOD) + 1, {"bad input": 1})
+    after = rows_of(run.out, seconds=True)
+    assert {vehicle for vehicle, camera in after if camera} == {*GOOD, *ILL} - {"broken"}
+    assert all(after[key] == row for key, row in before.items() if row["status"] == "done")
 
 
-def test_rows_are_what_solve_gives(fleet: Fleet) -> None:
-    folder = Path(fleet.manifest).parent
+def test_rows_are_what_solve_gives(
+    folder: Path, alone: dict[tuple[str, str], dict[str, Any]]
+) -> None:
     rig = load_rig(folder / "nominal.yaml")
-    result = solve(rig, load_correspondences(folder / f"{GOOD}.parquet"))
+    result = solve(rig, load_correspondences(folder / f"{GOOD[1]}.parquet"))
     for camera, T in result.T_camera_lidar.items():
-        row = fleet.rows[GOOD, camera]
-        assert row["verdict"] == result.camera_verdicts[camera].status
-        assert row["cannot_tell"] == result.camera_verdicts[camera].cannot_tell
-        assert row["of"] == "alignment"
-        doubt = result.camera_verdicts[camera].error_probability
-        assert doubt is not None
-        assert row["probability_off"] == pytest.approx(doubt.probability, rel=1e-3)
+        row, verdict = alone[GOOD[1], camera], result.camera_verdicts[camera]
+        found = row["verdict"], row["cannot_tell"], row["of"], row["batch"], row["mileage_km"]
+        assert found == (verdict.status, verdict.cannot_tell, "alignment", "1", 1000)
+        assert verdict.error_probability is not None
+        probability = verdict.error_probability.probability
+        assert row["probability_off"] == pytest.approx(probability, rel=1e-3)
         # The sums of one thread and of several differ in their rounding.
         np.testing.assert_allclose(np.reshape(row["T_camera_lidar"], (4, 4)), T, atol=1e-9)
-        np.testing.assert_allclose(
-            np.reshape(row["covariance"], (6, 6)), result.covariance[camera], rtol=1e-6, atol=1e-12
-        )
+        covariance = np.reshape(row["covariance"], (6, 6))
+        np.testing.assert_allclose(covariance, result.covariance[camera], rtol=1e-6, atol=1e-12)
 
 
-def test_columns_of_the_manifest_are_carried(fleet: Fleet) -> None:
-    mileages = {name: row["mileage_km"] for (name, _), row in fleet.rows.items()}
-    assert mileages == {GOOD: 1000, **dict.fromkeys((*ILL, BROKEN), 7)}
-    assert pa.types.is_string(read_rows(fleet.out).schema.field("batch").type)
-
-
-def test_a_log_per_vehicle_holds_its_tries(fleet: Fleet) -> None:
-    (log,) = (Path(fleet.out) / "_logs").glob("segfault-*.log")
-    assert log.read_text().count("failed: worker died") == RETRIES["worker died"]
-    (log,) = (Path(fleet.out) / "_logs").glob("bug-*.log")
-    assert "KeyError" in log.read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.ci
-def test_a_second_run_does_only_what_may_succeed_now(fleet: Fleet) -> None:
-    before = read_rows(fleet.out)
-    summary = run_fleet(fleet.manifest, fleet.out, limits=LIMITS, slots=3)
-    assert summary.skipped == 2
-    assert summary.failures == {"bad input": 1}
-    after = fleet.rows
-    assert {key[0] for key, row in after.items() if row["status"] == "done"} == {GOOD, *ILL}
-    for row in before.to_pylist():
-        if row["status"] == "done":
-            assert after[row["vehicle"], row["camera"]] == row
-
-
-def test_rows_of_another_version_are_not_mixed(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+def test_rows_and_workers_of_another_version_are_refused(
+    folder: Path, alone: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    manifest = str(folder / "fleet.csv")
+    with pytest.raises(CalibrationError, match=f"a worker has calibgraph {release()}, the command"):
+        run_job(Task(load_manifest(manifest).jobs[0], Limits(), "9.9"))
     monkeypatch.setattr("calibgraph.fleet.run.release", lambda: "9.9")
     with pytest.raises(FileError, match=r"holds rows of calibgraph .*, this is 9.9; choose"):
-        run_fleet(fleet.manifest, fleet.out)
+        run_fleet(manifest, str(folder / "alone"))
 
 
-def test_missing_recordings_are_refused_or_become_rows(fleet: Fleet, tmp_path: Path) -> None:
-    manifest = tmp_path / "fleet.csv"
+def test_missing_recordings_become_rows_that_are_tried_again(tmp_path: Path) -> None:
+    manifest, out = tmp_path / "fleet.csv", str(tmp_path / "out")
     manifest.write_text("vehicle,recording\na,none\nb,neither\n")
-    out = tmp_path / "out"
-    with pytest.raises(FileError, match=r"row 0: .*none: nothing is there \(and 1 more\)"):
-        run_fleet(str(manifest), str(out))
-    assert not out.exists()
-    summary = run_fleet(str(manifest), str(out), allow_missing=True)
-    assert summary.failures == {"bad input": 2}
-    assert run_fleet(str(manifest), str(out), allow_missing=True).skipped == 0
+    for _ in range(2):
+        summary = run_fleet(str(manifest), out)
+        assert (summary.skipped, summary.failures) == (0, {"bad input": 2})
+    assert "none" in rows_of(out)["a", ""]["error"]
 
 
-class LostCluster(ProcessEngine):
-    """Runs one task; then all workers are gone, and other tasks wait for ever."""
+def test_two_commands_do_not_write_to_one_folder(folder: Path, tmp_path: Path) -> None:
+    with RowStore(str(tmp_path)).locked(), pytest.raises(FileError, match="another command writes"):
+        run_fleet(str(folder / "fleet.csv"), str(tmp_path))
 
-    def __init__(self) -> None:
-        super().__init__(slots=1)
-        self._tasks = 0
 
-    def submit(self, task: Task) -> Future[Outcome]:
-        self._tasks += 1
-        return super().submit(task) if self._tasks == 1 else Future()
-
-    def has_workers(self) -> bool:
-        return False
+def test_dask_without_its_package_or_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(CalibrationError, match="--dask nonsense://x: no scheduler"):
+        dask_executor("nonsense://x").__enter__()
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(CalibrationError, match=r"pip install 'calibgraph\[fleet\]'"):
+        dask_executor("tcp://host:1").__enter__()
 
 
 @pytest.mark.slow
-def test_a_cluster_without_workers_ends_the_run_and_keeps_finished_rows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    manifest, out = write_fleet(tmp_path / "in", 2), str(tmp_path / "out")
-    monkeypatch.setattr("calibgraph.fleet.run.open_engine", lambda *_: LostCluster())
-    monkeypatch.setattr("calibgraph.fleet.driver.LONGEST_WITHOUT_WORKERS_S", 20.0)
-    with pytest.raises(CalibrationError, match="no worker for 20 s"):
-        run_fleet(str(manifest), out)
-    assert {row["vehicle"] for row in read_rows(out).to_pylist()} == {"car-00000"}
+def test_a_killed_command_leaves_rows_that_the_next_one_keeps(tmp_path: Path) -> None:
+    manifest, out = str(write_fleet(tmp_path / "in", 12)), tmp_path / "out"
+    command = [sys.executable, "-m", "calibgraph", "fleet", manifest, "--out", str(out), "--json"]
+    # Interrupted while it ends, Python ends by the signal itself, which a shell calls 130 as well.
+    codes = {signal.SIGINT: (130, -2, 0), signal.SIGTERM: (130, 0), signal.SIGKILL: (-9, 0)}
+    for stop, allowed in codes.items():
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        published, end = len(files_below(out)), time.monotonic() + 120
+        while len(files_below(out)) == published and process.poll() is None:
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        below = []
+        if process.poll() is None:  # it may have done all by now
+            below = psutil.Process(process.pid).children(recursive=True)
+        process.send_signal(stop)
+        assert process.wait(60) in allowed
+        psutil.wait_procs(below, timeout=60)  # one that still loads its libraries ends after that
+        assert not any(child.is_running() for child in below)
+    before = {row["vehicle"]: row["seconds"] for row in read_rows(str(out)).to_pylist()}
+    last = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    assert last["skipped"] == len(before) > 0
+    rows = read_rows(str(out)).to_pylist()
+    assert len(rows) == 24
+    assert before.items() <= {row["vehicle"]: row["seconds"] for row in rows}.items()
+
+
+def files_below(out: Path) -> list[Path]:
+    return list(out.glob("bucket=*/rows.parquet"))
+
+
+def children() -> list[psutil.Process]:
+    """The processes of jobs below this one."""
+    return [child for child in psutil.Process().children(recursive=True)
+            if "calibgraph.fleet.job" in child.cmdline()]  # fmt: skip

@@ -183,7 +183,7 @@ def test_stamps_that_are_far_apart_are_named(later_ms: float, message: str, samp
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("run.bag.active", "was not closed.*rosbag reindex"), ("run.mcap.zst", "zstd -d run.mcap.zst"),
+    [("run.bag.active", "was not closed.*rosbag reindex"), ("run.mcap.zst", "unzstd run.mcap.zst"),
      ("run.bag.gz", "gunzip run.bag.gz"), ("drive.zip", "is an archive")],
 )  # fmt: skip
 def test_a_file_that_is_not_read_is_named_with_the_way_out(

@@ -35,7 +35,7 @@ def test_kitti_extrinsics_use_the_whole_fourth_column(tmp_path: Path) -> None:
         ("P2: nan 0 6 0 0 7 2 0 0 0 1 0", "line 'P2' has 12 numbers, expected 12 finite"),
         ("Tr: 1 0 0 0 0 1 0 0 0 0 -1 0", "P2 and the LiDAR's pose: T_camera_lidar"),
         ("Tr: 1 0 0", "line 'Tr' has 3 numbers, expected 12"),
-        ("\xff\xfe", "is not a text file"),
+        ("\xff\xfe", "is not UTF-8"),
     ],
 )
 def test_a_wrong_kitti_calibration_is_one_line(tmp_path: Path, line: str, said: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import pytest
 
 from calibgraph import Dataset, Frame, Rig, dataset_from_arrays
 from calibgraph.matching.frame_choice import CANDIDATES, choose_frames, without_copies
-from calibgraph.rounds import _open
 from tests.conftest import make_camera
 
 CLOUD = np.ones((5, 4), np.float32)
@@ -39,7 +37,9 @@ def drive(
     images: dict[str, list[np.ndarray]] = {"front": [], "rear": []}
     for number, place in enumerate(at_px):
         view = np.ascontiguousarray(WALL[:HEIGHT, place : place + WIDTH])
-        images["rear"].append(view)
+        images["rear"].append(
+            np.ascontiguousarray(WALL[HEIGHT : 2 * HEIGHT, place : place + WIDTH])
+        )
         how = (spoilt or {}).get(number, "")
         if how == "blurred":
             view = cv2.blur(view, (41, 1))
@@ -68,19 +68,6 @@ def test_frames_are_spread_over_the_recording() -> None:
     assert [number // 30 for number in found] == list(range(10))
 
 
-def test_one_frame_is_chosen_while_the_vehicle_stands() -> None:
-    """Of 24 frames 16 are at one place: the other 8 places are all among the chosen."""
-    at_px = [0] * 16 + [200 * k for k in range(1, 9)]
-    choice = choose_frames(drive(at_px), RIG, 9)
-    found = [frame.index for frame in choice.dataset.frames]
-    assert found[1:] == list(range(16, 24)) and found[0] < 16
-    assert "in 15 the vehicle stands where it stood" in choice.text
-
-
-def test_where_it_always_stands_there_are_as_many_frames_as_asked_for() -> None:
-    assert len(chosen(drive([0] * 20), 6)) == 6
-
-
 def test_an_image_that_cannot_be_read_is_left_out() -> None:
     data = drive([100 * k for k in range(9)])
     frames = list(data.frames)
@@ -91,35 +78,12 @@ def test_an_image_that_cannot_be_read_is_left_out() -> None:
     assert choice.text.endswith("1 have an image that cannot be read")
 
 
-def test_few_frames_are_all_taken() -> None:
-    data = drive([0, 50, 100])
-    assert chosen(data, 3) == [0, 1, 2]
-
-
 def test_no_copy_takes_the_place_of_another_frame() -> None:
     """Of 12 frames, each three times, 12 are wanted."""
     data = drive([100 * (k // 3) for k in range(36)], copies=True)
     choice = choose_frames(data, RIG, 12)
     assert [frame.index for frame in choice.dataset.frames] == list(range(0, 36, 3))
     assert len(choice.copies) == 24
-
-
-def test_a_covered_camera_does_not_choose() -> None:
-    data = drive([100 * k for k in range(12)], {k: "blurred" for k in range(12) if k not in (4, 7)})
-    covered = [
-        replace(frame, images={**frame.images, "rear": np.zeros((HEIGHT, WIDTH, 3), np.uint8)})  # type: ignore[call-arg, attr-defined]
-        for frame in data.frames
-    ]
-    assert chosen(replace(data, frames=tuple(covered)), 2) == [4, 7]
-
-
-def test_the_choice_is_logged_and_the_others_stay_known(caplog: pytest.LogCaptureFixture) -> None:
-    data = drive([100 * k for k in range(12)])
-    with caplog.at_level(logging.INFO, logger="calibgraph"):
-        choice, _ = _open(data, RIG, 4)
-    few = choice.dataset
-    assert caplog.messages[0].startswith("4 of 12 frames are matched (--frames chooses others)")
-    assert len(few.frames) == 4 and len(few.recorded) == 12
 
 
 def test_copies_of_a_frame_are_left_out() -> None:
@@ -135,11 +99,3 @@ def test_copies_of_a_frame_are_left_out() -> None:
         RIG, [CLOUD, CLOUD + 1], {n: [WALL[:HEIGHT, :WIDTH]] * 2 for n in RIG.cameras}
     )
     assert without_copies(frozen).dataset is frozen
-
-
-def test_equal_files_of_other_cameras_are_no_copy(tmp_path: Path) -> None:
-    """Two frames with one cloud, and the same bytes from one camera and from another."""
-    path = tmp_path / "same"
-    path.write_bytes(b"same")
-    frames = tuple(Frame(k, n, path, {n: path}) for k, n in enumerate(("front", "rear")))
-    assert without_copies(Dataset(RIG, frames, ())).copies == ()

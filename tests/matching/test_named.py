@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Correspondences, Rig, StructureMatcher
+from calibgraph import Correspondences, Rig
 from calibgraph.matching.named import find_matcher
 from calibgraph.progress import no_progress
 from tests.conftest import SAMPLE
@@ -20,11 +20,6 @@ def truth() -> Rig:
 @pytest.fixture(scope="module")
 def table(truth: Rig) -> Correspondences:
     return calibgraph.simulate_correspondences(truth, frames=4, matches=20)
-
-
-def test_structure_is_found_by_name_and_gets_the_seed() -> None:
-    matcher = find_matcher("structure", seed=3)
-    assert isinstance(matcher, StructureMatcher) and matcher.seed == 3
 
 
 @pytest.mark.parametrize("source", ["memory", ".parquet", ".csv"])
@@ -52,13 +47,3 @@ def test_a_table_matches_the_frames_of_the_dataset(
 def test_other_names_are_errors(name: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         find_matcher(name)
-
-
-def test_the_matcher_of_a_name_states_its_source_of_stage_1() -> None:
-    """As one that is made by hand: the call of the library is that of the command line."""
-    data = calibgraph.load_dataset(SAMPLE)
-    tables = [
-        find_matcher(each).match(data, data.rig, round_index=5, progress=no_progress)
-        for each in ("structure", StructureMatcher())
-    ]
-    assert [table.findings.stage1 for table in tables] == ["rig", "rig"]

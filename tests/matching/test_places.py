@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph import Dataset, Rig
-from calibgraph.errors import DatasetError
 from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching import places
@@ -61,17 +59,6 @@ def test_unlike_clouds_are_of_other_places_if_they_show_enough(
     assert find_places(data, data.rig, name) == [[0, 1, 2, 3], [4, 5]]
 
 
-def test_another_recording_is_another_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    data, name = sample()
-    elsewhere = [
-        replace(frame, cloud_path=Path("other") / frame.cloud_path.name)
-        for frame in data.frames[3:]
-    ]
-    data = replace(data, frames=(*data.frames[:3], *elsewhere))
-    monkeypatch.setattr(places, "motions", lambda *_, **__: [None] * 5)
-    assert find_places(data, data.rig, name) == [[0, 1, 2], [3, 4, 5]]
-
-
 @pytest.mark.parametrize("axes", [("y", 180.0), ("x", 90.0), ("y", 45.0)])
 def test_the_places_do_not_depend_on_the_axes_of_the_clouds(
     axes: tuple[str, float], tmp_path: Path
@@ -90,29 +77,6 @@ def test_the_places_do_not_depend_on_the_axes_of_the_clouds(
     expected = find_places(data, data.rig, name)
     assert len(expected) == 2
     assert find_places(other, data.rig.moved_to(T), name) == expected
-
-
-def test_where_up_is_unknown_frames_are_of_one_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    data, name = sample()
-    steps = [None, driving(30.0), None, driving(9.0), driving(30.0)]
-    monkeypatch.setattr(places, "motions", lambda *_, **__: steps)
-    monkeypatch.setattr(places, "find_up", aligned_with_none)
-    assert find_places(data, data.rig, name) == [[0, 1, 2, 3, 4, 5]]
-
-
-def test_a_vehicle_that_stands_does_not_move() -> None:
-    data, name = sample()
-    standing = replace(data, frames=(data.frames[0], replace(data.frames[0], index=1)))
-    (motion,) = motions(standing, name, data.rig.cameras[name])
-    assert motion is not None
-    assert np.linalg.norm(motion[:3, 3]) < 0.02
-
-
-def test_a_frame_without_the_cameras_image_has_no_motion() -> None:
-    data, name = sample()
-    blind = replace(data.frames[1], image_paths={})
-    both = replace(data, frames=(data.frames[0], blind))
-    assert motions(both, name, data.rig.cameras[name]) == [None]
 
 
 def test_frame_by_frame_the_places_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,14 +103,6 @@ def test_frame_by_frame_the_places_are_the_same(monkeypatch: pytest.MonkeyPatch)
     assert asked.count((0, 1)) == 1 and asked.count((1, 2)) == cameras
 
 
-def test_a_frame_that_cannot_be_read_is_of_the_place_before() -> None:
-    data, _ = sample()
-    gone = {name: Path("gone.png") for name in data.frames[1].image_paths}
-    finder = PlaceFinder(data.rig)
-    frames = (data.frames[0], replace(data.frames[1], image_paths=gone))
-    assert [finder.first_of_place(frame) for frame in frames] == [frames[0].index] * 2
-
-
 @pytest.mark.parametrize(
     ("names", "places_found"),
     [
@@ -166,23 +122,6 @@ def test_a_frame_stays_after_an_unknown_motion_if_it_follows_closely(
     frames = [replace(f, name=name) for f, name in zip(data.frames, names, strict=False)]
     walk = PlaceWalk(in_sequence=True)
     assert [walk.first_of_place(frame, None) for frame in frames] == places_found
-
-
-@pytest.mark.parametrize("what", ["find_motion", "find_twist"])
-def test_a_frame_whose_motion_cannot_be_found_is_of_the_place_before(what: str) -> None:
-    """Its scan does not fit its neighbours'; frame by frame and in a batch."""
-
-    def misfit() -> Any:
-        raise DatasetError("the scans do not fit")
-
-    data, name = sample()
-    stamps = [str(10**15 + 10**5 * frame.index) for frame in data.frames[:3]]  # 0.1 s apart
-    frames = [replace(f, name=s) for f, s in zip(data.frames, stamps, strict=False)]
-    frames[1] = replace(frames[1], **{what: misfit})
-    finder = PlaceFinder(data.rig)
-    assert [finder.first_of_place(frame) for frame in frames] == [0, 0, 0]
-    found = find_places(replace(data, frames=tuple(frames)), data.rig, name)
-    assert 1 in found[0]
 
 
 # Places that were visited before
@@ -216,30 +155,12 @@ def test_who_turns_and_drives_back_is_at_the_same_places(there_and_back: list[Fr
     assert set(found[6:]) == {0, 3} and found[6] == 3 and found[-1] == 0
 
 
-def test_a_restart_finds_the_same_places(there_and_back: list[Frame]) -> None:
-    """It knows the places, and walks again since the newest of them, which begins at frame 3."""
-    found, again = walked(PlaceWalk(), there_and_back), PlaceWalk()
-    for first in (3, 0):
-        again.remember(there_and_back[first])
-    assert walked(again, there_and_back[3:]) == found[3:]
-
-
 def test_two_recordings_of_a_street_have_the_same_places(tmp_path: Path) -> None:
     once = scanned(tmp_path / "once", STOPS[:4])
     again = scanned(tmp_path / "again", STOPS[:4], first=4)
     rig = Rig(cameras={"front": make_camera()})
     data = Dataset(rig=rig, frames=(*once, *again), folders=(tmp_path,))
     assert find_places(data, rig, "front") == [[0, 1, 2, 4, 5, 6], [3, 7]]
-
-
-def test_places_that_were_not_visited_lately_are_forgotten(tmp_path: Path) -> None:
-    poses = [STOPS[stop] for stop in (0, 5, 0)]
-    frames = scanned(tmp_path, poses)
-    for most_places, expected in ((2, [0, 1, 0]), (1, [0, 1, 2])):
-        walk = PlaceWalk(most_places)
-        steps = [None, driving(45.0), driving(-45.0)]
-        found = [walk.first_of_place(*each) for each in zip(frames, steps, strict=True)]
-        assert found == expected
 
 
 def test_a_remembered_place_is_recognised(tmp_path: Path) -> None:

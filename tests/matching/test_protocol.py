@@ -91,21 +91,6 @@ def test_a_matcher_may_know_what_is_estimated_beside_the_pose() -> None:
     assert knowing.with_estimate(("focal", "offset")).rounds == 3
 
 
-def test_members_that_a_matcher_lacks_have_defaults(truth: Rig) -> None:
-    full = to_full_matcher(Minimal())  # type: ignore[arg-type]
-    assert (full.rounds, full.stage1) == (1, "pnp")
-    assert full.most_frames is None
-    assert full.tracking_rounds == ()
-    assert not full.image_checks_can_fail
-    data = calibgraph.load_dataset(SAMPLE, truth)
-    start = full.locate(data, truth, out_of_time=lambda: False, progress=no_progress)
-    assert start.rig is truth and start.first_round == 0
-    assert start.findings == MatcherFindings()
-    table = full.match(data, truth, round_index=0, progress=no_progress)
-    assert len(np.unique(table.frame)) == 6
-    full.release()  # of nothing
-
-
 def test_a_clock_without_a_motion_is_refused_before_any_work(truth: Rig) -> None:
     """Not of a matcher that knows the motion, which frames do not."""
 
@@ -123,27 +108,6 @@ def test_a_clock_without_a_motion_is_refused_before_any_work(truth: Rig) -> None
     assert matcher.calls == []
     run = match_in_rounds(data, matcher=Knowing(), config=config, progress=no_progress)
     assert {one.name for lens in run.solution.lens.values() for one in lens} == {"offset"}
-
-
-def test_a_repeated_round_names_what_is_estimated(truth: Rig) -> None:
-    class Late(Minimal):
-        knows_motion = True
-
-        def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN202
-            progress("matching", 0, 1)
-            found = simulate(dataset, truth)
-            twists = draw_twists(len(dataset.frames), np.random.default_rng(0))
-            return put_clock_error(found, truth, twists, Clock(0.1))
-
-    told: list[str] = []
-    run = match_in_rounds(
-        calibgraph.load_dataset(SAMPLE, truth),
-        matcher=Late(),
-        config=Config(estimate=("offset",)),
-        progress=lambda what, *_: told.append(what),
-    )
-    assert told[:2] == ["matching", "matching (offset: repeat 1, at most 4)"]
-    assert not run.warnings
 
 
 def test_a_clock_that_does_not_settle_is_warned_of(truth: Rig) -> None:
@@ -165,15 +129,6 @@ def test_a_clock_that_does_not_settle_is_warned_of(truth: Rig) -> None:
     )
     assert len(run.rounds) == 5
     assert run.warnings[-1].startswith("offset: after 4 repeats of the matching still changes by")
-
-
-def test_a_minimal_matcher_calibrates(truth: Rig) -> None:
-    data = calibgraph.load_dataset(SAMPLE, truth)
-    run = match_in_rounds(data, matcher=Minimal(), progress=no_progress)
-    assert len(run.rounds) == 1 and run.rematch is None
-    for error in calibgraph.evaluate(run.solution.solved_rig, truth).cameras.values():
-        assert error.rotation_error_deg < 0.1
-    assert run.solution.T_hat  # Stage 1 by PnP
 
 
 def test_every_member_is_used_in_its_turn(truth: Rig, guess: Rig) -> None:
@@ -204,13 +159,6 @@ def test_findings_of_the_start_and_of_the_last_round_are_in_the_table(
         assert found.range_rotation_deg == 7.0
 
 
-def test_a_matcher_without_rounds_is_an_error() -> None:
-    matcher = Minimal()
-    matcher.rounds = 0
-    with pytest.raises(ValueError, match="has 0 rounds, expected at least 1"):
-        to_full_matcher(matcher)  # type: ignore[arg-type]
-
-
 FINDINGS = MatcherFindings(
     z_score={"left": 17.5},
     start_dependence={"left": 0.1},
@@ -224,40 +172,6 @@ FINDINGS = MatcherFindings(
     systematic_rotation_rad=0.001,
     systematic_translation_m=0.02,
 )
-METADATA = {
-    "z_score": {"left": 17.5},
-    "start_dependence": {"left": 0.1},
-    "memorization": {"left": 0.9},
-    "failed_share": {"left": 0.25},
-    "found": {"left": 18.0},
-    "missed": {"right": 3.0},
-    "chance": {"left": 1e-5, "right": 0.7},
-    "range_rotation_deg": 20.0,
-    "range_translation_m": 1.5,
-    "systematic_rotation_rad": 0.001,
-    "systematic_translation_m": 0.02,
-}
-
-
-def test_former_keys_of_findings_are_read() -> None:
-    former = METADATA | {"contrast": METADATA["z_score"], "recall": METADATA["memorization"]}
-    del former["z_score"], former["memorization"]
-    assert MatcherFindings.from_metadata(former) == FINDINGS
-
-
-def test_a_current_key_overrides_its_former_one() -> None:
-    both = {"contrast": {"left": 1.0}, "z_score": {"left": 2.0}}
-    assert MatcherFindings.from_metadata(both).z_score == {"left": 2.0}
-
-
-def test_findings_keep_their_keys_on_disk() -> None:
-    assert FINDINGS.to_metadata() == METADATA
-    assert MatcherFindings.from_metadata(METADATA) == FINDINGS
-
-
-def test_findings_that_are_unknown_have_no_keys() -> None:
-    assert MatcherFindings().to_metadata() == {}
-    assert MatcherFindings.from_metadata({"matcher": "mine"}) == MatcherFindings()
 
 
 def test_findings_survive_a_file(truth: Rig, tmp_path: Path) -> None:
@@ -280,12 +194,3 @@ def test_findings_survive_a_file(truth: Rig, tmp_path: Path) -> None:
 def test_findings_of_another_kind_are_errors(metadata: dict[str, object], words: str) -> None:
     with pytest.raises(CorrespondenceError, match=words):
         MatcherFindings.from_metadata(metadata)
-
-
-def test_findings_that_are_empty_have_no_camera_and_an_error_names_its_camera() -> None:
-    for empty in ([], 0, None, {}):
-        assert MatcherFindings.from_metadata({"z_score": empty}).z_score == {}
-    assert MatcherFindings.from_metadata({"z_score": {3: 5}}).z_score == {"3": 5.0}
-    with pytest.raises(CorrespondenceError, match=r"z_score.left: .*found True") as caught:
-        MatcherFindings.from_metadata({"z_score": {"left": True}})
-    assert caught.value.camera == "left"

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from calibgraph import (
-    CorrespondenceError,
     Correspondences,
     Rig,
     dataset_from_arrays,
@@ -19,13 +18,11 @@ from calibgraph import (
     import_rig,
     load_correspondences,
     load_rig,
-    simulate_correspondences,
 )
-from calibgraph.errors import CalibrationError, FileError, MotionError
+from calibgraph.errors import CalibrationError, MotionError
 from calibgraph.matching.run import with_motion
 from calibgraph.model.clock import at_pixels, seen_at_rows, when_taken
 from calibgraph.simulation.rigs import rig_of
-from tests.conftest import make_pair
 
 TWISTS = np.array([[0.01, 0.02, 0.3, 8.0, 0.1, 0.0], [0.0, 0.0, -0.2, 12.0, 0.0, 0.1]])
 
@@ -86,28 +83,10 @@ def test_points_of_a_rolling_shutter_are_seen_at_their_rows() -> None:
     assert seen_at_rows(camera, points[:, None], None).shape == (3, 1, 3)
 
 
-def test_without_motion_or_times_nothing_moves() -> None:
-    late, table = rig_with(time_offset_s=0.05).cameras["image_2"], rows()
-    assert at_pixels(late, rows(None)).twist_per_s is None
-    np.testing.assert_array_equal(at_pixels(late, rows(None)).points_lidar_m, table.points_lidar_m)
-    assert at_pixels(rig_of("kitti").cameras["image_2"], table) is table
-    assert when_taken(late, None) is late
-
-
 @pytest.mark.parametrize("name", ["table.parquet", "table.csv"])
 def test_motion_is_kept_in_tables(tmp_path: Path, name: str) -> None:
     rows().save(tmp_path / name)
     np.testing.assert_array_equal(load_correspondences(tmp_path / name).twist_per_s, TWISTS)
-
-
-def test_half_a_motion_and_an_infinite_one_are_refused(tmp_path: Path) -> None:
-    rows().save(tmp_path / "table.csv")
-    text = (tmp_path / "table.csv").read_text().replace('"wz_rad_s",', "", 1)
-    (tmp_path / "table.csv").write_text(text)
-    with pytest.raises(FileError):
-        load_correspondences(tmp_path / "table.csv")
-    with pytest.raises(CalibrationError, match="twist must be finite"):
-        rows(np.full((2, 6), np.inf))
 
 
 def test_a_table_gets_the_motion_of_its_frames() -> None:
@@ -153,14 +132,3 @@ def test_evaluation_compares_times_that_both_rigs_state() -> None:
     found = evaluate(rig_with(time_offset_s=0.021, readout_s=0.03), rig_with(time_offset_s=0.02))
     assert found.time_offset_ms == pytest.approx(dict.fromkeys(found.cameras, 1.0))
     assert found.readout_ms == {}
-
-
-def test_a_motion_that_no_vehicle_has_is_refused() -> None:
-    """Translation first, as ROS has it, or degrees."""
-    table = simulate_correspondences(make_pair(), frames=1, matches=20)
-    for twist in ([15.0, 0.0, 0.0, 0.0, 0.0, 0.2], [0.0, 0.0, 11.5, 15.0, 0.0, 0.0]):
-        twists = np.tile(twist, (len(table), 1))
-        with pytest.raises(CorrespondenceError, match=r"twist must be under 6 rad/s, then under"):
-            replace(table, twist_per_s=twists)
-    fine = replace(table, twist_per_s=np.tile([0.0, 0.0, 0.5, 40.0, 0.0, 0.0], (len(table), 1)))
-    assert fine.twist_per_s is not None

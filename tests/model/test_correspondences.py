@@ -10,8 +10,6 @@ from calibgraph import (
     CorrespondenceError,
     concatenate,
 )
-from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.places import NOWHERE
 from tests.model.tables import table
 
 
@@ -77,22 +75,3 @@ def test_a_common_error_is_stated_if_all_joined_tables_state_it_as_the_largest()
         assert not concatenate([unstated, none]).findings.states_common_error
     without_rows = table().select(slice(0))
     assert concatenate([without_rows, small]).findings.systematic_sigmas == (0.002, 0.01)
-
-
-def test_a_table_holds_its_findings_and_places_and_rows_of_it_the_same() -> None:
-    stated = {"place_variance": 2.0, "places": [[0, 1]], "matcher": "mine"}
-    found = table(metadata=stated)
-    assert found.select(slice(2)).findings is found.findings
-    assert found.of_camera("left").places is found.places
-    assert (found.matcher, table().matcher) == ("mine", "")
-
-
-def test_findings_replace_what_they_state_and_leave_other_keys_of_the_file() -> None:
-    stated = {"place_variance": 2.0, "camera_share": 0.25, "places": [[0, 1]], "seed": 7}
-    found = table(metadata=stated).with_findings(MatcherFindings(place_variance=3.0))
-    assert found.metadata == {**stated, "place_variance": 3.0}
-    assert (found.findings.place_variance, found.findings.camera_share) == (3.0, 0.25)
-    assert found.places.places == ((0, 1),)
-    assert found.with_places(NOWHERE).metadata == {
-        "place_variance": 3.0, "camera_share": 0.25, "seed": 7,
-    }  # fmt: skip

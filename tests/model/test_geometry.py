@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import re
-
 import gtsam
 import numpy as np
 import pytest
 
 from calibgraph.model.geometry import (
     angle_deg,
-    camera_center,
     invert,
     invert_each,
     local_coordinates,
     point_in_lidar,
     pose_difference,
-    pose_rows,
     relative_covariance,
     relative_transform,
     retract_all,
@@ -25,7 +21,7 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
     twist_between,
 )
-from tests.conftest import ROOT, make_camera
+from tests.conftest import make_camera
 
 # A quarter turn about z and a shift: p_a = (-y, x, z) + (1, 2, 3).
 QUARTER = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
@@ -52,19 +48,6 @@ def test_a_transform_maps_from_its_second_frame_to_its_first() -> None:
     np.testing.assert_allclose(T_lidar_camera.transformTo(in_lidar), in_camera)
 
 
-def test_the_camera_center_is_the_origin_of_its_frame() -> None:
-    """p_camera = 0 means (-y, x, z) = (-1, -2, -3)."""
-    np.testing.assert_allclose(camera_center(QUARTER), [-2, 1, -3])
-    np.testing.assert_allclose((QUARTER @ [*camera_center(QUARTER), 1])[:3], 0, atol=1e-15)
-
-
-def test_the_variable_and_the_extrinsic_convert_into_each_other() -> None:
-    T = random_transform(1)
-    np.testing.assert_allclose(to_T_camera_lidar(to_T_lidar_camera(T)), T, atol=1e-15)
-    np.testing.assert_allclose(T @ to_T_lidar_camera(T).matrix(), np.eye(4), atol=1e-15)
-    np.testing.assert_allclose(T @ invert(T), np.eye(4), atol=1e-15)
-
-
 def test_a_relative_transform_maps_from_the_second_camera_to_the_first() -> None:
     T_a_lidar, T_b_lidar = random_transform(1), random_transform(2)
     point = np.array([0.3, -0.2, 5.0, 1.0])
@@ -87,15 +70,6 @@ def test_angles_and_distances_of_extrinsics_are_those_of_the_cameras() -> None:
     assert degrees == pytest.approx(0.0, abs=1e-12)
     assert centimetres == pytest.approx(5.0)
     assert angle_deg(QUARTER[:3, :3]) == pytest.approx(90.0)
-
-
-def test_rows_of_a_camera_are_six() -> None:
-    joint = np.arange(18)
-    assert [joint[pose_rows(camera)].tolist() for camera in range(3)] == [
-        [*range(0, 6)],
-        [*range(6, 12)],
-        [*range(12, 18)],
-    ]
 
 
 def test_the_covariance_of_a_pair_follows_from_finite_differences() -> None:
@@ -167,15 +141,3 @@ def test_the_covariance_of_ros_is_that_of_the_moved_pose() -> None:
     expected = jacobian @ covariance @ jacobian.T
     # Central differences: rounding 1e-16 / 1e-6, of values up to about 10.
     np.testing.assert_allclose(ros_pose_covariance(covariance, T), expected, atol=1e-7)
-
-
-def test_poses_are_inverted_in_one_file_of_the_package() -> None:
-    """A second inversion is how signs and directions get lost; ``factors`` has its own."""
-    files = [*(ROOT / "calibgraph").rglob("*.py"), *(ROOT / "factors").rglob("*.py")]
-    inverting = {
-        path.relative_to(ROOT).as_posix()
-        for path in files
-        if re.search(r"\.inverse\(\)|linalg\.inv\(\w*T_", path.read_text("utf-8"))
-    }
-    allowed = {f"factors/{name}.py" for name in ("block", "free_lens", "pose")}
-    assert inverting == {"calibgraph/model/geometry.py"} | allowed

@@ -36,11 +36,3 @@ def test_rigs_are_compared_by_their_lenses_in_the_corners() -> None:
     assert apart.keys() == {"a", "lost"}
     assert apart["a"] == pytest.approx(0.01 * np.hypot(619.5, 187.5))
     assert apart["lost"] == np.inf
-
-
-def test_lenses_of_images_that_differ_in_size_are_not_compared() -> None:
-    camera = camera_of("pinhole")
-    half = camera.model_copy(update={"width_px": WIDTH // 2})
-    found = evaluate(Rig(cameras={"a": camera}), Rig(cameras={"a": half}))
-    assert np.isnan(found.lens_px["a"])
-    assert found.to_mapping()["lens_px"] == {"a": None}

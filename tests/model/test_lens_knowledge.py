@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from calibgraph import Config, Rig, solve
+from calibgraph import Rig
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.lens_knowledge import (
     IN_DOUBT,
     LensSigmas,
-    describe_unstated,
     state_calibrated,
 )
 from tests.conftest import make_pair
-from tests.trust.conftest import simulated
 
 
 def test_a_calibrated_lens_is_known_to_a_500th_of_its_focal_length() -> None:
@@ -39,15 +37,3 @@ def test_a_lens_without_a_word_has_the_priors_of_a_stated_calibration() -> None:
         for each in (camera, stated)
     )
     assert with_sigmas == pytest.approx(without, rel=0.01)  # written to 0.01 px
-
-
-def test_a_result_says_whose_lens_counts_as_calibrated() -> None:
-    rig = make_pair()
-    plain = solve(rig, simulated(rig))
-    assert plain.unstated_lenses == (
-        "lens of left, right: counts as calibrated (the rig states no intrinsics_sigma_px)"
-    )
-    stated = state_calibrated(rig)
-    assert solve(stated, simulated(rig)).unstated_lenses == describe_unstated(stated) == ""
-    free = solve(rig, simulated(rig), Config(estimate=("focal",)))
-    assert free.unstated_lenses == ""

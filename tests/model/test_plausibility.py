@@ -70,15 +70,6 @@ def test_a_value_that_cannot_be_right_is_named_once_with_its_numbers(
     assert expected in line
 
 
-def test_a_fold_is_said_to_cover_the_share_that_it_covers() -> None:
-    """By hand: r (1 - r^2 / 2) is largest at r = sqrt(2 / 3), and is 2 / 3 of that there."""
-    radius_px = 480 * np.sqrt(2 / 3) * 2 / 3
-    rows, columns = np.mgrid[:360, :640]
-    share = np.mean(np.hypot(columns - 320, rows - 180) < radius_px)
-    (line,) = lines(distortion=(-0.5, 0, 0, 0))
-    assert f"covers {share:.0%} of" in line
-
-
 @pytest.mark.parametrize(
     "usual",
     [

@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 
 from calibgraph import (
-    Camera,
     FileError,
-    RelativePose,
     Rig,
-    RigError,
     load_rig,
 )
 from calibgraph.model.rig import rigid_transform
@@ -94,13 +91,6 @@ def test_a_bad_rig_file_is_refused_in_one_line(case: str, pair: Rig, tmp_path: P
     assert "\n" not in str(caught.value)
 
 
-def test_a_rig_file_without_a_format_is_refused(pair: Rig, tmp_path: Path) -> None:
-    path = written(pair, tmp_path)
-    path.write_text(path.read_text().replace("format: calibgraph-rig/1\n", ""))
-    with pytest.raises(FileError, match="add the line `format: calibgraph-rig/1`"):
-        load_rig(path)
-
-
 def test_merge_keys_may_share_a_lens(pair: Rig, tmp_path: Path) -> None:
     T = pair.T_camera_lidar["left"].tolist()
     path = tmp_path / "rig.yaml"
@@ -134,29 +124,11 @@ def test_camera_names_that_are_no_file_names_are_refused(name: str, pair: Rig) -
         Rig(cameras={name: pair.cameras["left"]})
 
 
-@pytest.mark.parametrize("name", UNSEEN)
-def test_frames_whose_name_cannot_be_seen_are_refused(name: str, pair: Rig) -> None:
-    camera = pair.cameras["left"].model_dump()
-    with pytest.raises(ValueError, match="frame_id"):
-        Camera.model_validate(camera | {"frame_id": name})
-
-
 def test_a_relative_pose_must_name_two_cameras(pair: Rig) -> None:
     relative = stereo_relative_pose(pair)
     for change, message in [({"b": "rear"}, "names camera 'rear'"), ({"b": "left"}, "itself")]:
         with pytest.raises(ValueError, match=message):
             Rig(cameras=pair.cameras, relative_poses=(relative.model_copy(update=change),))
-
-
-def test_a_relative_pose_is_not_known_to_less_than_10_micrometres(pair: Rig) -> None:
-    known = stereo_relative_pose(pair).model_dump()
-    with pytest.raises(ValueError, match="translation_sigma_m"):
-        RelativePose(**{**known, "translation_sigma_m": 1e-6})
-
-
-def test_a_pose_for_an_unknown_camera_is_refused(pair: Rig) -> None:
-    with pytest.raises(RigError, match="'rear' is not in the rig"):
-        pair.moved_to({"rear": np.eye(4)})
 
 
 def test_rounded_digits_are_made_a_rotation_again() -> None:
@@ -165,11 +137,3 @@ def test_rounded_digits_are_made_a_rotation_again() -> None:
     T[0, 0] += 4e-5
     R = rigid_transform(T)[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
-
-
-def test_a_changed_lens_is_not_the_old_one(pair: Rig) -> None:
-    camera = pair.cameras["left"]
-    other = camera.model_copy(update={"distortion": (-0.3, 0.1, 0.0, 0.0)})
-    point = np.array([[1.0, 0.5, 4.0]])
-    assert np.abs(other.lens.project(point)[0] - camera.lens.project(point)[0]).max() > 1
-    assert camera.moved_to(np.eye(4)).lens is camera.lens

@@ -6,11 +6,6 @@ import pytest
 from calibgraph import Check, Verdict
 from calibgraph.model.threshold import Direction, Threshold, beside, in_unit
 from calibgraph.model.verdict import (
-    ABOUT_THE_DATA,
-    COMMON_ERROR,
-    IMAGES_ELSEWHERE,
-    START,
-    WENT_ON,
     ErrorProbability,
     rig_verdict,
 )
@@ -86,33 +81,3 @@ def test_a_wide_error_bar_and_few_frames_cannot_tell() -> None:
         Verdict((FEW_FRAMES,)),
     ):
         assert (verdict.status, verdict.cannot_tell) == ("WARN", True)
-
-
-def test_what_looks_odd_right_or_wrong_is_no_lack_of_data() -> None:
-    for verdict, status in (
-        (Verdict((ODD,), ErrorProbability(0.05)), "WARN"),
-        (Verdict((FEW_FRAMES, ODD), ErrorProbability(0.05, 0.01)), "WARN"),
-        (Verdict((FEW_FRAMES, ODD)), "WARN"),
-        (Verdict((), ErrorProbability(0.05)), "WARN"),
-        (Verdict((), ErrorProbability(0.001)), "PASS"),
-        (Verdict((), ErrorProbability(0.5, 0.6)), "FAIL"),
-    ):
-        assert (verdict.status, verdict.cannot_tell) == (status, False)
-        assert not any("cannot tell" in reason for reason in verdict.reasons)
-
-
-def test_a_rig_cannot_tell_if_none_of_its_cameras_looks_odd() -> None:
-    unsure, odd = Verdict((), ErrorProbability(0.001, 0.3)), Verdict((ODD,), ErrorProbability(0.01))
-    good, wrong = Verdict((), ErrorProbability(0.001)), Verdict((), ErrorProbability(0.9))
-    assert rig_verdict({"a": unsure, "b": good}).cannot_tell
-    for other in (odd, wrong):
-        assert not rig_verdict({"a": unsure, "b": other}).cannot_tell
-
-
-def test_kinds_of_checks_of_the_data_are_those_of_the_table_or_have_no_number() -> None:
-    without_a_row = {"copies", "correspondences", "image evidence", "terms", COMMON_ERROR, WENT_ON}
-    without_a_row |= {IMAGES_ELSEWHERE, START}
-    names = {"difference between even and odd frames"}
-    assert threshold("halves_rotation").name in names
-    for key in ABOUT_THE_DATA - without_a_row - names:
-        assert threshold(key).key == key

@@ -8,12 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import calibgraph
 from calibgraph import Calibration
-from calibgraph.model.verdict import Status
-from calibgraph.report import point_overlay
-from calibgraph.report.point_overlay import Image
-from tests.conftest import SAMPLE, CommandRun
+from tests.conftest import CommandRun
 from tests.report.conftest import read_page, write_page
 
 pytestmark = pytest.mark.usefixtures("blank_diagrams")
@@ -57,21 +53,3 @@ def test_a_guess_that_projects_no_point_is_drawn(
     # With several rounds, the last began near the result, so that there are matches to draw.
     turned = replace(sample_result, initial_rig=guess, rounds=2 * sample_result.rounds)
     assert write_page(turned, tmp_path).count("data:image/jpeg") == 3 * 4 + 1
-
-
-def test_the_heading_of_an_overlay_is_its_own_cameras_verdict(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    headings: list[str] = []
-
-    def titled(image: Image, title: str) -> Image:
-        headings.append(title)
-        return image
-
-    monkeypatch.setattr(point_overlay, "_titled", titled)
-    data = calibgraph.load_dataset(SAMPLE)
-    verdicts: dict[str, Status] = {"front_left": "FAIL", "front_right": "PASS", "left": "WARN"}
-    point_overlay.write_overlays(data.frames[0], data.rig, data.rig, tmp_path, verdicts=verdicts)
-    assert headings[1::2] == [
-        "front_left, after: FAIL, do not use", "front_right, after: PASS", "left, after: WARN"
-    ]  # fmt: skip

@@ -49,7 +49,7 @@ def make_server(tmp_path: Path) -> Iterator[Make]:
     with ExitStack() as stack:
 
         def make(name: str = "data", **changes: Any) -> TestClient:
-            none = {"jobs_at_once": 0, "tracker_processes": 0, "free_bytes": 0}
+            none = {"jobs_at_once": 0, "tracker_processes": 1, "free_bytes": 0}
             app = create_app(Settings(data=tmp_path / name, **(none | changes)))
             client = TestClient(app, URL, raise_server_exceptions=False, follow_redirects=False)
             return stack.enter_context(client)
@@ -69,7 +69,7 @@ def working(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
 @pytest.fixture(scope="session")
 def solved(working: TestClient, small: Problem) -> str:
     """Id of a job with a result, of the server ``working``."""
-    id: str = working.post("/v1/solves", files=small.files).json()["id"]
+    id: str = working.post("/v1/jobs/solve", files=small.files).json()["id"]
     assert working.get(f"/v1/jobs/{id}", params={"wait_s": 60}).json()["state"] == "succeeded"
     return id
 
@@ -78,9 +78,9 @@ def bearer(token: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {token}"}
 
 
-def make_tokens(path: Path, *tokens: tuple[str, Scope]) -> list[dict[str, str]]:
-    """Headers with new tokens of tenants."""
-    return [bearer(add_token(path, tenant, scope)) for tenant, scope in tokens]
+def make_tokens(path: Path, *scopes: Scope) -> list[dict[str, str]]:
+    """Headers with new tokens."""
+    return [bearer(add_token(path, scope)) for scope in scopes]
 
 
 def service_folder(client: TestClient) -> Path:

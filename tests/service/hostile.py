@@ -70,7 +70,7 @@ def _rigs(rig: bytes) -> Iterator[Hostile]:
         "unknown key": rig + b"evil: 1\n",
     }
     for name, content in contents.items():
-        yield Hostile(f"rig: {name}", "solves", {"rig": content})
+        yield Hostile(f"rig: {name}", "solve", {"rig": content})
 
 
 def _tables() -> Iterator[Hostile]:
@@ -102,7 +102,7 @@ def _tables() -> Iterator[Hostile]:
         "empty": b"",
     }
     for name, content in contents.items():
-        yield Hostile(f"table: {name}", "solves", {"correspondences": content})
+        yield Hostile(f"table: {name}", "solve", {"correspondences": content})
 
 
 def _settings() -> Iterator[Hostile]:
@@ -115,16 +115,16 @@ def _settings() -> Iterator[Hostile]:
         "megabytes": " " * 1_100_000,
     }
     for name, content in contents.items():
-        yield Hostile(f"settings: {name}", "solves", fields={"settings": content})
+        yield Hostile(f"settings: {name}", "solve", fields={"settings": content})
 
 
 def _names() -> Iterator[Hostile]:
     for name in ("../../evil.yaml", "/etc/passwd", "C:\\x", "a\x00b", "x" * 3000, "; rm -rf *"):
-        yield Hostile(f"name: {name[:20]!r}", "solves", names={"rig": name}, is_harmless=True)
-    yield Hostile("field: ../rig", "solves", {"../rig": b"x"})
-    yield Hostile("field: rig/../../x", "solves", fields={"rig/../../x": "x"})
-    yield Hostile("URI: file:///etc/passwd", "checks", fields={"recording": "file:///etc/passwd"})
-    yield Hostile("URI: of a chain", "checks", fields={"recording": "simplecache::file:///etc"})
+        yield Hostile(f"name: {name[:20]!r}", "solve", names={"rig": name}, is_harmless=True)
+    yield Hostile("field: ../rig", "solve", {"../rig": b"x"})
+    yield Hostile("field: rig/../../x", "solve", fields={"rig/../../x": "x"})
+    yield Hostile("URI: file:///etc/passwd", "check", fields={"recording": "file:///etc/passwd"})
+    yield Hostile("URI: of a chain", "check", fields={"recording": "simplecache::file:///etc"})
 
 
 def _archives() -> Iterator[Hostile]:
@@ -159,7 +159,7 @@ def _archives() -> Iterator[Hostile]:
         "empty": zipped({}),
     }
     for name, content in contents.items():
-        yield Hostile(f"archive: {name}", "calibrations", {"recording": content})
+        yield Hostile(f"archive: {name}", "calibrate", {"recording": content})
 
 
 def _recordings() -> Iterator[Hostile]:
@@ -182,7 +182,7 @@ def _recordings() -> Iterator[Hostile]:
         "rig bomb": {**good, "rig.yaml": b"a: " + b"[" * 40_000},
     }
     for name, files in changes.items():
-        yield Hostile(f"recording: {name}", "calibrations", {"recording": zipped(files)})
+        yield Hostile(f"recording: {name}", "calibrate", {"recording": zipped(files)})
     bags = {
         "ROS 1 mark alone": b"#ROSBAG V2.0\n",
         "ROS 1 with a huge record": b"#ROSBAG V2.0\n" + struct.pack("<I", 2**31 - 1) + bytes(50),
@@ -193,7 +193,7 @@ def _recordings() -> Iterator[Hostile]:
         "nothing": b"",
     }
     for name, content in bags.items():
-        yield Hostile(f"bag: {name}", "calibrations", {"recording": content})
+        yield Hostile(f"bag: {name}", "calibrate", {"recording": content})
 
 
 def _dataset() -> dict[str, bytes]:
@@ -242,13 +242,13 @@ def _png_bomb() -> bytes:
 def as_form(upload: Hostile, rig: bytes, table: bytes) -> tuple[list, dict[str, str]]:  # type: ignore[type-arg]
     """The files and the fields of a form, the good parts with the hostile ones."""
     good: dict[str, bytes] = {}
-    if upload.kind == "solves":
+    if upload.kind == "solve":
         good = {"rig": rig, "correspondences": table}
-    if upload.kind == "checks":
+    if upload.kind == "check":
         good = {"rig": rig}
     files = {**good, **upload.files}
     parts = [(name, (upload.names.get(name, name), content)) for name, content in files.items()]
     fields = dict(upload.fields)
-    if upload.kind == "solves" and "settings" not in fields:
+    if upload.kind == "solve" and "settings" not in fields:
         fields["settings"] = json.dumps({"report": False})
     return parts, fields

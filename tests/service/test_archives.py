@@ -21,9 +21,9 @@ def files_of_the_sample(top: str = "") -> dict[str, bytes]:
 
 
 def unpacked(folder: Path, files: dict[str, bytes]) -> Path:
-    upload = folder / "recording"
+    upload = folder / "upload"
     upload.write_bytes(zipped(files))
-    return open_upload(upload, 10**9)
+    return open_upload(upload, folder / "recording", 10**9)
 
 
 @pytest.mark.parametrize("top", ["", "sample/", "data/sample/", "My drive (1)/"])

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import errno
-import socket
 import time
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
 from calibgraph.errors import CalibrationError
-from calibgraph.service import submission
 from calibgraph.service.app import create_app
-from calibgraph.service.database import DATABASE
+from calibgraph.service.data_folder import DataFolder
+from calibgraph.service.jobs import DATABASE
 from calibgraph.service.settings import Settings
 from tests.service.conftest import URL, Make, Problem, service_folder
-from tests.service.ports import on_a_port
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
@@ -32,19 +29,18 @@ def test_a_full_disk_acknowledges_nothing(
         raise OSError(number, "no space left")
 
     with monkeypatch.context() as patch:
-        patch.setattr(submission, "sync_tree", full)
-        answer = client.post("/v1/solves", files=small.files)
+        patch.setattr(DataFolder, "keep", full)
+        answer = client.post("/v1/jobs/solve", files=small.files)
     assert answer.status_code == 507
     assert client.get("/v1/jobs").json()["jobs"] == []
     assert not list((service_folder(client) / "arriving").iterdir())
-    assert client.post("/v1/solves", files=small.files).status_code == 202
+    assert client.post("/v1/jobs/solve", files=small.files).status_code == 202
 
 
 def test_an_almost_full_disk_takes_nothing_in(make_server: Make, small: Problem) -> None:
     client = make_server(free_bytes=10**18)
-    assert client.post("/v1/solves", files=small.files).status_code == 507
-    assert client.get("/readyz").status_code == 507
-    assert client.get("/healthz").status_code == 200
+    assert client.post("/v1/jobs/solve", files=small.files).status_code == 507
+    assert client.get("/healthz").status_code == 507
 
 
 def test_a_database_that_cannot_be_read_at_the_start_is_named(tmp_path: Path) -> None:
@@ -60,7 +56,7 @@ def test_a_database_that_fails_later_is_503_and_heals(
     make_server: Make, small: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client = make_server()
-    id = client.post("/v1/solves", files=small.files).json()["id"]
+    id = client.post("/v1/jobs/solve", files=small.files).json()["id"]
     app: Any = client.app
 
     def broken(*_: object, **__: object) -> Any:
@@ -71,8 +67,8 @@ def test_a_database_that_fails_later_is_503_and_heals(
         patch.setattr(app.state.service.engine, "begin", broken)
         statuses = {
             client.get(f"/v1/jobs/{id}").status_code,
-            client.post("/v1/solves", files=small.files).status_code,
-            client.get("/readyz").status_code,
+            client.post("/v1/jobs/solve", files=small.files).status_code,
+            client.get("/healthz").status_code,
         }
     assert statuses == {503}
     assert client.get(f"/v1/jobs/{id}").json()["state"] == "queued"
@@ -83,38 +79,22 @@ def test_a_clock_that_jumps_loses_no_waiting_job(
     make_server: Make, small: Problem, monkeypatch: pytest.MonkeyPatch, jump_s: float
 ) -> None:
     client = make_server(keep_s=86400.0)
-    id = client.post("/v1/solves", files=small.files).json()["id"]
+    id = client.post("/v1/jobs/solve", files=small.files).json()["id"]
     app: Any = client.app
     jumped = time.time() + jump_s
     monkeypatch.setattr(time, "time", lambda: jumped)
-    later = client.post("/v1/solves", files=small.files).json()["id"]
+    later = client.post("/v1/jobs/solve", files=small.files).json()["id"]
     app.state.service.runner.remove_expired()
     assert [job["id"] for job in client.get("/v1/jobs").json()["jobs"]] == [later, id]
     assert app.state.service.jobs.start_next().id == id  # the order is that of submission
 
 
-def test_a_client_that_goes_half_way_leaves_nothing(tmp_path: Path) -> None:
-    settings = Settings(data=tmp_path / "data", jobs_at_once=0, free_bytes=0)
-    with on_a_port(settings) as (host, port, app):
-        with socket.create_connection((host, port)) as connection:
-            connection.sendall(
-                b"POST /v1/solves HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100000\r\n"
-                b"Content-Type: multipart/form-data; boundary=b\r\n\r\n--b\r\n"
-                b'Content-Disposition: form-data; name="rig"; filename="r"\r\n\r\nformat'
-            )
-            time.sleep(0.2)
-        folder = app.state.service.folder
-        end = time.monotonic() + 10
-        while list(folder.arriving.iterdir()) and time.monotonic() < end:
-            time.sleep(0.02)
-        assert not list(folder.arriving.iterdir())
-        assert httpx.get(f"http://{host}:{port}/v1/jobs").json()["jobs"] == []
-
-
 def test_a_job_whose_process_is_killed_is_run_again(working: TestClient, small: Problem) -> None:
     app: Any = working.app
     app.state.service.runner._slots[0].child.kill()
-    answer = working.post("/v1/solves", files=small.files, data={"settings": '{"report": false}'})
+    answer = working.post(
+        "/v1/jobs/solve", files=small.files, data={"settings": '{"report": false}'}
+    )
     at = answer.headers["location"]
     assert working.get(at, params={"wait_s": 60}).json()["state"] == "succeeded"
 

@@ -71,16 +71,9 @@ def postgres(tmp_path: Path) -> Iterator[Postgres]:
     server.stop()
 
 
-def test_jobs_and_trackers_are_kept_by_postgresql(
-    postgres: Postgres, make_server: Make, small: Problem
-) -> None:
+def test_jobs_are_kept_by_postgresql(postgres: Postgres, make_server: Make, small: Problem) -> None:
     client = make_server(database=postgres.url, jobs_at_once=1)
-    key = {"Idempotency-Key": "one"}
-    answers = [client.post("/v1/solves", files=small.files, headers=key) for _ in range(2)]
-    assert [answer.status_code for answer in answers] == [202, 202]
-    ids = {answer.json()["id"] for answer in answers}
-    assert len(ids) == 1
-    id = ids.pop()
+    id = client.post("/v1/jobs/solve", files=small.files).json()["id"]
     job = client.get(f"/v1/jobs/{id}", params={"wait_s": 60}).json()
     assert (job["state"], job["verdict"]) == ("succeeded", "PASS")
     assert client.get(f"/v1/jobs/{id}/result").json()["verdict"] == "PASS"
@@ -92,22 +85,22 @@ def test_a_database_that_is_away_for_a_while_loses_nothing(
     postgres: Postgres, make_server: Make, small: Problem
 ) -> None:
     client = make_server(database=postgres.url)
-    first = client.post("/v1/solves", files=small.files).json()["id"]
+    first = client.post("/v1/jobs/solve", files=small.files).json()["id"]
     postgres.stop()  # as a crash does
-    assert client.post("/v1/solves", files=small.files).status_code == 503
+    assert client.post("/v1/jobs/solve", files=small.files).status_code == 503
     assert client.get(f"/v1/jobs/{first}").status_code == 503
-    assert client.get("/readyz").status_code == 503
+    assert client.get("/healthz").status_code == 503
     postgres.start()
     assert client.get(f"/v1/jobs/{first}").json()["state"] == "queued"
-    assert client.post("/v1/solves", files=small.files).status_code == 202
-    assert client.get("/readyz").status_code == 200
+    assert client.post("/v1/jobs/solve", files=small.files).status_code == 202
+    assert client.get("/healthz").status_code == 200
 
 
 def test_a_job_that_a_server_left_running_waits_again(
     postgres: Postgres, make_server: Make, small: Problem
 ) -> None:
     client = make_server(database=postgres.url)
-    id = client.post("/v1/solves", files=small.files).json()["id"]
+    id = client.post("/v1/jobs/solve", files=small.files).json()["id"]
     table: JobTable = client.app.state.service.jobs  # type: ignore[attr-defined]
     started = table.start_next()
     assert started is not None

@@ -1,68 +1,109 @@
-"""Trackers over HTTP: frames once, on disk when acknowledged, state over restarts."""
+"""Trackers over HTTP: frames once, as `track` prints them, on disk when acknowledged."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
+import pytest
 import yaml
 from starlette.testclient import TestClient
 
-from tests.service.conftest import Make, Problem, frames_as_lines
+from calibgraph import perturb
+from tests.service.conftest import Problem, frames_as_lines, service_folder
+from tests.tracking.drives import as_lines, drive, expected_lines, pair_of
 
-LINES = {"Content-Type": "application/x-ndjson"}
 
-
-def begin(client: TestClient, small: Problem) -> str:
-    answer = client.post("/v1/trackers", json={"rig": yaml.safe_load(small.rig), "name": "car-1"})
-    assert answer.status_code == 201, answer.text
-    return str(answer.headers["location"])
+@pytest.fixture
+def at(working: TestClient, small: Problem) -> Iterator[str]:
+    """A tracker of the small problem's rig."""
+    answer = working.put("/v1/trackers/car-1", content=small.rig)
+    assert answer.status_code == 200, answer.text
+    yield "/v1/trackers/car-1"
+    working.delete("/v1/trackers/car-1")
 
 
 def send(client: TestClient, at: str, *lines: bytes) -> Any:
-    return client.post(f"{at}/frames", content=b"".join(lines), headers=LINES).json()
+    return client.post(at, content=b"".join(lines)).json()
 
 
-def test_frames_are_taken_in_once(working: TestClient, small: Problem) -> None:
-    at, lines = begin(working, small), frames_as_lines(small.table)
+def test_frames_are_taken_in_once(working: TestClient, small: Problem, at: str) -> None:
+    lines = frames_as_lines(small.table)
     first = send(working, at, *lines[:2])
     assert [update["frame"] for update in first["updates"]] == [0, 1]
     again = send(working, at, *lines[:3])
     assert (again["known"], [update["frame"] for update in again["updates"]]) == (2, [2])
 
 
-def test_what_cannot_be_read_is_refused_in_words(working: TestClient, small: Problem) -> None:
-    answer = send(working, begin(working, small), b'{"frame": 1, "cameras": {"nobody": {}}}\n')
+def test_updates_are_those_of_the_command(working: TestClient) -> None:
+    import json
+
+    guess, tables = perturb(pair_of(), rotation_deg=1, translation_m=0.1, seed=1), drive(pair_of())
+    rig = yaml.safe_dump(guess.model_dump(mode="json")).encode()
+    assert working.put("/v1/trackers/other", content=rig).status_code == 200
+    found = send(working, "/v1/trackers/other", as_lines(tables))["updates"]
+    assert found == [json.loads(line) for line in expected_lines(guess, tables, together=10)]
+    assert working.delete("/v1/trackers/other").status_code == 200
+
+
+def test_what_cannot_be_read_is_refused_in_words(working: TestClient, at: str) -> None:
+    answer = send(working, at, b'{"frame": 1, "cameras": {"nobody": {}}}\n')
     assert answer["updates"] == []
     assert "nobody" in answer["refused"][0]
 
 
-def test_a_state_survives_its_process(working: TestClient, small: Problem) -> None:
-    at, lines = begin(working, small), frames_as_lines(small.table)
-    send(working, at, *lines[:4])
-    before = working.get(f"{at}/state").json()
+def test_a_request_with_a_motion_of_no_vehicle_is_refused_whole(
+    working: TestClient, small: Problem, at: str
+) -> None:
+    lines = [line.rstrip() for line in frames_as_lines(small.table)[:3]]
+    with_motion = [
+        line[:-1] + b', "twist_per_s": [%d, 0.0, 0.0, 0.0, 0.0, 0.1]}\n' % ahead
+        for line, ahead in zip(lines, (1, 8, 9), strict=True)
+    ]
+    answer = working.post(at, content=b"".join(with_motion))
+    assert answer.status_code == 422
+    assert answer.json()["detail"].endswith("; none of these frames was taken in")
+    assert len(send(working, at, *(line + b"\n" for line in lines))["updates"]) == 3
+
+
+def test_a_state_survives_its_process(working: TestClient, small: Problem, at: str) -> None:
+    send(working, at, *frames_as_lines(small.table)[:4])
+    before = working.get(at).json()
     app: Any = working.app
-    for host in app.state.service.trackers._hosts:
-        host._child.kill()
-    working.get(f"{at}/state")  # it may meet the end of the process
-    assert working.get(f"{at}/state").json() == before
+    for child, _ in app.state.service.trackers._hosts:
+        child.kill()
+    working.get(at)  # it may meet the end of the process
+    assert working.get(at).json() == before
     assert before["frame"] == 3
 
 
-def test_a_drift_is_drawn_and_shown(working: TestClient, small: Problem) -> None:
-    at, lines = begin(working, small), frames_as_lines(small.table)
-    send(working, at, *lines[:4])
-    assert working.get(f"{at}/drift.png").content.startswith(b"\x89PNG")
-    page = working.get(at.removeprefix("/v1")).text
-    assert f"{at}/drift.png" in page
-    assert "car-1" in page
+@pytest.mark.parametrize(
+    ("rig", "config", "detail"),
+    [
+        (b"cameras: 7", "{}", "rig.yaml"),
+        (b"\xff\xfe", "{}", "rig.yaml"),
+        (None, '{"evil": 1}', "evil"),
+        (None, "{", "Expecting"),
+        (None, '{"estimate": ["focal_length"]}', ""),
+    ],
+)
+def test_a_tracker_that_cannot_be_made_leaves_nothing(
+    working: TestClient, small: Problem, rig: bytes | None, config: str, detail: str
+) -> None:
+    at = "/v1/trackers/broken"
+    answer = working.put(at, content=rig or small.rig, params={"config": config})
+    assert answer.status_code == 422 and detail in answer.json()["detail"], answer.text
+    assert str(service_folder(working)) not in answer.text
+    assert working.get(at).status_code == 404
+    assert not (service_folder(working) / "trackers" / "broken").exists()
 
 
-def test_a_removed_tracker_is_gone(working: TestClient, small: Problem) -> None:
-    at = begin(working, small)
-    assert working.delete(at).status_code == 204
-    assert working.get(f"{at}/state").status_code == 404
+def test_names_of_trackers_are_no_paths(working: TestClient, small: Problem) -> None:
+    for name in ("..%2Fcar", "%2e%2e", ".hidden", "a%00b", "x" * 65, "a%0ab"):
+        assert working.put(f"/v1/trackers/{name}", content=small.rig).status_code in (404, 405, 422)
 
 
-def test_a_server_without_trackers_refuses(make_server: Make, small: Problem) -> None:
-    answer = make_server().post("/v1/trackers", json={"rig": yaml.safe_load(small.rig)})
-    assert answer.status_code == 503
+def test_a_tracker_is_made_once_and_removed(working: TestClient, small: Problem, at: str) -> None:
+    assert working.put(at, content=small.rig).status_code == 409
+    assert working.delete(at).status_code == 200
+    assert working.get(at).status_code == working.delete(at).status_code == 404

@@ -7,10 +7,9 @@ import pytest
 
 import calibgraph
 from calibgraph import Correspondences, MatcherErrors, Rig, simulate_correspondences
-from calibgraph.simulation.matcher_errors import PoseSpread
+from calibgraph.simulation.correspondences import PoseSpread
 from calibgraph.simulation.rigs import RIG_NAMES, rig_of
 from calibgraph.solver.joint import solve_joint
-from tests.draws.drives import simulate_drive
 
 
 def residuals(rig: Rig, table: Correspondences, name: str) -> np.ndarray:
@@ -66,17 +65,6 @@ def test_stuck_frames_have_the_matches_of_a_displaced_pose() -> None:
     assert 0.36 < moved.mean() < 0.64  # 4 sigma of 200 frames
 
 
-def test_confidences_fall_with_the_noise_if_informative() -> None:
-    rig = rig_of("kitti")
-    for informative in (True, False):
-        errors = MatcherErrors(noise_spread=1.0, informative_confidence=informative)
-        table = simulate_correspondences(rig, frames=5, matches=1000, errors=errors, depth_m=None)
-        sizes = np.hypot(*residuals(rig, table, "image_2").T)
-        confidence = table.of_camera("image_2").confidence
-        correlation = np.corrcoef(np.log(sizes), confidence)[0, 1]
-        assert correlation < -0.2 if informative else abs(correlation) < 0.06  # 4 sigma of 5000
-
-
 def test_a_guess_of_the_same_seed_is_independent_of_the_matchers_errors(pair: Rig) -> None:
     """One number seeds both, and generators of [seed, 0] and of seed are the same."""
     pose = PoseSpread((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
@@ -91,14 +79,3 @@ def test_a_guess_of_the_same_seed_is_independent_of_the_matchers_errors(pair: Ri
             b = guess.T_camera_lidar[name][:3, 3] - T[:3, 3]
             alike.append(abs(a @ b) / np.linalg.norm(a) / np.linalg.norm(b))
     assert np.mean(alike) < 0.8  # 0.5 +- 0.07 of independent directions, 1 of equal ones
-
-
-def test_a_drives_bias_is_one_per_camera(pair: Rig) -> None:
-    errors = MatcherErrors(noise_px=0.0, bias_px=3.0)
-    tables = list(simulate_drive(lambda frame: pair, frames=4, matches=300, errors=errors, seed=5))
-
-    found = np.array(
-        [[residuals(pair, table, name).mean(axis=0) for table in tables] for name in pair.cameras]
-    )
-    assert np.ptp(found, axis=1).max() < 1.0  # 3 px of scatter over the image, 300 places
-    assert np.abs(found[0].mean(axis=0) - found[1].mean(axis=0)).max() > 1.0

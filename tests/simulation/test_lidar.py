@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from calibgraph.simulation.lidar import (
     lidar_of,
     return_chance,
-    ring_gains,
     scan,
     shot_directions,
 )
@@ -55,27 +52,6 @@ def test_range_noise_and_dropouts_are_as_configured(drive: Drive) -> None:
     chance = np.where(within, return_chance(SCAN, albedo[:, 3] * incidence, truth), 0.0)
     # Noise moves shots across the limits of the range, and changes the chance by 1e-3 or so.
     assert abs(n - chance.sum()) < 4 * np.sqrt((chance * (1 - chance)).sum()) + 1e-3 * n
-
-
-def test_far_dark_and_slanted_surfaces_return_less() -> None:
-    lidar = lidar_of(64)
-    near, far = return_chance(lidar, np.array([0.1, 0.1]), np.array([10.0, 80.0]))
-    bright, dark = return_chance(lidar, np.array([0.8, 0.02]), np.array([60.0, 60.0]))
-    assert near == pytest.approx(1 - lidar.dropout, abs=1e-6)
-    assert far < 0.95 < bright
-    assert dark < 0.7
-
-
-def test_rings_keep_their_gains(drive: Drive) -> None:
-    gains = ring_gains(SCAN, np.random.default_rng(2))
-    plain = replace(SCAN, range_noise_m=0.0, intensity_noise=0.0)
-    T = drive.T_world_lidar[0]
-    alike, ringed = (scan(drive.world, plain, g, T, rng=np.random.default_rng(0))
-                     for g in (np.ones(16), gains))  # fmt: skip
-    ring = shots_of(alike) // 360
-    unsaturated = (ringed[:, 3] > 0) & (ringed[:, 3] < 1) & (alike[:, 3] < 1)
-    ratio = ringed[unsaturated, 3] / alike[unsaturated, 3]
-    assert np.allclose(ratio, gains[ring[unsaturated]], rtol=1e-5)
 
 
 def test_32_beams_cover_a_sector_and_the_others_a_full_turn() -> None:

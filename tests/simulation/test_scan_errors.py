@@ -11,7 +11,7 @@ import pytest
 from calibgraph import Rig, simulate_street
 from calibgraph.simulation.lidar import scan
 from calibgraph.simulation.recording import Drive
-from calibgraph.simulation.scan_errors import ScanErrors, draw_scan_errors, foremost
+from calibgraph.simulation.scan_errors import ScanErrors, foremost
 from calibgraph.simulation.world import Hits, cast
 from tests.simulation.conftest import SCAN, small_camera
 
@@ -54,13 +54,6 @@ def test_a_moving_sensor_is_behind_when_it_looks_right_and_ahead_when_left(drive
     assert np.mean(np.abs(cast(drive.world, origins, rays).distance_m - ranges) < 0.02) > 0.98
 
 
-def test_ranges_of_dark_surfaces_are_longer(drive: Drive) -> None:
-    plain, biased = (scanned(drive, ScanErrors(dark_m=d)) for d in (0.0, 0.05))
-    assert len(plain) == pytest.approx(len(biased), rel=0.01)
-    mean = [np.linalg.norm(c[:, :3], axis=1).mean() for c in (plain, biased)]
-    assert 0.0 < mean[1] - mean[0] < 0.05
-
-
 def hits(*distances: float) -> list[Hits]:
     """Of one shot of seven rays."""
     one = np.zeros((1, 2), np.float32)
@@ -81,15 +74,6 @@ def test_of_a_wide_beam_the_foremost_surface_returns_that_two_parts_meet() -> No
     assert np.isinf(sky.distance_m[0])
     edge = foremost(hits(np.inf, 10.0, 10.0, *[np.inf] * 4))
     assert edge.distance_m[0] == pytest.approx(10.0)
-
-
-def test_drawn_errors_have_the_stated_sizes() -> None:
-    drawn = [draw_scan_errors(64, 1.0, np.random.default_rng(k)) for k in range(300)]
-    elevations = np.array([one.elevations_deg for one in drawn])
-    assert elevations.mean(axis=1).std() == pytest.approx(0.05, rel=0.15)
-    assert elevations[:, 0].std() == pytest.approx(np.sqrt(0.05**2 + 0.05**2 + 0.04**2), rel=0.15)
-    assert np.std([one.motion_m for one in drawn]) == pytest.approx(0.1, rel=0.15)
-    assert all(1.0 <= one.beam_mrad <= 3.5 and 0.0 <= one.dark_m <= 0.03 for one in drawn)
 
 
 def test_a_size_gives_other_clouds_and_a_wrong_one_is_refused(tmp_path: Path) -> None:

@@ -160,22 +160,6 @@ def test_the_joint_optimum_of_a_paper_preset_is_that_of_all_terms(rig: Rig) -> N
     assert pair_error(back.T_camera_lidar, rig.moved_to(solution.T_camera_lidar))[1] < 0.05
 
 
-def test_without_common_features_the_solve_is_as_before(rig: Rig) -> None:
-    errors = MatcherErrors(outlier_share=0.1)
-    table = simulate_correspondences(rig, frames=FRAMES, errors=errors, seed=0)
-    before = solve_joint(rig, table)
-    after = solve_joint(rig, table, camera_matches=CameraMatches.empty(tuple(rig.cameras)))
-    for name, T in before.T_camera_lidar.items():
-        np.testing.assert_array_equal(T, after.T_camera_lidar[name])
-
-
-def test_frames_select_their_pairs_too(rig: Rig) -> None:
-    objective = solved(rig, True).inliers
-    even = {n: block.select(block.frame % 2 == 0) for n, block in objective.blocks.items()}
-    pairs = objective.with_blocks(even).pairs
-    assert {frame % 2 for pair in pairs for frame in pair.frame} == {0}
-
-
 def test_frame_gradients_add_up_and_frames_are_clusters(rig: Rig) -> None:
     solution = solved(rig, True)
     T = solution.T_camera_lidar

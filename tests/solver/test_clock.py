@@ -11,22 +11,17 @@ from scipy.stats import chi2
 
 from calibgraph import (
     Config,
-    CorrespondenceError,
     Rig,
     load_calibration,
     load_correspondences,
-    simulate_correspondences,
     solve,
 )
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.error_sources import LENSES
 from calibgraph.model.geometry import twist_between
-from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from factors import Clock
 from tests.draws.clocks import draw_twists, put_clock_error
 from tests.draws.lenses import put_lens_error
-from tests.solver.test_elimination import STATED
 from tests.solver.test_lens import FIVE_SIGMAS, simulated, squared_errors
 
 STRAIGHT = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
@@ -113,38 +108,6 @@ def test_a_stated_error_of_the_clock_is_one_of_the_pose() -> None:
             assert np.abs(twist_between(unknown.T_camera_lidar[name], T)).max() < 1e-6
 
 
-def test_an_alignment_of_a_distorted_scan_has_the_error_of_the_clock_too() -> None:
-    """There the alignment is a variable of its own; shares name the source."""
-    truth, table = late(0.0, 0.0, twists=np.tile(STRAIGHT, (30, 1)))
-    stated = table.with_findings(replace(table.findings, **STATED))
-    doubted = with_times(truth, time_offset_sigma_s=0.01)
-    known, unknown = (solve(rig, stated) for rig in (truth, doubted))
-    for name, before in known.covariance.items():
-        after = unknown.covariance[name]
-        assert before is not None and after is not None
-        assert np.sqrt(after[5, 5] - before[5, 5]) == pytest.approx(0.1, rel=0.05)
-        assert LENSES not in known.error_sources[name].translation
-        assert unknown.error_sources[name].translation[LENSES] > 0.5
-    assert unknown.pair_covariance.keys() == known.pair_covariance.keys()
-    for pair, before in known.pair_covariance.items():
-        np.testing.assert_allclose(unknown.pair_covariance[pair], before, rtol=1e-6, atol=1e-12)
-
-
-def test_the_sentence_names_the_time_only_where_it_is_not_included() -> None:
-    truth, table = late(0.0, 0.0)
-    still, doubted = replace(table, twist_per_s=None), with_times(truth, time_offset_sigma_s=0.01)
-    mount, alignment = Config(of="mount"), "intrinsics, time offset, range scale"
-    beyond = "intrinsics (beyond what the rig states, or a calibration with a target leaves)"
-    assert solve(doubted, table, mount).not_included == f"{beyond}, range scale"
-    assert solve(truth, table, mount).not_included == f"{beyond}, time offset, range scale"
-    assert solve(doubted, still, mount).not_included == f"{beyond}, time offset, range scale"
-    assert solve(truth, table).not_included == alignment
-    assert solve(doubted, still).not_included == alignment
-    assert solve(doubted, table).not_included == "intrinsics, range scale"
-    estimated = solve(truth, table, Config(estimate=("offset",)))
-    assert estimated.not_included == "intrinsics, range scale"
-
-
 def test_a_saved_result_is_solved_again(tmp_path: Path) -> None:
     truth, table = late(0.03, 0.0)
     result = solve(truth, table, Config(estimate=("offset",)))
@@ -182,17 +145,6 @@ def test_at_rest_or_straight_ahead_the_offset_stays_at_its_prior(twists: np.ndar
         assert ahead_m == pytest.approx(10.0 * one.sigma, rel=0.05)
 
 
-def test_a_vehicle_at_rest_keeps_the_prior_and_an_unknown_motion_is_refused() -> None:
-    rig, table = simulated(0, frames=10, matches=150)
-    with pytest.raises(CorrespondenceError, match="offset, readout, the motion of the LiDAR must"):
-        solve_joint(rig, table, Config(estimate=("clock",)))
-    at_rest = replace(table, twist_per_s=np.zeros((len(table), 6)))
-    found = solve_joint(rig, at_rest, Config(estimate=("clock",)))
-    for parameters in found.lens.values():
-        assert [one.name for one in parameters] == ["offset", "readout"]
-        assert not any(one.is_determined for one in parameters)
-
-
 def test_lens_and_clock_are_told_apart() -> None:
     truth, table = late(0.05, 0.0)
     found = solve_joint(put_lens_error(truth, "focal", 0.01), table, Config(estimate="lens,offset"))
@@ -202,18 +154,6 @@ def test_lens_and_clock_are_told_apart() -> None:
             one = by_name[name]
             assert one.is_determined
             assert abs(one.value - right) < FIVE_SIGMAS * one.sigma
-
-
-def test_a_panorama_has_a_clock() -> None:
-    rig = rig_of("panorama")
-    (name,) = rig.cameras
-    table = simulate_correspondences(rig, frames=20, matches=200)
-    twists = draw_twists(20, np.random.default_rng(0))
-    table = put_clock_error(table, rig, twists, Clock(0.05))
-    found = solve_joint(rig, table, Config(estimate="lens,offset"))
-    (one,) = found.lens[name]
-    assert one.name == "offset"
-    assert abs(one.value - 0.05) < FIVE_SIGMAS * one.sigma
 
 
 @pytest.mark.statistics
@@ -240,15 +180,6 @@ def test_alignments_err_as_their_error_bar_says_with_the_stated_error_of_a_clock
         )
     scatter = 3 * np.sqrt(2 / 6 / draws)
     assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter
-
-
-def test_times_of_a_rig_that_are_not_used_are_told() -> None:
-    rig, table = late(0.02, 0.0)
-    stated = with_times(rig, time_offset_s=0.02)
-    (text,) = solve(stated, replace(table, twist_per_s=None)).warnings
-    assert ", ".join(rig.cameras) in text
-    assert "time_offset_s and readout_s are not used" in text and "wx_rad_s to vz_m_s" in text
-    assert solve(stated, table).warnings == ()
 
 
 def test_a_lidar_that_turns_about_its_way_is_told() -> None:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from calibgraph import (
-    CorrespondenceError,
     Correspondences,
     MatcherErrors,
     Rig,
-    load_correspondences,
     simulate_correspondences,
     solve,
 )
@@ -22,7 +18,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.error_components import error_components
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.verdict import COMMON_ERROR
-from calibgraph.simulation.matcher_errors import PoseSpread
+from calibgraph.simulation.correspondences import PoseSpread
 
 ZERO = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
 
@@ -44,14 +40,6 @@ def test_a_table_that_states_none_is_no_pass(pair: Rig, metadata: dict[str, Any]
     assert reason.text.startswith("cannot tell: scatter only: ")
     assert reason.cameras == ("left", "right")
     assert any("common_deg and common_cm" in action for action in result.summary.actions)
-
-
-def test_it_changes_no_probability_and_no_pose(pair: Rig) -> None:
-    silent, stated = (solve(pair, table(pair, metadata)) for metadata in ({}, ZERO))
-    for name, verdict in stated.camera_verdicts.items():
-        assert verdict.status == "PASS"
-        assert silent.camera_verdicts[name].error_probability == verdict.error_probability
-        np.testing.assert_array_equal(silent.T_camera_lidar[name], stated.T_camera_lidar[name])
 
 
 @pytest.mark.parametrize("matcher", ["structure", "cmrnext"])
@@ -76,20 +64,6 @@ def test_the_settings_state_it_for_a_table_that_does_not(pair: Rig) -> None:
     assert sigmas is not None and sigmas[0].max() > 0.1 and sigmas[1].max() > 2.0
     assert not common_checks(pair, table(pair, {}), config)
     assert not common_checks(pair, table(pair, {}), Config(common_deg=0.0))
-
-
-def test_settings_that_contradict_the_table_are_refused(pair: Rig) -> None:
-    config = Config(common_deg=0.1)
-    with pytest.raises(CorrespondenceError, match="states that its frames share 0 deg and 0 cm"):
-        solve(pair, table(pair, ZERO), config)
-
-
-def test_a_table_without_metadata_on_disk_states_none(pair: Rig, tmp_path: Path) -> None:
-    simulate_correspondences(pair, frames=8, matches=200).save(tmp_path / "table.csv")
-    found = load_correspondences(tmp_path / "table.csv")
-    assert len(common_checks(pair, found)) == 1
-    stated = solve(pair, tmp_path / "table.csv", Config(common_deg=0.05, common_cm=1.0))
-    assert stated.verdict.status == "PASS"
 
 
 def test_simulated_matchers_state_it_where_they_have_none(pair: Rig) -> None:

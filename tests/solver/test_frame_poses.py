@@ -29,18 +29,6 @@ def test_every_frame_ends_where_levenberg_marquardt_of_gtsam_does(mixed_rig: Rig
             np.testing.assert_allclose(T, found, atol=1e-7)
 
 
-def test_a_frame_without_matches_stays_and_does_not_disturb_the_others(pair: Rig) -> None:
-    table = simulate_correspondences(pair, frames=2, matches=100).of_camera("left")
-    camera = pair.cameras["left"]
-    block = ProjectionBlock(camera.lens, table.points_lidar_m, table.pixels_px)
-    start = np.tile(camera.T_camera_lidar, (3, 1, 1))
-    edge = int(np.searchsorted(table.frame, 1))
-    with_empty = fit_frames(block, to_runs(np.array([0, edge, edge, len(table)])), start)
-    without = fit_frames(block, to_runs(np.array([0, edge, len(table)])), start[:2])
-    np.testing.assert_array_equal(with_empty.T_camera_lidar[1], camera.T_camera_lidar)
-    np.testing.assert_array_equal(with_empty.T_camera_lidar[[0, 2]], without.T_camera_lidar)
-
-
 def test_a_free_direction_gets_no_step() -> None:
     sums = np.zeros((1, 28))
     sums[0, :21] = np.diag([1.0, 2, 0, 4, 5, 6])[np.triu_indices(6)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -14,8 +13,6 @@ from calibgraph import (
     Config,
     MatcherErrors,
     Rig,
-    load_calibration,
-    preset,
     simulate_correspondences,
     solve,
 )
@@ -24,10 +21,8 @@ from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.variables import aligned_key, body_key, lens_key
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import twist_between
-from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.lens_knowledge import LensSigmas
 from calibgraph.model.rig import IntrinsicsSigma
-from calibgraph.report.as_json import result_summary
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.lens_estimates import lens_estimates
@@ -155,22 +150,6 @@ def test_the_lens_is_part_of_an_alignment_and_an_error_of_a_mount(
         assert shares["uncertain lenses and clocks"] > 0.9
 
 
-def test_a_mount_errs_by_what_is_not_estimated_of_its_lens(
-    drawn: tuple[Rig, Correspondences],
-) -> None:
-    """The focal length moves it along the axis, the centre turns it."""
-    truth, table = drawn
-    fixed = solve_joint(truth, table, Config(of="mount"))
-    free = solve_joint(truth, table, Config(of="mount", estimate=("centre",)))
-    for number, name in enumerate(truth.cameras):
-        ahead = 6 * number + 5
-        assert free.covariance[ahead, ahead] == pytest.approx(
-            fixed.covariance[ahead, ahead], rel=0.1
-        )
-        shares = free.marginals.error_sources(free.covariance)[name].translation
-        assert shares["uncertain lenses and clocks"] > 0.9
-
-
 def test_the_covariance_of_a_mount_is_that_of_its_graph(
     drawn: tuple[Rig, Correspondences],
 ) -> None:
@@ -257,23 +236,6 @@ def test_lenses_that_see_all_round_are_estimated(name: str) -> None:
             assert found.distortion[0] == right.distortion[0]
 
 
-@pytest.mark.parametrize(
-    ("name", "needed"),
-    [
-        ("focal", "record several distances, towards the corners, too"),
-        ("aspect", "record near things at the sides, above and below"),
-        ("centre_y", "record near and far things over the whole image"),
-        ("k1", "record matches near the corners of the image"),
-        ("p2", "record matches near the corners of the image"),
-        ("readout", "record turns and changes of speed"),
-    ],
-)
-def test_what_is_not_determined_names_what_to_record(name: str, needed: str) -> None:
-    one = LensEstimate(name, "", 1.0, 0.1, 1.0, 0.1, "z", 0.5)
-    assert one.describe() == f"not determined by these data; {needed}; with z 0.50"
-    assert replace(one, sigma=0.01).describe() == "with z 0.50"
-
-
 def test_the_rig_states_how_well_its_new_lens_is_known(
     drawn: tuple[Rig, Correspondences],
 ) -> None:
@@ -291,58 +253,6 @@ def test_the_rig_states_how_well_its_new_lens_is_known(
     next_prior = LensVariable.of(found.rig.cameras["image_2"], ("focal",)).free.sigmas
     focal = found.lens["image_2"][0]
     assert next_prior[0] == pytest.approx(focal.sigma / focal.value, rel=1e-9)
-
-
-def test_the_joint_covariance_of_pose_and_lens_is_kept(
-    drawn: tuple[Rig, Correspondences], tmp_path: Path
-) -> None:
-    """Its blocks are those that are reported, and a longer lens moves the pose as it says."""
-    truth, table = drawn
-    found = solve(truth, table, Config(estimate=("focal",)))
-    found.save(tmp_path)
-    written, summary = load_calibration(tmp_path), result_summary(found, [])
-    longer = found.rig
-    for name, joint in found.lens_covariance.items():
-        assert joint.shape == (7, 7)
-        np.testing.assert_array_equal(joint[:6, :6], found.covariance[name])
-        assert joint[6, 6] ** 0.5 == pytest.approx(found.lens[name][0].sigma, rel=1e-9)
-        assert np.linalg.eigvalsh(joint / np.sqrt(np.outer(np.diag(joint), np.diag(joint))))[0] > 0
-        np.testing.assert_array_equal(written.lens_covariance[name], joint)
-        of_json = summary["cameras"][name]["lens_covariance"]
-        assert of_json["parameters"][5:] == ["translation_z_m", "focal_px"]
-        assert of_json["covariance"] == joint.tolist()
-        camera = longer.cameras[name]
-        share = 1.0 + 2.0 / camera.intrinsics_px.fx
-        intrinsics = {key: share * getattr(camera.intrinsics_px, key) for key in ("fx", "fy")}
-        moved = camera.intrinsics_px.model_copy(update=intrinsics)
-        cameras = {**longer.cameras, name: camera.model_copy(update={"intrinsics_px": moved})}
-        longer = longer.model_copy(update={"cameras": cameras})
-    fixed = solve(longer, table)
-    for name, joint in found.lens_covariance.items():
-        ahead_m = twist_between(fixed.T_camera_lidar[name], found.T_camera_lidar[name])[5]
-        assert ahead_m == pytest.approx(2.0 * joint[5, 6] / joint[6, 6], rel=0.1)
-
-
-def test_a_result_is_a_rig_whose_lens_is_the_mean_of_the_next_prior(
-    drawn: tuple[Rig, Correspondences],
-) -> None:
-    truth, table = drawn
-    config = Config(estimate=("focal",))
-    first = solve(put_lens_error(truth, "focal", 0.02), table, config)
-    again = solve(first.rig, table, config)
-    for name, (one,) in again.lens.items():
-        assert one.prior == pytest.approx(first.lens[name][0].value, rel=1e-9)
-
-
-def test_refuses_what_has_no_lens_or_no_error_model(drawn: tuple[Rig, Correspondences]) -> None:
-    truth, table = drawn
-    with pytest.raises(ValueError, match="preset auto"):
-        solve(truth, table, preset("kitti").changed(estimate="focal"))
-    with pytest.raises(ValueError, match="equirectangular"):
-        solve(rig_of("panorama"), table, Config(estimate=("focal",)))
-    assert Config(estimate="lens").estimate == ("focal", "centre", "distortion")
-    with pytest.raises(ValueError, match="estimate"):
-        Config(estimate="focus")
 
 
 @pytest.mark.statistics

@@ -71,24 +71,6 @@ def test_compensating_twist_undoes_what_an_unknown_displaces() -> None:
     np.testing.assert_allclose(fit.free(0).compensating[:, 0], -twist, rtol=1e-5)
 
 
-def test_one_fit_gives_those_of_every_choice_of_unknowns() -> None:
-    """Without outliers the weights differ little; those of the other fits are their own."""
-    rng = np.random.default_rng(6)
-    camera, points = make_camera(), points_in_front(rng, 400)
-    fields = rng.standard_normal((3, 2, 400))
-    root = rng.uniform(0.5, 2, (400, 2))
-    information = np.column_stack([root[:, 0], 0.3 * np.ones(400), root[:, 1]])
-    pixels = project_with_jacobian(camera, points)[0] + rng.standard_normal((400, 2))
-    table = table_of(pixels, points, 7, information_px=information)
-    together = fit_table(camera, table, fields)
-    for choice in ([0], [1, 2], [0, 1, 2]):
-        alone = fit_table(camera, table, fields[choice])
-        assert alone is not None and together is not None
-        own, found = alone.free(*range(len(choice))), together.free(*choice)
-        assert np.abs((found.values - own.values) / own.sigmas).max() < 0.1
-        np.testing.assert_allclose(found.sigmas, own.sigmas, rtol=0.1)
-
-
 @pytest.mark.parametrize("outliers", [0, 90])
 def test_sigmas_are_the_scatter_of_the_values(outliers: int) -> None:
     """Over 60 draws, 0.7 to 1.5 of it: four times the scatter of a standard deviation (9 %)."""

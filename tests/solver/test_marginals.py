@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 import pytest
 
 from calibgraph import Config, Rig, preset, simulate_correspondences, solve
-from calibgraph.arrays import Array
-from calibgraph.solver.curvature import robust_hessian
 from calibgraph.solver.joint import solve_joint
-from factors import ProjectionBlock
 from tests.solver.test_camera_pairs import simulated_pairs
 
 
@@ -36,19 +32,3 @@ def test_without_camera_pairs_a_solution_is_its_own(pair: Rig) -> None:
     assert tied.without_pairs() is tied.without_pairs()
     assert alone.covariance is not None and tied.without_pairs().covariance is not None
     np.testing.assert_allclose(tied.without_pairs().covariance, alone.covariance, rtol=1e-9)
-
-
-def test_the_curvature_of_a_camera_is_summed_once_for_error_model_and_scatter(
-    pair: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    solution = solve_joint(pair, simulate_correspondences(pair, frames=6, matches=80, seed=0))
-    assert solution.errors is None  # of one place: the model is made from the estimate
-    calls: list[ProjectionBlock] = []
-
-    def counted(block: ProjectionBlock, pose: gtsam.Pose3) -> Array:
-        calls.append(block)
-        return robust_hessian(block, pose)
-
-    monkeypatch.setattr("calibgraph.solver.curvature.robust_hessian", counted)
-    assert solution.marginals.errors is not None and solution.marginals.scatter is not None
-    assert len(calls) == len(pair.cameras)

@@ -8,25 +8,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
 import calibgraph
 from calibgraph import (
     Config,
-    CorrespondenceError,
     Correspondences,
     FileError,
     MatcherErrors,
     Rig,
-    load_correspondences,
     simulate_correspondences,
 )
 from calibgraph.io import correspondence_tables
 from calibgraph.solver import preprocess
 from calibgraph.solver.preprocess import Preprocessed
-from tests.model.tables import table
 
 to_arrow = Correspondences.to_arrow
 
@@ -148,16 +144,6 @@ def test_a_solve_of_a_file_is_that_of_the_table_to_the_last_bit(pair: Rig, tmp_p
     assert one.counts == other.counts
 
 
-def test_a_csv_file_is_solved_too(pair: Rig, tmp_path: Path) -> None:
-    table = simulate_correspondences(pair, frames=6, matches=100)
-    table.save(tmp_path / "table.csv")
-    one = calibgraph.solve(pair, str(tmp_path / "table.csv"))
-    read = load_correspondences(tmp_path / "table.csv")
-    other = calibgraph.solve(pair, read)
-    for name in pair.cameras:
-        np.testing.assert_array_equal(one.T_camera_lidar[name], other.T_camera_lidar[name])
-
-
 @pytest.mark.usefixtures("small_parts")
 @pytest.mark.parametrize("row", [3, SMALL_PART, 5 * SMALL_PART + 11])
 def test_a_bad_row_is_counted_from_the_beginning_of_the_file(
@@ -175,31 +161,6 @@ def test_a_bad_row_is_counted_from_the_beginning_of_the_file(
         parquet.write_table(changed, tmp_path / "table.parquet")
         with pytest.raises(FileError, match=message):
             calibgraph.solve(pair, tmp_path / "table.parquet")
-
-
-@pytest.mark.usefixtures("small_parts")
-def test_other_wrong_files_are_named_as_when_they_are_loaded(pair: Rig, tmp_path: Path) -> None:
-    path = tmp_path / "table.parquet"
-    table = simulate_correspondences(pair, frames=4, matches=300)
-    unknown = Correspondences.from_arrays(
-        camera="rear", frame=0, pixels_px=[[1, 2]], points_lidar_m=[[5, 0, 0]]
-    )
-    calibgraph.concatenate([table, unknown]).save(path)
-    with pytest.raises(CorrespondenceError, match="camera 'rear' of the correspondences"):
-        calibgraph.solve(pair, path)
-    arrow = to_arrow(table)
-    cases = (arrow.slice(0, 0), arrow.drop_columns(["v_px"]),
-             arrow.replace_schema_metadata({"matcher": "no JSON"}))  # fmt: skip
-    for wrong in cases:
-        parquet.write_table(wrong, path)
-        with pytest.raises(FileError) as whole:
-            load_correspondences(path)
-        with pytest.raises(FileError) as parts:
-            calibgraph.solve(pair, path)
-        assert str(parts.value) == str(whole.value)
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(FileError, match="is it complete"):
-        calibgraph.solve(pair, path)
 
 
 @pytest.mark.usefixtures("small_parts")
@@ -222,25 +183,6 @@ def test_memory_does_not_grow_with_the_table(pair: Rig) -> None:
 
     peak_bytes(2)  # compiles
     assert peak_bytes(24) < 1.1 * peak_bytes(6)
-
-
-def test_one_row_group_of_a_file_is_in_memory(pair: Rig, tmp_path: Path) -> None:
-    """Of a file of 24 groups a quarter is more than the bytes of two, as read and as decoded."""
-    table = simulate_correspondences(pair, frames=24, matches=1000)
-    path = saved(table, tmp_path / "table.parquet", row_group_size=2000, compression="none")
-    before = pa.total_allocated_bytes()
-    held = [pa.total_allocated_bytes() - before for _ in correspondence_tables.parts_of_table(path)]
-    assert len(held) == 24
-    assert max(held) < path.stat().st_size / 4
-
-
-def test_preprocessing_keeps_the_best_of_each_cell(pair: Rig) -> None:
-    kept = preprocess.preprocess(pair, table(), Config())
-    # Rows 1 and 3 share a camera, frame and cell: the more confident one stays.
-    assert kept.table.confidence.tolist() == pytest.approx([0.9, 0.8, 1.0])
-    assert kept.counts["left"] == {
-        "given": 3, "projectable": 3, "confident": 3, "best_in_cell": 2, "capped": 2,
-    }  # fmt: skip
 
 
 def test_preprocessing_counts_at_every_filter(pair: Rig) -> None:
@@ -266,8 +208,3 @@ def test_preprocessing_counts_at_every_filter(pair: Rig) -> None:
     assert per_frame.tolist() == [100, 100, 100]
     # The cap keeps the most confident.
     assert kept.table.confidence.min() > config.confidence_min + 0.1
-
-
-def test_preprocessing_names_an_unknown_camera(pair: Rig) -> None:
-    with pytest.raises(CorrespondenceError, match="camera 'rear' of the correspondences"):
-        preprocess.preprocess(pair, table(camera="rear"), Config())

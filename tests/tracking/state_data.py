@@ -50,14 +50,6 @@ def filled(folder: Path, number: int, *, snapshot_every: int = 3) -> bytes:
         return list(drive(database, number, snapshot_every=snapshot_every))[-1]
 
 
-def crashed(folder: Path, number: int) -> tuple[Files, bytes]:
-    """The files of a folder after a number of inputs, as a kill leaves them; and the truth."""
-    with opened(folder) as database:
-        database.snapshot(b"")
-        truth = list(drive(database, number))[-1]
-        return content(folder), truth
-
-
 def recovered(folder: Path) -> Recovered:
     with opened(folder) as database:
         return database.recovered

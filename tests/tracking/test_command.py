@@ -17,7 +17,6 @@ from calibgraph import (
     Correspondences,
     Rig,
     concatenate,
-    load_calibration,
     perturb,
 )
 from calibgraph.io.rigs import load_rig
@@ -170,54 +169,7 @@ def test_any_rig_continues_with_the_same_lines(
     assert (first + second).splitlines() == file_lines(guess, tables[:9], tables[9:])
 
 
-def test_a_camera_may_come_later_or_never(call: Call, tmp_path: Path) -> None:
-    truth = pair_of()
-    truth.save(tmp_path / "rig.yaml")
-    for right_from, code in ((6, 0), (FRAMES, 1)):
-        tables = drive(truth, blind={"right": range(right_from)})
-        source, out = tmp_path / f"{right_from}.parquet", tmp_path / str(right_from)
-        concatenate(tables).save(source)
-        found, text, _ = call("track", tmp_path / "rig.yaml", source, "--out", out)
-        assert found == code
-        last = json.loads(text.splitlines()[-1])["cameras"]
-        assert last["left"]["verdict"] != "FAIL"
-        assert last["right"]["verdict"] != "FAIL"  # it may come yet
-        assert last["right"]["cannot_tell"] or code == 0
-        at_the_end = load_calibration(out).camera_verdicts["right"].status
-        assert (at_the_end == "FAIL") == (code == 1)
-
-
 # Sources that hold nothing, and standard streams that are closed
-
-
-def test_an_empty_source_is_reported_in_one_line(
-    world: World, call: Call, piped: Callable[..., Any], tmp_path: Path
-) -> None:
-    out = ("--out", tmp_path / "out")
-    (tmp_path / "folder").mkdir()
-    concatenate(world.tables).select(slice(0, 0)).save(tmp_path / "empty.parquet")
-    for code, text, err in (
-        piped(world.rig, b"", *out),
-        call("track", world.rig, tmp_path / "folder", *out),
-        call("track", world.rig, tmp_path / "missing.parquet", *out),
-    ):
-        assert (code, text) == (2, "")
-        assert err.startswith("calibgraph: ") and err.count("\n") == 1
-    code, text, err = call("track", world.rig, tmp_path / "empty.parquet", *out)
-    assert (code, text) == (2, "")
-    assert err.splitlines()[-1].endswith("held no frame that could be used (1 left out); check it")
-
-
-@pytest.mark.parametrize("which", ["stdin", "stdout"])
-def test_a_closed_standard_stream_is_reported_in_one_line(
-    which: str, world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(sys, which, None)
-    code, _, err = call("track", world.rig, "-", "--out", tmp_path / "out")
-    assert code == 2
-    assert err.startswith(f"calibgraph: standard {which.removeprefix('std')}put: is closed")
-    assert err.count("\n") == 1
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_reader_that_goes_away_ends_it_with_all_saved(
@@ -233,15 +185,3 @@ def test_a_reader_that_goes_away_ends_it_with_all_saved(
     assert "the reader of standard output is gone" in err and "Traceback" not in err
     code, out, _ = call(*arguments)
     assert code == 0 and out.splitlines() == world.file_lines[1:]
-
-
-def test_a_full_disk_under_standard_output_is_reported_in_one_line(
-    world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    with open("/dev/full", "w") as full, monkeypatch.context() as patch:
-        patch.setattr(sys, "stdout", full)
-        code, _, err = call("track", world.rig, world.source, "--out", tmp_path / "out")
-    assert code == 2
-    assert err.startswith("calibgraph: standard output: cannot be written to")
-    _, out, _ = call("track", world.rig, world.source, "--out", tmp_path / "out")
-    assert out.splitlines() == world.file_lines

@@ -68,15 +68,6 @@ def test_a_signal_ends_it_with_the_code_of_the_verdict(
     assert (first + second).splitlines() == world.lines
 
 
-def test_a_signal_before_the_first_frame_is_no_error(
-    world: World, piped: Callable[..., Any], tmp_path: Path
-) -> None:
-    feed = Feed([], 0, lambda: signal.raise_signal(signal.SIGTERM))
-    code, out, err = piped(world.rig, feed, "--out", tmp_path / "out")
-    assert (code, out) == (1, "")  # the verdict without an estimate is FAIL
-    assert "Traceback" not in err
-
-
 def test_a_second_signal_ends_it_at_once_and_loses_nothing(
     world: World, monkeypatch: pytest.MonkeyPatch, piped: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -16,7 +14,6 @@ import pytest
 
 from calibgraph import (
     Calibration,
-    CalibrationError,
     Config,
     Correspondences,
     DatasetError,
@@ -24,13 +21,9 @@ from calibgraph import (
     concatenate,
 )
 from calibgraph.io.dataset import Dataset, load_dataset
-from calibgraph.io.frame import Frame
-from calibgraph.matching.protocol import to_full_matcher
 from calibgraph.tracking import command, dataset_frames
 from calibgraph.tracking.command import Tracking, track
-from calibgraph.tracking.dataset_frames import DatasetDrive, with_places
-from calibgraph.tracking.streams import StreamFrame
-from calibgraph.trust.pose_posterior import PosePosterior, no_posteriors
+from calibgraph.trust.pose_posterior import no_posteriors
 from calibgraph.trust.run_evidence import RunEvidence
 from tests.tracking.drives import (
     FRAMES,
@@ -70,12 +63,17 @@ class Given:
 @pytest.fixture
 def recorded(world: World, tmp_path: Path) -> Dataset:
     folder = tmp_path / "data"
-    for number in range(FRAMES):
-        for place in ("cameras/left", "cameras/right", "lidar"):
-            suffix = ".npy" if place == "lidar" else ".png"
-            path = folder / place / f"{number:03d}{suffix}"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(str(number).encode())
+    for place in ("cameras/left", "cameras/right", "lidar"):
+        (folder / place).mkdir(parents=True)
+        for number in range(FRAMES):
+            if place == "lidar":
+                np.save(
+                    folder / place / f"{number:03d}.npy", np.full((9, 4), 1 + number, np.float32)
+                )
+                continue
+            camera = world.guess.cameras[place.removeprefix("cameras/")]
+            image = np.full((camera.height_px, camera.width_px), number, np.uint8)
+            cv2.imwrite(str(folder / place / f"{number:03d}.png"), image)
     shutil.copy(world.rig, folder / "rig.yaml")
     return load_dataset(folder)
 
@@ -154,178 +152,4 @@ def test_flat_images_widen_the_result_at_the_end_and_its_verdict(
     assert wide.camera_verdicts["left"].status == "WARN"
     assert wide.camera_verdicts["left"].cannot_tell
     assert "beyond_tolerance" not in {c.kind for c in narrow.camera_verdicts["left"].checks}
-    assert "no images" in narrow.verdict.images_note and not wide.verdict.images_note
-
-
-@pytest.fixture
-def follow(
-    world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[], tuple[Calibration, list[str]]]:
-    """Tracks the dataset, whose files hold no images, with a matcher whose images count."""
-    monkeypatch.setattr(RunEvidence, "_measure_posteriors", no_posteriors)
-    monkeypatch.setattr(Given, "image_checks_can_fail", True, raising=False)
-
-    def run() -> tuple[Calibration, list[str]]:
-        notes: list[str] = []
-        matcher = Given(concatenate(world.tables))
-        wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
-        result, (saved, *_) = track(wanted, recorded.folders, notify=notes.append)
-        assert saved.is_file() and result.covariance["left"] is not None
-        assert result.verdict.images_note
-        return result, notes
-
-    return run
-
-
-@pytest.mark.parametrize("error", [None, np.linalg.LinAlgError, cv2.error, RuntimeError])
-def test_images_that_cannot_be_scored_at_the_end_leave_the_result_without_them(
-    error: type[Exception] | None,
-    follow: Callable[[], tuple[Calibration, list[str]]],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def fail(*_: object, **__: object) -> None:
-        assert error is not None
-        raise error("not positive definite")
-
-    if error is not None:
-        monkeypatch.setattr(dataset_frames, "measure_posteriors", fail)
-    why = "" if error is None else "not positive definite"
-    _, notes = follow()
-    assert any(n.startswith(f"warning: the images could not be checked: {why}") for n in notes)
-
-
-def test_after_a_signal_the_result_is_written_without_the_images(
-    follow: Callable[[], tuple[Calibration, list[str]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given: list[str] = []
-
-    def write(line: str) -> None:
-        given.append(line)
-        if len(given) == FRAMES - 2:
-            signal.raise_signal(signal.SIGTERM)
-
-    def score(*_: object, **__: object) -> None:
-        raise AssertionError("images are scored")
-
-    monkeypatch.setattr(command, "print_line", write)
-    monkeypatch.setattr(dataset_frames, "measure_posteriors", score)
-    _, notes = follow()
-    assert len(given) == FRAMES - 2
-    assert "stopped: the images were not compared with the clouds" in notes
-
-
-def test_a_signal_while_images_are_scored_ends_that(
-    follow: Callable[[], tuple[Calibration, list[str]]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def score(*_: object, **__: object) -> None:
-        signal.raise_signal(signal.SIGINT)
-        raise AssertionError("it went on")
-
-    monkeypatch.setattr(dataset_frames, "measure_posteriors", score)
-    _, notes = follow()
-    assert "stopped: the images were not compared with the clouds" in notes
-
-
-def test_a_result_that_cannot_be_solved_for_is_one_error_and_the_updates_stay(
-    follow: Callable[[], tuple[Calibration, list[str]]],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise RuntimeError("\nIndeterminant linear system detected\nwhile working near x0")
-
-    with monkeypatch.context() as patched, pytest.raises(CalibrationError) as caught:
-        patched.setattr(DatasetDrive, "result", fail)
-        follow()
-    assert f"after frame {FRAMES - 1} " in str(caught.value) and "\n" not in str(caught.value)
-    assert (tmp_path / "out" / "state").is_dir()
-    follow()
-
-
-class Numbers(list[int]):
-    """Counts how often all are read."""
-
-    reads = 0
-
-    def __iter__(self) -> Iterator[int]:
-        self.reads += 1
-        return super().__iter__()
-
-
-def test_frames_to_score_are_found_in_linear_time(
-    world: World, recorded: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def measure(data: Dataset, *_: object, seed: int) -> dict[str, PosePosterior]:
-        assert [frame.index for frame in data.frames] == [2, 5]
-        return {"left": flat(1.0, 1.0)}
-
-    monkeypatch.setattr(dataset_frames, "measure_posteriors", measure)
-    given = DatasetDrive(recorded, to_full_matcher(Given(world.tables[0])), Config())
-    numbers = Numbers([5, 2])
-    assert given._measure(recorded.rig, numbers, {}, []) and numbers.reads == 1
-
-
-def test_the_result_names_the_places_of_its_frames(
-    world: World, recorded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As that of ``calibrate``."""
-    monkeypatch.setattr(dataset_frames, "PlaceFinder", lambda *_, **__: Odometer())
-    stated = [replace(t, metadata={"place_variance": 8.0}) for t in world.tables]
-    matcher = Given(concatenate(stated))
-    wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / "out", matcher=matcher)
-    result, _ = track(wanted, recorded.folders, notify=lambda _: None)
-    assert result.places == ((0, 1, 2, 3), (4, 5, 6, 7), (8, 9, 10, 11), (12, 13))
-    for name, found in result.error_sources.items():
-        assert sum(found.translation.values()) == pytest.approx(1.0)
-        assert found.translation["errors that a place shares"] > 0.01
-        assert found.translation_cm == pytest.approx(float(result.sigmas(name)[1].max()), rel=0.01)
-    assert result.error_sources.keys() == result.rig.cameras.keys()
-
-
-class Odometer:
-    """Finds a new place every four frames; notes what it is shown."""
-
-    def __init__(self) -> None:
-        self.shown: list[int] = []
-        self.remembered: list[int] = []
-
-    def first_of_place(self, frame: Frame) -> int:
-        self.shown.append(frame.index)
-        return frame.index // 4 * 4
-
-    def remember(self, frame: Frame) -> None:
-        self.remembered.append(frame.index)
-
-
-@pytest.mark.parametrize(
-    ("known", "start", "again"),
-    [((), 0, 0), (("", "gate"), 2, 2), (("0", "4"), 7, 4), (("4", "0"), 9, 4)],
-)
-def test_frames_of_a_dataset_have_their_places(
-    known: tuple[str, ...], start: int, again: int, world: World, recorded: Dataset
-) -> None:
-    """A restart looks again at the first frames of all places, and at those since the newest."""
-    stated = [replace(t, metadata={"place_variance": 8.0}) for t in world.tables]
-    items = [StreamFrame(n, stated[n]) for n in range(start, FRAMES)]
-    finder = Odometer()
-    found = list(with_places(items, recorded, finder, known))  # type: ignore[arg-type]
-    names = [item.table.metadata["place"] for item in found if isinstance(item, StreamFrame)]
-    assert names == [str(n // 4 * 4) for n in range(start, FRAMES)]
-    assert finder.remembered == [int(name) for name in known if name.isdigit()]
-    assert finder.shown == list(range(again, FRAMES))
-
-
-def test_a_restart_looks_again_at_few_frames(
-    world: World, recorded: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(dataset_frames, "MOST_AGAIN", 2)
-    stated = replace(world.tables[8], metadata={"place_variance": 8.0})
-    finder = Odometer()
-    list(with_places([StreamFrame(8, stated)], recorded, finder, ("0",)))  # type: ignore[arg-type]
-    assert finder.shown == [6, 7, 8]
-
-
-def test_without_an_error_of_places_no_image_is_looked_at(world: World, recorded: Dataset) -> None:
-    finder, items = Odometer(), [StreamFrame(0, world.tables[0])]
-    assert list(with_places(items, recorded, finder, ())) == items  # type: ignore[arg-type]
-    assert not finder.shown
+    assert "images" in narrow.verdict.images_note and not wide.verdict.images_note

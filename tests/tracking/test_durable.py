@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import errno
-import json
 import shutil
 import sqlite3
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,41 +19,19 @@ from calibgraph import (
     perturb,
 )
 from calibgraph.tracking import command, durable, tracker
-from calibgraph.tracking.history import History
-from calibgraph.tracking.run import Run
-from calibgraph.tracking.state_database import DATABASE, StateDatabase
-from calibgraph.tracking.streams import StreamFrame
+from calibgraph.tracking.state_database import DATABASE
 from calibgraph.tracking.update import json_line
 from tests.conftest import KANNALA, Call
 from tests.tracking.drives import (
     FRAMES,
     Crashed,
     World,
-    as_lines,
     file_lines,
     files_in,
     pair_of,
 )
 
 pytestmark = pytest.mark.usefixtures("no_picture")
-
-
-def test_a_line_is_given_once_its_update_is_on_disk(world: World, tmp_path: Path) -> None:
-    rig = world.guess
-
-    def write(line: str) -> None:
-        shutil.copytree(tmp_path / "state", tmp_path / "copy", dirs_exist_ok=False)
-        with DurableCalibrator(tmp_path / "copy", rig) as found:
-            assert found.tracker.frame == json.loads(line)["frame"]
-        shutil.rmtree(tmp_path / "copy")
-        written.append(line)
-
-    written: list[str] = []
-    frames = [StreamFrame(int(table.frame[0]), table) for table in world.tables[:7]]
-    with DurableCalibrator(tmp_path / "state", rig) as calibrator:
-        run = Run(calibrator, History(), write, print)
-        run.follow(frames, every=1, stop=lambda: False)
-    assert run.updates == 7 and written == world.lines[:7]
 
 
 def test_a_refused_update_changes_neither_the_tracker_nor_the_disk(
@@ -98,13 +72,6 @@ def test_a_refused_update_changes_neither_the_tracker_nor_the_disk(
 
 
 # State
-
-
-def test_a_folder_in_use_is_refused_in_one_line(world: World, call: Call, tmp_path: Path) -> None:
-    with DurableCalibrator(tmp_path / "state", world.guess):
-        code, out, err = call("track", world.rig, world.source, "--out", tmp_path)
-    assert (code, out) == (2, "")
-    assert "is in use by another process" in err and err.count("\n") == 1
 
 
 def test_a_state_of_another_rig_or_config_is_refused_in_one_line(
@@ -153,21 +120,6 @@ def test_a_damaged_snapshot_is_named_and_costs_nothing(
     ]
 
 
-def test_a_damaged_database_is_refused_in_one_line(
-    world: World, call: Call, tmp_path: Path
-) -> None:
-    call("track", world.rig, world.source, "--out", tmp_path)
-    path = tmp_path / "state" / DATABASE
-    data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2])
-    before = files_in(tmp_path / "state")
-    code, out, err = call("track", world.rig, world.source, "--out", tmp_path)
-    assert (code, out) == (2, "")
-    assert f"{path}: is damaged" in err and "choose another folder" in err
-    assert err.count("\n") == 1
-    assert files_in(tmp_path / "state") == before
-
-
 def test_a_state_of_another_version_is_refused_in_one_line(
     world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -177,39 +129,6 @@ def test_a_state_of_another_version_is_refused_in_one_line(
     code, _, err = call("track", world.rig, world.source, "--out", tmp_path)
     assert code == 2
     assert "holds a state of another version" in err and err.count("\n") == 1
-
-
-def test_a_counter_that_starts_anew_is_reported(
-    world: World, piped: Callable[..., Any], tmp_path: Path
-) -> None:
-    later = [replace(table, frame=table.frame + 100) for table in world.tables]
-    piped(world.rig, as_lines(later), "--out", tmp_path)
-    _, out, err = piped(world.rig, as_lines(world.tables), "--out", tmp_path)
-    assert out == ""
-    assert "frame 0 and others up to 113 are known: skipped" in err
-    assert f"{FRAMES} known from before" in err
-
-
-def test_a_full_disk_under_the_state_is_reported_in_one_line_and_costs_nothing(
-    world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    append = StateDatabase.append
-
-    def full(database: StateDatabase, record: bytes) -> None:
-        if len(left) == 0:
-            raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path))
-        left.pop()
-        append(database, record)
-
-    left = [0] * 5
-    with monkeypatch.context() as patch:
-        patch.setattr(StateDatabase, "append", full)
-        code, first, err = call("track", world.rig, world.source, "--out", tmp_path)
-    assert code == 2
-    assert err.splitlines()[-1] == f"calibgraph: {tmp_path}: No space left on device"
-    _, second, _ = call("track", world.rig, world.source, "--out", tmp_path)
-    assert first.splitlines() == world.file_lines[:5]
-    assert second.splitlines() == world.file_lines[4:]  # those of the last write come again
 
 
 def test_a_tracker_that_throws_leaves_the_state_as_it_was(

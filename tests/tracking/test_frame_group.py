@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -12,19 +11,17 @@ import pytest
 
 from calibgraph import (
     Calibration,
-    Config,
     CorrespondenceError,
     Correspondences,
-    DurableCalibrator,
     IncrementalCalibrator,
     Rig,
     perturb,
     solve,
 )
 from calibgraph.model.correspondences import concatenate
-from calibgraph.tracking.frame_group import in_groups, update_all
+from calibgraph.tracking.frame_group import update_all
 from calibgraph.tracking.stream_tables import Refused, StreamFrame
-from calibgraph.tracking.update import Update, json_line, json_lines
+from calibgraph.tracking.update import Update
 from tests.draws.drives import simulate_drive
 from tests.tracking.drives import ERRORS, drive, pair_of
 
@@ -91,45 +88,7 @@ def test_along_places_estimates_are_those_of_a_batch() -> None:
         assert sigmas_apart(found[-1], batch, camera) < 0.2 * np.sqrt(6)
 
 
-def test_frames_of_an_epochs_number_are_not_divided() -> None:
-    """The epoch is longer, and the frames that come next so fill one each."""
-    rig, tracker = pair_of(), IncrementalCalibrator(guess_of(pair_of()))
-    frames = frames_of(drive(rig, 57))
-    together(tracker, frames[:7])
-    groups = [together(tracker, frames[first : first + EPOCH])[1] for first in range(7, 57, EPOCH)]
-    assert groups == [[EPOCH]] * 5
-    lengths = [len(epoch.frames) for epoch in tracker._state.epochs]
-    assert lengths == [7 + EPOCH, *[EPOCH] * 4, 0]
-
-
-def test_all_updates_of_a_group_have_the_estimate_after_it() -> None:
-    rig = pair_of()
-    tracker = IncrementalCalibrator(guess_of(rig))
-    found, _ = together(tracker, frames_of(drive(rig, 30)))
-    last = found[-EPOCH:]
-    assert len({id(one.T_camera_lidar["left"]) for one in last}) == 1
-    present = tracker.calibration().T_camera_lidar
-    for name, T in last[0].T_camera_lidar.items():
-        np.testing.assert_array_equal(T, present[name])
-    assert len({tuple(one.used.values()) for one in last}) > 1  # each its own
-
-
-def test_an_update_cannot_change_another_one_or_the_tracker() -> None:
-    rig = pair_of()
-    tracker = IncrementalCalibrator(guess_of(rig))
-    *_, one, other = together(tracker, frames_of(drive(rig, 20)))[0]
-    before = json_lines([one, other])
-    with pytest.raises(ValueError, match="read-only"):
-        one.T_camera_lidar["left"][0, 3] += 1.0
-    covariance = one.covariance["left"]
-    assert covariance is not None and not covariance.flags.writeable
-    for part in (one.T_camera_lidar, one.covariance, one.verdicts):
-        del part["left"]  # type: ignore[attr-defined]
-    assert json_line(other) == json_lines([one, other])[1] == before[1]
-    assert "left" in tracker.calibration().camera_verdicts
-
-
-@pytest.mark.parametrize("size", [1.0, 0.15])
+@pytest.mark.parametrize("size", [pytest.param(1.0, marks=pytest.mark.slow), 0.15])
 def test_a_move_is_found_at_the_same_frame_as_one_by_one(size: float) -> None:
     """Frames that disagree are taken in one by one; a small step shows at the end of an epoch."""
     rig = pair_of()
@@ -188,122 +147,3 @@ def test_frames_that_stand_out_are_taken_in_by_themselves() -> None:
         (u.frame, u.left_out, {*u.used}) for u in expected
     ]
     assert found[23].left_out == ("left", "right") and not found[31].used and not found[33].used
-
-
-@pytest.fixture(scope="module")
-def started() -> bytes:
-    """After 16 frames."""
-    rig = pair_of()
-    tracker = IncrementalCalibrator(guess_of(rig))
-    together(tracker, frames_of(drive(rig, 16)))
-    return tracker.to_bytes()
-
-
-def hostile_frames(seed: int, first: int, last: int) -> list[StreamFrame]:
-    """Frames most of which lack a camera or matches, repeat an earlier one, or are wrong."""
-    rng, tables = np.random.default_rng(seed), drive(pair_of(), last)
-    for number in range(first, last):
-        table, earlier = tables[number], tables[number - int(rng.integers(1, 5))]
-        size = table.points_lidar_m.shape
-        kinds = [
-            table.of_camera("left"),
-            table.of_camera("right"),
-            table.select(slice(0, int(rng.integers(0, 12)))),
-            replace(earlier, frame=np.full(len(earlier), number)),
-            replace(table, stamp_ns=np.full(len(table), 10**9 * number)),
-            replace(table, points_lidar_m=table.points_lidar_m + 3 * rng.normal(size=size)),
-            replace(table, metadata={**table.metadata, "place": str(rng.integers(0, 3))}),
-        ]
-        kind = int(rng.integers(0, 2 * len(kinds)))
-        tables[number] = kinds[kind] if kind < len(kinds) else table
-    return [StreamFrame(number, tables[number]) for number in range(first, last)]
-
-
-@pytest.mark.parametrize(
-    "seed", [*range(3), *(pytest.param(n, marks=pytest.mark.slow) for n in range(3, 40))]
-)
-def test_whatever_comes_the_same_is_absorbed_as_one_by_one(seed: int, started: bytes) -> None:
-    """Also a camera's last cloud that comes again after frames without the camera."""
-    frames = hostile_frames(seed, 16, 32)
-    expected, _ = one_by_one(IncrementalCalibrator.from_bytes(started), frames)
-    found, _ = together(IncrementalCalibrator.from_bytes(started), frames)
-    assert [(u.frame, u.left_out, {*u.used}, [*map(str, u.events)]) for u in found] == [
-        (u.frame, u.left_out, {*u.used}, [*map(str, u.events)]) for u in expected
-    ]
-
-
-@pytest.mark.parametrize("kept", [0, 5])
-def test_a_camera_that_repeats_after_frames_without_matches_counts_once(
-    kept: int, started: bytes
-) -> None:
-    """Frame 17 has its cloud of frame 15 again; frame 16 has none, or too few matches."""
-    tables = drive(pair_of(), 20)
-    left, right = tables[16].of_camera("left"), tables[16].of_camera("right")
-    again = tables[15].of_camera("right")
-    again = replace(again, frame=np.full(len(again), 17))
-    tables[16] = concatenate([left, right.select(slice(0, kept))])
-    tables[17] = concatenate([tables[17].of_camera("left"), again])
-    found, groups = together(IncrementalCalibrator.from_bytes(started), frames_of(tables[16:]))
-    assert [[*u.used] for u in found] == [["left"], ["left"], *[["left", "right"]] * 2]
-    assert groups == [1, 1, 2]
-
-
-def test_a_blind_camera_is_reported_at_its_frame() -> None:
-    rig = pair_of()
-    blind = [t.of_camera("left") if 22 <= i < 45 else t for i, t in enumerate(drive(rig, 60))]
-    alone = IncrementalCalibrator(guess_of(rig))
-    expected = [[*map(str, alone.update(table).events)] for table in blind]
-    found, _ = together(IncrementalCalibrator(guess_of(rig)), frames_of(blind))
-    assert [[*map(str, update.events)] for update in found] == expected
-    assert sum(map(len, expected)) == 4  # two start, one is blind, and back
-
-
-def test_an_error_in_a_group_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = pair_of()
-    frames = frames_of(drive(rig, 28))
-    tracker = IncrementalCalibrator(guess_of(rig))
-    together(tracker, frames[:25])
-    before = tracker.to_bytes()
-
-    def singular(*_: object) -> None:
-        patch.undo()  # what had been taken in is taken in again
-        raise np.linalg.LinAlgError("Singular matrix")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("calibgraph.tracking.tracker.make_updates", singular)
-        assert tracker.update_together(frames[25:]) == []
-    assert tracker.to_bytes() == before
-
-
-def test_a_restart_goes_on_with_the_same_numbers(tmp_path: Path) -> None:
-    """In the middle of an epoch, from bytes and from disk."""
-    rig = pair_of()
-    frames = frames_of(drive(rig, 40))
-    tracker = IncrementalCalibrator(guess_of(rig))
-    together(tracker, frames[:27])
-    copy = IncrementalCalibrator.from_bytes(tracker.to_bytes())
-    expected, _ = together(tracker, frames[27:])
-    assert [*map(json_line, together(copy, frames[27:])[0])] == [*map(json_line, expected)]
-    calibrator = DurableCalibrator(tmp_path, guess_of(rig))
-    together(calibrator, frames[:27])
-    calibrator.abandon()  # as a kill leaves it
-    with DurableCalibrator(tmp_path, guess_of(rig)) as resumed:
-        assert resumed.repeated[-1].frame == 26 and len(resumed.last_repeated) == 7
-        again, _ = together(resumed, frames[27:])
-    assert [*map(json_line, again)] == [*map(json_line, expected)]
-
-
-def test_time_offsets_are_estimated_one_by_one() -> None:
-    rig = pair_of()
-    tracker = IncrementalCalibrator(rig, Config(estimate="offset"))
-    frames = frames_of(drive(rig, 3))
-    assert tracker.update_together(frames) == []
-
-
-def test_groups_are_in_the_order_of_their_numbers() -> None:
-    rig = pair_of()
-    one, two, three = frames_of(drive(rig, 3))
-    wrong = Refused("half a line")
-    groups = in_groups([one, two, three, wrong, two, one, three], 2)
-    found = [group if isinstance(group, Refused) else [f.frame for f in group] for group in groups]
-    assert found == [[0, 1], [2], wrong, [1], [0, 2]]

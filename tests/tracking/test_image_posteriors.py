@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,8 +12,7 @@ from calibgraph.arrays import Array
 from calibgraph.model.config import Tracking
 from calibgraph.model.geometry import relative_transform
 from calibgraph.model.rig import RelativePose
-from calibgraph.tracking.shown_frames import groups_by_frames
-from calibgraph.trust.pose_posterior import MAX_FRAMES, PosePosterior
+from calibgraph.trust.pose_posterior import PosePosterior
 from tests.tracking.drives import drive, flat, pair_of
 
 SHORT = Config(tracking=Tracking(epoch_frames=4, live_epochs=2))
@@ -88,35 +86,3 @@ def test_cameras_are_scored_on_frames_that_show_them(
     assert scorer.asked == {tuple(frames): groups for frames, groups in asked.items()}
     for verdict in result.camera_verdicts.values():
         assert "flat_evidence" in {check.kind for check in verdict.checks}
-
-
-@pytest.mark.parametrize("tied", [True, False])
-def test_a_camera_that_no_frame_shows_is_not_compared(tied: bool) -> None:
-    scorer = Scorer()
-    result = result_of(scorer, 22, tied=tied, right=range(6, 22))
-    assert scorer.asked == {tuple(range(12, 22)): [LEFT]}
-    assert result.covariance["right"] is not None
-    found = {
-        name: [check for check in verdict.checks if check.name == "image evidence"]
-        for name, verdict in result.camera_verdicts.items()
-    }
-    (check,) = found["right"]
-    assert check.status == "WARN" and "were not compared" in check.text
-    assert not found["left"]
-
-
-def test_without_images_no_check_speaks_of_them() -> None:
-    tracker = IncrementalCalibrator(rig_of(tied=False), SHORT)
-    for table in drive(pair_of()):
-        tracker.update(table)
-    checks = tracker.calibration().verdict.checks
-    assert checks and not {"image evidence", "flat_evidence"} & {check.kind for check in checks}
-
-
-def test_of_a_drift_the_last_frames_are_scored() -> None:
-    """Those of another camera, which does not drift, all the same."""
-    frames = [SimpleNamespace(number=n, raw={0: None, 1: None}) for n in range(30)]
-    state: Any = SimpleNamespace(names=BOTH, live_frames=frames, drifting=[1])
-    last, whole = tuple(range(30 - MAX_FRAMES, 30)), tuple(range(30))
-    assert groups_by_frames(state, [BOTH]) == {last: [BOTH]}
-    assert groups_by_frames(state, [LEFT, RIGHT]) == {whole: [LEFT], last: [RIGHT]}

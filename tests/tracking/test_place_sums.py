@@ -36,15 +36,6 @@ def sums_of(*parts: dict[str, Sums]) -> PlaceSums:
     return found
 
 
-def test_whoever_comes_back_adds_to_the_same_place() -> None:
-    sums = sums_of(part("a", 0), part("b", 1), part("a", 2))
-    assert sums.names[1:] == ("b", "a")
-    both = part("a", 0)["a"] + part("a", 2)["a"]
-    np.testing.assert_allclose(sums.rows.hessian[2], both.hessian)
-    np.testing.assert_array_equal(sums.frames[1:], [[3, 3], [6, 6]])
-    assert not sums.is_of_one_place and sums_of(part("a", 0)).is_of_one_place
-
-
 def test_older_places_are_one_row_that_counts_as_many() -> None:
     """Nothing is lost of the sums, and nothing of the scatter about the places' means."""
     names = [str(number) for number in range(MOST_PLACES + 5)]
@@ -55,21 +46,6 @@ def test_older_places_are_one_row_that_counts_as_many() -> None:
     np.testing.assert_allclose(bounded.rows.total().hessian, whole.rows.total().hessian)
     for found, expected in zip(bounded.within_places, whole.within_places, strict=True):
         np.testing.assert_allclose(found, expected)
-
-
-def test_older_places_count_by_their_frames() -> None:
-    """Of 12 frames at one place and 3 at another, the mean has the error of 15^2 / (12^2 + 3^2)."""
-    sums = sums_of(part("a", 0, frames=12), part("b", 1)).bounded(most=0)
-    np.testing.assert_allclose(sums.places[0], 15**2 / (12**2 + 3**2))
-
-
-def test_a_reference_that_moves_moves_the_gradient() -> None:
-    sums, steps = sums_of(part("a", 0)), np.arange(12.0).reshape(2, 6)
-    moved = sums.shift_reference(steps)
-    for camera in range(2):
-        before, after = (one.rows[1].step(camera) for one in (sums, moved))
-        assert before is not None and after is not None
-        np.testing.assert_allclose(before - after, steps[camera], atol=1e-9)
 
 
 def test_a_camera_restarts_without_the_others() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import gtsam
@@ -12,12 +11,10 @@ import pytest
 
 from calibgraph import (
     Config,
-    CorrespondenceError,
     Correspondences,
     MatcherErrors,
     Update,
     concatenate,
-    simulate_correspondences,
 )
 from calibgraph.graph.variables import camera_key
 from calibgraph.model.geometry import (
@@ -29,22 +26,15 @@ from calibgraph.model.geometry import (
     twist_between,
 )
 from calibgraph.model.rig import IntrinsicsSigma
-from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.elimination import fit_latent_poses, start_values
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.scan_distortion import DistortionEvidence, distortions_at
+from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
-from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.contradictions import pose_priors
-from calibgraph.tracking.frame_order import PLACE, with_place
 from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model
 from calibgraph.tracking.place_sums import PlaceSums, sums_by_place
 from calibgraph.tracking.quadratics import quadratics_of
-from calibgraph.tracking.steps import shift_covariance
-from calibgraph.tracking.stream_lines import frames_of_lines
-from calibgraph.tracking.streams import Refused, StreamFrame
-from calibgraph.tracking.window import Window
 from calibgraph.trust.evidence import Evidence
 from tests.conftest import stereo_relative_pose
 from tests.draws.places import Drawn, draw_places, tied
@@ -103,18 +93,6 @@ def test_places_give_what_a_batch_gives(places: int, frames: int, rounds: int, t
     np.testing.assert_allclose(sigmas_of_pair(T, found), sigmas_of_pair(T, joint), rtol=0.08)
 
 
-def test_many_places_give_the_mount_of_a_batch() -> None:
-    """In a mount is what residuals show of the scan distortion, over all epochs."""
-    drawn = drawn_of(20, 3, 1, tie=False)
-    T, joint = batch_of(drawn, of="mount")
-    tracker = IncrementalCalibrator(drawn.rig, MOUNT)
-    for frame in np.unique(drawn.table.frame):
-        tracker.update(drawn.table.select(drawn.table.frame == frame))
-    found = tracker.calibration().T_camera_lidar
-    apart = np.concatenate([twist_between(found[name], T[name]) for name in T])
-    assert np.sqrt(np.mean(np.square(apart) / np.diag(joint))) < 0.3
-
-
 def states(table: Correspondences, **more: object) -> Correspondences:
     return replace(table, metadata={**table.metadata, **STATED, **more})
 
@@ -124,24 +102,6 @@ def last_of(tables: list[Correspondences], places: list[str | None]) -> Update:
     for table, place in zip(tables, places, strict=True):
         update = tracker.update(table, place=place)
     return update
-
-
-def sigma_of(update: Update) -> float:
-    covariance = update.covariance["left"]
-    assert covariance is not None
-    return float(np.sqrt(np.trace(covariance[:3, :3])))
-
-
-def test_a_vehicle_that_stands_learns_less_than_one_that_drives_or_circles() -> None:
-    """And not knowing where it is is as standing. Without sizes that all frames share."""
-    alone = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
-    tables = [states(table, **alone) for table in drive(pair_of(), 40)]
-    unknown = sigma_of(last_of(tables, [None] * 40))
-    standing = sigma_of(last_of(tables, ["here"] * 40))
-    circling = sigma_of(last_of(tables, [f"corner {frame // 5 % 4}" for frame in range(40)]))
-    driving = sigma_of(last_of(tables, [str(frame // 5) for frame in range(40)]))
-    assert unknown == standing
-    assert driving < 0.9 * circling < 0.9 * 0.8 * standing
 
 
 def test_standing_for_long_moves_the_estimate_no_more_than_passing() -> None:
@@ -295,16 +255,6 @@ def test_an_update_is_the_optimum_of_the_graph_with_all_places() -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(joint.joint_covariance)), sigmas.ravel(), rtol=0.01)
 
 
-def test_places_on_both_sides_of_a_time_cancel() -> None:
-    by_cloud, own = np.eye(12), np.tile(np.eye(6), (2, 1, 1))
-    of = partial(shift_covariance, by_cloud=by_cloud, own=own)
-    here, there = np.array([[10.0, 10], [0, 0]]), np.array([[0.0, 0], [5, 5]])
-    np.testing.assert_allclose(of(here, 3 * here), 0.0, atol=1e-12)
-    apart, half = of(here, there), of(here + 2 * there, there)
-    assert (np.diag(apart) > 0).all()
-    np.testing.assert_allclose(half, apart / 4, rtol=1e-9)
-
-
 def test_a_camera_that_is_blind_at_new_places_stops_nothing() -> None:
     """Its error bar stays that of the places where it saw something."""
     tracker = IncrementalCalibrator(pair_of())
@@ -329,72 +279,7 @@ def test_a_camera_that_sees_a_place_later_than_another_is_taken_in() -> None:
     assert [counts[name]["frames_used"] for name in ("left", "right")] == [40, 38]
 
 
-def test_within_an_epoch_the_window_holds_the_graph_of_its_last_frame() -> None:
-    """Also the covariances that depend on all frames: a new window has the same marginal."""
-    rig = rig_of("panorama")
-    table = simulate_correspondences(rig, frames=16, matches=180, seed=0)
-    stated = {"places": [[*range(16)]], "place_variance": 8.0, "scan_motion_m": 0.15}
-    tracker = IncrementalCalibrator(rig, MOUNT)
-    for frame in range(16):
-        tracker.update(replace(table.select(table.frame == frame), metadata=stated))
-        held = tracker._assess().window
-        anew, keys = Window(held.model, held.places, held.values), held.model.reported_keys
-        covariance = anew.covariance(keys)
-        np.testing.assert_allclose(
-            held.covariance(keys), covariance, atol=1e-3 * np.abs(covariance).max()
-        )
-
-
 # Where the place of a frame comes from
-
-
-def place_after(table: Correspondences, place: str | int | None = None) -> str:
-    tracker = IncrementalCalibrator(pair_of())
-    tracker.update(table, place=place)
-    return tracker.places[-1]
-
-
-def test_the_callers_place_counts_before_that_of_the_table() -> None:
-    table = drive(pair_of(), 1)[0]
-    listed = replace(table, metadata={"places": [[7, 8], [3, 0]]})
-    named = replace(table, metadata={"places": [[7, 8], [3, 0]], PLACE: "yard"})
-    assert place_after(table) == ""
-    assert place_after(listed) == "3"
-    assert place_after(named) == "yard"
-    assert place_after(named, 12) == "12"
-    assert place_after(table, "gate") == "gate"
-
-
-@pytest.mark.parametrize(("place", "name"), [('"gate 4"', "gate 4"), ("-7", "-7"), ("null", "")])
-def test_a_line_names_its_place(place: str, name: str) -> None:
-    line = f'{{"frame": 7, "cameras": {{}}, "place": {place}}}'
-    (item,) = frames_of_lines([line.encode()], "lines")
-    assert isinstance(item, StreamFrame)
-    assert item.table.metadata.get(PLACE, "") == name
-
-
-@pytest.mark.parametrize("place", ["1.5", "true", "[]", '"' + "x" * 201 + '"'])
-def test_a_line_with_another_place_is_left_out(place: str) -> None:
-    line = f'{{"frame": 7, "cameras": {{}}, "place": {place}}}'
-    (item,) = frames_of_lines([line.encode()], "lines")
-    assert isinstance(item, Refused) and "place" in item.message
-
-
-@pytest.mark.parametrize("place", [True, 1.5, "x" * 201, "a\0b"])
-def test_a_place_that_is_no_name_is_refused_and_changes_nothing(place: object) -> None:
-    tracker, table = IncrementalCalibrator(pair_of()), drive(pair_of(), 1)[0]
-    before = tracker.to_bytes()
-    with pytest.raises(CorrespondenceError, match="the place of a frame must"):
-        tracker.update(table, place=place)  # type: ignore[arg-type]
-    with pytest.raises(CorrespondenceError, match="the place of a frame must"):
-        tracker.update(replace(table, metadata={PLACE: place}))
-    assert tracker.to_bytes() == before
-
-
-def test_the_journal_keeps_the_name_of_the_place_and_no_lists() -> None:
-    table = drive(pair_of(), 1)[0]
-    listed = replace(table, metadata={"places": [[0, 3]], "of": "someone"})
-    assert with_place(listed, None).metadata == {PLACE: "0", "of": "someone"}
 
 
 @pytest.mark.parametrize("cut", [41, 63, 69, 70])
@@ -470,39 +355,6 @@ def test_a_frame_of_another_place_disagrees_by_what_places_differ_by() -> None:
     for turn_rad, place in ((0.0025, "here"), (0.02, "there")):
         kinds, left_out = found(turn_rad, place)
         assert set(kinds) == {"moved"} and left_out > 0
-
-
-def test_a_camera_that_sees_all_round_shows_the_motion_as_in_a_batch() -> None:
-    """Motion of 0.1 m, of a table that states 0.15 m; the second place begins within an epoch.
-
-    A batch looks at 4000 matches, so there are fewer.
-    """
-    rig = rig_of("panorama")
-    whole = simulate_correspondences(rig, frames=20, matches=180, seed=0)
-    bent = whole.points_lidar_m + 0.1 * distortions_at(whole.points_lidar_m)[2]
-    places = {"places": [[*range(12)], [*range(12, 20)]], "place_variance": 8.0}
-    stated = {**places, "scan_motion_m": 0.15}
-    table = replace(whole, points_lidar_m=bent, metadata=stated)
-    solved = solve_joint(rig, table, Config(learnt_weights=False))
-    assert solved.errors is not None
-    (_, _, motion_m), (_, _, sigma_m) = solved.errors.scan_distortion(table.findings.bend_sigmas)
-    tracker, mounted, unstated = (
-        IncrementalCalibrator(rig, config) for config in (Config(), MOUNT, MOUNT)
-    )
-    for frame in range(20):
-        one = table.select(table.frame == frame)
-        tracker.update(one)
-        mounted.update(one)
-        unstated.update(replace(one, metadata=places))
-    value, covariance = ClosedPlaces.of(tracker._state).fitted(tracker._state).fit.distortion
-    np.testing.assert_allclose(0.15 * covariance[2, 2] ** 0.5, sigma_m, rtol=0.1)
-    assert abs(0.15 * value[2] - motion_m) < 0.1 * sigma_m
-    (truth,) = rig.T_camera_lidar.values()
-    after, before = (
-        np.abs(twist_between(one.rig.T_camera_lidar["panorama"], truth)).max()
-        for one in (mounted, unstated)
-    )
-    assert after < 0.5 * before
 
 
 def test_bends_widen_the_error_bar_as_in_a_batch_and_survive_a_restart(tmp_path: Path) -> None:

@@ -1,14 +1,14 @@
-"""The tracker's state on disk: what comes back, after kills, power cuts and failing writes too."""
+"""The tracker's state on disk: power cuts, kills, damaged rows, files of others, and the lock."""
 
 from __future__ import annotations
 
 import os
-import resource
+import signal
 import sqlite3
+import struct
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -20,67 +20,18 @@ from calibgraph.tracking.state_recovery import Recovered
 from tests.tracking.state_data import (
     INPUT_BYTES,
     LOG,
-    Files,
     content,
-    crashed,
     drive,
     filled,
     held,
-    inputs,
     opened,
     recovered,
+    require_refused,
     require_usable,
     restored,
 )
 
 # What it does when nothing goes wrong.
-
-
-def test_a_new_folder_holds_nothing(tmp_path: Path) -> None:
-    assert recovered(tmp_path / "a" / "b") == Recovered(None, (), ())
-    assert recovered(tmp_path / "a" / "b") == Recovered(None, (), ())
-
-
-def test_inputs_come_back_in_order_without_a_snapshot(tmp_path: Path) -> None:
-    records = [b"first", b"", b"\x00" * 100, os.urandom(60_000), b"last"]
-    with opened(tmp_path) as database:
-        for record in records:
-            database.append(record)
-    assert recovered(tmp_path) == Recovered(None, tuple(records), ())
-
-
-def test_a_snapshot_replaces_the_inputs_before_it(tmp_path: Path) -> None:
-    with opened(tmp_path) as database:
-        database.append(b"before")
-        database.snapshot(b"state")
-        database.append(b"after")
-    assert recovered(tmp_path) == Recovered(b"state", (b"after",), ())
-
-
-def test_opening_does_not_change_what_is_held(tmp_path: Path) -> None:
-    files, truth = crashed(tmp_path / "state", 5)
-    folder = restored(tmp_path / "copy", files)
-    for _ in range(2):
-        assert held(recovered(folder)) == truth
-        assert content(folder) == files
-
-
-def test_two_snapshots_are_kept_and_the_inputs_since_the_older(tmp_path: Path) -> None:
-    filled(tmp_path, 13)
-    with closing(sqlite3.connect(tmp_path / DATABASE)) as database:
-        snapshots = database.execute("SELECT number FROM snapshot").fetchall()
-        journal = database.execute("SELECT number FROM journal ORDER BY number").fetchall()
-    assert snapshots == [(9,), (12,)]
-    assert journal == [(10,), (11,), (12,), (13,)]
-
-
-def test_real_sizes_come_back(tmp_path: Path) -> None:
-    state, records = os.urandom(5_000_000), tuple(os.urandom(60_000) for _ in range(100))
-    with opened(tmp_path) as database:
-        database.snapshot(state)
-        for record in records:
-            database.append(record)
-    assert recovered(tmp_path) == Recovered(state, records, ())
 
 
 def test_the_folder_does_not_grow_with_the_number_of_snapshots(memory: Path) -> None:
@@ -97,15 +48,6 @@ def test_other_files_are_left_alone(tmp_path: Path) -> None:
     truth = filled(tmp_path, 5)
     assert held(recovered(tmp_path)) == truth
     assert others.items() <= content(tmp_path).items()
-
-
-def test_writing_after_closing_is_refused(tmp_path: Path) -> None:
-    database = StateDatabase(tmp_path)
-    database.close()
-    database.close()
-    for use in (lambda: database.append(b""), lambda: database.snapshot(b"")):
-        with pytest.raises(ValueError, match="is closed"):
-            use()
 
 
 def test_a_file_in_the_folders_place_is_refused(tmp_path: Path) -> None:
@@ -137,15 +79,6 @@ def test_every_commit_is_synced(tmp_path: Path) -> None:
         ):
             found = database._connection.execute(f"PRAGMA {pragma}").fetchone()
             assert found == (expected,), pragma
-
-
-def test_a_kill_between_two_calls_keeps_every_acknowledged_input(tmp_path: Path) -> None:
-    moments: list[tuple[Files, bytes]] = []
-    with opened(tmp_path / "state") as database:
-        for done in drive(database, 10):
-            moments.append((content(tmp_path / "state"), done))
-    for files, done in moments:
-        require_usable(restored(tmp_path / "copy", files), done)
 
 
 def test_a_power_cut_during_an_append_keeps_every_acknowledged_input(memory: Path) -> None:
@@ -255,73 +188,116 @@ def test_every_input_acknowledged_before_a_sigkill_is_there(tmp_path: Path) -> N
     assert result.damages == ()
 
 
-# Failing writes.
+# Damage.
 
 
-@contextmanager
-def file_size_limit(limit_bytes: int) -> Iterator[None]:
-    """The system lets no file grow beyond a size, as if the disk were full."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+def edited(folder: Path, statement: str) -> None:
+    with closing(sqlite3.connect(folder / DATABASE, isolation_level=None)) as database:
+        database.execute(statement)
 
 
-def test_a_write_that_fails_at_any_byte_loses_no_acknowledged_input(memory: Path) -> None:
-    for limit in range(20_000, 2_000_000, 14_983):
-        folder = memory / str(limit)
-        done, failed = b"", False
-        database = StateDatabase(folder)
-        with file_size_limit(limit):
-            try:
-                for done in drive(database, 7):  # noqa: B007 - read after a failure
-                    pass
-            except OSError as error:
-                failed = True
-                assert error.filename == str(folder / DATABASE)
-                assert "free or mend the disk and start again" in str(error)
-                for use in (lambda: database.append(b""), lambda: database.snapshot(b"")):  # noqa: B023
-                    with pytest.raises(ValueError, match="is closed"):
-                        use()
-            database.close()
-        result = recovered(folder)
-        assert held(result) in (done, done + inputs(1, first=len(done) // INPUT_BYTES)[0])
-        with opened(folder) as again:
-            again.append(b"abc")
-        assert recovered(folder).inputs[-1] == b"abc"
-        if not failed:
-            assert limit > 300_000
-            return
-    pytest.fail("no limit was large enough")
+def test_a_damaged_snapshot_is_replaced_by_the_one_before_and_the_inputs_since(
+    tmp_path: Path,
+) -> None:
+    truth = filled(tmp_path, 8)
+    edited(tmp_path, "UPDATE snapshot SET content = x'00' WHERE number = 6")
+    result = recovered(tmp_path)
+    assert (result.snapshot, len(result.inputs)) == (truth[: 3 * INPUT_BYTES], 5)
+    assert held(result) == truth
+    assert result.damages == (
+        f"{tmp_path / DATABASE}: the snapshot after input 6 is damaged: not used",
+    )
 
 
-def test_a_state_that_a_full_disk_hides_is_not_called_damaged(memory: Path) -> None:
-    truth = filled(memory / "state", 5)
-    full = pytest.raises(FileError, match="cannot be read .*: is the disk full")
-    with file_size_limit(1000), full:
-        StateDatabase(memory / "state")
-    require_usable(memory / "state", truth)
+@pytest.mark.parametrize(
+    ("statement", "match"),
+    [
+        ("UPDATE snapshot SET content = x'00'", "no snapshot has the right checksum"),
+        ("UPDATE snapshot SET content = 'text'", "no snapshot has the right checksum"),
+        ("UPDATE journal SET content = x'00' WHERE number = 8", "input 8 is missing or has a"),
+        ("UPDATE journal SET digest = zeroblob(32) WHERE number = 7", "input 7 is missing or"),
+        ("UPDATE journal SET number = 9 WHERE number = 7", "input 7 is missing or has a wrong"),
+        ("DELETE FROM journal WHERE number = 7", "input 7 is missing or has a wrong checksum"),
+        ("DELETE FROM status", "is damaged"),
+        ("UPDATE status SET number = 9", "input 9 is missing"),
+        ("UPDATE status SET number = 7", "is damaged"),
+    ],
+)
+def test_damaged_rows_are_refused(tmp_path: Path, statement: str, match: str) -> None:
+    filled(tmp_path, 8)
+    edited(tmp_path, statement)
+    require_refused(tmp_path, match)
 
 
-def test_an_interrupted_append_is_taken_back(tmp_path: Path) -> None:
-    with opened(tmp_path) as database:
-        database.append(b"first")
-        with pytest.raises(KeyboardInterrupt), database._writing() as connection:
-            connection.execute("INSERT INTO journal VALUES (2, x'00', x'00')")
-            raise KeyboardInterrupt
-        with pytest.raises(ValueError, match="is closed"):
-            database.append(b"next")
-    assert recovered(tmp_path) == Recovered(None, (b"first",), ())
+# Files of others.
 
 
-def test_a_full_disk_is_reported_as_one(tmp_path: Path) -> None:
-    with opened(tmp_path) as database:
-        database.append(b"first")
-        assert database._connection is not None
-        database._connection.execute("PRAGMA max_page_count=1")
-        with pytest.raises(OSError, match=r"No space|full") as error:
-            database.append(b"x" * 100_000)
-    assert error.value.errno == 28
-    assert recovered(tmp_path) == Recovered(None, (b"first",), ())
+@pytest.mark.parametrize(
+    ("statement", "match"),
+    [
+        ("PRAGMA user_version=3", "is state of layout 3, expected 2; choose another folder, or"),
+        ("PRAGMA application_id=5", "is a database of another program; choose another folder"),
+    ],
+)
+def test_a_database_of_another_layout_or_program_is_refused(
+    tmp_path: Path, statement: str, match: str
+) -> None:
+    filled(tmp_path, 5)
+    edited(tmp_path, statement)
+    require_refused(tmp_path, match)
+
+
+def test_pages_that_refer_to_each_other_end_the_reading(tmp_path: Path) -> None:
+    """A tree of 16 levels, each of a page with 3000 references to the next one: 10^55 rows."""
+    filled(tmp_path, 5)
+    data = bytearray((tmp_path / DATABASE).read_bytes())
+    size, first = 32768, len(data) // 32768 + 1
+    row = b"\x06\x00\x00\x00\x00\x0fx"  # a record of four NULLs and a text
+    for level in range(17):
+        last = level == 16
+        cell = bytes([len(row), 1]) + row if last else struct.pack(">IB", first + level, 1)
+        count = 1 if last else 3000
+        starts = range(size - count * len(cell), size, len(cell))
+        page = bytes(data[:100]) if level == 0 else b""
+        page += struct.pack(">BHHHx", 13 if last else 5, 0, count, starts[0])
+        page += (b"" if last else cell[:4]) + struct.pack(f">{count}H", *starts)
+        page = page.ljust(starts[0], b"\0") + cell * count
+        data = bytearray(page) + data[size:] if level == 0 else data + page
+    data[28:32] = struct.pack(">I", len(data) // size)
+    restored(tmp_path, {DATABASE: bytes(data)})
+    require_refused(tmp_path, "is damaged")
+
+
+@pytest.mark.parametrize("log", [b"", b"theirs"])
+def test_files_beside_a_database_of_another_program_are_left_alone(
+    tmp_path: Path, log: bytes
+) -> None:
+    with closing(sqlite3.connect(tmp_path / DATABASE)) as database:
+        database.executescript("PRAGMA journal_mode=WAL; CREATE TABLE theirs (number INTEGER)")
+    files = content(tmp_path) | {f"{DATABASE}-shm": b"theirs", LOG: log}
+    require_refused(restored(tmp_path, files), "is a database of another program")
+
+
+# The lock.
+
+
+HOLDING = """
+import sys
+from pathlib import Path
+from calibgraph.tracking.state_database import StateDatabase
+database = StateDatabase(Path(sys.argv[1]))
+print("locked", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_two_processes_cannot_have_one_folder(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HOLDING, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"locked\n"
+        with pytest.raises(FileError, match="is in use by another process; stop that one"):
+            StateDatabase(tmp_path)
+        other.send_signal(signal.SIGKILL)
+        other.wait()
+    filled(tmp_path, 1)

@@ -55,11 +55,6 @@ def test_a_line_of_metadata_alone_holds_for_the_frames_after_it() -> None:
     assert third.table.metadata == {"systematic_rotation_rad": 0.001, "matcher": "other"}
 
 
-@pytest.mark.parametrize("wrong", [3, {"systematic_rotation_rad": "much"}])
-def test_a_wrong_header_is_refused_at_its_line(wrong: object) -> None:
-    assert "metadata" in refusal(json.dumps({"metadata": wrong}).encode())
-
-
 @pytest.mark.parametrize("cameras", [{}, {"left": camera(0)}])
 def test_a_frame_without_rows_is_a_frame(cameras: dict[str, Any]) -> None:
     (item,) = of_bytes(line(9, cameras=cameras, stamp_ns=5, metadata={"k": 1}))
@@ -69,61 +64,32 @@ def test_a_frame_without_rows_is_a_frame(cameras: dict[str, Any]) -> None:
     assert item.table.metadata == {"k": 1}
 
 
-def test_empty_lines_are_skipped_but_counted() -> None:
-    assert outcomes(of_bytes(b"\n \r\n" + line(1) + b"{\n" + line(2).rstrip())) == [
-        1,
-        "standard input, line 4: is not JSON (EOF while parsing an object at line 1 "
-        "column 1); send one frame a line, as JSON",
-        2,
-    ]
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         (line()[:-9], "is not JSON"),
         (b"\xfe\xfe", "is not JSON"),
-        (line()[:-1].decode().encode("utf-16"), "is not JSON"),
         (b"[" * 100_000, "is not JSON (recursion limit exceeded"),
         (b"[1]", "expected keys with values, as in {key: value}, found [1]"),
         (b'{"frame": ' + b"9" * 5000 + b', "cameras": {}}', "is not JSON (number out of range"),
         (b'{"frame": 7}', "key 'cameras' is missing"),
         (line(weather="rain"), "unknown key 'weather'; remove it"),
         (line(1.0), "frame: Input should be a valid integer, found 1.0"),
-        (line(True), "frame: Input should be a valid integer, found True"),
         (line(2**63), "frame: Input should be less than 9223372036854775808, found"),
-        (line("7"), "frame: Input should be a valid integer, found '7'"),
-        (line(stamp_ns=None), "stamp_ns: Input should be a valid integer, found None"),
-        (line(cameras=[]), "cameras: expected keys with values, as in {key: value}, found []"),
-        (
-            line(cameras={"left": None}),
-            "cameras.left: expected keys with values, as in {key: value}, found None",
-        ),
         (line(cameras={"left": {}}), "key 'cameras.left.u_px' is missing"),
         (line(cameras={"left": camera(depth=[1])}), "unknown key 'cameras.left.depth'"),
-        (line(cameras={"left": camera(u_px=5)}), "u_px: Input should be a valid list, found 5"),
         (
             line(cameras={"left": camera(u_px=[True])}),
             "u_px.0: Input should be a valid number, found True",
-        ),
-        (
-            line(cameras={"left": camera(u_px=[[1]])}),
-            "u_px.0: Input should be a valid number, found [1]",
-        ),
-        (
-            line(cameras={"left": camera(u_px=[None])}),
-            "u_px.0: Input should be a valid number, found None",
         ),
         (
             line(cameras={"left": camera(u_px=[10**400])}),
             "u_px.0: Input should be a valid number, found 1000",
         ),
         (line(cameras={"left": camera(u_px=[float("nan")])}), "is not JSON"),
-        (line(cameras={"left": camera(u_px=[-float("inf")])}), "is not JSON"),
         (line().replace(b"[1.5]", b"[1e999]"), "pixel must be finite"),
         (line(cameras={"left": camera(u_px=[1, 2])}), "differ in length: {'u_px': 2, 'v_px': 1"),
         (line(cameras={"left": camera(confidence=[2])}), "confidence must lie in (0, 1]"),
-        (line(cameras={"left": camera(confidence=[1e300])}), "confidence must lie in (0, 1]"),
         (
             line(cameras={"left": camera(point_index=[0.5])}),
             "point_index.0: Input should be a valid integer, found 0.5",
@@ -137,14 +103,9 @@ def test_empty_lines_are_skipped_but_counted() -> None:
             line(cameras={str(i): camera(0) for i in range(1001)}),
             "cameras: Dictionary should have at most 1000 items",
         ),
-        (line(metadata=[]), "metadata: expected keys with values, as in {key: value}, found []"),
         (
             line(metadata={"systematic_rotation_rad": "x"}),
             "systematic_rotation_rad: expected a number from 0 to 3.14, found 'x'; correct it, or",
-        ),
-        (
-            line(metadata={"systematic_rotation_rad": 10**400}),
-            "systematic_rotation_rad: expected a number from 0 to 3.14, found 1000",
         ),
     ],
 )

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from calibgraph import concatenate
 from calibgraph.tracking.streams import StreamFrame, frames_of
 from tests.tracking.stream_data import (
-    of_bytes,
     outcomes,
     spoilt,
     table,
@@ -40,13 +36,6 @@ def test_a_table_gives_its_frames_in_ascending_order(suffix: str, tmp_path: Path
         assert last.table.metadata == {"matcher": "m"}
 
 
-def test_all_cameras_of_a_frame_come_together(tmp_path: Path) -> None:
-    path = tmp_path / "table.parquet"
-    concatenate([table([0, 1], camera="left"), table([0, 1], camera="right")]).save(path)
-    frames = [item for item in frames_of(path) if isinstance(item, StreamFrame)]
-    assert [item.table.counts() for item in frames] == [{"left": 1, "right": 1}] * 2
-
-
 @pytest.mark.parametrize("row_group_size", [1, 2, 3, 5, 100])
 @pytest.mark.parametrize(
     "numbers", [[0, 0, 1, 2, 2, 2, 2, 2, 5], [1, 0, 2, 2, 3, 2, 4, 9, 5], [7] * 9, [3, 2, 1, 0]]
@@ -59,28 +48,6 @@ def test_row_groups_do_not_show(row_group_size: int, numbers: list[int], tmp_pat
     for item in frames:
         rows = np.flatnonzero(np.array(numbers) == item.frame)
         assert item.table.pixels_px[:, 0].tolist() == rows.tolist()
-
-
-def test_a_sorted_table_is_read_by_row_groups(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "table.parquet"
-    numbers = np.repeat(np.arange(50), 10).tolist()
-    parquet.write_table(to_arrow(table(numbers)), path, row_group_size=25)
-    read: list[int] = []
-    whole = parquet.ParquetFile.read_row_group
-
-    def counted(self: Any, group: int, columns: list[str] | None = None) -> Any:
-        if columns is None:
-            read.append(group)
-        return whole(self, group, columns=columns)
-
-    monkeypatch.setattr(parquet.ParquetFile, "read_row_group", counted)
-    frames = frames_of(path)
-    assert outcomes([next(frames), next(frames)]) == [0, 1]
-    assert read == [0]
-    assert outcomes(frames) == list(range(2, 50))
-    assert read == list(range(20))
 
 
 @pytest.mark.parametrize("row_group_size", [2, 100])
@@ -104,15 +71,6 @@ def test_a_wrong_value_refuses_its_frame_alone(
     assert (first, last) == (0, 2)
     assert str(refused).startswith(f"{path}: frame 1 is left out; among its rows, row 0")
     assert message in str(refused)
-
-
-def test_rows_without_a_frame_are_refused_together(tmp_path: Path) -> None:
-    path = tmp_path / "table.parquet"
-    wrong = spoilt(spoilt(to_arrow(table([0, 1, 2, 3])), "frame", 0, None), "frame", 2, None)
-    parquet.write_table(wrong, path)
-    refused, *frames = outcomes(frames_of(path))
-    assert refused == f"{path}: column 'frame' is empty in 2 rows; fill in or drop them"
-    assert frames == [1, 3]
 
 
 def test_a_file_that_is_no_table_is_refused_in_one_line(tmp_path: Path) -> None:
@@ -161,30 +119,3 @@ def test_a_damaged_row_group_ends_the_table_after_the_good_ones(tmp_path: Path) 
 
 
 # Standard input
-
-
-def test_a_file_that_is_no_stream_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "table.parquet"
-    table([0]).save(path)
-    assert outcomes(of_bytes(path.read_bytes())) == [
-        "standard input: is a Parquet file; send a line of JSON per frame"
-    ]
-    assert "is an Arrow stream" in str(outcomes(of_bytes(b"\xff\xff\xff\xff\0"))[0])
-    assert "is an Arrow file" in str(outcomes(of_bytes(b"ARROW1\0\0\0"))[0])
-
-
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        ([b"PA", b"R1xx\nyy"], "is a Parquet file; send a line of JSON per frame"),
-        ([b"A", b"RRO", b"W1"], "is an Arrow file; send a line of JSON per frame"),
-        ([b"PA", b"R"], "is not JSON"),
-    ],
-)
-def test_a_mark_that_comes_in_parts_is_found(parts: list[bytes], message: str) -> None:
-    class Parts(io.BytesIO):
-        def read1(self, size: int | None = -1, /) -> bytes:
-            return parts.pop(0) if parts else b""
-
-    (found,) = outcomes(frames_of("-", stdin=Parts()))
-    assert message in str(found)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import signal
 import subprocess
@@ -18,7 +17,7 @@ import pytest
 
 from calibgraph import FileError
 from calibgraph.tracking import streams
-from calibgraph.tracking.streams import StreamFrame, frames_of
+from calibgraph.tracking.streams import frames_of
 from tests.tracking.stream_data import (
     line,
     outcomes,
@@ -93,48 +92,6 @@ def test_a_followed_file_is_read_when_it_is_complete(tmp_path: Path) -> None:
     writer.join()
 
 
-@pytest.mark.usefixtures("quick")
-def test_a_followed_csv_is_read_when_it_no_longer_grows(tmp_path: Path) -> None:
-    """Half a CSV looks complete."""
-    path = tmp_path / "a.csv"
-    path.write_text("camera,frame,u_px,v_px,x_m,y_m,z_m\nleft,1,1,2,3,4,5\nleft,1,1,2,3,4,5")
-    following = Following(tmp_path)
-    assert following.next(seconds=0.05) is None
-    with path.open("a") as file:
-        file.write("5\n")
-    item = next(frames_of(tmp_path, follow=True))
-    assert isinstance(item, StreamFrame)
-    assert item.table.points_lidar_m[:, 2].tolist() == [5, 55]
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_followed_file_that_stays_unreadable_is_refused_once(tmp_path: Path) -> None:
-    (tmp_path / "a.parquet").write_bytes(b"half")
-    (tmp_path / "b.parquet").symlink_to(tmp_path / "nothing")
-    (tmp_path / "c.parquet").mkdir()
-    following = Following(tmp_path)
-    start = time.monotonic()
-    messages = sorted(str(following.next()).removeprefix(f"{tmp_path}/") for _ in range(3))
-    assert time.monotonic() - start >= streams.QUIET_S - streams.POLL_S
-    for message, expected in zip(
-        messages,
-        ["a.parquet: cannot", "b.parquet: is no file", "c.parquet: is a folder"],
-        strict=True,
-    ):
-        assert message.startswith(expected)
-    assert following.next(seconds=0.1) is None
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_followed_folder_that_goes_away_ends_in_one_line(tmp_path: Path) -> None:
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    frames = frames_of(folder, follow=True)
-    folder.rmdir()
-    (refused,) = outcomes(frames)
-    assert "the folder cannot be read any more" in str(refused)
-
-
 # Waiting and stopping
 
 
@@ -173,15 +130,6 @@ def test_a_waiting_stream_ends_when_it_is_stopped(
     assert time.monotonic() < until + 5 * streams.POLL_S
 
 
-def test_a_stopped_stream_gives_no_more_of_what_it_has() -> None:
-    stopped: list[int] = []
-    three = io.BytesIO(line(1) + line(2) + line(3))
-    frames = frames_of("-", stdin=three, stop=lambda: len(stopped) > 0)
-    assert outcomes([next(frames)]) == [1]
-    stopped.append(1)
-    assert outcomes(frames) == []
-
-
 def test_a_signal_ends_the_waiting_for_standard_input() -> None:
     program = """
         import signal, sys
@@ -209,13 +157,6 @@ def test_a_signal_ends_the_waiting_for_standard_input() -> None:
 # Sources
 
 
-def test_a_source_is_what_it_looks_like(tmp_path: Path) -> None:
-    table([3]).save(tmp_path / "a.parquet")
-    assert outcomes(frames_of(tmp_path)) == [3]
-    assert outcomes(frames_of(str(tmp_path / "a.parquet"))) == [3]
-    assert outcomes(frames_of("-", stdin=io.BytesIO(line(4)))) == [4]
-
-
 def test_a_source_that_is_none_is_refused_at_once(tmp_path: Path) -> None:
     table([3]).save(tmp_path / "a.parquet")
     os.mkfifo(tmp_path / "pipe")
@@ -228,16 +169,3 @@ def test_a_source_that_is_none_is_refused_at_once(tmp_path: Path) -> None:
     for message, call in calls.items():
         with pytest.raises(FileError, match=message):
             call()
-
-
-def test_a_closed_or_unreadable_stream_is_refused_in_one_line() -> None:
-    closed = io.BytesIO()
-    closed.close()
-    assert "standard input: cannot be read" in str(outcomes(frames_of("-", stdin=closed))[0])
-
-    class Broken(io.BytesIO):
-        def read1(self, size: int | None = -1, /) -> bytes:
-            raise OSError("the wire is cut")
-
-    (refused,) = outcomes(frames_of("-", stdin=Broken()))
-    assert refused == "standard input: cannot be read (the wire is cut); restart"

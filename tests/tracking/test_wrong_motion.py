@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from calibgraph import Correspondences, DurableCalibrator, concatenate
+from calibgraph import DurableCalibrator, concatenate
 from calibgraph.errors import MotionError
 from calibgraph.tracking.history import History
 from calibgraph.tracking.run import MOTION_FRAMES, Run
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
 from tests.conftest import Call
-from tests.tracking.drives import content_of
 from tests.tracking.late_drives import OFFSET, late, town
 
 SWAPPED = [3, 4, 5, 0, 1, 2]
 RULE = "twist must be under 6 rad/s, then under 100 m/s (rotation first, in radians), found ["
-
-
-def with_twists(tables: Sequence[Correspondences], by: Callable[[Any], Any]) -> bytes:
-    """As lines of JSON, with other motions."""
-    content = [
-        {**content_of(table), "twist_per_s": by(table.twist_per_s[0]).tolist()}
-        for table in tables
-        if table.twist_per_s is not None
-    ]
-    return b"".join(json.dumps(one).encode() + b"\n" for one in content)
 
 
 def swapped_after_two(twists: np.ndarray) -> np.ndarray:
@@ -66,23 +53,6 @@ def test_a_table_of_wrong_motions_is_refused_before_its_first_frame(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_stream_of_wrong_motions_ends_at_its_line(
-    piped: Callable[..., Any], tmp_path: Path
-) -> None:
-    truth, tables = late(town(5, 1), np.zeros(5))
-    truth.save(tmp_path / "rig.yaml")
-    given = with_twists(tables[:1], lambda t: 0.1 * t) + with_twists(
-        tables[1:], lambda t: t[SWAPPED]
-    )
-    code, _, err = piped(
-        tmp_path / "rig.yaml", given, "--estimate", "offset", "--out", tmp_path / "out"
-    )
-    assert code == 2
-    assert f"standard input, line 2: row 0 (camera 'image_2', frame 1): {RULE}" in err
-    assert err.endswith("correct the motion of all frames, and take another --out\n")
-    assert not (tmp_path / "out" / "calibration.yaml").exists()
-
-
 def test_one_wrong_motion_in_a_long_stream_is_an_outlier(tmp_path: Path) -> None:
     """A second one before as many sound frames have passed is not."""
     truth, (table,) = late(town(1, 1), np.zeros(1), matches=10)
@@ -103,32 +73,3 @@ def test_one_wrong_motion_in_a_long_stream_is_an_outlier(tmp_path: Path) -> None
     assert (run.updates, run.refused) == (MOTION_FRAMES + 5, 1)
     with pytest.raises(MotionError, match=r"line 7: too fast; correct the motion of all frames"):
         follow([*once, wrong])
-
-
-def test_a_frame_without_its_motion_is_left_out_by_its_line(
-    piped: Callable[..., Any], tmp_path: Path
-) -> None:
-    truth, tables = late(town(3, 1), np.zeros(3))
-    truth.save(tmp_path / "rig.yaml")
-    without = json.dumps(content_of(tables[1])).encode() + b"\n"
-    given = with_twists(tables[:1], np.asarray) + without + with_twists(tables[2:], np.asarray)
-    _, out, err = piped(
-        tmp_path / "rig.yaml", given, "--estimate", "offset", "--out", tmp_path / "out"
-    )
-    assert len(out.splitlines()) == 2
-    assert "left out: standard input, line 2: to estimate offset, the motion of the LiDAR" in err
-
-
-@pytest.mark.parametrize("name", ["images", "drive.mcap"])
-def test_a_dataset_without_a_matcher_is_told_from_tables(
-    name: str, call: Call, tmp_path: Path
-) -> None:
-    truth, _ = late(town(1, 1), np.zeros(1))
-    truth.save(tmp_path / "rig.yaml")
-    if "." in name:
-        (tmp_path / name).write_bytes(b"\x89MCAP0\r\n")
-    else:
-        (tmp_path / name / "image_2").mkdir(parents=True)
-    code, _, err = call("track", tmp_path / "rig.yaml", tmp_path / name, "--out", tmp_path / "out")
-    assert code == 2 and err.count("\n") == 1
-    assert "to track a dataset, say what matches its frames: --matcher structure" in err

@@ -20,7 +20,3 @@ def test_the_bootstrap_agrees_with_the_reported_covariance(pair: Rig) -> None:
         (check,) = named(result, name, "bootstrap")
         # The check's scatter is of both cameras jointly, the reported one of each by itself.
         assert check.status == "PASS" and check.value == pytest.approx(ratio.max(), rel=0.1)
-
-
-def test_without_the_setting_nothing_is_drawn(pair: Rig) -> None:
-    assert not solve(pair, simulated(pair)).bootstrap

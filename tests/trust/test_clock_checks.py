@@ -86,13 +86,6 @@ def test_a_table_with_motion_is_checked_and_names_the_cure() -> None:
         assert "correct the time stamps; or run with --estimate offset" in check.text
 
 
-def test_scans_that_are_not_of_one_drive_at_a_constant_rate_show_no_motion(
-    dataset: Dataset,
-) -> None:
-    """Frames of the sample are stops 2 to 6 m apart, and turned."""
-    assert _with_known_motion(keep_frames(dataset))[0] is None
-
-
 class Recorder:
     """A matcher that searches the offset, too, and records the offsets of the rigs it is given."""
 
@@ -198,28 +191,3 @@ def test_clouds_are_as_far_apart_as_their_stamps_or_numbers_say(
     checks = image_offset_checks(run_of(matcher, rig, kept.frames, table))
     told = ["successive clouds are taken to be 0.1 s apart" in c[0].text for c in checks.values()]
     assert told == [is_told] * len(rig.cameras)
-
-
-def test_without_the_image_checks_right_to_fail_a_late_image_is_a_warning() -> None:
-    rig, table, twists = late_by(0.04)
-    matcher = Recorder(replace(table, twist_per_s=None))
-    evidence = run_of(matcher, rig, moving_frames(twists), table)
-    (first, *_) = image_offset_checks(evidence).values()
-    matcher.image_checks_can_fail = False
-    evidence = run_of(matcher, rig, moving_frames(twists), table)
-    (second, *_) = image_offset_checks(evidence).values()
-    assert [first[0].status, second[0].status] == ["FAIL", "WARN"]
-    assert first[0].text == second[0].text
-
-
-def test_a_released_matcher_is_not_used_again() -> None:
-    class Released(Recorder):
-        def with_estimate(self, parts: Sequence[str]) -> Released:  # noqa: ARG002
-            return self  # does not search the offset
-
-        def match(self, *_: object, **__: object) -> Correspondences:
-            raise AssertionError("its network has been dropped")
-
-    rig, table, twists = late_by(0.04)
-    plain = Released(table)
-    assert image_offset_checks(run_of(plain, rig, moving_frames(twists), table)) == {}

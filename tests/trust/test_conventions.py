@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import calibgraph
-from calibgraph.errors import RigError
 from calibgraph.model.geometry import T_OPTICAL_LINK
 from calibgraph.trust.conventions import (
     convention_error_between,
@@ -63,16 +62,6 @@ def test_a_mistake_is_recognised_by_the_images_at_a_rough_guess(error: str, seed
         np.testing.assert_allclose(camera.T_camera_lidar, rough.T_camera_lidar[name], atol=1e-9)
 
 
-def test_the_camera_is_named_if_only_its_guess_is_wrong() -> None:
-    rough = rough_guess(5)
-    wrong = np.linalg.inv(rough.T_camera_lidar["left"])
-    found = likely_intended_guess(one_frame(), rough.moved_to({"left": wrong}))
-    assert found == (
-        "the images of left fit clearly better if the guess is inverted (it is T_lidar_camera); "
-        "undo it with calibgraph rig RIG --correct left=inverse --out FILE.yaml"
-    )
-
-
 def test_mirrored_images_are_named(tmp_path: Path) -> None:
     """The principal point is that of the mirrored image, so that only its content is wrong."""
     copy = tmp_path / "sample"
@@ -81,20 +70,6 @@ def test_mirrored_images_are_named(tmp_path: Path) -> None:
         cv2.imwrite(str(path), cv2.flip(cv2.imread(str(path)), 1))
     found = likely_intended_guess(calibgraph.load_dataset(copy, frames="0:3"), rough_guess(5))
     assert found is not None and found.startswith("the images of left are mirrored")
-
-
-def test_an_error_is_undone_by_its_name_for_one_camera_or_all() -> None:
-    rig = calibgraph.load_rig(SAMPLE)
-    left = correct_guess(rig, ["left=inverse"])
-    changed = {n for n, T in rig.T_camera_lidar.items() if (left.T_camera_lidar[n] != T).any()}
-    assert changed == {"left"}
-    twice = correct_guess(rig, ["inverse", "inverse"])
-    for name, T in rig.T_camera_lidar.items():
-        np.testing.assert_allclose(twice.T_camera_lidar[name], T, atol=1e-12)
-    with pytest.raises(RigError, match="no mistake 'sideways' .* known are inverse, camera-flu"):
-        correct_guess(rig, ["sideways"])
-    with pytest.raises(RigError, match="no camera 'rear'"):
-        correct_guess(rig, ["rear=inverse"])
 
 
 @pytest.mark.parametrize(("rotation_deg", "translation_m"), [(4.0, 0.3), (20.0, 1.5)])

@@ -92,29 +92,6 @@ def test_a_camera_without_structure_gets_a_warning(
     assert "structure in both image and cloud" in checks[0].text
 
 
-def test_a_camera_that_was_not_found_has_no_pose_to_check(
-    dataset: Dataset, truth: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    measured: list[str] = []
-
-    def measure(_: Dataset, rig: Rig, **__: object) -> dict[str, ImageEvidence]:
-        measured.extend(rig.cameras)
-        return dict.fromkeys(rig.cameras, ImageEvidence(0))
-
-    monkeypatch.setattr(image_checks, "measure_image_evidence", measure)
-    missed = EMPTY.with_metadata({"missed": {NAME: 5.0}})
-    others = truth.cameras.keys() - {NAME}
-    assert check_images(dataset, truth, missed).keys() == {*measured} == others
-    alone = Rig(cameras={NAME: truth.cameras[NAME]})
-    assert check_images(dataset, alone, missed) == {}
-
-
-def test_frames_are_named_by_number_and_file() -> None:
-    found = ImageEvidence(100, displaced_z_score=5.0, frames_best=0.5, frames_lost=(3, 5))
-    (check,) = (c for c in evidence_checks(found, NAMES) if c.value == 0.5)
-    assert "frames 3 (000003), 5 (000005) have higher scores" in check.text
-
-
 @pytest.mark.parametrize(("displaced_z_score", "status"), [(5.0, "WARN"), (0.1, "PASS")])
 def test_clouds_of_another_time_are_shown_by_cameras_that_agree_with_clouds_at_all(
     dataset: Dataset, monkeypatch: pytest.MonkeyPatch, displaced_z_score: float, status: str

@@ -16,7 +16,7 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
 from calibgraph.trust.evidence import Evidence
-from calibgraph.trust.image_record import RunChecks, _same_lens, to_metadata
+from calibgraph.trust.image_record import RunChecks, to_metadata
 from calibgraph.trust.pose_posterior import PosePosterior
 from tests.conftest import make_pair
 from tests.trust.conftest import simulated
@@ -105,20 +105,6 @@ def test_what_images_said_with_another_lens_is_not_of_this_one(
     assert "flat_evidence" not in [check.kind for check in found.camera_verdicts[CAMERA].checks]
 
 
-def test_joined_tables_keep_what_all_state(
-    left_by_run: tuple[Calibration, Correspondences],
-) -> None:
-    """Of tables of several runs it is said that nobody compared these images with all clouds."""
-    made, table = left_by_run
-    parts = [table.select(table.frame % 2 == odd) for odd in (0, 1)]
-    assert calibgraph.concatenate(parts).metadata[IMAGES] == table.metadata[IMAGES]
-    parts[1] = parts[1].with_metadata({})
-    for order in (parts, parts[::-1]):
-        found = calibgraph.solve(made.rig, calibgraph.concatenate(order))
-        (said,) = images_of(found, CAMERA)
-        assert said.status == "WARN" and "of several runs" in said.text
-
-
 def test_a_fault_of_one_camera_stays_where_another_has_moved(
     left_by_run: tuple[Calibration, Correspondences],
 ) -> None:
@@ -146,41 +132,8 @@ def test_checks_of_another_tolerance_are_no_pass(
         assert said.status == "WARN" and "a tolerance of 0.5 deg, 10 cm" in said.text
 
 
-def test_a_camera_that_the_run_did_not_have_is_told_so(
-    left_by_run: tuple[Calibration, Correspondences],
-) -> None:
-    made, table = left_by_run
-    record = dict(table.metadata[IMAGES])
-    record["cameras"] = {CAMERA: record["cameras"][CAMERA]}
-    found = calibgraph.solve(made.rig, table.with_metadata({**table.metadata, IMAGES: record}))
-    assert not images_of(found, CAMERA)
-    assert [each.status for each in images_of(found, OTHER)] == ["WARN"]
-
-
-def test_what_images_said_at_another_time_is_not_of_this_one(
-    left_by_run: tuple[Calibration, Correspondences],
-) -> None:
-    made, table = left_by_run
-    late = made.rig.cameras[CAMERA].model_copy(update={"time_offset_s": 0.05})
-    rig = made.rig.model_copy(update={"cameras": {**made.rig.cameras, CAMERA: late}})
-    (said,) = images_of(calibgraph.solve(rig, table), CAMERA)
-    assert "another time" in said.text
-
-
 def images_of(found: Calibration, name: str) -> list[Check]:
     return [check for check in found.camera_verdicts[name].checks if check.name == "images"]
-
-
-@pytest.mark.parametrize("distortion", [(), (-0.42, 0.22, 0.0, 0.0, -0.06)])
-def test_a_lens_that_differs_in_its_last_digit_is_the_same(
-    left_by_run: tuple[Calibration, Correspondences], distortion: tuple[float, ...]
-) -> None:
-    """Also one that has no rays in the corners of its image."""
-    camera = left_by_run[0].rig.cameras[CAMERA].model_copy(update={"distortion": distortion})
-    for share, same in ((1e-9, True), (0.02, False)):
-        lens = camera.intrinsics_px
-        lens = lens.model_copy(update={"fx": (1 + share) * lens.fx})
-        assert _same_lens(camera, camera.model_copy(update={"intrinsics_px": lens})) is same
 
 
 @pytest.mark.parametrize(

@@ -40,12 +40,6 @@ def test_the_sample_has_no_warning() -> None:
     assert check_inputs(calibgraph.load_dataset(SAMPLE), RIG) == ()
 
 
-def test_a_value_that_cannot_be_right_is_a_warning() -> None:
-    data = calibgraph.load_dataset(SAMPLE)
-    (warning,) = check_inputs(data, with_principal_point(80, 45))
-    assert warning.startswith("left: principal point (80, 45) of a 640x360 px image")
-
-
 def test_a_rig_whose_cameras_all_see_no_point_is_refused_before_the_search(
     folder: Path, call: Call
 ) -> None:
@@ -79,19 +73,6 @@ def test_warnings_are_logged_and_recorded_and_nothing_is_printed(
     assert "principal point (80, 45)" in result.warnings[0]
     assert load_calibration(result.save(tmp_path)).warnings == result.warnings
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.slow
-def test_the_command_prints_warnings_once(folder: Path, call: Call, tmp_path: Path) -> None:
-    with_principal_point(80, 45).save(folder / "rig.yaml")
-    table = calibgraph.simulate_correspondences(RIG, frames=2, matches=200, seed=1)
-    table.save(tmp_path / "table.parquet")
-    _, out, err = call(
-        "calibrate", folder, "--matcher", tmp_path / "table.parquet", "--out", tmp_path / "out"
-    )
-    assert out == ""
-    assert err.startswith("warning: left: principal point (80, 45) of a 640x360 px image")
-    assert err.count("warning: left: principal point") == 1
 
 
 @pytest.mark.parametrize(("limits", "expected"), [((None, None), "FAIL"), ((1.0, 2.0), "WARN")])

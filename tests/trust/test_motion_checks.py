@@ -73,10 +73,3 @@ def test_where_clouds_are_further_apart_than_usual_the_speed_per_turn_counts(
 ) -> None:
     """Every frame is 0.36 s after the one before, which no name says."""
     assert doubts(drive / 3.6, NUMBERED) == []
-
-
-def test_straight_ahead_without_stamps_nothing_is_known(drive: np.ndarray) -> None:
-    straight = drive * KMH
-    straight[:, :3] = 0.0
-    assert doubts(straight, STAMPED) != []
-    assert doubts(np.zeros_like(drive), []) == []

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Calibration, MatcherErrors, Rig, perturb, simulate_correspondences
+from calibgraph import (
+    Calibration,
+    MatcherErrors,
+    RelativePose,
+    Rig,
+    perturb,
+    simulate_correspondences,
+)
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.solver.pair_refinement import fit_pairs
@@ -77,17 +84,6 @@ def test_wrong_intrinsics_leave_residuals_that_no_place_explains(pair: Rig) -> N
     assert agreement(wrong, table, None).least_px > 1.5 * agreement(pair, table, None).least_px
 
 
-def test_without_a_covariance_there_are_no_sigmas(pair: Rig) -> None:
-    found = agreement(pair, simulated_pairs(pair), None)
-    assert np.isnan(found.sigmas) and found.degrees < 0.02
-
-
-def test_pairs_without_surfaces_are_left_out(pair: Rig) -> None:
-    table = simulated_pairs(pair)
-    bare = table.with_planes(np.full_like(table.planes_lidar_per_m, np.nan))
-    assert fit_pairs(pair, bare, Config(), np.array([COVARIANCE[:6, :6]] * 2)) == []
-
-
 def judged(truth: Rig, seen: Rig, matches: CameraMatches | None) -> Calibration:
     """A result of correspondences that fit one rig, and of images of another, the true one."""
     shared = {"systematic_rotation_rad": np.radians(0.09), "systematic_translation_m": 0.02}
@@ -106,20 +102,6 @@ def test_the_verdict_names_a_pair_whose_images_disagree(pair: Rig) -> None:
         (failed,) = named(wrong, name, "by images")
         assert failed.status != "PASS"
         assert "contradict each other on the pose of left to right" in failed.text
-
-
-def test_what_the_correspondences_say_alone_is_checked_without_the_pairs(pair: Rig) -> None:
-    """Restarts and lenses are those of the correspondences, although the pairs move the result."""
-    moved = perturb(pair, rotation_deg=0.8, translation_m=0.0, seed=1).T_camera_lidar["right"]
-    wrong = judged(pair, pair.moved_to({"right": moved}), simulated_pairs(pair))
-    for name in pair.cameras:
-        for words in ("solving again", "residuals over the image"):
-            assert {check.status for check in named(wrong, name, words)} <= {"PASS"}
-
-
-def test_without_camera_matches_there_is_no_check(pair: Rig) -> None:
-    for matches in (None, CameraMatches.empty(tuple(pair.cameras))):
-        assert named(judged(pair, pair, matches), "left", "by images") == []
 
 
 def disagreement(a: str, b: str, sigmas: float) -> PairAgreement:
@@ -141,3 +123,26 @@ def test_of_two_cameras_either_may_be_wrong() -> None:
     assert [check_agreement(found[0], name, found).status for name in "ab"] == ["FAIL", "FAIL"]
     nearly = [*found, disagreement("b", "c", 1.5)]  # a neighbour of b agrees
     assert check_agreement(nearly[0], "a", nearly).status == "FAIL"
+
+
+@pytest.mark.parametrize(("tied", "metres"), [(False, 0.0), (False, 0.02), (True, 0.0)])
+def test_cameras_that_end_at_one_pose_are_no_pass_unless_the_rig_ties_them(
+    pair: Rig, tied: bool, metres: float
+) -> None:
+    T = pair.T_camera_lidar["left"].copy()
+    T[0, 3] += metres
+    rig = pair.moved_to({"right": T})
+    table = simulate_correspondences(rig, frames=8, matches=200)
+    if tied:
+        tie = RelativePose(
+            a="left", b="right", T_a_b=np.eye(4),
+            rotation_sigma_rad=0.001, translation_sigma_m=0.001,
+        )  # fmt: skip
+        rig = rig.model_copy(update={"relative_poses": (tie,)})
+    verdicts = calibgraph.solve(rig, table).camera_verdicts
+    asked = not tied and metres == 0
+    for verdict in verdicts.values():
+        assert [check.kind for check in verdict.checks if check.kind == "one_pose"] == (
+            ["one_pose"] if asked else []
+        )
+        assert not (asked and verdict.status != "WARN")

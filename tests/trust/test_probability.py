@@ -13,7 +13,6 @@ from calibgraph.model.verdict import (
     Check,
     ErrorProbability,
     Verdict,
-    rig_verdict,
 )
 from calibgraph.trust.probability import (
     STRUCTURE,
@@ -22,7 +21,6 @@ from calibgraph.trust.probability import (
     probability_beyond,
     probability_of_checks,
     probability_outside,
-    steps,
 )
 from calibgraph.trust.thresholds import THRESHOLDS, threshold
 from tests.trust.conftest import simulated
@@ -39,25 +37,6 @@ def test_a_check_that_gets_worse_is_never_less_severe(row) -> None:  # type: ign
     assert row.check(row.warn).severity <= 1.0
     assert row.check(float(np.nextafter(row.warn, far))).severity >= 1.0
     assert max(severities) <= 3.0
-
-
-def test_severity_has_no_step_at_the_limits() -> None:
-    row = threshold("halves_rotation")
-    for limit, expected in ((row.warn, 1.0), (row.fail, 2.0)):
-        for side in (1 - 1e-9, 1 + 1e-9):
-            assert row.check(limit * side).severity == pytest.approx(expected, abs=1e-6)
-
-
-def test_a_finding_without_a_number_is_in_the_middle_of_its_status() -> None:
-    severities = [Check("x", status, "").severity for status in ("PASS", "WARN", "FAIL")]
-    assert severities == [0.0, 1.5, 2.5]
-    assert threshold("halves_rotation").check(math.nan).severity == 3.0
-
-
-def test_steps_go_through_pass_warn_and_fail() -> None:
-    assert [list(steps(s)) for s in (0.0, 0.5, 1.25, 3.0)] == [
-        [0, 0, 0], [0.5, 0, 0], [1, 0.25, 0], [1, 1, 1],
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("model", [TABLES, STRUCTURE])
@@ -170,33 +149,6 @@ def test_a_small_probability_is_a_pass_but_for_missing_data_or_a_failed_check(
 ) -> None:
     verdict = Verdict((check,), ErrorProbability(0.1 * PASS_BELOW))
     assert (verdict.status, verdict.reasons) == (status, ("a reason",))
-
-
-def test_a_wide_error_bar_is_no_fail_but_named() -> None:
-    verdict = Verdict((), ErrorProbability(0.01, 0.6))
-    assert verdict.status == "WARN"
-    assert "the error bar is too wide" in verdict.reasons[0]
-    assert "cannot tell" not in Verdict((), ErrorProbability(0.6, 0.01)).reasons[0]
-
-
-def test_probabilities_are_printed_without_digits_that_mean_nothing() -> None:
-    printed = [ErrorProbability(p).percent for p in (1e-6, 0.0023, 0.0456, 0.5, 0.999)]
-    assert printed == ["<0.1%", "0.2%", "4.6%", "50%", "over 99%"]
-
-
-def test_a_probability_is_not_printed_where_data_for_it_are_missing() -> None:
-    few = threshold("frames").check(3)
-    assert (few.status, Verdict((few,), ErrorProbability(1e-5)).percent) == ("WARN", "-")
-    assert Verdict((few,), ErrorProbability(0.0, 0.1)).percent == "10%"
-    assert (Verdict((), ErrorProbability(1e-5)).percent, Verdict().percent) == ("<0.1%", "-")
-
-
-def test_a_rig_is_as_doubtful_as_its_worst_camera() -> None:
-    rig = rig_verdict(
-        {"a": Verdict((), ErrorProbability(0.001)), "b": Verdict((), ErrorProbability(0.5))}
-    )
-    assert rig.error_probability == ErrorProbability(0.5)
-    assert rig.status == "FAIL"
 
 
 def test_the_tolerance_is_a_setting_and_the_probability_is_kept(pair: Rig, tmp_path: Path) -> None:

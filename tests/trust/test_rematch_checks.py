@@ -1,19 +1,13 @@
 from __future__ import annotations
 
-import shutil
-import time
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 import calibgraph
-from calibgraph import MatcherErrors, Rig, simulate_correspondences
-from calibgraph.model.config import Config
+from calibgraph import Rig, simulate_correspondences
 from calibgraph.rounds import match_in_rounds
-from calibgraph.trust.rematch_checks import compare_ends, last_round_checks
-from calibgraph.trust.run_evidence import RunEvidence
+from calibgraph.trust.rematch_checks import compare_ends
 from tests.conftest import SAMPLE
 
 
@@ -83,53 +77,3 @@ def test_a_camera_is_taken_from_where_image_and_cloud_agree_clearly_better(truth
     began = calibgraph.evaluate(matched.solution.rig, truth).cameras
     assert began["left"].translation_error_cm < 1e-6  # the guess, of the first rounds
     assert began["front_left"].translation_error_cm > 1  # of the second, displaced from an end
-
-
-def test_no_round_of_matching_again_begins_when_time_is_over(truth: Rig) -> None:
-    matcher = Simulated([truth, truth])
-    match = matcher.match
-
-    def slow(*arguments, **named):  # noqa: ANN002, ANN003, ANN202
-        time.sleep(0.3)
-        return match(*arguments, **named)
-
-    matcher.match = slow  # type: ignore[method-assign]
-    matched = match_in_rounds(SAMPLE, truth, matcher, time_limit_s=0.2, progress=silent)
-    assert matched.out_of_time and matched.rematch is None and len(matcher.seen) == 1
-
-
-def test_of_ends_too_far_apart_the_first_is_kept(truth: Rig) -> None:
-    """The camera fails; which of the ends is better does not matter then."""
-    other = calibgraph.perturb(truth, rotation_deg=0.9, translation_m=0.08, seed=1)
-    agreed = [dict.fromkeys(truth.cameras, z_score) for z_score in (6.0, 7.5)]
-
-    matched = match_in_rounds(SAMPLE, truth, Scored([truth, other], agreed), progress=silent)
-    for error in calibgraph.evaluate(matched.solution.solved_rig, truth).cameras.values():
-        assert error.rotation_error_deg < 0.1
-
-
-def test_the_last_round_is_checked_only_if_there_are_others() -> None:
-    still = {"front": {"matches": 9, "moved_deg": 0.0, "moved_cm": 0.0}}
-    moving = {"front": {"matches": 9, "moved_deg": 0.5, "moved_cm": 5.0}}
-
-    def statuses(*rounds: object) -> list[str]:
-        solution = SimpleNamespace(config=Config())
-        evidence = RunEvidence(SimpleNamespace(rounds=rounds, solution=solution), {})
-        return [check.status for check in last_round_checks(evidence).get("front", ())]
-
-    assert statuses(moving) == []
-    assert statuses(still, moving) == ["FAIL", "WARN"]
-    assert statuses(moving, still) == ["PASS", "PASS"]
-
-
-def test_unreadable_images_that_the_matcher_does_not_need_are_a_reason_not_an_error(
-    tmp_path: Path, truth: Rig
-) -> None:
-    """A table of nonsense, and images that cannot be read: FAIL, and the images are named."""
-    shutil.copytree(SAMPLE, tmp_path / "data")
-    for path in (tmp_path / "data" / "cameras").rglob("*.jpg"):
-        path.write_bytes(path.read_bytes()[:1000])
-    nonsense = simulate_correspondences(truth, frames=6, errors=MatcherErrors(outlier_share=1.0))
-    result = calibgraph.calibrate(tmp_path / "data", matcher=nonsense)
-    assert result.verdict.status == "FAIL"
-    assert any("the images could not be checked" in reason for reason in result.verdict.reasons)

@@ -1,19 +1,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 import calibgraph
 from calibgraph import CorrespondenceError, Correspondences, Rig, concatenate, solve
-from calibgraph.model.causes import action_of
-from calibgraph.model.verdict import Verdict
-from calibgraph.pipeline import hash_inputs
-from calibgraph.solver.repeats import number_repeats
-from calibgraph.trust.rematch_checks import check_repeated_files, repeated_file_checks
+from calibgraph.trust.rematch_checks import check_repeated_files
 from tests.conftest import SAMPLE
 from tests.trust.conftest import simulated
 
@@ -36,21 +30,6 @@ def test_frames_with_the_same_cloud_or_image_are_reported() -> None:
         "repeats out"
     )
     assert found["front_left"] == []
-
-
-def test_copies_that_were_left_out_are_named_and_are_data_that_are_missing() -> None:
-    data = calibgraph.load_dataset(SAMPLE).select("0:2")
-    run = SimpleNamespace(dataset=data, copies=(("a", "000000"), ("b", "000000")))
-    solution = SimpleNamespace(cameras=("left",))
-    evidence: Any = SimpleNamespace(run=run, hashes=hash_inputs(data), solution=solution)
-    (check,) = repeated_file_checks(evidence)["left"]
-    assert (check.name, check.status, check.value) == ("copies", "WARN", 2)
-    assert check.text == (
-        "frames 000000 and a have the same cloud and images, and 1 more repeat one; leave repeats "
-        "out"
-    )
-    assert Verdict((check,)).cannot_tell
-    assert action_of("copies") == "Leave the copies out."
 
 
 def copies(table: Correspondences, number: int) -> Correspondences:
@@ -108,24 +87,6 @@ def test_frames_of_a_stuck_camera_count_as_one(pair: Rig) -> None:
         assert any("a camera or the LiDAR was stuck" in text for text in verdict.reasons)
 
 
-def test_pixels_of_a_grid_are_no_repeats() -> None:
-    """A dense matcher has a point for each of the same pixels in every frame."""
-    rng = np.random.default_rng(0)
-    u, v = (0.5 + 7.7 * axis.ravel() for axis in np.mgrid[:60, :30])
-    parts = [
-        Correspondences.from_arrays(
-            camera="left",
-            frame=frame,
-            pixels_px=np.column_stack([u, v]),
-            points_lidar_m=rng.uniform(5, 20, (len(u), 3)),
-        )
-        for frame in range(3)
-    ]
-    table = concatenate(parts)
-    numbers = number_repeats(table, table.camera_index.astype(np.int64))
-    np.testing.assert_array_equal(numbers, table.frame)
-
-
 def test_copies_do_not_narrow_the_error_bar(pair: Rig) -> None:
     table = simulated(pair, frames=8)
     last = table.select(table.frame == 7)
@@ -146,24 +107,3 @@ def test_frames_of_one_place_count_as_one_frame(pair: Rig) -> None:
     assert result.counts["left"]["frames"] == 7 and result.counts["left"]["repeated_frames"] == 3
     with pytest.raises(CorrespondenceError, match="stationary"):
         replace(table, metadata={**table.metadata, "stationary": [[2, "3"]]})
-
-
-def test_the_part_that_a_place_shares_falls_with_the_number_of_places(pair: Rig) -> None:
-    """Eight frames of one place, or of four: of what they share, a quarter of the variance."""
-    table = simulated(pair, frames=8)
-    found = []
-    for places in ([], [[0, 1], [2, 3], [4, 5], [6, 7]]):
-        named = {"place_variance": 300.0, "places": places}
-        result = solve(pair, replace(table, metadata={**table.metadata, **named}))
-        covariance = result.covariance["left"]
-        assert covariance is not None
-        found.append(covariance)
-        assert result.counts["left"]["places"] == max(1, len(places))
-    np.testing.assert_allclose(np.diag(found[1]) / np.diag(found[0]), 0.25, rtol=0.02)
-
-
-def test_places_that_are_no_lists_of_frames_are_refused(pair: Rig) -> None:
-    table = simulated(pair, frames=8)
-    for wrong in ([[2, "3"]], [2], "all"):
-        with pytest.raises(CorrespondenceError, match="places of the table's metadata"):
-            replace(table, metadata={**table.metadata, "places": wrong})

@@ -151,20 +151,22 @@ class FrameTree:
 
     def _above(self, frame: str) -> Iterator[str]:
         """A frame and its ancestors but for the root."""
+        passed: set[str] = set()
         while frame in self._links:
+            if frame in passed:
+                raise CalibrationError(f"frame {frame!r} is its own ancestor; correct the file")
+            passed.add(frame)
             yield frame
             frame = self._links[frame].parent
 
     def _in_root(self, frame: str) -> tuple[str, Array]:
+        """The root above a frame, and the (4, 4) pose of the frame in it."""
         if frame not in self.names:
             raise CalibrationError(f"no frame {frame!r}; there are {', '.join(self.names)}")
-        T, passed = np.eye(4), {frame}
-        while frame in self._links:
-            link = self._links[frame]
+        T = np.eye(4)
+        for each in self._above(frame):
+            link = self._links[each]
             T, frame = link.T_parent_child @ T, link.parent
-            if frame in passed:
-                raise CalibrationError(f"frame {frame!r} is its own ancestor; correct the file")
-            passed.add(frame)
         return frame, T
 
 

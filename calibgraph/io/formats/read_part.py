@@ -9,19 +9,16 @@ from calibgraph.files import read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.formats.autoware import is_autoware, read_autoware
-from calibgraph.io.formats.basalt import is_basalt, read_basalt
 from calibgraph.io.formats.camera_info import is_camera_info, read_camera_info
-from calibgraph.io.formats.camera_maps import read_camera_maps
-from calibgraph.io.formats.colmap import is_colmap, read_colmap
 from calibgraph.io.formats.documents import (
     YAML_SUFFIXES,
     content_of_storage,
     read_documents,
     read_xml,
 )
+from calibgraph.io.formats.foreign_keys import read_foreign
 from calibgraph.io.formats.kalibr import is_kalibr, read_kalibr
-from calibgraph.io.formats.kitti_lines import is_kitti_lines, read_kitti_lines
-from calibgraph.io.formats.koide import is_koide, read_koide
+from calibgraph.io.formats.matrix_lines import read_lines
 from calibgraph.io.formats.part import Part, RelativeCamera
 from calibgraph.io.formats.ros_transforms import (
     is_tf2,
@@ -36,7 +33,6 @@ from calibgraph.io.rigs import is_exported_rig, read_rig
 from calibgraph.model.rig import KNOWLEDGE, Camera
 
 _MAX_BYTES, _HEAD_BYTES = 32 * 2**20, 2**16
-_COLMAP_NAME = "cameras.txt"
 
 
 def read_part(path: Path, name: str | None) -> Part:  # noqa: PLR0911 - a line for each kind
@@ -77,13 +73,10 @@ def _read_xml(path: Path, name: str | None) -> Part:
 
 def _read_lines(path: Path, name: str | None) -> Part:
     """What a text file of lines holds."""
-    if path.suffix.lower() == ".npy":
-        return read_kitti_lines(path, name)
+    found = read_lines(path, name)
+    if found is not None:
+        return found
     text = read_text(path)
-    if is_colmap(text) or path.name == _COLMAP_NAME:
-        return read_colmap(path)
-    if is_kitti_lines(text):
-        return read_kitti_lines(path, name)
     first = next((line for line in text.splitlines() if line.strip()), "")
     raise FileError(path, _unknown(f"its line {first[:40]!r} is", text))
 
@@ -116,7 +109,7 @@ def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None)
     for matches, read in _READERS:
         if matches(content):
             return read(content, path, name)
-    found = read_camera_maps(content, path, name)
+    found = read_foreign(content, path, name)
     if found is None:
         keys = ", ".join(str(key) for key in list(content)[:5])
         raise FileError(path, _unknown(f"its keys ({keys}) are"))
@@ -136,8 +129,6 @@ _READERS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[..., Part]], ..
     (is_camera_info, read_camera_info),
     (_is_rig, lambda _, path, __: _part_of_rig(path)),
     (is_kalibr, lambda content, path, _: read_kalibr(content, path)),
-    (is_koide, read_koide),
-    (is_basalt, lambda content, path, _: read_basalt(content, path)),
     (is_autoware, lambda content, path, _: read_autoware(content, path)),
 )
 

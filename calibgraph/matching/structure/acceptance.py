@@ -54,10 +54,9 @@ scale. In clouds of other places the sum was 0.9 to 1.2 times that in mirrored i
 in most rendered scenes, up to 1.6 times in tunnels and in streets that are all alike."""
 
 
-def second_look_chance(mirrored: float, rolls: int) -> Chance:
-    """Of the sum of both z-scores, from what searches for some rolls find in mirrored images."""
-    location = MIRRORED_RATIO * mirrored - SECOND_LOOK_SCALE * math.log(rolls)
-    return Chance(location, MIRRORED_SPREAD * mirrored, SECOND_LOOK_SCALE)
+def second_look_chance(mirrored: float) -> Chance:
+    """Of the sum of both z-scores, from what a search for one roll finds in mirrored images."""
+    return Chance(MIRRORED_RATIO * mirrored, MIRRORED_SPREAD * mirrored, SECOND_LOOK_SCALE)
 
 
 def least_z_score(tries: float, chance: Chance = SEARCH) -> float:

@@ -20,8 +20,9 @@ from calibgraph.arrays import Array
 from calibgraph.matching.structure.correlation_kernels import find_best_shifts, sum_z_scores
 from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.score_kernel import score_windows
-from calibgraph.matching.structure.shift_scores import downscale_log_gray, name_cells
+from calibgraph.matching.structure.shift_scores import name_cells
 from calibgraph.matching.structure.visibility import find_visible
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.model.rig import Camera
@@ -128,7 +129,7 @@ class _AngularImage:
 
 
 def correlate(
-    grays: Sequence[NDArray[np.uint8]],
+    grays: Sequence[PreparedImage],
     clouds: Sequence[PreparedCloud],
     camera: Camera,
     cores: Executor,
@@ -158,7 +159,7 @@ def correlate(
 
 
 def _correlate_frame(
-    gray: NDArray[np.uint8],
+    gray: PreparedImage,
     cloud: PreparedCloud,
     *,
     camera: Camera,
@@ -231,7 +232,7 @@ def _score_maps(
     return np.asarray(maps * inside)
 
 
-def _to_angular_image(gray: NDArray[np.uint8], camera: Camera) -> _AngularImage:
+def _to_angular_image(image: PreparedImage, camera: Camera) -> _AngularImage:
     """Resample an image over view angles."""
     azimuth = np.arange(-MAX_AZIMUTH_RAD, MAX_AZIMUTH_RAD, STEP_RAD)
     elevation = np.arange(-MAX_ELEVATION_RAD, MAX_ELEVATION_RAD, STEP_RAD)
@@ -241,13 +242,13 @@ def _to_angular_image(gray: NDArray[np.uint8], camera: Camera) -> _AngularImage:
     seen = (valid & camera.in_image(pixels)).reshape(right.shape)
     rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    small, scale = downscale_log_gray(gray, camera, STEP_RAD, BLUR_STEPS)
+    small, scale = image.log_gray(camera, STEP_RAD, BLUR_STEPS)
     places = ((pixels.reshape(*right.shape, 2)[part] + 0.5) * scale - 0.5).astype(np.float32)
-    image = cv2.remap(
+    remapped = cv2.remap(
         small, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     origin_rad = np.array([azimuth[columns[0]], elevation[rows[0]]])
-    return _AngularImage(np.asarray(image, dtype=np.float32), seen[part], origin_rad)
+    return _AngularImage(np.asarray(remapped, dtype=np.float32), seen[part], origin_rad)
 
 
 def _group_windows(centres_m: Array) -> tuple[NDArray[np.intp], NDArray[np.int32], Array]:

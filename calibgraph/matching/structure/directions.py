@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
+from factors.compiled import compiled
 
 Rows = NDArray[np.intp]
 
@@ -60,11 +61,17 @@ def thin(angles: Array, cell_rad: float) -> Rows:
     along = (azimuth + math.pi) * cosine[row] / cell_rad
     column = np.floor(along)
     off = (along - column - 0.5) ** 2 + (up - floor - 0.5) ** 2
-    columns = math.ceil(2 * math.pi / cell_rad) + 1
-    cell = row * columns + column.astype(np.intp)
-    least = np.full(cell.max() + 1, np.inf)
-    np.minimum.at(least, cell, off)
-    nearest = np.full(len(least), -1, np.intp)
-    kept = np.flatnonzero(off == least[cell])[::-1]
-    nearest[cell[kept]] = kept  # of equally near ones, the first
+    column -= column.min()
+    cell = row * (int(column.max()) + 1) + column.astype(np.intp)
+    nearest = np.full(cell.max() + 1, -1, np.intp)
+    _find_nearest(cell, off, nearest)
     return nearest[nearest >= 0]
+
+
+@compiled()
+def _find_nearest(cell, off, nearest):  # type: ignore[no-untyped-def]
+    """Fill the number of each cell's nearest direction; of equally near ones, the first."""
+    for i in range(len(cell)):
+        before = nearest[cell[i]]
+        if before < 0 or off[i] < off[before]:
+            nearest[cell[i]] = i

@@ -5,14 +5,12 @@ from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import KeptFrame
 from calibgraph.io.motion import ScanMotion
 from calibgraph.matching.structure.pose_refinement import CameraFrames
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.prepared_image import PreparedImage, SmallImages
 from calibgraph.matching.structure.window_table import WindowTables
 from calibgraph.memory import mmap_copy
 from calibgraph.model.rig import Camera, Rig
@@ -35,8 +33,8 @@ class FrameCache:
         self._clouds: KeyedCache[tuple[FileVersion, ScanMotion | None], PreparedCloud] = (
             KeyedCache()
         )
-        self._images: KeyedCache[tuple[FileVersion, int, int], NDArray[np.uint8]] = KeyedCache()
-        self._tables = WindowTables()
+        self._images: KeyedCache[tuple[FileVersion, int, int], PreparedImage] = KeyedCache()
+        self._tables, self._smaller = WindowTables(), SmallImages()
 
     def keep_only(self, frames: Iterable[Frame]) -> None:
         """Drop all other frames: memory stays bounded along a drive."""
@@ -44,6 +42,8 @@ class FrameCache:
         self._clouds.keep_only(lambda key: key[0][0] in kept)
         self._images.keep_only(lambda key: key[0][0] in kept)
         self._tables.keep_only(cloud.identity for cloud in self._clouds.values())
+        images = {image.identity for image in self._images.values()}
+        self._smaller.keep_only(lambda key: key[0] in images)
 
     def cloud(self, frame: Frame) -> PreparedCloud:
         """The frame's cloud."""
@@ -54,13 +54,14 @@ class FrameCache:
         self._clouds.keep_last(MAX_CLOUD_BYTES, lambda cloud: cloud.nbytes)
         return cloud
 
-    def image(self, frame: Frame, name: str, camera: Camera) -> NDArray[np.uint8]:
-        """(height, width) the camera's image, gray; its size is checked against the camera's."""
+    def image(self, frame: Frame, name: str, camera: Camera) -> PreparedImage:
+        """The camera's image; its size is checked against the camera's."""
         key = (_file_version(frame.image_paths[name]), camera.width_px, camera.height_px)
 
-        def load() -> NDArray[np.uint8]:
+        def load() -> PreparedImage:
             gray = frame.load_gray(name, camera)
-            return gray if isinstance(frame, KeptFrame) else mmap_copy(gray)
+            kept = gray if isinstance(frame, KeptFrame) else mmap_copy(gray)
+            return PreparedImage.from_gray(kept, camera, self._smaller)
 
         image = self._images.get(key, load)
         self._images.keep_last(MAX_IMAGE_BYTES, lambda image: image.nbytes)

@@ -10,16 +10,22 @@ no pose of a camera is accepted, it has not been found: the best of the rejected
 taken.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
-from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE, least_z_score
-from calibgraph.matching.structure.bodies import Body, lead, place_member, rigid_bodies
+from calibgraph.matching.structure.acceptance import least_z_score
+from calibgraph.matching.structure.bodies import place_member, rigid_bodies
 from calibgraph.matching.structure.box_search import CANDIDATES
 from calibgraph.matching.structure.pose_refinement import CameraFrames, Candidate
-from calibgraph.matching.structure.pose_search import ROLLS_RAD, PoseSearch, SearchRange
-from calibgraph.model.geometry import pose_difference
+from calibgraph.matching.structure.pose_search import (
+    ROLLS_RAD,
+    PoseSearch,
+    SearchRange,
+    distinct,
+    is_accepted,
+    is_same_pose,
+)
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.progress import Progress
 
@@ -29,9 +35,6 @@ RETRY_EFFORT = 2
 TRIES = {1: len(ROLLS_RAD), 2: (1 + RETRY_EFFORT) * len(ROLLS_RAD)}
 """Amount of searching after a number of searches, in searches for one roll."""
 ALONE = 1 / CANDIDATES  # the same of a single pose
-
-SAME_DEG, SAME_CM = 1.0, 30.0
-"""Poses nearer than this are the same: the rounds correct the error that refinements leave."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +48,15 @@ class Located:
         accepted: whether that is far better than by chance.
         chance: the probability that a search with nothing to find ends as high; in few frames
             alone, where an accepted camera is at its pose by the fine levels.
+        contradicted_by: a camera that sees it elsewhere, while image and cloud of both are accepted
+            where they are; empty without.
     """
 
     camera: Camera
     z_score: float
     accepted: bool
     chance: float | None = None
+    contradicted_by: str = ""
 
 
 def locate_cameras(
@@ -78,10 +84,12 @@ class Locator:
     Attributes:
         best: the candidate of the highest z-score of each body, by its lead's name.
         located: those that are accepted.
+        contradictions: pairs of these that see each other elsewhere.
     """
 
     def __init__(self, search: PoseSearch, pool: Executor, progress: Progress) -> None:
         self._search, self._pool, self._progress = search, pool, progress
+        search.report = self._report
         self._bodies = {next(iter(body)): body for body in rigid_bodies(search.rig)}
         self._searches = dict.fromkeys(self._bodies, 0)
         self._proposers: list[Candidate] = []  # that have proposed
@@ -89,12 +97,13 @@ class Locator:
         self._near: dict[str, Candidate] = {}
         self.best: dict[str, Candidate] = {}
         self.located: dict[str, Candidate] = {}
+        self.contradictions: list[tuple[Candidate, Candidate]] = []
 
     def locate(self) -> dict[str, Located]:
         """Locate all bodies, as far as time allows."""
         self._report("trying the guess")
         for name, body in self._bodies.items():
-            guesses = _distinct(place_member(body, n, self._search.guess[n]) for n in body)
+            guesses = distinct(place_member(body, n, self._search.guess[n]) for n in body)
             tried = list(self._pool.map(self._search.near, guesses))
             best = max(range(len(tried)), key=lambda k: tried[k].z_score)
             self._bodies[name], self._near[name] = guesses[best], tried[best]
@@ -114,7 +123,7 @@ class Locator:
         looked_at = self._search.second_look(candidate, tries)
         if name not in self.best or candidate.z_score > self.best[name].z_score:
             self.best[name] = replace(candidate, chance=looked_at.chance)
-        if not _is_accepted(looked_at, tries):
+        if not is_accepted(looked_at, tries):
             return False
         self.located[name] = looked_at
         return True
@@ -148,7 +157,7 @@ class Locator:
     def _compare(self, one: Candidate, two: Candidate) -> None:
         """Resolve two inconsistent bodies: keep the placement with the higher summed z-score."""
         seen_two = self._search.seen_by(one.body, two.body)
-        if seen_two is None or _is_same_pose(seen_two, two.body):
+        if seen_two is None or is_same_pose(seen_two, two.body):
             return
         moved_two = self._search.at(seen_two)
         seen_one = self._search.seen_by(two.body, one.body)
@@ -159,17 +168,18 @@ class Locator:
             self._replace(two, moved_two, by=one)
 
     def _replace(self, old: Candidate, new: Candidate, by: Candidate) -> None:
-        """Move a body to where another one sees it.
+        """Move a body to where another one sees it, if it is accepted there, and only once.
 
-        It is not located if it is not accepted there, against one that is; nor if it was moved by
-        the same one before, since then no two poses of theirs agree.
+        Else it remains where it is: what both see in common, as a part of the vehicle, may be no
+        point of the scene, and its own image is no worse for it. But neither of them can be right
+        without a doubt.
         """
         name, mover = next(iter(old.body)), next(iter(by.body))
-        del self.located[name]
-        self._searches[name], self.best[name] = SEARCHES, new
         if (name, mover) not in self._moves:
             self._moves.add((name, mover))
-            self._consider(name, new, ALONE)
+            if self._consider(name, new, ALONE):
+                return
+        self.contradictions.append((old, by))
 
     def _search_next(self) -> bool:
         """Search for the most promising body that has not been searched for."""
@@ -187,7 +197,7 @@ class Locator:
         for name in self._missing():
             near = self._near[name]
             enough = near.z_score >= least_z_score(ALONE)  # no second look: tunnels are alike
-            if enough and _is_same_pose(near.body, self.best[name].body):
+            if enough and is_same_pose(near.body, self.best[name].body):
                 self.located[name] = self._search.second_look(near, ALONE)
                 return True
         return False
@@ -216,12 +226,9 @@ class Locator:
         return [name for name in self._bodies if name not in self.located]
 
     def _search_for(self, name: str, effort: int) -> None:
-        tries = TRIES[self._searches[name] + 1]
-        z_score, least = self.best[name].z_score, least_z_score(tries)
-        before = f" (best z-score {z_score:.1f}, accepted from {least:.1f})" if z_score > 0 else ""
-        self._report(f"searching: {name}{before}")
         self._searches[name] += 1
-        found = self._search.everywhere(self._bodies[name], effort)
+        tries = TRIES[self._searches[name]]
+        found = self._search.everywhere(self._bodies[name], effort, tries)
         self._consider(name, found, tries)
 
     def _report(self, what: str) -> None:
@@ -231,28 +238,19 @@ class Locator:
 
     def _result(self) -> dict[str, Located]:
         found = {name: self.located.get(name, self.best[name]) for name in self._bodies}
+        doubts: dict[str, str] = {}
+        for pair in self.contradictions:
+            if all(one in self.located.values() for one in pair):  # and neither has moved since
+                one, two = (next(iter(each.body)) for each in pair)
+                doubts |= {one: two, two: one}
         return {
-            member: Located(camera, found[name].z_score, name in self.located, found[name].chance)
+            member: Located(
+                camera,
+                found[name].z_score,
+                name in self.located,
+                found[name].chance,
+                doubts.get(name, ""),
+            )
             for name in self._bodies
             for member, camera in found[name].body.items()
         }
-
-
-def _is_accepted(candidate: Candidate, tries: float) -> bool:
-    if candidate.chance is not None:
-        return candidate.chance <= FALSE_ACCEPTANCE
-    return candidate.z_score >= least_z_score(tries)
-
-
-def _distinct(bodies: Iterable[Body]) -> list[Body]:
-    """The candidates without those at the pose of an earlier one."""
-    kept: list[Body] = []
-    for body in bodies:
-        if not any(_is_same_pose(body, other) for other in kept):
-            kept.append(body)
-    return kept
-
-
-def _is_same_pose(one: Body, two: Body) -> bool:
-    degrees, centimetres = pose_difference(lead(one).T_camera_lidar, lead(two).T_camera_lidar)
-    return degrees < SAME_DEG and centimetres < SAME_CM

@@ -272,6 +272,9 @@ def _search_findings(
         found={n: c.z_score for n, c in candidates.items() if c.accepted},
         missed={n: max(0.0, c.z_score) for n, c in candidates.items() if not c.accepted},
         chance={n: c.chance for n, c in candidates.items() if c.chance is not None},
+        contradicted={
+            n: c.contradicted_by for n, c in candidates.items() if c.accepted and c.contradicted_by
+        },
         range_rotation_deg=search_range.rotation_deg,
         range_translation_m=search_range.translation_m,
     )

@@ -30,7 +30,10 @@ class NearestRays:
     def __init__(
         self, rays_m: Array, rows: NDArray[np.int32], angles: Array, cell_rad: float
     ) -> None:
-        self._rays_m, self._rows, self._cell_rad = np.ascontiguousarray(rays_m), rows, cell_rad
+        self._rows, self._cell_rad = rows, cell_rad
+        x, y, z = rays_m[rows].T
+        self._units = np.column_stack([x, y, z]) * (1.0 / np.sqrt(x * x + y * y + z * z))[:, None]
+        self._elevation = np.ascontiguousarray(angles[:, 1])
         self._azimuth = angles[:, 0].astype(np.float32)
         row = np.floor(angles[:, 1] / cell_rad).astype(np.int64)
         self._lowest = int(row[0]) if len(row) else 0
@@ -39,8 +42,9 @@ class NearestRays:
 
     @property
     def nbytes(self) -> int:
-        """Size in memory, without the rays and their rows."""
-        return self._azimuth.nbytes + self._starts.nbytes
+        """Size in memory, without the rows."""
+        arrays = self._units, self._elevation, self._azimuth, self._starts
+        return sum(array.nbytes for array in arrays)
 
     def of(
         self, centres: NDArray[np.int32], most: int, reach: float
@@ -53,22 +57,22 @@ class NearestRays:
         """
         members = np.empty((len(centres), most), np.int32)
         counts = np.empty(len(centres), np.int32)
-        cloud = self._rays_m, self._rows, self._azimuth, self._starts
+        cloud = self._units, self._rows, self._azimuth, self._starts
         grid = self._lowest, self._cell_rad, reach
-        _find_nearest(cloud, grid, centres, members, counts)
+        _find_nearest(cloud, self._elevation, grid, centres, members, counts)
         return members, counts
 
 
 @compiled()
-def _find_nearest(cloud, grid, centres, members, counts):  # type: ignore[no-untyped-def]
+def _find_nearest(cloud, elevation, grid, centres, members, counts):  # type: ignore[no-untyped-def]
     """See :meth:`NearestRays.of`."""
-    (rays, rows, _, starts), (lowest, cell, reach) = cloud, grid
+    (units, rows, _, starts), (lowest, cell, reach) = cloud, grid
     squares, direction = np.empty(members.shape[1]), np.empty(3)
     for w in range(len(centres)):
         centre, count = centres[w], np.int64(0)  # a literal 0 has another type
-        x, y, z = rays[rows[centre], 0], rays[rows[centre], 1], rays[rows[centre], 2]
-        over, up = 1.0 / math.sqrt(x * x + y * y + z * z), math.atan2(z, math.sqrt(x * x + y * y))
-        direction[0], direction[1], direction[2] = x * over, y * over, z * over
+        up = elevation[centre]
+        direction[0], direction[1] = units[centre, 0], units[centre, 1]
+        direction[2] = units[centre, 2]
         for k in range(len(squares)):  # a slice compiles slowly
             squares[k] = reach * reach
         above = math.floor(up / cell) - lowest
@@ -92,7 +96,7 @@ def _find_nearest(cloud, grid, centres, members, counts):  # type: ignore[no-unt
 @compiled(part=True)
 def _visit_row(cloud, row, centre, direction, squares, found, count):  # type: ignore[no-untyped-def]
     """Insert the rays of a row that are nearer than the farthest; how many are found by then."""
-    rays, rows, azimuth, starts = cloud
+    units, rows, azimuth, starts = cloud
     first, size, own = starts[row], starts[row + 1] - starts[row], azimuth[centre]
     low, high = 0, size
     while low < high:
@@ -109,10 +113,8 @@ def _visit_row(cloud, row, centre, direction, squares, found, count):  # type: i
             if not _is_within(cosine * (away - away**3 / 6), squares[-1]):
                 break
             left -= 1 - side
-            x, y, z = rays[rows[at], 0], rays[rows[at], 1], rays[rows[at], 2]
-            over = 1.0 / math.sqrt(x * x + y * y + z * z)
-            x, y, z = x * over - direction[0], y * over - direction[1], z * over - direction[2]
-            square = x * x + y * y + z * z
+            x, y = units[at, 0] - direction[0], units[at, 1] - direction[1]
+            square = x * x + y * y + (units[at, 2] - direction[2]) ** 2
             if square < squares[-1]:
                 count = min(count + 1, len(found))
                 place = count - 1

@@ -5,9 +5,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from calibgraph.io.frame import Frame
 from calibgraph.matching.structure.bodies import Body, adjoint, lead, place
 from calibgraph.matching.structure.consensus import (
@@ -16,6 +13,7 @@ from calibgraph.matching.structure.consensus import (
     score_displaced,
 )
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import LEVELS, WIDE, Level
 from calibgraph.matching.structure.shift_scores import (
     ShiftScores,
@@ -58,7 +56,7 @@ class CameraFrames:
     """The data of one camera in a few frames."""
 
     frames: Sequence[Frame]
-    grays: Sequence[NDArray[np.uint8]]
+    grays: Sequence[PreparedImage]
     clouds: Sequence[PreparedCloud]
     cores: Executor
 

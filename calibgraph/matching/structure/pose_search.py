@@ -1,7 +1,7 @@
 """Pose search: tries poses of the bodies of a rig, near a given one or all over the range."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from calibgraph.matching.structure.acceptance import (
     FALSE_ACCEPTANCE,
     FEW_FRAMES,
+    least_z_score,
     probability_by_chance,
     second_look_chance,
 )
@@ -28,7 +29,7 @@ from calibgraph.matching.structure.pose_refinement import (
     refine,
     refine_on,
 )
-from calibgraph.model.geometry import relative_transform, transform
+from calibgraph.model.geometry import pose_difference, relative_transform, transform
 from calibgraph.model.rig import Camera, Rig
 
 SEARCH_WINDOWS, DENSE_WINDOWS = 2100, 9000  # of the maps, per camera over all frames
@@ -40,6 +41,9 @@ ROLLS_RAD = np.radians([0.0, -12.0, 12.0])
 """Windows lie in the maps as they are seen from the guess: if it is rolled by more than some 8
 degrees, right places stand out no more."""
 SURVIVORS = 2  # candidates of a roll that are refined, those that are best after an approach
+
+SAME_DEG, SAME_CM = 1.0, 30.0
+"""Poses nearer than this are the same: the rounds correct the error that refinements leave."""
 
 DRAWS_AROUND, AROUND_RAD, AROUND_M = 12, np.radians(4.0), 0.8  # per axis
 MAX_LOOKS = 3
@@ -63,7 +67,11 @@ class SearchRange:
 
 
 class PoseSearch:
-    """Tries poses of bodies, see :func:`locate_cameras`."""
+    """Tries poses of bodies, see :func:`locate_cameras`.
+
+    Attributes:
+        report: called with what is being done.
+    """
 
     def __init__(
         self,
@@ -76,6 +84,7 @@ class PoseSearch:
     ) -> None:
         self.rig, self.guess, self.out_of_time = rig, rig.T_camera_lidar, out_of_time
         self._frames, self._range, self._seed = frames, search_range, seed
+        self.report: Callable[[str], None] = lambda _: None
         most = max((len(one.frames) for one in frames.values()), default=0)
         self._few = 0 < most <= FEW_FRAMES
 
@@ -100,12 +109,18 @@ class PoseSearch:
         """The body near a pose that is off by less than a degree."""
         return self._settle(refine(self._frames, body))
 
-    def everywhere(self, body: Body, effort: int) -> Candidate:
-        """The best pose in all of the range; of those from CONFIDENT on, the first."""
+    def everywhere(self, body: Body, effort: int, tries: float) -> Candidate:
+        """The best pose in all of the range; of those from CONFIDENT on, the first.
+
+        In few frames, the best of the rolls up to the first that is accepted after so many tries.
+        """
         best = Candidate(body, -math.inf)
-        for roll in ROLLS_RAD:
+        for number, roll in enumerate(ROLLS_RAD, 1):
+            self.report(f"searching: {next(iter(body))}, roll {number} of {len(ROLLS_RAD)}")
             best = max(best, self.with_roll(body, roll, effort=effort), key=_by_z_score)
             if best.z_score >= CONFIDENT or self.out_of_time():
+                break
+            if self._few and is_accepted(self.second_look(best, tries), tries):
                 break
         return best
 
@@ -113,7 +128,8 @@ class PoseSearch:
         """The best pose all over the range about a body's guess, with maps for one roll.
 
         All candidates of the box search are approached, and the best are refined; with few
-        frames all are, also without an approach, which may lead away from the right pose.
+        frames all are, also without an approach, which may lead away from the right pose, but not
+        twice at one pose.
         """
         maps = self._correlate(_turn_about_axis(body, roll_rad), effort)
         nothing = Candidate(body, -math.inf)
@@ -127,7 +143,7 @@ class PoseSearch:
         near = list(self._while_time(approach, starts))
         near.sort(key=_by_z_score, reverse=True)
         if self._few:
-            survivors = [*(one.body for one in near), *starts]
+            survivors = distinct([*(one.body for one in near), *starts])
         else:
             survivors = [one.body for one in near[: effort * SURVIVORS]]
         refined = self._while_time(refine, survivors)
@@ -155,7 +171,7 @@ class PoseSearch:
             return replace(candidate, chance=chance)
         fine = look_again(self._frames, candidate.body)
         if chance > FALSE_ACCEPTANCE:
-            mirrored = second_look_chance(self._mirrored_evidence, len(ROLLS_RAD))
+            mirrored = second_look_chance(self._mirrored_evidence)
             chance = probability_by_chance(candidate.z_score + fine.z_score, tries, mirrored)
         return replace(candidate, body=fine.body, chance=chance)
 
@@ -166,14 +182,19 @@ class PoseSearch:
     def _mirrored_evidence(self) -> float:
         """Mean over the bodies of the most that a search finds in mirrored images: by chance.
 
-        These are as alike to the clouds as images of other places of the kind.
+        These are as alike to the clouds as images of other places of the kind. For one roll: the
+        acceptance counts the searches.
         """
         frames = {name: _mirror(one) for name, one in self._frames.items()}
         search = PoseSearch(
             self.rig, frames, self._range, seed=self._seed, out_of_time=self.out_of_time
         )
-        found = [search.everywhere(body, effort=1) for body in rigid_bodies(self.rig)]
-        evidence = [search._evidence(one) for one in found if math.isfinite(one.z_score)]
+        evidence = []
+        for body in rigid_bodies(self.rig):
+            self.report(f"searching mirrored images: {next(iter(body))}")
+            found = search.with_roll(body, ROLLS_RAD[0], effort=1)
+            if math.isfinite(found.z_score):
+                evidence.append(search._evidence(found))
         if self.out_of_time() or not evidence:  # of a search that was cut, chance is not known
             return math.inf
         return float(np.mean(evidence))
@@ -222,8 +243,12 @@ class PoseSearch:
         drawn = box.transforms(unit * box.half_widths)
         near = [approach(self._frames, place(candidate.body, T)) for T in drawn]
         near.sort(key=_by_z_score, reverse=True)
-        refined = [refine(self._frames, one.body) for one in near[:SURVIVORS]]
-        return max(refined, key=_by_z_score)
+        others = [
+            one.body for one in near[:SURVIVORS] if not is_same_pose(one.body, candidate.body)
+        ]
+        return max(
+            (refine(self._frames, body) for body in others), key=_by_z_score, default=candidate
+        )
 
     def _correlate(self, body: Body, effort: int) -> BodyMaps:
         """The maps of those cameras that the clouds are in view of."""
@@ -250,9 +275,31 @@ class PoseSearch:
         )
 
 
+def is_same_pose(one: Body, two: Body) -> bool:
+    """Whether two poses of a body are so near that refinements and rounds end alike."""
+    degrees, centimetres = pose_difference(lead(one).T_camera_lidar, lead(two).T_camera_lidar)
+    return degrees < SAME_DEG and centimetres < SAME_CM
+
+
+def distinct(bodies: Iterable[Body]) -> list[Body]:
+    """The bodies without those at the pose of an earlier one."""
+    kept: list[Body] = []
+    for body in bodies:
+        if not any(is_same_pose(body, other) for other in kept):
+            kept.append(body)
+    return kept
+
+
+def is_accepted(candidate: Candidate, tries: float) -> bool:
+    """Whether a candidate agrees far better than by chance, after so many tries."""
+    if candidate.chance is not None:
+        return candidate.chance <= FALSE_ACCEPTANCE
+    return candidate.z_score >= least_z_score(tries)
+
+
 def _mirror(frames: CameraFrames) -> CameraFrames:
     """The frames with the images' left and right swapped."""
-    return replace(frames, grays=[np.ascontiguousarray(gray[:, ::-1]) for gray in frames.grays])
+    return replace(frames, grays=[gray.mirrored() for gray in frames.grays])
 
 
 def _by_z_score(candidate: Candidate) -> float:

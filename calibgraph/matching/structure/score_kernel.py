@@ -1,7 +1,7 @@
 """The kernel that scores windows against an image at every shift of a grid.
 
 Where the time of a calibration goes. What makes it fast, measured against a matrix product by
-``benchmarks.speed.kernel``: the shifts are taken in strips, a vector wide, whose sums stay in the
+``benchmarks.speed.gate``: the shifts are taken in strips, a vector wide, whose sums stay in the
 first-level cache, and the points four at a time, so that a sum is loaded and stored once for all of
 them. The image has zero mean, which keeps single precision: its sum of squares is then not the
 difference of two large numbers.

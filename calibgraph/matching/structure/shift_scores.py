@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import Level
 from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.visibility import find_in_view, find_places, find_visible
@@ -23,7 +23,6 @@ from calibgraph.model.clock import seen_at_rows, when_taken
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_twist import project_with_jacobian
 
-Gray = NDArray[np.uint8]
 Grids = NDArray[np.float32]
 
 OCTAVES_PER_BIN = 0.5  # depth bin of a group, so that its parallax is nearly constant
@@ -32,7 +31,6 @@ MIN_REACH_STEPS = 6  # with wide or small lenses a pixel is much of a level's re
 MAX_COVERED = 0.3  # share of a window that something nearer may cover at a coarse level
 OCCLUSION_SPACINGS = 1.5  # occlusion cell in sample spacings: about one sample each
 VARIANCES = 256  # grids of which they are computed at once, in double precision
-LOG_GRAY = np.log1p(np.arange(256, dtype=np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +95,7 @@ class ShiftScores:
 
 
 def score_frame(  # noqa: PLR0913 - what is scored, and how
-    gray: Gray,
+    gray: PreparedImage,
     cloud: PreparedCloud,
     camera: Camera,
     level: Level,
@@ -130,7 +128,7 @@ def score_frame(  # noqa: PLR0913 - what is scored, and how
 
 
 def view_windows(  # noqa: PLR0913 - what is seen, and how
-    gray: Gray,
+    gray: PreparedImage,
     cloud: PreparedCloud,
     camera: Camera,
     level: Level,
@@ -143,7 +141,7 @@ def view_windows(  # noqa: PLR0913 - what is seen, and how
     With the twist of the LiDAR, (6,), when the camera takes it.
     """
     camera = when_taken(camera, twist_per_s)
-    image, scale = downscale_log_gray(gray, camera, level.step_rad, level.blur_steps)
+    image, scale = gray.log_gray(camera, level.step_rad, level.blur_steps)
     windows = select_windows(cloud, camera, level, max_windows=max_windows)
     T, viewpoint_m = camera.T_camera_lidar, cloud.viewpoint_lidar_m(camera)
     centres_lidar_m = windows.rays_m[:, 0] + viewpoint_m
@@ -217,22 +215,6 @@ def pad_grids(scores: Sequence[ShiftScores]) -> list[ShiftScores]:
         else one
         for one, margin in zip(scores, margins, strict=True)
     ]
-
-
-def downscale_log_gray(
-    gray: Gray, camera: Camera, step_rad: float, blur_steps: float
-) -> tuple[NDArray[np.float32], Array]:
-    """Logarithm of gray, down-scaled so that a pixel is a step; its (2,) scales of u and v.
-
-    A pixel p of the image lies at (p + 0.5) scale - 0.5.
-    """
-    factor = min(1.0, 1.0 / (camera.lens.pixels_per_rad * step_rad))
-    height, width = gray.shape
-    size = (max(8, round(width * factor)), max(8, round(height * factor)))
-    small = cv2.resize(cv2.LUT(gray, LOG_GRAY), size, interpolation=cv2.INTER_AREA)
-    small = cv2.GaussianBlur(small, (0, 0), blur_steps)
-    scale = np.array([size[0] / width, size[1] / height])
-    return np.ascontiguousarray(small, dtype=np.float32), scale
 
 
 def group_windows(

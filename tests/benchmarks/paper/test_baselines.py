@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
-import pytest
 
-from benchmarks.paper.baselines import (
-    TRF_TOLERANCE,
-    oracle_weights,
-    paper_solve,
-    prior_rows,
-)
-from benchmarks.paper.methods import PreparedDraw
-from benchmarks.paper.sources import source_from
-from calibgraph import Config, preset
+from benchmarks.paper.baselines import TRF_TOLERANCE, prior_rows
+from benchmarks.paper.draws import PreparedDraw, source_from
+from calibgraph import preset
 from calibgraph.model.geometry import to_T_lidar_camera
-from calibgraph.simulation.scenarios import scenario_of
-from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.joint import solve_joint
 
 KITTI = preset("kitti")
@@ -73,22 +62,3 @@ def test_priors_alone_have_their_minimum_at_stage_1() -> None:
     solved, T_hat = prepared.solve_as_paper("priors"), prepared.aggregate_pnp("median")
     for name, T in T_hat.items():
         np.testing.assert_allclose(solved[name], T, atol=1e-9)
-
-
-def test_the_papers_solver_refuses_settings_that_are_not_the_papers() -> None:
-    draw = source_from("kitti").draw(1, seed=0)
-    with pytest.raises(ValueError, match="needs a Cauchy loss"):
-        paper_solve(draw.rig, draw.table, draw.rig.T_camera_lidar, Config(), "full")
-
-
-def test_oracle_weights_are_low_for_frames_with_errors() -> None:
-    rig = scenario_of("kitti").rig
-    table = source_from("kitti").draw(4, seed=2).table.of_camera("image_2")
-    wrong = table.frame == 1
-    spoilt = replace(table, pixels_px=table.pixels_px + np.where(wrong, 5.0, 0.0)[:, None])
-    block = camera_blocks(rig, spoilt, KITTI)["image_2"]
-    weights = oracle_weights(block, rig.cameras["image_2"].T_camera_lidar)
-    assert weights.max() == 1.0
-    # 1000 matches that are all 5 px off: the squared error of the frame's optimum is
-    # 1000 * 50 / 6 px^2 of a single match; of the other frames some px^2 at most.
-    assert weights[block.frame == 1].max() < 0.01

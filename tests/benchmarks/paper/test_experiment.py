@@ -7,24 +7,20 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from benchmarks.paper.__main__ import main
+from benchmarks.paper.draws import HEADLINE, METHODS, STAGE1, TRF_TERMS, Draw, Source, source_from
 from benchmarks.paper.experiment import interval, run_experiment
-from benchmarks.paper.methods import HEADLINE, METHODS, ORACLE, STAGE1, TRF_TERMS
-from benchmarks.paper.output import markdown, to_mapping, write_report
-from benchmarks.paper.published import PAIR, published
-from benchmarks.paper.sources import Draw, Simulated, source_from
-from calibgraph import CorrespondenceError, preset
-from tests.conftest import SAMPLE
+from benchmarks.paper.output import PAIR, markdown, published, to_mapping
+from calibgraph import preset
 
 KITTI = preset("kitti")
 
 
 @dataclass(frozen=True)
-class Thinned(Simulated):
+class Thinned(Source):
     """A scenario whose first camera has few matches per draw."""
 
     kept: int = 5
@@ -47,10 +43,10 @@ def test_every_row_and_metric_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run_main(monkeypatch, "kitti", "--frames", 5, "--draws", 2, "--out", tmp_path)
-    assert "5 frames, 2 draws, against truth" in capsys.readouterr().out
+    assert "5 frames, 2 draws" in capsys.readouterr().out
     content = json.loads((tmp_path / "paper.json").read_text())
     (block,) = content["blocks"]
-    assert (block["frames"], block["draws"], block["reference"]) == (5, 2, "truth")
+    assert (block["frames"], block["draws"]) == (5, 2)
     assert list(block["rows"]) == list(METHODS)
     for row in block["rows"].values():
         assert row["failed"] == 0
@@ -58,12 +54,11 @@ def test_every_row_and_metric_is_written(
         for camera in ("image_2", "image_3"):
             numbers = row["numbers"][camera]
             assert len(numbers) == 10  # E_t, E_R, six axes, reprojection, improvement
-            assert all(np.isfinite(value["median"]) for value in numbers.values())
+            assert np.isfinite([*numbers.values()]).all()
     stage1 = block["rows"][STAGE1]["numbers"]["image_2"]
-    assert stage1["reprojection_improvement_px"]["median"] == 0.0
+    assert stage1["reprojection_improvement_px"] == [0.0, 0.0, 0.0]
     tables = (tmp_path / "paper.md").read_text()
     assert all(name in tables for name in METHODS)
-    assert cv2.imread(str(tmp_path / "paper.png")) is not None
 
 
 def numbers_of(*, seed: int = 0, jobs: int = 1) -> dict[str, object]:
@@ -81,16 +76,11 @@ def test_the_same_seed_gives_the_same_numbers() -> None:
     assert numbers_of(seed=1)["blocks"] != numbers_of()["blocks"]
 
 
-@pytest.mark.slow
-def test_several_processes_give_the_same_numbers() -> None:
-    assert numbers_of(jobs=2) == numbers_of()
-
-
 def test_intervals_are_medians_and_quantiles() -> None:
     found = interval([5.0, 1.0, 3.0, 2.0, 4.0, np.nan])
     # Linear between order statistics: 5 % of the way along 1 .. 5 is 1.2.
-    assert (found.low, found.median, found.high) == pytest.approx((1.2, 3.0, 4.8))
-    assert np.isnan(interval([np.nan]).median)
+    assert found == pytest.approx((1.2, 3.0, 4.8))
+    assert np.isnan(interval([np.nan])).all()
 
 
 def test_rows_that_fail_are_counted_and_marked() -> None:
@@ -100,47 +90,6 @@ def test_rows_that_fail_are_counted_and_marked() -> None:
     assert "| failed |" in markdown(report)
 
 
-def test_a_recording_without_matches_fails_in_every_row(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def find_nothing(*arguments: object, **options: object) -> None:
-        raise CorrespondenceError("nothing", camera="left")
-
-    monkeypatch.setattr("benchmarks.paper.sources.match_in_rounds", find_nothing)
-    report = run_experiment(source_from(str(SAMPLE)), frames=[2], draws=1, config=KITTI)
-    assert report.published_as == ""
-    assert all(row.failed == 1 for row in report.blocks[0].rows.values())
-    assert len(write_report(report, tmp_path)) == 3
-    with pytest.raises(SystemExit):
-        run_main(monkeypatch, SAMPLE, "--frames", 2, "--draws", 1, "--out", tmp_path / "new")
-    assert "calibgraph calibrate reports why" in capsys.readouterr().err
-    assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("nowhere",), "'nowhere' is no scenario (kitti, walkley"),
-        (("kitti", "--frames", "ten"), "--frames: invalid int value: 'ten'"),
-        (("kitti", "--preset", "auto"), "--preset: invalid choice: 'auto'"),
-        (("kitti", "--frames", "10001"), "10001 frames: at most 10000"),
-        (("kitti", "--draws", "0"), "nothing to do: 0 draws"),
-    ],
-)
-def test_wrong_arguments_are_one_line(
-    arguments: tuple[str, ...],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with pytest.raises(SystemExit) as exit_code:
-        run_main(monkeypatch, *arguments, "--out", tmp_path / "out")
-    assert exit_code.value.code == 2
-    assert message in capsys.readouterr().err.splitlines()[-1]
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_papers_numbers_are_those_of_its_tables() -> None:
     full = list(TRF_TERMS)[-1]
     assert published("kitti", full, 100, 0)["translation_error_cm"] == 0.89
@@ -148,17 +97,3 @@ def test_the_papers_numbers_are_those_of_its_tables() -> None:
     assert published("kitti", full, 10, PAIR)["rotation_error_deg"] == 0.033
     assert published("kitti", full, 10, 1)["reprojection_px"] == 0.41
     assert published("surround", full, 10, 0) == published("kitti", HEADLINE, 10, 0) == {}
-
-
-def test_only_simulations_have_oracle_weights() -> None:
-    draw = source_from("kitti").draw(2, seed=0)
-    real = replace(draw, simulated=False, references={"reference": draw.references["truth"]})
-
-    @dataclass(frozen=True)
-    class Real(Simulated):
-        def draw(self, frames: int, seed: int) -> Draw:
-            return real
-
-    report = run_experiment(Real("kitti"), frames=[2], draws=1, config=KITTI, trf=False)
-    expected = [n for n in METHODS if n != ORACLE and n not in TRF_TERMS]
-    assert list(report.blocks[0].rows) == expected

@@ -8,11 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from calibgraph import CalibrationError, FileError, load_dataset, load_rig
-from calibgraph.io.bags import is_bag
 from calibgraph.io.clouds import load_cloud
 from calibgraph.io.images import load_image
 from tests.conftest import SAMPLE
@@ -33,60 +31,6 @@ def test_a_truncated_bag_is_named(tmp_path: Path, kind: str, share: float) -> No
         load_dataset(bag, load_rig(SAMPLE))
     assert str(caught.value).startswith(str(bag))
     assert "or repair it with `" in str(caught.value)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_overwritten_bytes_end_in_one_line_or_in_data(tmp_path: Path, kind: str) -> None:
-    bag = sample_bag(tmp_path, kind)
-    path, rig = data_file(bag), load_rig(SAMPLE)
-    whole = np.frombuffer(path.read_bytes(), np.uint8)
-    generator = np.random.default_rng(5)
-    refused = 0
-    last = len(whole) - 4096
-    for start in (0, last, *generator.integers(last, size=18)):
-        spoilt = whole.copy()
-        spoilt[start : start + 4096] = generator.integers(0, 256, 4096)
-        path.write_bytes(spoilt.tobytes())
-        try:
-            for frame in load_dataset(bag, rig).frames:
-                frame.load_cloud()
-                for name, camera in rig.cameras.items():
-                    frame.load_image(name, camera)
-        except CalibrationError as error:
-            refused += 1
-            assert "\n" not in str(error)
-    assert refused >= 2  # without the start or the end of its file, no bag is one
-
-
-def test_a_recording_that_was_not_closed_is_named(tmp_path: Path) -> None:
-    rig, bag = load_rig(SAMPLE), sample_bag(tmp_path, "sqlite3")
-    (bag / "metadata.yaml").rename(tmp_path / "metadata.yaml")
-    with pytest.raises(FileError, match=r"has no metadata.yaml, .* name drive_sqlite3.db3, or"):
-        load_dataset(bag, rig)
-    assert len(load_dataset(bag / "drive_sqlite3.db3", rig).frames) == 6
-    (tmp_path / "dataset").mkdir()
-    for name in ("lidar", "cameras", "drive.db3"):  # a bag may lie beside a dataset's files
-        source = bag / "drive_sqlite3.db3" if name == "drive.db3" else SAMPLE / name
-        (tmp_path / "dataset" / name).symlink_to(source)
-    assert load_dataset(tmp_path / "dataset", rig).frames[0].cloud_path.suffix == ".npy"
-    log = bag / "drive_sqlite3.db3-wal"
-    log.write_bytes(b"messages")
-    for path in (bag / "drive_sqlite3.db3", bag):
-        if path == bag:
-            (tmp_path / "metadata.yaml").rename(bag / "metadata.yaml")
-        with pytest.raises(FileError, match="was not closed: drive_sqlite3.db3-wal holds messages"):
-            load_dataset(path, rig)
-
-
-def test_a_file_of_another_kind_is_no_bag(tmp_path: Path) -> None:
-    path = tmp_path / "drive.bag"
-    path.write_bytes(b"no bag at all")
-    with pytest.raises(FileError, match=r"drive.bag: is truncated, was not closed or is no"):
-        load_rig(path)
-    (tmp_path / "metadata.yaml").write_text("title: a folder of something else")
-    assert not is_bag(tmp_path)
-    with pytest.raises(FileError, match="no such folder or ROS bag"):
-        load_dataset(tmp_path / "missing.mcap")
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import yaml
 
 from calibgraph import (
     MatcherErrors,
-    Rig,
     export_calibration,
     import_rig,
     load_calibration,
@@ -21,23 +18,14 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
-from calibgraph.errors import FileError
-from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.mounts import find_mounts
 from calibgraph.model.geometry import invert
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
-    Messages,
-    Stamped,
     sample_bag,
-    sample_messages,
     tree_of,
-    without,
-    write_bag,
 )
 from tests.io.formats.readers import READERS
-
-MAKE = Messages("mcap")
 
 
 @pytest.fixture(scope="module")
@@ -113,13 +101,6 @@ def test_the_exported_transforms_replace_those_of_the_robots_tree(
         np.testing.assert_allclose(T_camera_lidar, estimate[name], atol=1e-9)
 
 
-def test_an_exported_robot_is_whole(result: Path, tmp_path: Path) -> None:
-    export_calibration(result, tmp_path / "a.urdf", "urdf", even_if_failed=True)
-    joints = ElementTree.parse(tmp_path / "a.urdf").getroot().findall("joint")
-    links = {(j.find("parent").get("link"), j.find("child").get("link")) for j in joints}  # type: ignore[union-attr]
-    assert links == {(parent, child) for child, (parent, _) in EDGES.items()}
-
-
 def test_the_exported_transforms_are_read_back_over_the_robots_description(
     result: Path, bag: Path, tmp_path: Path
 ) -> None:
@@ -160,64 +141,3 @@ def test_the_link_that_moves_is_the_uppermost_of_the_camera_alone(name: str) -> 
     found = find_mounts(cameras, "velodyne", parents, lambda *_: np.eye(4))
     moved = {n: (found[n].parent, found[n].child) if n in found else None for n in expected}
     assert moved == expected
-
-
-def test_autowares_link_is_above_the_optical_frame_of_the_bag(bag: Path, tmp_path: Path) -> None:
-    rig = rig_of_bag(bag)
-    front = rig.cameras["left"].model_copy(update={"frame_id": "camera5/camera_optical_link"})
-    named = rig.model_copy(update={"cameras": {**rig.cameras, "left": front}})
-    export_calibration(named, tmp_path / "kit.yaml", "autoware")
-    frames = yaml.safe_load((tmp_path / "kit.yaml").read_text())["sensor_kit_base_link"]
-    assert list(frames) == [
-        "velodyne", "front_left/camera_link", "front_right/camera_link", "camera5/camera_link"
-    ]  # fmt: skip
-
-
-def test_a_rig_file_keeps_frames_and_needs_none(bag: Path, tmp_path: Path) -> None:
-    rig = rig_of_bag(bag)
-    rig.save(tmp_path / "rig.yaml")
-    content = yaml.safe_load((tmp_path / "rig.yaml").read_text())
-    assert content["cameras"]["left"]["frame_id"] == "left_optical"
-    found = load_rig(tmp_path / "rig.yaml").cameras
-    assert {name: camera.frame_id for name, camera in found.items()} == IDS
-    assert "frame_id" not in load_rig(SAMPLE).model_dump()["cameras"]["left"]
-    content["cameras"]["left"]["frame_id"] = "two words"
-    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(content))
-    with pytest.raises(FileError, match="frame_id"):
-        load_rig(tmp_path / "rig.yaml")
-
-
-def test_an_import_keeps_the_frames_and_looks_for_them_in_other_files(tmp_path: Path) -> None:
-    written = without(sample_messages(MAKE), "/tf_static")
-    for each in written:
-        if "camera_info" in each.topic:
-            each.content.header.frame_id = f"optical_of_{each.topic.split('/')[1]}"
-    bare = write_bag(tmp_path, "mcap", written)
-    joints = "".join(
-        f'<link name="optical_of_{name}"/><joint name="{name}" type="fixed">'
-        f'<parent link="velodyne"/><child link="optical_of_{name}"/>'
-        f'<origin xyz="0.5 0 {k}" rpy="-1.57 0 -1.57"/></joint>'
-        for k, name in enumerate(IDS)
-    )
-    (tmp_path / "robot.urdf").write_text(f'<robot name="r"><link name="velodyne"/>{joints}</robot>')
-    rig: Rig = import_rig([bare, tmp_path / "robot.urdf"], rename={"left": "port"})
-    assert rig.lidar == "velodyne"
-    assert rig.cameras["port"].frame_id == "optical_of_left"
-
-
-def test_a_frame_that_is_not_the_images_is_not_kept(tmp_path: Path) -> None:
-    turned = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    written = []
-    for each in sample_messages(MAKE):
-        topic = each.topic.replace("/left/image_raw", "/left/image_rect")
-        if topic == "/left/camera_info":
-            each.content.r = turned.ravel()
-        if topic == "/front_left/camera_info":
-            each.content.header.frame_id = "front_right_optical"
-        written.append(Stamped(topic, each.type, each.record_ns, each.content))
-    bag = write_bag(tmp_path, "mcap", written)
-    assert [camera.frame_id for camera in rig_of_bag(bag).cameras.values()] == [None] * 3
-    assert (
-        "left: its images are rectified, and turned by 90 deg against frame 'left_optical'; an "
-        "export has a frame of their own"
-    ) in read_bag_rig(bag).notes

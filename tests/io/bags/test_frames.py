@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibgraph import BagOptions, Dataset, DatasetError, Frame, calibrate, load_dataset, load_rig
+from calibgraph import BagOptions, Dataset, DatasetError, calibrate, load_dataset, load_rig
 from calibgraph.io.frame import hash_source
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
@@ -123,17 +122,6 @@ def test_images_pair_with_the_cloud_of_the_nearest_stamp(tmp_path: Path) -> None
     assert "left +7 ms (median), at most 11; 3 without an image of left" in near.notes[-1]
 
 
-def test_a_frame_without_an_image_is_left_out_and_is_no_ones_neighbour(tmp_path: Path) -> None:
-    def drop(number: int, each: Stamped) -> Stamped | None:
-        return None if number == 2 and each.topic == LEFT else each
-
-    data = load_dataset(changed(tmp_path, drop))
-    assert numbers(data) == [0, 1, 3, 4, 5]
-    assert "1 without an image of left" in data.notes[-1]
-    assert data.neighbour(data.frames[1], 1) is None
-    assert data.neighbour(data.frames[2], 1) == data.frames[3]
-
-
 def test_repeated_stamps_and_empty_clouds_are_left_out_and_counted(tmp_path: Path) -> None:
     make = Messages("mcap")
     nothing = structured(np.full((5, 4), np.nan, np.float32))
@@ -183,15 +171,6 @@ def test_clocks_that_differ_are_named_and_the_time_of_recording_serves(tmp_path:
     with pytest.raises(DatasetError, match=r"/left.* 0.003 to 0.503 s do not meet; set stamps"):
         load_dataset(bag)
     assert numbers(load_dataset(bag, bag=BagOptions(stamps="record"))) == [0, 1, 2, 3, 4, 5]
-
-
-def test_messages_recorded_in_the_same_nanosecond_stay_apart(tmp_path: Path) -> None:
-    def at_once(number: int, each: Stamped) -> Stamped:
-        return replace(each, record_ns=START_NS)
-
-    data, folder = load_dataset(changed(tmp_path, at_once)), load_dataset(SAMPLE)
-    for found, expected in zip(data.frames, folder.frames, strict=True):
-        np.testing.assert_array_equal(found.load_cloud(), expected.load_cloud())
 
 
 def long_bag(folder: Path, kind: str, frames: int) -> Path:
@@ -248,14 +227,6 @@ def test_times_of_points_are_noticed(tmp_path: Path) -> None:
     )
 
 
-def test_a_file_of_a_bag_is_a_bag(tmp_path: Path) -> None:
-    bag = sample_bag(tmp_path, "mcap")
-    data = load_dataset(bag / "drive_mcap.mcap")
-    np.testing.assert_array_equal(
-        data.frames[5].load_cloud(), load_dataset(bag).frames[5].load_cloud()
-    )
-
-
 @pytest.mark.parametrize(
     ("kind", "compression"),
     [("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite3", "FILE"), ("sqlite3", "MESSAGE"),
@@ -270,20 +241,3 @@ def test_compressed_bags_hold_the_same(tmp_path: Path, kind: str, compression: s
             np.testing.assert_array_equal(
                 found.load_image(name, camera), expected.load_image(name, camera)
             )
-
-
-def test_threads_read_a_bag_at_the_same_time(tmp_path: Path) -> None:
-    for kind in KINDS:
-        frames = load_dataset(long_bag(tmp_path, kind, 12)).frames
-        alone = [frame.load_cloud() for frame in frames]
-        with ThreadPoolExecutor(8) as pool:
-            for one, two in zip(pool.map(Frame.load_cloud, frames), alone, strict=True):
-                np.testing.assert_array_equal(one, two)
-
-
-def test_options_of_bags_are_checked() -> None:
-    with pytest.raises(ValueError, match="are given without a bag"):
-        load_dataset(SAMPLE, bag=BagOptions(every_s=1.0))
-    for wrong in ({"every_s": 0.0}, {"sync_tolerance_s": -1.0}, {"stamps": "best"}):
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            BagOptions(**wrong)  # type: ignore[arg-type]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from calibgraph import DatasetError, FileError, load_dataset, load_rig
+from calibgraph import FileError, load_dataset, load_rig
 from calibgraph.io.bags.mcap_files import McapFile
 from calibgraph.io.bags.messages import Bag
 from tests.conftest import SAMPLE
@@ -20,7 +19,6 @@ from tests.io.bags.writing import (
     STORES,
     Messages,
     Stamped,
-    sample_bag,
     sample_messages,
     write_bag,
 )
@@ -147,68 +145,6 @@ def test_channels_of_other_encodings_are_left_alone(
     path = write_mcap(tmp_path / "drive.mcap", messages, beside=encoding or "none", **WHOLE[name])
     require_the_sample(path)
     assert "/notes" in Bag(path).topics
-
-
-def test_a_channel_that_has_the_name_of_an_image_in_json_is_no_camera(tmp_path: Path) -> None:
-    path = tmp_path / "drive.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("", "test")
-        number = writer.register_schema("sensor_msgs/msg/Image", "jsonschema", b"{}")
-        channel = writer.register_channel("/front/image_raw", "json", number)
-        writer.add_message(channel, START_NS, json.dumps({"width": 4}).encode(), START_NS)
-        writer.finish()
-    with pytest.raises(DatasetError, match=r"nor PointCloud2, but sensor_msgs/msg/Image \(json\)"):
-        load_rig(path)
-
-
-@pytest.mark.parametrize(
-    ("kind", "profile"), [("mcap", "ros1"), ("mcap", "px4"), ("ros1", ""), ("ros1", "ros2")]
-)
-def test_the_messages_encoding_counts_not_the_profile(
-    tmp_path: Path, kind: str, profile: str
-) -> None:
-    messages = sample_messages(Messages(kind))
-    require_the_sample(write_mcap(tmp_path / "d.mcap", messages, kind=kind, profile=profile))
-
-
-@pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
-def test_the_storage_of_a_folder_is_that_of_its_files(tmp_path: Path, kind: str) -> None:
-    bag = sample_bag(tmp_path, kind)
-    metadata = yaml.safe_load((bag / "metadata.yaml").read_text())
-    stated = metadata["rosbag2_bagfile_information"]
-    stated["storage_identifier"] = ""
-    stated["topics_with_message_count"][0]["topic_metadata"]["serialization_format"] = "json"
-    (bag / "metadata.yaml").write_text(yaml.safe_dump(metadata))
-    require_the_sample(bag)
-
-
-def test_a_file_that_a_folder_lacks_is_named(tmp_path: Path) -> None:
-    bag = sample_bag(tmp_path, "mcap")
-    (bag / "drive_mcap.mcap").rename(tmp_path / "elsewhere.mcap")
-    with pytest.raises(FileError, match=r"names drive_mcap.mcap, which is not there; copy it th"):
-        load_rig(bag)
-
-
-def test_only_a_file_without_its_end_is_called_truncated(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "drive.mcap", sample_messages(Messages("mcap")))
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-1])
-    with pytest.raises(FileError, match=r"is truncated, .*\(its end is missing\).*`mcap recover`"):
-        load_rig(path)
-
-
-def test_a_message_that_is_none_of_its_type_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "drive.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "test")
-        number = writer.register_schema("sensor_msgs/msg/PointCloud2", "ros2msg", b"")
-        channel = writer.register_channel("/points", "cdr", number)
-        writer.add_message(channel, START_NS, b"\x00\x01\x00\x00abc", START_NS)
-        writer.finish()
-    with pytest.raises(FileError, match=r"the message of /points recorded at \d+ ns is no sensor"):
-        Bag(path).first("/points")
 
 
 def test_an_unknown_compression_is_named(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from calibgraph.io.bags.point_clouds import timed_points_of
 from calibgraph.io.frame import load_entry_cloud
 from calibgraph.io.motion import ScanMotion
 from calibgraph.matching import places
-from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.model.geometry import invert
 from calibgraph.trust.inputs import find_doubts
 from tests.conftest import SAMPLE
@@ -70,24 +69,6 @@ def test_poses_correct_them(bag: tuple[Path, list[np.ndarray]], motion: str) -> 
 
 def test_registration_of_neighbours_corrects_them(bag: tuple[Path, list[np.ndarray]]) -> None:
     assert max(errors_m(bag, "scans")) < 0.01  # surfaces without noise, in voxels of 0.25 m
-
-
-def test_a_cache_tells_corrected_clouds_from_those_as_recorded(
-    bag: tuple[Path, list[np.ndarray]],
-) -> None:
-    cache = FrameCache()
-    options = (BagOptions(), BagOptions(motion="tf"))
-    frames = [load_dataset(bag[0], bag=each).frames[1] for each in options]
-    one, two = (cache.cloud(frame) for frame in frames)
-    assert one is not two
-    assert cache.cloud(frames[1]) is two
-    cache.keep_only(frames[:1])
-    assert cache.cloud(frames[0]) is one
-
-
-def test_the_note_states_the_correction(bag: tuple[Path, list[np.ndarray]]) -> None:
-    notes = load_dataset(bag[0], bag=BagOptions(motion="tf")).notes
-    assert notes[-1].endswith("clouds are corrected for motion by tf, with the t")
 
 
 @pytest.mark.parametrize(("motion", "limit_m"), [("odometry", 2e-4), ("scans", 0.1)])
@@ -148,25 +129,6 @@ def test_times_that_are_none_are_refused() -> None:
     rows["time"] = 7.0, np.nan
     with pytest.raises(DatasetError, match="time: times from .* are not those of one scan"):
         timed_points_of(MAKE.cloud(rows, START_NS), "here")
-
-
-def test_what_is_missing_is_named(bag: tuple[Path, list[np.ndarray]], tmp_path: Path) -> None:
-    written, _ = messages()
-    still = [each for each in written if each.topic not in ("/odom", "/tf")]
-    parked = write_bag(tmp_path / "still", "mcap", still)
-    with pytest.raises(DatasetError, match="has 0 topics of Odometry"):
-        load_dataset(parked, bag=BagOptions(motion="odometry"))
-    with pytest.raises(DatasetError, match="has 0 poses of the LiDAR"):
-        load_dataset(parked, bag=BagOptions(motion="tf"))
-    few = [e for e in written if e.topic != "/odom" or e.record_ns < START_NS + PERIOD_NS]
-    short = write_bag(tmp_path / "short", "mcap", few)
-    last = load_dataset(short, bag=BagOptions(motion="odometry")).frames[-1]
-    with pytest.raises(DatasetError, match="no poses of the LiDAR within 0.5 s at"):
-        last.load_cloud()
-    with pytest.raises(ValueError, match="motion 'wheels': known are none, odometry, tf, scans"):
-        BagOptions(motion="wheels")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="by the stamps of the headers"):
-        BagOptions(motion="tf", stamps="record")
 
 
 def driven_sample(folder: Path) -> Path:

@@ -14,9 +14,7 @@ import pytest
 from PIL import Image
 
 from calibgraph import BagOptions, CalibrationError, DatasetError, FileError, load_dataset, load_rig
-from calibgraph.io.bags.messages import Bag
 from calibgraph.io.bags.rig import read_bag_rig, rig_of_bag
-from calibgraph.io.bags.topics import choose_topics
 from calibgraph.io.ros_messages import image_from_message
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
@@ -77,33 +75,6 @@ def test_cameras_of_one_namespace_have_their_own_lens(
     for name, camera in rig_of_bag(bag, BagOptions(topics=topics)).cameras.items():
         assert camera.frame_id == f"{name}_optical"
         np.testing.assert_allclose(camera.T_camera_lidar, RIG.T_camera_lidar[name], atol=1e-9)
-
-
-def test_a_camera_info_that_could_be_of_several_is_asked_for(tmp_path: Path) -> None:
-    def change(each: Stamped) -> Stamped | None:
-        if "camera_info" in each.topic:
-            kept = each.topic == "/left/camera_info"
-            return replace(each, topic="/cams/camera_info") if kept else None
-        return renamed("/cams/{}/compressed", "")(each)
-
-    bag = recording(tmp_path, change)
-    with pytest.raises(DatasetError, match=r"which camera_info is that of /cams/front_left/comp"):
-        rig_of_bag(bag)
-    topics = {"left": "/cams/left/compressed,/cams/camera_info"}
-    assert [*rig_of_bag(bag, BagOptions(topics=topics)).cameras] == ["left"]
-    assert len(load_dataset(bag, bag=BagOptions(topics=topics)).frames) == 6
-    with pytest.raises(DatasetError, match="has no messages of /cams/none"):
-        rig_of_bag(bag, BagOptions(topics={"left": "/cams/left/compressed,/cams/none"}))
-
-
-def test_image_topics_that_are_not_used_are_named(tmp_path: Path) -> None:
-    bag = recording(tmp_path, lambda each: each)
-    topics = {"left": "/left/image_raw/compressed"}
-    unused = choose_topics(Bag(bag), topics).notes
-    assert [note.split(": ")[1].split()[0] for note in unused] == [
-        f"/{name}/image_raw/compressed" for name in ("front_left", "front_right")
-    ]
-    assert choose_topics(Bag(bag), {}).notes == ()
 
 
 TEXTS = {
@@ -202,16 +173,6 @@ def test_a_camera_info_that_changes_is_noted_and_its_frames_left_out(
     assert note in found and ("camera_info" in found) == bool(note)
 
 
-def test_a_rig_with_the_later_lens_takes_the_later_frames(tmp_path: Path) -> None:
-    bag = recording(tmp_path, infos(lambda n: zoomed(1.25) if n >= 4 else {}))
-    rig = load_dataset(bag).rig
-    k = rig.cameras["left"].intrinsics_px
-    larger = k.model_copy(update={name: 1.25 * value for name, value in k.model_dump().items()})
-    later = rig.cameras["left"].model_copy(update={"intrinsics_px": larger})
-    data = load_dataset(bag, rig.model_copy(update={"cameras": {"left": later}}))
-    assert [frame.index for frame in data.frames] == [4, 5]
-
-
 def test_without_any_lens_the_first_camera_info_is_named(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"/left/camera_info: K: .*not calibrated"):
         load_dataset(recording(tmp_path, infos(lambda _: {"K": np.zeros(9)})))
@@ -256,30 +217,6 @@ def test_clouds_of_another_frame_are_left_out_and_counted(tmp_path: Path) -> Non
     data = load_dataset(recording(tmp_path, change))
     assert len(data.frames) == 4
     assert "/points: 2 name another frame than the first (rear, not velodyne)" in data.notes[-1]
-
-
-@pytest.mark.parametrize(
-    ("field", "note"),
-    [
-        ("time_stamp", "points have a time_stamp: unless they are corrected for motion"),
-        ("gps_time", "gps_time may be times of points, which are read from t, time"),
-        ("timestamps", "timestamps may be times of points"),
-        ("point_time_offset", "point_time_offset may be times of points"),
-        ("ts", "ts may be times of points"),
-        ("ring", ""),
-    ],
-)
-def test_fields_that_may_be_times_are_named(tmp_path: Path, field: str, note: str) -> None:
-    def change(each: Stamped) -> Stamped:
-        if each.topic != "/points":
-            return each
-        points = np.zeros(50, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (field, "<u4")])
-        points["x"] = 5.0
-        return replace(each, content=MAKE.cloud(points, each.record_ns))
-
-    bag = recording(tmp_path, change)
-    found = load_dataset(bag, RIG).notes[-1].rpartition("clouds, ")[2]
-    assert note in found and ("times" in found or "have a" in found) == bool(note)
 
 
 def turned(orientation: int, form: str) -> bytes:

@@ -14,7 +14,6 @@ from calibgraph import (
     DatasetError,
     FileError,
     camera_from_message,
-    describe_rig,
     import_rig,
     load_dataset,
     load_rig,
@@ -24,7 +23,6 @@ from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.bags.messages import Bag, Drive
 from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.transforms import Transforms
-from calibgraph.model.geometry import relative_transform
 from tests.conftest import SAMPLE, make_camera
 from tests.io.bags.writing import (
     KINDS,
@@ -70,28 +68,6 @@ def test_one_point_goes_through_the_tree_by_hand(tmp_path: Path, kind: str) -> N
     # (-x of the image), 0.5 m above (-y), 0.5 m ahead.
     np.testing.assert_allclose(T_optical_lidar @ [3, 0, 0, 1], [-3, -0.5, 0.5, 1], atol=1e-12)
     assert transforms.between("optical", "elsewhere") is None
-
-
-def test_the_cameras_relative_poses_are_measurements_only_on_request(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path, "mcap", sample_messages(MAKE))
-    assert rig_of_bag(bag).relative_poses == ()
-    guess = load_rig(SAMPLE).T_camera_lidar
-    poses = rig_of_bag(bag, relative_sigmas=(0.002, 0.01)).relative_poses
-    assert [(pose.a, pose.b) for pose in poses] == [
-        ("front_left", "front_right"), ("front_left", "left"),
-    ]  # fmt: skip
-    for pose in poses:
-        expected = relative_transform(guess[pose.a], guess[pose.b])
-        np.testing.assert_allclose(pose.T_a_b, expected, atol=1e-12)
-        assert (pose.rotation_sigma_rad, pose.translation_sigma_m) == (0.002, 0.01)
-
-
-def test_a_rig_is_described_in_a_sentence_per_camera(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path, "mcap", sample_messages(MAKE))
-    assert describe_rig(rig_of_bag(bag))[2] == (
-        "left looks along LiDAR +y, 14 deg to the right, 3 deg down, sits 0.05 m behind, 0.29 m "
-        "left and 0.19 m below the LiDAR"
-    )
 
 
 def test_body_axes_in_place_of_optical_ones_are_noticed(tmp_path: Path) -> None:

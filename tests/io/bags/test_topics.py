@@ -79,12 +79,6 @@ def test_depth_and_images_without_a_lens_are_no_cameras(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_topics_are_chosen_by_name(tmp_path: Path) -> None:
-    bag = bag_of(tmp_path, "/a/image_raw", "/a/camera_info", "/b/image_raw", clouds=("/p", "/q"))
-    assert found(bag, lidar="/q", other="/b/image_raw") == {"other": "/b/image_raw"}
-    assert choose_topics(bag, {"lidar": "/q"}).lidar == "/q"
-
-
 def test_what_cannot_be_chosen_is_offered(tmp_path: Path) -> None:
     bag = bag_of(tmp_path / "two", "/a/image_raw", "/a/camera_info", clouds=("/p", "/q"))
     with pytest.raises(DatasetError, match=r"2 topics of clouds: /p \(1\), /q \(1\); name"):

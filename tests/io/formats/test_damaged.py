@@ -83,7 +83,7 @@ def message_of(*paths: Path) -> str:
         ("kit.yaml", "gnss_link", "livox_left", "could be livox_left, velodyne_top_base_link"),
         ("tf.yaml", "w: 0.5", "v: 0.5", "rotation.w' is missing"),
         ("tf.yaml", "frame_id: base_link", "frame_id: odom", "no lens"),
-        ("calib.json", "plumb_bob", "equirectangular", "intrinsics: Tuple should have at most 2"),
+        ("calib.json", "plumb_bob", "equirectangular", "expected width and height"),
         ("calib.json", "plumb_bob", "atan", "'atan' is none of"),
         ("calib.json", '"T_lidar_camera": [', '"T_lidar_camera": [[', "is not valid JSON"),
         ("calib.json", '"intrinsics": [', '"intrinsics": [1,', "intrinsics"),
@@ -113,7 +113,7 @@ def test_damaged_files_are_one_line(
 def test_a_zero_quaternion_of_koide3_is_one_line(tmp_path: Path) -> None:
     content = {**KOIDE, "results": {"T_lidar_camera": [0.0] * 7}}
     (tmp_path / "calib.json").write_text(json.dumps(content))
-    assert "calib.json: T_lidar_camera" in message_of(tmp_path / "calib.json")
+    assert "calib.json: camera: T_lidar_camera" in message_of(tmp_path / "calib.json")
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
@@ -158,7 +158,7 @@ def test_unknown_and_unexpanded_files_are_named(tmp_path: Path) -> None:
     (other,) = write(tmp_path, a__yaml="speed: 3\n")
     assert "its keys (speed) are of no known format; known are those of Kalibr" in message_of(other)
     (other,) = write(tmp_path, a__csv="1,2\n")
-    assert "its format is not known" in message_of(other)
+    assert "its line '1,2' is of no known format" in message_of(other)
     assert "no such file" in message_of(tmp_path / "nothing.yaml")
     (bomb,) = write(
         tmp_path,

@@ -272,7 +272,7 @@ def test_a_matrix_is_read_in_the_direction_of_its_name(suffix: str, tmp_path: Pa
 
 @pytest.mark.parametrize(
     ("name", "text", "words"),
-     ("echo.txt", "At time 0.0\n- Rotation: in Quaternion (xyzw) [0, 0, 0, 1]\n", "topic echo"),
+    [("echo.txt", "At time 0.0\n- Rotation: in Quaternion (xyzw) [0, 0, 0, 1]\n", "topic echo"),
      ("ost.ini", "[front]\n\ncamera matrix\n480 0 320\n", "give the .yaml"),
      ("rig.ini", "[front]\n", "a file .ini is of no known format; known are those of Kalibr")],
 )  # fmt: skip

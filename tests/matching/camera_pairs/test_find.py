@@ -10,7 +10,7 @@ import pytest
 import calibgraph
 from calibgraph import Camera, Dataset, Rig, simulate_street
 from calibgraph.matching.camera_pairs import match_cameras, with_surfaces
-from calibgraph.matching.camera_pairs.features import detect_features, match_features
+from calibgraph.matching.camera_pairs.features import detect_features
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.simulation.rigs import rig_of
@@ -59,22 +59,9 @@ def test_matches_are_right_where_the_lidar_knows(
         assert np.mean(errors < 4) > 0.85
 
 
-def test_pairs_can_be_chosen(data: Dataset, truth: Rig) -> None:
-    one = data.select("0")
-    assert match_cameras(one, truth, pairs=[("front_right", "left")]).pairs() == []
-    assert match_cameras(one, truth, pairs=[]).pairs() == []
-
-
 def test_matching_is_repeatable(found: CameraMatches, data: Dataset, truth: Rig) -> None:
     again = match_cameras(data, truth)
     np.testing.assert_array_equal(found.pixels_px, again.pixels_px)
-
-
-def test_images_without_texture_have_no_features(truth: Rig) -> None:
-    camera = truth.cameras["front_left"]
-    none = detect_features(np.full((360, 640), 90, np.uint8), camera)
-    assert len(none.rays) == 0
-    assert match_features(none, none).shape == (0, 2)
 
 
 def test_features_have_no_bias(data: Dataset, truth: Rig) -> None:

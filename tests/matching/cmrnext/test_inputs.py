@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from calibgraph import DatasetError
 from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.inputs import (
     LidarImage,
     View,
     encode_depth,
     halve_lidar,
-    lidar_channels,
     network_size,
-    rgb_tensor,
 )
 from tests.conftest import KANNALA, RADTAN5, make_camera
 from tests.matching.cmrnext.builders import cloud_before
@@ -75,15 +72,6 @@ def test_published_inputs_are_reproduced(reference_folder: Path) -> None:
     np.testing.assert_allclose(found, vectors["lidar_input"], atol=1e-3, rtol=0)
 
 
-def test_padding_has_the_mean_colour() -> None:
-    image = np.full((100, 150, 3), 255, np.uint8)
-    tensor = rgb_tensor(image, normalize=True)
-    assert tensor.shape == (3, 128, 192)
-    assert not tensor[:, 100:].any() and not tensor[:, :, 150:].any()
-    np.testing.assert_allclose(tensor[:, 0, 0], (1 - np.array([0.485, 0.456, 0.406])) / np.array(
-        [0.229, 0.224, 0.225]), rtol=1e-6)  # fmt: skip
-
-
 @pytest.mark.parametrize(("model", "distortion"), [("pinhole", RADTAN5), ("fisheye", KANNALA)])
 def test_distortion_is_removed_and_added_again(model: str, distortion: tuple[float, ...]) -> None:
     """A dot moves to the pinhole's pixel, and back to its own."""
@@ -99,16 +87,6 @@ def test_distortion_is_removed_and_added_again(model: str, distortion: tuple[flo
     assert on_image.all()
     assert np.linalg.norm(centre - dot) > 1  # it was distorted
     np.testing.assert_allclose(back[0], dot, atol=0.1)  # a disc's centre moves by curvature
-
-
-def test_clouds_without_intensity_are_refused_where_it_is_needed() -> None:
-    camera = make_camera()
-    cloud = cloud_before(camera, 100)
-    cloud[:, 3] = np.nan
-    lidar = LidarImage.render(cloud, camera.T_camera_lidar, View(camera))
-    with pytest.raises(DatasetError, match="intensity"):
-        lidar_channels(lidar, Architecture(reflectance=True), 160.0)
-    assert lidar_channels(lidar, Architecture(), 160.0).shape[0] == 1
 
 
 def test_intensities_of_bytes_become_unit() -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -18,13 +17,10 @@ from calibgraph import (
     Dataset,
     evaluate,
     load_rig,
-    perturb,
 )
 from calibgraph.matching.cmrnext import CmrNextMatcher
 from calibgraph.matching.cmrnext.flow_matching import FlowMatcher, MatchingJob, to_table
 from calibgraph.matching.cmrnext.inputs import LidarImage, network_size
-from calibgraph.matching.cmrnext.network import CmrNext, Flow
-from calibgraph.matching.protocol import FullMatcher
 from tests.conftest import SAMPLE
 from tests.matching.cmrnext.builders import nll_content, saved
 
@@ -173,40 +169,3 @@ def test_predicted_sigmas_become_information(sample: Dataset, tmp_path: Path) ->
     assert table.metadata["confidence"] == "predicted"
     sigma = table.information_px[:, [0, 2]] ** -0.5
     np.testing.assert_allclose(table.confidence, (2 / sigma.sum(axis=1)).clip(1e-3, 1), rtol=1e-5)
-
-
-def test_findings_keep_their_keys_on_disk(sample: Dataset, weights: Path) -> None:
-    table = CmrNextMatcher([weights], iterations=1, half_resolution=True).match(
-        sample.select("0"), sample.rig, round_index=0, progress=lambda *_: None
-    )
-    for key in ("failed_share", "failed_frames", "start_dependence", "memorization"):
-        assert table.metadata[key].keys() == sample.rig.cameras.keys()
-    assert table.findings.memorization == table.metadata["memorization"]
-    assert table.metadata["systematic_rotation_rad"] == np.radians(0.06)
-    assert table.metadata["systematic_translation_m"] == 0.025
-
-
-def test_it_has_every_member_of_a_matcher(sample: Dataset, weights: Path) -> None:
-    matcher: FullMatcher = CmrNextMatcher([weights])
-    assert (matcher.rounds, matcher.stage1, matcher.most_frames) == (1, "pnp", None)
-    assert (matcher.tracking_rounds, matcher.image_checks_can_fail) == ((), False)
-    start = matcher.locate(sample, sample.rig, out_of_time=lambda: False, progress=lambda *_: None)
-    assert (start.rig, start.first_round) == (sample.rig, 0)
-
-
-@pytest.mark.slow
-def test_a_start_without_points_in_the_image_is_reported(sample: Dataset, weights: Path) -> None:
-    turned = perturb(sample.rig, rotation_deg=180, translation_m=0, seed=3)
-    with pytest.raises(calibgraph.CalibrationError, match="usable correspondences"):
-        calibgraph.calibrate(sample.select("0:1"), turned, CmrNextMatcher([weights], iterations=1))
-
-
-def test_networks_are_for_evaluation(weights: Path) -> None:
-    matcher = CmrNextMatcher([weights, weights])
-    assert matcher.networks[0] is matcher.networks[1]  # loaded once
-    model = matcher.networks[0].model
-    assert isinstance(model, CmrNext) and not model.training
-    assert isinstance(
-        model(*(torch.zeros(1, n, 128, 128, device=matcher.device) for n in (3, 25)), iterations=1),
-        Flow,
-    )

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from calibgraph.matching.cmrnext import network as network_module
 from calibgraph.matching.cmrnext.architecture import Architecture
-from calibgraph.matching.cmrnext.correlation import OnTheFly, Volume, volume_bytes
+from calibgraph.matching.cmrnext.correlation import OnTheFly, Volume
 from calibgraph.matching.cmrnext.network import CmrNext
 from tests.matching.cmrnext import reference_network
 
@@ -119,33 +118,3 @@ def test_published_vectors_with_uncertainty_are_reproduced(
         found = model(torch.tensor(vectors["rgb"]), torch.tensor(vectors["lidar_input"]))
     np.testing.assert_allclose(found.flow_px, vectors[f"{kind}_flow_iter12"], atol=1e-3, rtol=0)
     np.testing.assert_allclose(found.sigma_px, vectors[f"{kind}_sigma_iter12"], atol=1e-4, rtol=0)
-
-
-def test_parameters_are_named_and_shaped_as_published(reference_folder: Path) -> None:
-    listed = {}
-    for line in (reference_folder / "cmrnext_state_dict.txt").read_text().splitlines():
-        if line.startswith(("fnet_", "cnet", "update_block")):
-            name, shape, _ = line.split("\t")[:3]
-            listed[name] = tuple(int(n) for n in shape.strip("()").split(",") if n.strip())
-    state = CmrNext(Architecture()).state_dict()
-    assert {name: tuple(tensor.shape) for name, tensor in state.items()} == listed
-
-
-def test_large_images_are_correlated_on_the_fly(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert volume_bytes(1, 384, 1280) < network_module.VOLUME_BYTES_MAX  # KITTI: 0.29 GiB
-    assert volume_bytes(1, 1216, 1920) > network_module.VOLUME_BYTES_MAX  # 6.6 GiB
-    architecture = ARCHITECTURES["A: LiDAR context"]
-    model, (rgb, lidar) = generated(architecture), inputs(architecture, batch=1)
-    with torch.inference_mode():
-        volume = model(rgb, lidar, iterations=2)
-        monkeypatch.setattr(network_module, "VOLUME_BYTES_MAX", 0)
-        assert isinstance(model.correlation(rgb, lidar), OnTheFly)
-        on_the_fly = model(rgb, lidar, iterations=2)
-    torch.testing.assert_close(volume.flow_px, on_the_fly.flow_px, atol=1e-4, rtol=0)
-
-
-@pytest.mark.parametrize("size", [(100, 192), (64, 192), (128, 130)])
-def test_wrong_image_sizes_are_refused(size: tuple[int, int]) -> None:
-    model = CmrNext(Architecture(width=8))
-    with pytest.raises(ValueError, match="multiples of 64"):
-        model(torch.zeros(1, 3, *size), torch.zeros(1, 25, *size))

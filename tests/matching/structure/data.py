@@ -41,13 +41,6 @@ def with_points_shuffled(data: Dataset, folder: Path, most: int | None = None) -
     return replace(data, frames=tuple(frames))
 
 
-def with_frames_repeated(data: Dataset, count: int) -> Dataset:
-    """So many frames, the same again and again, as of one drive."""
-    given = data.frames
-    frames = tuple(replace(given[i % len(given)], index=i, name=str(i)) for i in range(count))
-    return replace(data, frames=frames)
-
-
 def with_noise_images(data: Dataset, name: str, folder: Path) -> Dataset:
     """The dataset with images of noise for one camera."""
     rng = np.random.default_rng(0)

@@ -20,16 +20,6 @@ def test_background_behind_a_near_object_is_hidden() -> None:
     assert visible[:-100][np.abs(wall[:, 0]) > 0.5].all()
 
 
-def test_thinning_is_independent_of_the_order_of_points() -> None:
-    rng = np.random.default_rng(0)
-    rays = rng.standard_normal((20_000, 3))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    order = rng.permutation(len(rays))
-    one, two = (thin(sphere_angles(each), 0.05) for each in (rays, rays[order]))
-    np.testing.assert_array_equal(rays[one], rays[order][two])
-    assert len(one) == pytest.approx(4 * np.pi / 0.05**2, rel=0.05)  # cells of the sphere
-
-
 def test_thinned_directions_are_as_dense_everywhere() -> None:
     rng = np.random.default_rng(0)
     rays = rng.standard_normal((400_000, 3))

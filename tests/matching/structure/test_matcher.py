@@ -14,9 +14,8 @@ import pytest
 import calibgraph
 from calibgraph import Rig, StructureMatcher
 from calibgraph.errors import DatasetError
-from calibgraph.matching import frame_choice
 from calibgraph.matching.protocol import Start
-from calibgraph.matching.structure import global_search, pose_search
+from calibgraph.matching.structure import global_search
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
@@ -24,7 +23,6 @@ from tests.conftest import SAMPLE, Call
 from tests.matching.structure.data import (
     far_from,
     never,
-    with_frames_repeated,
     with_half_images,
     with_noise_images,
     with_points_shuffled,
@@ -58,15 +56,6 @@ class TestSearch:
             assert error.rotation_error_deg < 0.7, name  # the reach of the next round
             assert error.translation_error_cm < 20, name
 
-    @pytest.mark.slow
-    def test_a_seed_determines_what_is_found(self, truth: Rig) -> None:
-        far = far_from(truth, seed=1)
-        rig = Rig(cameras={"front_left": far.cameras["front_left"]})
-        data = calibgraph.load_dataset(SAMPLE, rig).select("0:2")
-        one, two = (locate(data, data.rig) for _ in range(2))
-        for name, T in one.rig.T_camera_lidar.items():
-            np.testing.assert_array_equal(T, two.rig.T_camera_lidar[name])
-
     def test_a_known_relative_pose_locates_a_camera(self, truth: Rig) -> None:
         """One camera has its true guess; the guess of the other is beyond the range."""
         names = ["front_left", "front_right"]
@@ -83,19 +72,6 @@ class TestSearch:
         cameras = {n: truth.cameras[n] for n in names}
         cameras[names[1]] = cameras[names[1]].moved_to(turned @ T[names[1]])
         rig = Rig(cameras=cameras, relative_poses=(pair,))
-        start = locate(calibgraph.load_dataset(SAMPLE, rig).select("0:3"), rig)
-        assert names[1] in start.findings.found
-        error = calibgraph.evaluate(start.rig, truth).cameras[names[1]]
-        assert error.rotation_error_deg < 0.7
-
-    @pytest.mark.slow
-    def test_overlap_with_another_camera_locates_a_camera(
-        self, truth: Rig, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """One camera has its true guess; the other's is far off, and no search finds it."""
-        monkeypatch.setattr(pose_search, "search_box", lambda *_, **__: [])
-        far, names = far_from(truth, seed=1), ("front_left", "front_right")
-        rig = Rig(cameras={names[0]: truth.cameras[names[0]], names[1]: far.cameras[names[1]]})
         start = locate(calibgraph.load_dataset(SAMPLE, rig).select("0:3"), rig)
         assert names[1] in start.findings.found
         error = calibgraph.evaluate(start.rig, truth).cameras[names[1]]
@@ -146,18 +122,6 @@ class TestRounds:
             assert error.translation_error_cm < 0.5
 
     @pytest.mark.slow
-    def test_more_frames_do_not_give_fewer_matches(self, truth: Rig) -> None:
-        """Frames share the windows that bound the time, and a group needs some in one frame."""
-        rig = Rig(cameras={"left": truth.cameras["left"]})
-        data = calibgraph.load_dataset(SAMPLE, rig)
-        matcher = StructureMatcher()
-        few, many = (
-            len(matcher.match(repeated, rig, round_index=5, progress=no_progress))
-            for repeated in (with_frames_repeated(data, count) for count in (6, 60))
-        )
-        assert many > few
-
-    @pytest.mark.slow
     def test_images_of_320_pixels_are_matched(self, tmp_path: Path, truth: Rig) -> None:
         """The last rounds reach few of their pixels only, by their angles."""
         data = calibgraph.load_dataset(SAMPLE)
@@ -168,27 +132,6 @@ class TestRounds:
         pixel_deg = np.degrees(1 / data.rig.cameras["left"].intrinsics_px.fx)
         assert error.rotation_error_deg < pixel_deg
         assert error.translation_error_cm < 10
-
-    @pytest.mark.slow
-    def test_a_long_drive_is_thinned_unless_all_frames_are_requested(
-        self, truth: Rig, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(frame_choice, "_content", lambda frame: frame.index)  # no copies
-        drive = with_frames_repeated(calibgraph.load_dataset(SAMPLE, truth), 100)
-        seen = []
-
-        class Counting(StructureMatcher):
-            def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN202
-                seen.append([frame.index for frame in dataset.frames])
-                return calibgraph.simulate_correspondences(rig, matches=100)
-
-        settings = {"search_deg": None, "search_m": None, "levels": LEVELS[:1]}
-        everything = Counting(**settings, most_frames=None)  # type: ignore[arg-type]
-        for matcher in (everything, Counting(**settings)):  # type: ignore[arg-type]
-            match_in_rounds(drive, matcher=matcher, progress=no_progress)
-        assert seen[0] == list(range(100))
-        assert len(seen[-1]) == 30 and seen[-1][0] < 4 and seen[-1][-1] > 95
-        assert np.diff(seen[-1]).max() < 8  # one of each thirtieth: of neighbours the clearest
 
     @pytest.mark.slow
     def test_the_number_of_threads_does_not_matter(
@@ -233,13 +176,6 @@ class TestTimeLimit:
             for reason in result.verdict.reasons
         )
 
-    def test_a_generous_limit_cuts_nothing_off(self) -> None:
-        data = calibgraph.load_dataset(SAMPLE).select("0:2")
-        run = match_in_rounds(
-            data, matcher=without_search(LEVELS[:1]), time_limit_s=600, progress=no_progress
-        )
-        assert not run.out_of_time and run.missed_rounds == 0
-
 
 class TestArguments:
     @pytest.mark.parametrize(
@@ -256,14 +192,6 @@ class TestArguments:
         with pytest.raises(ValueError, match=words):
             StructureMatcher(**ranges)  # type: ignore[arg-type]
 
-    def test_at_least_one_frame_is_used(self) -> None:
-        with pytest.raises(ValueError, match="at least one frame"):
-            StructureMatcher(most_frames=0)
-
-    def test_a_time_limit_is_positive(self) -> None:
-        with pytest.raises(ValueError, match="the time limit must be positive, found 0"):
-            calibgraph.calibrate(SAMPLE, time_limit_s=0)
-
     @pytest.mark.parametrize(
         ("arguments", "line"),
         [
@@ -279,11 +207,3 @@ class TestArguments:
         code, _, err = call("calibrate", SAMPLE, "--out", tmp_path / "out", *arguments)
         assert code == 2
         assert line in err and len(err.strip().splitlines()) == 1
-
-    def test_none_is_no_search(self, call: Call, tmp_path: Path) -> None:
-        out = tmp_path / "matches.parquet"
-        arguments = ("--frames", "0", "--search-deg", "none", "--time-limit-s", "0.001")
-        code, _, err = call("match", SAMPLE, "--out", out, *arguments)
-        assert code == 0, err
-        metadata = calibgraph.load_correspondences(out).metadata
-        assert metadata["range_rotation_deg"] == pytest.approx(2.5)

@@ -8,6 +8,7 @@ import calibgraph
 from calibgraph import Rig
 from calibgraph.matching.structure.consensus import z_score
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
+from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import (
     CHANCE_DEPTH,
@@ -112,26 +113,11 @@ def test_unrelated_windows_score_no_higher_on_structure_than_on_a_flat_image() -
     assert abs(structured - flat) < 0.5 * CHANCE_DEPTH
 
 
-def test_shifts_at_which_a_window_leaves_the_image_score_zero() -> None:
-    rng = np.random.default_rng(0)
-    image = rng.standard_normal((20, 30)).astype(np.float32)
-    places = rng.integers([1, 1], [6, 6], (12, 2)).astype(np.int32)  # next to the first corner
-    basis = orthonormal(12, 4, rng).astype(np.float32)
-    grids = np.zeros((1, 5, 5), np.float32)
-    score_windows(
-        image, places[None], np.array([12], np.int32), basis[None], np.zeros(1, np.int32),
-        np.array([-2, -2]), False, grids,
-    )  # fmt: skip
-    outside = -places.min(axis=0)  # the first shift inside, (u, v)
-    assert not grids[0, : outside[1] + 2].any() and not grids[0, :, : outside[0] + 2].any()
-    assert grids[0, outside[1] + 2 :, outside[0] + 2 :].all()
-
-
 def test_scores_of_a_frame_agree_at_the_true_pose(truth: Rig) -> None:
     frame = calibgraph.load_dataset(SAMPLE).frames[0]
     camera = truth.cameras["front_left"]
     gray, cloud = (
-        frame.load_gray("front_left", camera),
+        PreparedImage(frame.load_gray("front_left", camera)),
         PreparedCloud.from_points(frame.load_cloud()),
     )
     scores = score_frame(gray, cloud, camera, LEVELS[1], frame=7, max_windows=2_000)

@@ -6,10 +6,7 @@ import pytest
 from calibgraph import Camera, Intrinsics
 from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.visibility import (
-    HIDDEN_M,
-    HIDDEN_RATIO,
     find_in_view,
-    find_visible,
 )
 
 T = np.array([[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, -0.2], [1.0, 0.0, 0.0, 0.3], [0, 0, 0, 1]])
@@ -46,18 +43,3 @@ def test_all_points_that_project_into_the_image_are_in_view(seen_by: Camera) -> 
     np.testing.assert_array_equal(rows, np.flatnonzero(valid & inside))
     np.testing.assert_allclose(angles, view_angles(in_camera[rows]), atol=1e-12)
     np.testing.assert_allclose(distance_m, np.linalg.norm(in_camera[rows], axis=1), rtol=1e-12)
-
-
-def test_the_nearest_points_of_each_cell_are_visible() -> None:
-    rng, cell_rad = np.random.default_rng(1), 0.02
-    angles, distance_m = rng.uniform(-0.7, 0.4, (5000, 2)), rng.uniform(2.0, 60.0, 5000)
-    cells = [tuple(cell) for cell in ((angles - angles.min(axis=0)) // cell_rad).astype(int)]
-    nearest = {}
-    for cell, distance in zip(cells, distance_m, strict=True):
-        nearest[cell] = min(distance, nearest.get(cell, np.inf))
-    expected = [
-        distance < HIDDEN_RATIO * nearest[cell] + HIDDEN_M
-        for cell, distance in zip(cells, distance_m, strict=True)
-    ]
-    np.testing.assert_array_equal(find_visible(angles, distance_m, cell_rad), expected)
-    assert not find_visible(np.empty((0, 2)), np.empty(0), cell_rad).size

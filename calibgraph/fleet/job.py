@@ -1,0 +1,164 @@
+"""One job in one process: fetch, calibrate or solve, and return the cells of its rows.
+
+``run_job`` is the task of an executor: of threads here, or of Dask on other machines. Each thread
+keeps a child process, because loading the libraries takes longer than a small solve.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from calibgraph.child_process import (
+    ChildEndedError,
+    ChildProcess,
+    ChildTimeoutError,
+    answer_requests,
+    memory_limit,
+    output_to,
+)
+from calibgraph.errors import CalibrationError
+from calibgraph.fleet.task import Outcome, Task, describe_failure, release
+from calibgraph.fleet.uris import fetch
+
+_LOG, _MOST_LOG = "log.txt", 2**16
+_kept = threading.local()
+_children: list[ChildProcess] = []
+
+
+def run_job(task: Task) -> Outcome:
+    """Run a job in the child process of this thread.
+
+    Raises:
+        CalibrationError: if this machine has another version of the package than the command.
+    """
+    if task.release != release():
+        raise CalibrationError(
+            f"a worker has calibgraph {release()}, the command {task.release}; install the same "
+            "version on all machines"
+        )
+    if getattr(_kept, "child", None) not in _children:
+        _kept.child = ChildProcess(__name__)
+        _children.append(_kept.child)
+    with TemporaryDirectory(prefix="calibgraph-fleet-") as folder:
+        start = time.perf_counter()
+        try:
+            _kept.child.start()
+            start = time.perf_counter()  # the libraries' loading is not the job's time
+            outcome: Outcome = _kept.child.ask((task, Path(folder)), task.limits.timeout_s)
+        except ChildEndedError as error:
+            outcome = Outcome(error_kind="worker died", error=str(error))
+        except ChildTimeoutError as error:
+            outcome = Outcome(error_kind="timeout", error=f"{error}; see --timeout-s")
+        seconds, log = time.perf_counter() - start, Path(folder) / _LOG
+        text = log.read_bytes()[-_MOST_LOG:].decode(errors="replace") if log.exists() else ""
+    return replace(outcome, seconds=seconds, log=text)
+
+
+def interrupt_jobs() -> None:
+    """End all jobs of this process's threads, which then start no other."""
+    for child in _children:
+        child.interrupt()
+
+
+def end_children() -> None:
+    """End the processes of threads that have ended."""
+    while _children:
+        _children.pop().close()
+
+
+def main() -> None:
+    """The child's side."""
+    import calibgraph.pipeline  # noqa: F401 - it takes seconds, which are not the first job's
+
+    fetched: list[Path] = []
+
+    def answer(request: tuple[Task, Path], _: object) -> Outcome:
+        task, folder = request
+        fetched[:] = [folder]
+        with output_to(folder / _LOG), memory_limit(task.limits.memory_bytes):
+            return execute(task, folder)
+
+    def remove_fetched() -> None:
+        for folder in fetched:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    answer_requests(answer, remove_fetched)
+
+
+def execute(task: Task, folder: Path) -> Outcome:
+    """Run a job here; what is wrong with its data or its machine is part of the outcome."""
+    places = dict[str, str]()
+    try:
+        return Outcome(_calibrate(task, lambda uri: _local(uri, task, folder, places)))
+    except Exception as error:
+        kind, text = describe_failure(error)
+    for place, uri in places.items():
+        text = text.replace(place, uri)
+    return Outcome(error_kind=kind, error=str(CalibrationError(text)))  # in one line
+
+
+def _local(uri: str, task: Task, folder: Path, places: dict[str, str]) -> Path:
+    """The local path of a URI, noted in ``places`` for messages."""
+    target = folder / str(len(places))
+    target.mkdir()
+    try:
+        path = fetch(uri, target, task.limits.fetch_bytes)
+    except CalibrationError:
+        raise
+    except Exception as error:  # of any store's client: the next time it may work
+        raise OSError(f"{uri}: cannot be fetched ({error})") from error
+    places[str(path)] = uri
+    return path
+
+
+def _calibrate(task: Task, local: Callable[[str], Path]) -> tuple[dict[str, Any], ...]:
+    """The cells of each camera's row."""
+    from calibgraph.io.dataset import load_dataset
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.matching.structure import StructureMatcher
+    from calibgraph.pipeline import calibrate, solve
+
+    job, settings = task.job, task.job.settings
+    rig = load_rig(local(job.rig)) if job.rig else None
+    paths = [local(uri) for uri in job.recordings]
+    if job.is_table and rig is not None:
+        return _cells(solve(rig, paths[0], settings.config, settings.terms))
+    given = {"search_deg": settings.search_deg, "search_m": settings.search_m}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    if settings.frames is not None:
+        options["most_frames"] = None
+    result = calibrate(
+        load_dataset(paths, rig, frames=settings.frames),
+        matcher=StructureMatcher(seed=settings.config.seed, **options),
+        config=settings.config,
+        terms=settings.terms,
+        time_limit_s=task.limits.timeout_s / 2,  # the rest is for the checks
+    )
+    return _cells(result)
+
+
+def _cells(result: Any) -> tuple[dict[str, Any], ...]:
+    rows = []
+    for camera, verdict in result.camera_verdicts.items():
+        doubt, covariance = verdict.error_probability, result.covariance[camera]
+        summary = result.summary_of(camera)
+        rows.append({
+            "camera": camera, "verdict": verdict.status, "cannot_tell": verdict.cannot_tell,
+            "probability_off": None if doubt is None else doubt.probability,
+            "reasons": [reason.text for reason in summary.reasons],
+            "actions": [*summary.actions], "of": result.config.of,
+            "T_camera_lidar": result.T_camera_lidar[camera].ravel().tolist(),
+            "covariance": None if covariance is None else covariance.ravel().tolist(),
+        })  # fmt: skip
+    return tuple(rows)
+
+
+if __name__ == "__main__":
+    main()

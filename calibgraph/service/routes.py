@@ -1,0 +1,197 @@
+"""Routes of jobs and of their results, the page, health and a few counters."""
+
+import asyncio
+import time
+from datetime import datetime
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
+
+from calibgraph.model.result_files import REPORT_FILE
+from calibgraph.report.kit import load_template
+from calibgraph.service.data_folder import ARCHIVE, FILES, LOG, RESULT, SUMMARY
+from calibgraph.service.job_requests import RECORDING, RIG, TABLE, TEXTS, JobKind, JobProgress
+from calibgraph.service.jobs import JobRecord, JobState
+from calibgraph.service.problems import Problem
+from calibgraph.service.state import Service, service_of
+from calibgraph.service.uploads import receive_job
+
+State = Annotated[Service, Depends(service_of)]
+Before = Annotated[int | None, Query(ge=0, le=2**62)]
+router = APIRouter()
+
+REPORT_POLICY = (
+    "sandbox allow-scripts; default-src 'none'; img-src data:; "
+    "style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+)
+"""The report is one file with its own styles: it may do nothing else, and is of no origin."""
+
+_LONGEST_WAIT_S = 60.0
+_LONGEST_PAUSE_S = 0.5
+_MOST_LOG = 2**20
+
+
+class JobAnswer(BaseModel):
+    """A job.
+
+    Attributes:
+        created, started, finished: times (UTC); null if not yet.
+        verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
+        cannot_tell: whether the data determine too little for another verdict.
+        error_kind, error: why it failed: bad input, io, out of memory, timeout, worker died or
+            internal error; and in one line what to do.
+    """
+
+    model_config = ConfigDict(from_attributes=True)
+
+    id: str
+    kind: JobKind
+    state: JobState
+    name: str
+    note: str
+    created: Annotated[datetime, Field(validation_alias="created_s")]
+    started: Annotated[datetime | None, Field(validation_alias="started_s")]
+    finished: Annotated[datetime | None, Field(validation_alias="finished_s")]
+    progress: JobProgress | None = None
+    verdict: str | None
+    cannot_tell: bool | None
+    error_kind: str | None
+    error: str | None
+
+
+class JobList(BaseModel):
+    """Jobs, the newest first; ``next`` is ``before`` of the next page, null on the last."""
+
+    jobs: list[JobAnswer]
+    next: int | None
+
+
+def _answer(record: JobRecord, state: Service) -> JobAnswer:
+    progress = {"progress": state.runner.steps.get(record.id)}
+    return JobAnswer.model_validate(record).model_copy(update=progress)
+
+
+_FILE = {"type": "string", "format": "binary"}
+_PARTS = {RIG: _FILE, TABLE: _FILE, RECORDING: {"type": "array", "items": _FILE}}
+_FORM = {"type": "object", "properties": _PARTS | dict.fromkeys(TEXTS, {"type": "string"})}
+
+
+@router.post(
+    "/v1/jobs/{kind}",
+    status_code=202,
+    openapi_extra={"requestBody": {"content": {"multipart/form-data": {"schema": _FORM}}}},
+)
+async def submit(kind: JobKind, request: Request, response: Response, state: State) -> JobAnswer:
+    """Ask for a job: a form with files, or fields with their URIs, and settings as JSON."""
+    size = int(request.headers.get("content-length", "0"))
+    await run_in_threadpool(state.require_room, size)
+    id, job = await receive_job(request, kind, state.folder, state.roots)
+    record = await run_in_threadpool(state.add, id, job)
+    response.headers["Location"] = f"/v1/jobs/{id}"
+    return _answer(record, state)
+
+
+@router.get("/v1/jobs")
+def list_jobs(
+    state: State,
+    limit: Annotated[int, Query(ge=1, le=500)] = 50,
+    before: Before = None,
+) -> JobList:
+    """The jobs, the newest first."""
+    records = state.jobs.newest(limit, before)
+    following = records[-1].number if len(records) == limit else None
+    return JobList(jobs=[_answer(record, state) for record in records], next=following)
+
+
+def _found(state: Service, id: str) -> JobRecord:
+    record = state.jobs.get(id)
+    if record is None:
+        raise Problem(404, "no such job; finished jobs are removed after some time")
+    return record
+
+
+@router.get("/v1/jobs/{id}")
+async def get_job(
+    id: str, state: State, wait_s: Annotated[float, Query(ge=0, le=_LONGEST_WAIT_S)] = 0.0
+) -> JobAnswer:
+    """A job; with ``wait_s`` the answer waits until it is finished, not longer than that."""
+    start = time.monotonic()
+    while True:
+        record = await run_in_threadpool(_found, state, id)
+        waited_s = time.monotonic() - start
+        if record.is_finished or waited_s >= wait_s or state.is_stopping:
+            return _answer(record, state)
+        pause_s = min(_LONGEST_PAUSE_S, 0.02 + waited_s / 10)  # short jobs are seen at once
+        await asyncio.sleep(min(pause_s, wait_s - waited_s))
+
+
+@router.delete("/v1/jobs/{id}")
+def cancel_job(id: str, state: State) -> JobAnswer:
+    """Cancel a job that waits or runs."""
+    _found(state, id)
+    if not state.runner.cancel(id):
+        raise Problem(409, "the job is finished")
+    return _answer(_found(state, id), state)
+
+
+@router.get("/v1/jobs/{id}/log", response_class=PlainTextResponse)
+def job_log(id: str, state: State) -> str:
+    """What the job printed: its last part."""
+    _found(state, id)
+    folder = state.folder.of_job(id)
+    try:
+        text = (folder / LOG).read_bytes()[-_MOST_LOG:].decode(errors="replace")
+    except FileNotFoundError:  # it expires at this moment
+        return ""
+    return text.replace(str(folder), "").replace(str(state.folder.path), "")
+
+
+_RESULTS = {
+    "result": (SUMMARY, "application/json"),
+    "report.html": (f"{FILES}/{REPORT_FILE}", "text/html"),
+    "files.zip": (ARCHIVE, "application/zip"),
+}
+
+
+@router.get("/v1/jobs/{id}/{part}", response_class=FileResponse)
+def result(id: str, part: Literal["result", "report.html", "files.zip"], state: State) -> Response:
+    """The result as ``--json`` prints it, the page that explains it, or all files."""
+    record = _found(state, id)
+    if record.state != "succeeded":
+        why = f" ({record.error})" if record.error else ""
+        raise Problem(409, f"the job has no result: it is {record.state}{why}")
+    name, media_type = _RESULTS[part]
+    path = state.folder.of_job(id) / RESULT / name
+    if not path.exists():
+        raise Problem(404, "no such file: it was not asked for, or has been removed")
+    policy = {"Content-Security-Policy": REPORT_POLICY} if part == "report.html" else {}
+    return FileResponse(path, media_type=media_type, headers=policy)
+
+
+@router.get("/", include_in_schema=False)
+def jobs_page(state: State, before: Before = None) -> HTMLResponse:
+    """The page for people: jobs, verdicts, reports; all text in it is escaped."""
+    template = load_template("page.html.j2", "calibgraph.service")
+    return HTMLResponse(template.render(list=list_jobs(state, before=before)))
+
+
+@router.get("/healthz")
+def healthz(state: State) -> dict[str, str]:
+    """Whether jobs can be taken in: the database, the disk."""
+    state.require_room(0)
+    state.jobs.counts()
+    return {"status": "ok"}
+
+
+@router.get("/metrics", response_class=PlainTextResponse)
+def metrics(state: State) -> str:
+    """Counters as Prometheus reads them: jobs by state, answers by status."""
+    jobs = [f'calibgraph_jobs{{state="{key}"}} {n}' for key, n in state.jobs.counts().items()]
+    answers = [
+        f'calibgraph_answers_total{{status="{status}"}} {n}'
+        for status, n in sorted(state.answers.items())
+    ]
+    return "\n".join([*jobs, *answers, ""])

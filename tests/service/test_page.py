@@ -1,0 +1,69 @@
+"""The page in Chromium: nothing in its console, contrast, a phone's width, the token."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calibgraph.service.access import add_token
+from tests.service.conftest import Problem, bearer
+from tests.service.test_server import Server
+
+sync_api = pytest.importorskip("playwright.sync_api")
+axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+CHROMIUM = shutil.which("chromium")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium"),
+]
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory, small: Problem) -> Iterator[tuple[str, str]]:
+    """A server with jobs of all states, and a token of it."""
+    folder = tmp_path_factory.mktemp("page")
+    token = add_token(folder / "tokens", "submit")
+    server = Server(folder / "data", "--tokens", str(folder / "tokens"))
+    server.start()
+    server.http.headers.update(bearer(token))
+    about = {"name": "car 7 <b>", "note": "after the repair of the left camera's bracket " * 5}
+    wrong = {**small.files, "rig": b"cameras: 7"}
+    for files, data in ((small.files, about), (wrong, {}), (small.files, {})):
+        at = server.http.post("/v1/jobs/solve", files=files, data=data).headers["location"]
+        server.wait_for(at)
+    yield str(server.http.base_url), token
+    server.http.close()
+    server.end(9)
+
+
+@pytest.mark.parametrize("size", [(390, 844), (1280, 900)], ids=["phone", "desk"])
+def test_the_page_is_clean_readable_and_leads_to_reports(
+    served: tuple[str, str], size: tuple[int, int], tmp_path: Path
+) -> None:
+    url, token = served
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page: Any = browser.new_page(
+            viewport={"width": size[0], "height": size[1]},
+            http_credentials={"username": "", "password": token},
+        )
+        errors: list[str] = []
+        page.on("console", lambda message: errors.append(message.text))
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("requestfailed", lambda request: errors.append(request.url))
+        page.goto(url, wait_until="networkidle")
+        page.screenshot(path=tmp_path / f"jobs_{size[0]}.png", full_page=True)
+        assert page.locator("text=car 7 <b>").count() == 1
+        assert page.locator(".badge.PASS").count() == 2
+        for _ in range(2):
+            found = axe.Axe().run(page, options={"resultTypes": ["violations"]})
+            assert found.violations_count == 0, found.generate_report()
+            assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+            page.click("text=Report >> nth=0") if page.url.endswith("/") else None
+        assert page.url.endswith("/report.html")
+        assert errors == []
+        browser.close()
