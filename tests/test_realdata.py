@@ -86,7 +86,7 @@ def test_untrained_networks_fail_on_real_frames(realdata: Path, tmp_path: Path, 
         config.write_text(f"start_from: {start_from}\nhalf_resolution: true\n")
         code, _, text = call(
             "calibrate", folder, "--frames", "0,1", "--matcher", "cmrnext",
-            "--weights", weights, weights, "--config", config,
+            "--weights", weights, "--weights", weights, "--config", config,
             "--out", tmp_path / start_from,
         )  # fmt: skip
         assert code == 1

@@ -1,5 +1,6 @@
 """The commands that compare calibrations with a recording, and with each other: check, drift."""
 
+from contextlib import suppress
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -9,7 +10,7 @@ from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
-from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import elapsed_s, print_json, print_line, progress_bar, terminal
 
 _EXIT_CODES = {"OK": 0, "WRONG": 1, "CHANGED": 1, "CANNOT TELL": 3}
 
@@ -22,9 +23,7 @@ def check(
     tolerance_cm: options.ToleranceCm = 10.0,
     frames: options.Frames = None,
     seed: options.Seed = 0,
-    page: Path | None = Option(
-        None, metavar="FILE.html", help="Show the answer on a page, with pictures."
-    ),
+    out: Path | None = Option(None, metavar="FILE.html", help="The answer as a page."),
     as_json: options.JsonOption = False,
     force: options.Force = False,
 ) -> None:
@@ -39,8 +38,8 @@ def check(
     from calibgraph.files import require_new_file
     from calibgraph.io.rigs import load_rig
 
-    if page is not None:
-        require_new_file(page, ".html", ".htm", force=force)
+    if out is not None:
+        require_new_file(out, ".html", ".htm", force=force)
     with checked_arguments():
         Tolerance(tolerance_deg, tolerance_cm)
         matcher = matcher_from("structure", seed=seed, all_frames=frames is not None)
@@ -48,41 +47,31 @@ def check(
     origin = provenance(rig, data)
     with progress_bar() as progress:
         audit = check(
-            deployed,
-            data,
-            tolerance_deg=tolerance_deg,
-            tolerance_cm=tolerance_cm,
-            matcher=matcher,
-            seed=seed,
-            progress=progress,
-        )
+            deployed, data, tolerance_deg=tolerance_deg, tolerance_cm=tolerance_cm,
+            matcher=matcher, seed=seed, progress=progress,
+        )  # fmt: skip
     audit = replace(audit, same_recording=origin.same_recording, deployed_verdict=origin.verdict)
-    if page is not None:
+    if out is not None:
         from calibgraph.audit.page import write_audit_report
 
-        write_audit_report(audit, page)
+        write_audit_report(audit, out)
     if as_json:
         from calibgraph.audit import audit_summary
 
         print_json(audit_summary(audit))
     else:
-        from calibgraph.cli.audit_tables import print_audit
+        from calibgraph.audit.tables import print_audit
 
-        print_audit(terminal(), audit, page)
+        print_audit(terminal(), audit, out, elapsed_s())
     raise typer.Exit(_EXIT_CODES[audit.status])
 
 
 def drift(
     results: list[Path] = Argument(
-        ...,
-        metavar="RESULT...",
-        help="Results of one rig: their folders, or calibration.yaml files.",
+        ..., metavar="RESULT...", help="Of one rig: their folders, or calibration.yaml files."
     ),
     days: str | None = Option(
-        None,
-        metavar="DAY,DAY,...",
-        help="When each was recorded, for the trend: dates like 2026-03-01, or numbers of "
-        "days. (default: the order given)",
+        None, metavar="DAY,DAY,...", help="When each was recorded: dates, or numbers of days."
     ),
     tolerance_deg: options.ToleranceDeg = 0.5,
     tolerance_cm: options.ToleranceCm = 10.0,
@@ -111,25 +100,23 @@ def drift(
 
         print_json(drift_summary(found))
     else:
-        from calibgraph.cli.audit_tables import print_drift
+        from calibgraph.audit.tables import print_drift
 
         print_drift(terminal(), found)
-        print_plain(terminal(), "nothing was written")
+        print_line("nothing was written")
     raise typer.Exit(_EXIT_CODES[found.status])
 
 
 def _parse_days(text: str) -> list[float]:
     """Days of dates or numbers, separated by commas."""
-    return [_parse_day(part.strip()) for part in text.split(",")]
 
+    def parse(part: str) -> float:
+        with suppress(ValueError):
+            return float(part)
+        return float(date.fromisoformat(part).toordinal())
 
-def _parse_day(text: str) -> float:
     try:
-        return float(text)
-    except ValueError:
-        pass
-    try:
-        return float(date.fromisoformat(text).toordinal())
+        return [parse(part.strip()) for part in text.split(",")]
     except ValueError as error:
         raise ValueError(
             f"--days {text!r}: expected a date like 2026-03-01 or a number, for each result, "

@@ -17,13 +17,12 @@ from calibgraph.cli.arguments import (
     dataset_from,
     matcher_from,
     time_limit_of,
-)
-from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
+)  # fmt: skip
+from calibgraph.cli.terminal import elapsed_s, print_json, print_line, progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.io.dataset import Dataset
     from calibgraph.model.calibration import Calibration
-    from calibgraph.model.correspondences import Correspondences
 
 TABLE_SUFFIXES = (".parquet", ".csv")
 
@@ -48,8 +47,8 @@ def calibrate(
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
-    from calibgraph.cli.compile_ahead import compile_ahead
     from calibgraph.cli.settings import read_settings
+    from calibgraph.compile_ahead import compile_ahead
     from calibgraph.memory import keep_freed_memory
     from calibgraph.model.result_files import require_result_folder
 
@@ -68,13 +67,9 @@ def calibrate(
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
     with compile_ahead(data.rig), progress_bar() as progress:
         result = calibrate(
-            data,
-            matcher=chosen,
-            config=settings,
-            terms=rare.terms,
-            time_limit_s=time_limit_of(matcher, time_limit_s),
-            progress=progress,
-        )
+            data, matcher=chosen, config=settings, terms=rare.terms,
+            time_limit_s=time_limit_of(matcher, time_limit_s), progress=progress
+        )  # fmt: skip
         result = _warned_of_same_data(result, rig)
         written = write_result(result, out, data)
     checks = next(iter(result.camera_verdicts.values())).checks
@@ -123,54 +118,45 @@ def match(
         run = match_in_rounds(data, matcher=chosen, time_limit_s=limit_s, progress=progress)
         run.correspondences.save(out)
     _print_frames_used(len(run.dataset.frames), data, len(run.copies))
-    _print_table_and_exit(run.correspondences, out, as_json=as_json)
+    counts, missed = run.correspondences.counts(), list(run.correspondences.findings.missed)
+    if as_json:
+        print_json({"out": str(out), "matches": counts, "missed": missed})
+    else:
+        of_each = ", ".join(f"{name} {count}" for name, count in counts.items())
+        print_line(f"{out}: {len(run.correspondences)} correspondences ({of_each})")
+    if missed:
+        lost = f"not found: {', '.join(missed)}"
+        print_line(f"{lost}: a solve of their matches from the guess will FAIL")
+        raise typer.Exit(1)
 
 
 def solve(
     rig: Path = Argument(..., metavar="RIG", help="Rig with the initial guess."),
     correspondences: Path = Argument(
-        ...,
-        metavar="CORRESPONDENCES",
-        help="Table, .parquet or .csv, or a folder of .parquet files; larger than memory too.",
+        ..., metavar="CORRESPONDENCES", help="Table, .parquet or .csv, or a folder of .parquet."
     ),
     out: options.ResultFolder = Path("calibration"),
     terms: str | None = Option(
-        None,
-        metavar="full|reprojection|priors|stage1",
-        help="Terms of the objective. (default: full)",
+        None, metavar="full|reprojection|priors|stage1", help="Of the objective. (default: full)"
     ),
     estimate: options.Estimate = None,
     of: options.Of = None,
     camera_matches: Path | None = Option(
-        None,
-        metavar="FILE",
-        help="Features that cameras have in common: camera_matches.parquet of a result.",
+        None, metavar="FILE", help="What cameras have in common: the table of a result."
     ),
     common_deg: float | None = Option(
-        None,
-        metavar="DEG",
-        min=0,
-        help="Error per axis that all frames share, 1 sigma; 0 if none. (default: as the "
-        "table states)",
+        None, metavar="DEG", min=0, help="Error that all frames share. (default: the table's)"
     ),
     common_cm: float | None = Option(None, metavar="CM", min=0, help="Likewise, of the position."),
     print_graph: bool = Option(
-        False,
-        "--print-graph",
-        callback=options.require_stdout,
-        help="Print every factor of the graph whose optimum is the result, in place of tables.",
-    ),
-    graph: Path | None = Option(
-        None, metavar="FILE.dot", help="Write the graph in Graphviz's language."
+        False, "--print-graph", callback=options.require_stdout, help="Print every factor."
     ),
     config: options.ConfigFile = None,
     as_json: options.JsonOption = False,
-    force: options.Force = False,
 ) -> None:
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
     from calibgraph.cli.settings import read_settings
-    from calibgraph.files import require_new_file, sha256, write_text
-    from calibgraph.graph.variables import to_dot
+    from calibgraph.files import sha256
     from calibgraph.io.camera_match_tables import load_camera_matches
     from calibgraph.io.correspondence_tables import table_files
     from calibgraph.io.rigs import load_rig
@@ -180,8 +166,6 @@ def solve(
 
     matches = [] if camera_matches is None else [camera_matches]
     require_result_folder(out, [*_rig_files(rig), correspondences, *matches])
-    if graph is not None:
-        require_new_file(graph, ".dot", force=force)
     with checked_arguments():
         settings, rare = read_settings(
             config, terms=terms, estimate=estimate, of=of, common_deg=common_deg,
@@ -196,8 +180,6 @@ def solve(
                                      for path in table_files(correspondences)})  # fmt: skip
         result = _warned_of_same_data(result, rig)
         written = write_result(result, out)
-        if graph is not None:
-            write_text(graph, to_dot(result.graph))
     if print_graph:
         print(result.graph)
         raise typer.Exit(1 if result.verdict.status == "FAIL" else 0)
@@ -235,23 +217,7 @@ def _print_frames_used(used: int, data: Dataset, copies: int) -> None:
     if copies:
         text += f"; {copies} {'copies' if copies > 1 else 'copy'} left out"
     if used < len(data.frames):
-        print_plain(terminal(), text)
-
-
-def _print_table_and_exit(table: Correspondences, out: Path, *, as_json: bool) -> None:
-    """Print the counts of a table of correspondences; exit 1 if a camera was not found."""
-    missed = list(table.findings.missed)
-    if as_json:
-        print_json({"out": str(out), "matches": table.counts(), "missed": missed})
-    else:
-        counts = ", ".join(f"{name} {count}" for name, count in table.counts().items())
-        print_plain(terminal(), f"{out}: {len(table)} correspondences ({counts})")
-    if missed:
-        names = ", ".join(missed)
-        print_plain(
-            terminal(), f"not found: {names}: a solve of their matches from the guess will FAIL"
-        )
-        raise typer.Exit(1)
+        print_line(text)
 
 
 def _print_and_exit(result: Calibration, written: list[Path], *, as_json: bool) -> None:
@@ -261,8 +227,8 @@ def _print_and_exit(result: Calibration, written: list[Path], *, as_json: bool) 
 
         print_json(result_summary(result, written))
     else:
-        from calibgraph.cli.tables import print_result
+        from calibgraph.report.tables import print_result
 
-        print_result(terminal(), result, written)
+        print_result(terminal(), result, written, elapsed_s())
     if result.verdict.status == "FAIL":
         raise typer.Exit(1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,14 +11,13 @@ from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.terminal import print_plain, terminal
+from calibgraph.cli.terminal import print_line
 from calibgraph.io.formats.names import EXPORT_FORMATS
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from calibgraph.model.rig import Rig
 
 _LIST = "list"
 
@@ -58,18 +56,15 @@ def export(
     camera_frame: str | None = Option(
         None,
         metavar="TEXT",
-        help="Frame id of optical frames; {camera} is the name. (default: the bag's, kept in "
-        "the rig, or {camera}_optical_frame)",
+        help="Frame id of optical frames; {camera} is the name. (default: that of the bag, or "
+        "{camera}_optical_frame)",
     ),
     lidar_pose: str | None = Option(
         None,
         metavar='"X Y Z ROLL PITCH YAW"',
-        help="Of autoware: where the LiDAR is mounted, in sensor_kit_base_link, metres and "
-        "radians as in URDF. (default: at its origin)",
+        help="Of autoware: the LiDAR in sensor_kit_base_link, metres and radians. (default: at 0)",
     ),
-    even_if_failed: bool = Option(
-        False, "--even-if-failed", help="Export although the verdict is FAIL."
-    ),
+    even_if_failed: bool = Option(False, "--even-if-failed", help="Also with the verdict FAIL."),
     force: options.Force = False,
 ) -> None:
     """Write a calibration in the format of another program, with its direction as a comment."""
@@ -77,30 +72,24 @@ def export(
 
     from calibgraph.io.formats.export import export_calibration
     from calibgraph.io.rigs import load_rig
-    from calibgraph.model.plausibility import MAX_DISTANCE_M
+    from calibgraph.model.plausibility import MAX_DISTANCE_M, find_implausible
 
     with checked_arguments():
         T_base_lidar = None if lidar_pose is None else _parse_pose(lidar_pose)
         written = export_calibration(
-            source,
-            out,
-            format,
-            cameras=camera or None,
-            lidar_frame=lidar_frame,
-            camera_frame=camera_frame,
-            T_base_lidar=T_base_lidar,
-            even_if_failed=even_if_failed,
+            source, out, format, cameras=camera or None, lidar_frame=lidar_frame,
+            camera_frame=camera_frame, T_base_lidar=T_base_lidar, even_if_failed=even_if_failed,
             force=force,
-        )
+        )  # fmt: skip
         rig = load_rig(source)
     rig = rig.model_copy(
         update={"cameras": {name: rig.cameras[name] for name in camera or rig.cameras}}
     )
     if T_base_lidar is not None and np.linalg.norm(T_base_lidar[:3, 3]) > MAX_DISTANCE_M:
-        print_plain(terminal(), f"warning: --lidar-pose {lidar_pose!r}: lengths in millimetres?")
-    print_doubts(rig)
-    for path in written:
-        print_plain(terminal(), f"{path}: written ({format})")
+        print_line(f"warning: --lidar-pose {lidar_pose!r}: lengths in millimetres?")
+    lines = [f"warning: {line}" for line in find_implausible(rig)]
+    for line in [*lines, *(f"{path}: written ({format})" for path in written)]:
+        print_line(line)
 
 
 def _parse_pose(text: str) -> NDArray[np.float64]:
@@ -117,13 +106,3 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
         return pose_of_angles((x, y, z), (roll, pitch, yaw))
     except ValueError as error:
         raise ValueError(f"--lidar-pose {text!r}: {error}") from error
-
-
-def print_doubts(rig: Rig, notes: Sequence[str] = ()) -> None:
-    """Print what was assumed of files, and the values of a rig that cannot be right."""
-    from calibgraph.model.plausibility import find_implausible
-
-    for note in notes:
-        print_plain(terminal(), f"note: {note}")
-    for line in find_implausible(rig):
-        print_plain(terminal(), f"warning: {line}")

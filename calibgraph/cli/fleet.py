@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING
 
 import typer
 from typer import Argument, Option
 
 from calibgraph.cli.options import JsonOption
-from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import print_json, print_line, progress_bar
 
 if TYPE_CHECKING:
     from calibgraph.fleet.page import FleetReport
@@ -33,8 +34,7 @@ def fleet(
     dask: str | None = Option(
         None,
         metavar="ADDRESS",
-        help="Run the jobs on the workers of this Dask scheduler: tcp://host:8786. (default: on "
-        "this machine)",
+        help="Run the jobs on this Dask cluster, as tcp://host:8786. (default: on this machine)",
     ),
     jobs: int | None = Option(
         None, min=1, help="Jobs at once on this machine. (default: one per core)"
@@ -75,12 +75,7 @@ def fleet(
 @contextmanager
 def _interrupt_on_sigterm() -> Iterator[None]:
     """End as on Ctrl-C when a scheduler stops this process: what is done is published."""
-    import signal
-
-    def interrupt(*_: Any) -> NoReturn:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:
@@ -102,4 +97,4 @@ def _print(summary: Summary, report: FleetReport, out: str) -> None:
     lines += [f"{vehicle}: all cameras moved alike: the LiDAR was moved"
               for vehicle in report.moved_lidars]  # fmt: skip
     for line in [*lines, f"wrote {out}/fleet.html"]:
-        print_plain(terminal(), line)
+        print_line(line)

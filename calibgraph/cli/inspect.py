@@ -1,56 +1,28 @@
-"""The commands about a result, a rig or a dataset: report, evaluate, perturb, doctor."""
-
-from __future__ import annotations
+"""The commands about what is there: report, evaluate, perturb, doctor, weights."""
 
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import bag_options_from, checked_arguments
-from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
-
-if TYPE_CHECKING:
-    from calibgraph.model.calibration import Calibration
+from calibgraph.cli.terminal import print_json, print_line, progress_bar, terminal
 
 _PAGES = (".html", ".htm")
 
 
-def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
-    """A result, with its frames where they are now."""
-    from calibgraph.io.calibrations import load_calibration
-    from calibgraph.io.dataset import load_dataset
-    from calibgraph.report.frames import relocate_frames
-
-    loaded = load_calibration(result)
-    if not dataset:
-        return loaded
-    with checked_arguments():
-        return relocate_frames(loaded, load_dataset(dataset, loaded.rig))
-
-
 def report(
-    result: Path = Argument(
-        ..., metavar="RESULT", help="Result: its folder, or its calibration.yaml."
-    ),
+    result: Path = Argument(..., metavar="RESULT", help="Its folder, or its calibration.yaml."),
     out: Path | None = Option(
-        None,
-        metavar="FILE.html",
-        help="Page to write. (default: report.html in the folder; none with --rerun or --mcap)",
+        None, metavar="FILE.html", help="Page. (default: report.html beside, or none for viewers)"
     ),
-    rerun: Path | None = Option(
-        None, metavar="FILE.rrd", help="Recording for Rerun: `rerun FILE.rrd` shows it."
-    ),
+    rerun: Path | None = Option(None, metavar="FILE.rrd", help="Recording for Rerun."),
     mcap: Path | None = Option(None, metavar="FILE.mcap", help="Recording for Foxglove."),
     dataset: list[Path] | None = Option(
-        None,
-        metavar="DATASET",
-        help="Where the images and clouds are now, if they have moved; repeat it for several "
-        "folders, in the order in which they were calibrated.",
+        None, metavar="DATASET", help="Where images and clouds are now; repeat it in their order."
     ),
     force: options.Force = False,
 ) -> None:
@@ -59,14 +31,19 @@ def report(
     Viewers show clouds, images and projected points, before and after.
     """
     from calibgraph.files import require_new_file
+    from calibgraph.io.calibrations import load_calibration
+    from calibgraph.io.dataset import load_dataset
     from calibgraph.model.result_files import REPORT_FILE
+    from calibgraph.report.frames import relocate_frames
     from calibgraph.report.html import write_report
 
     for path, suffixes in ((out, _PAGES), (rerun, (".rrd",)), (mcap, (".mcap",))):
         if path is not None:
             require_new_file(path, *suffixes, force=force)
-    loaded = _load_result(result, dataset)
-    written = []
+    loaded, written = load_calibration(result), []
+    if dataset:
+        with checked_arguments():
+            loaded = relocate_frames(loaded, load_dataset(dataset, loaded.rig))
     if out is not None or (rerun is None and mcap is None):
         folder = result if result.is_dir() else result.parent
         written.append(write_report(loaded, out or folder / REPORT_FILE))
@@ -81,7 +58,7 @@ def report(
 
             written.append(write_mcap(loaded, mcap, progress=progress))
     for path in written:
-        print_plain(terminal(), f"{path}: written; the verdict is {loaded.verdict.status}")
+        print_line(f"{path}: written; the verdict is {loaded.verdict.status}")
 
 
 def evaluate(
@@ -102,7 +79,7 @@ def evaluate(
     if as_json:
         print_json(errors.to_mapping())
     else:
-        from calibgraph.cli.tables import print_evaluation
+        from calibgraph.report.tables import print_evaluation
 
         print_evaluation(terminal(), errors, path, rig_file(reference))
 
@@ -124,15 +101,10 @@ def perturb(
     require_new_file(out, ".yaml", ".yml", force=force)
     given = load_rig(rig)
     with checked_arguments():
-        displaced = perturb(
-            given,
-            rotation_deg=rotation_deg,
-            translation_m=translation_m,
-            seed=seed,
-            uniform=uniform,
-        )
+        size = {"rotation_deg": rotation_deg, "translation_m": translation_m}
+        displaced = perturb(given, **size, seed=seed, uniform=uniform)
     displaced.save(out)
-    print_plain(terminal(), f"{out}: {len(displaced.cameras)} cameras displaced (seed {seed})")
+    print_line(f"{out}: {len(displaced.cameras)} cameras displaced (seed {seed})")
 
 
 def doctor(
@@ -144,10 +116,7 @@ def doctor(
     motion: options.Motion = None,
     config: options.ConfigFile = None,
     out: Path | None = Option(
-        None,
-        metavar="DIR",
-        help="Folder for guess_CAMERA.png, the guess on an image of each camera, and the "
-        "findings, doctor.json.",
+        None, metavar="DIR", help="For guess_CAMERA.png, images with the guess, and doctor.json."
     ),
     as_json: options.JsonOption = False,
 ) -> None:
@@ -170,11 +139,35 @@ def doctor(
     if as_json:
         print_json(found.to_mapping())
     else:
-        for finding in found.findings:
-            print_plain(terminal(), f"{finding.level:8} {finding.text}")
-        for path in found.pictures:
-            print_plain(terminal(), f"{path}: written")
+        lines = [f"{finding.level:8} {finding.text}" for finding in found.findings]
+        lines += [f"{path}: written" for path in found.pictures]
         if all(finding.level == "note" for finding in found.findings):
-            print_plain(terminal(), "no faults; next: calibgraph calibrate")
+            lines.append("no faults; next: calibgraph calibrate")
+        for line in lines:
+            print_line(line)
     if not found.healthy:
         raise typer.Exit(1)
+
+
+def weights(
+    file: Path = Argument(..., metavar="FILE", help="Weights, .tar or .safetensors."),
+    out: Path | None = Option(None, metavar="FILE", help="Convert to this .safetensors file."),
+    as_json: options.JsonOption = False,
+    force: options.Force = False,
+) -> None:
+    """Check a file of CMRNext weights, print what is in it, and convert it to safetensors."""
+    from calibgraph.files import require_new_file
+
+    if out is not None:
+        require_new_file(out, ".safetensors", force=force)
+    from calibgraph.matching.cmrnext import load_checkpoint
+
+    checkpoint = load_checkpoint(file)
+    if out is not None:
+        checkpoint.save_safetensors(out)
+    if as_json:
+        print_json(checkpoint.summary())
+    else:
+        from calibgraph.report.tables import print_weights
+
+        print_weights(terminal(), checkpoint.summary(), out)

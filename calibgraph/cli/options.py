@@ -11,7 +11,7 @@ SHARED = (
 )  # fmt: skip
 """Names of the options that mean the same in every command, but where a command describes its own:
 ``docs/commands.md`` lists them once."""
-_BAGS, _CMRNEXT, _STRUCTURE = "ROS bags", "Matcher cmrnext", "Matcher structure"
+_BAGS, _STRUCTURE = "ROS bags", "Matcher structure"
 _MOST_SEED = 2**31 - 1
 
 
@@ -43,14 +43,9 @@ Frames = Annotated[
         "all; of more than 30 the matcher structure takes 30: spread, clear ones)",
     ),
 ]
+_EVERY = "One frame in this time; only its surroundings are read. (default: all frames)"
 EveryS = Annotated[
-    float | None,
-    Option(
-        metavar="SECONDS",
-        min=0.001,
-        rich_help_panel=_BAGS,
-        help="One frame in this time; only its surroundings are read. (default: all frames)",
-    ),
+    float | None, Option(metavar="SECONDS", min=0.001, rich_help_panel=_BAGS, help=_EVERY)
 ]
 Topic = Annotated[
     list[str] | None,
@@ -81,15 +76,8 @@ IntervalS = Annotated[
 MatcherName = Annotated[
     str, Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences.")
 ]
-Weights = Annotated[
-    list[Path] | None,
-    Option(
-        metavar="FILE...",
-        rich_help_panel=_CMRNEXT,
-        help="Weights of the networks, .tar or .safetensors, in the order in which they run; a "
-        "file may be repeated: --weights iter1.tar iter5.tar iter5.tar iter6.tar.",
-    ),
-]
+_WEIGHTS = "Networks of cmrnext, .tar or .safetensors; repeat it in the order in which they run."
+Weights = Annotated[list[Path] | None, Option(metavar="FILE", help=_WEIGHTS)]
 TimeLimitS = Annotated[
     float | None,
     Option(
@@ -100,21 +88,18 @@ TimeLimitS = Annotated[
     ),
 ]
 SearchDeg = Annotated[
-    str | None,
+    float | None,
     Option(
-        metavar="DEG|none",
+        metavar="DEG",
+        min=0,
         rich_help_panel=_STRUCTURE,
-        help="Largest rotation error of the guess, per axis; none: no search, for a guess within "
+        help="Largest rotation error of the guess, per axis; 0: no search, for a guess within "
         "about 2.5 deg and 25 cm. The guess itself is tried first. (default: 20)",
     ),
 ]
+_SEARCH_M = "Largest translation error of the guess, per axis. (default: 1.5)"
 SearchM = Annotated[
-    str | None,
-    Option(
-        metavar="M|none",
-        rich_help_panel=_STRUCTURE,
-        help="Largest translation error of the guess, per axis; or none. (default: 1.5)",
-    ),
+    float | None, Option(metavar="M", min=0, rich_help_panel=_STRUCTURE, help=_SEARCH_M)
 ]
 ConfigFile = Annotated[
     Path | None,
@@ -125,8 +110,7 @@ Estimate = Annotated[
     Option(
         metavar="PART,...",
         help="Estimate each camera's lens and clock too: focal, aspect, centre, distortion, or "
-        "lens for all but aspect; offset, readout, or clock for both. The rig may state how well "
-        "they are known.",
+        "lens for all but aspect; offset, readout, or clock for both.",
     ),
 ]
 Of = Annotated[
@@ -142,12 +126,8 @@ ResultFolder = Annotated[
     Option(metavar="DIR", help="Folder for the result; that of an older result is written again."),
 ]
 Seed = Annotated[int, Option(min=0, max=_MOST_SEED, help="Seed of everything random.")]
-SeedOrConfig = Annotated[
-    int | None,
-    Option(
-        min=0, max=_MOST_SEED, help="Seed of everything random. (default: that of --config, else 0)"
-    ),
-]
+_SEED = "Seed of everything random. (default: that of --config, else 0)"
+SeedOrConfig = Annotated[int | None, Option(min=0, max=_MOST_SEED, help=_SEED)]
 ToleranceDeg = Annotated[
     float, Option(metavar="DEG", help="Largest deviation about an axis that is OK.")
 ]

@@ -13,18 +13,25 @@ from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import bag_options_from, checked_arguments, parse_names
-from calibgraph.cli.export import print_doubts
-from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import print_json, print_line, progress_bar
+from calibgraph.errors import CalibrationError
 from calibgraph.io.formats.names import IMPORT_FORMATS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from calibgraph.guessing.guess import RigGuess
     from calibgraph.io.formats.rig_import import RigParts
     from calibgraph.model.rig import Rig
 
 _SEARCH = "search"
+
+
+_TAKEN = {
+    "a folder of images and clouds": {"mount", "lens"},
+    "a bag alone": {"topic", "tie_deg", "tie_m", "correct", "json"},
+    "files": {"mount", "dataset", "rename", "lidar_frame", "camera_frame", "size", "tie_deg",
+              "tie_m", "correct", "json"},
+}  # fmt: skip
+"""The options that change something, by the kind of source."""
 
 
 def rig(
@@ -35,9 +42,7 @@ def rig(
         f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
     ),
     out: Path | None = Option(
-        None,
-        metavar="FILE.yaml",
-        help="Rig file to write. (default: rig.yaml in the folder; of bags and files none)",
+        None, metavar="FILE.yaml", help="Rig to write. (default: in a folder rig.yaml, else none)"
     ),
     mount: list[str] | None = Option(
         None,
@@ -57,17 +62,13 @@ def rig(
     dataset: list[Path] | None = Option(
         None,
         metavar="DATASET",
-        help="Images and clouds: cameras without words or an extrinsic in a file are searched "
-        "for over all headings. Slower, and less sure. May be repeated.",
+        help="Images and clouds, in which cameras without words or an extrinsic in a file are "
+        "searched for, over all headings. May be repeated.",
     ),
-    forward: str = Option(
-        "+x", metavar="+x|-x|+y|-y", help="Axis of the LiDAR frame that points ahead; z is up."
-    ),
+    forward: str = Option("+x", metavar="+x|-x|+y|-y", help="The LiDAR's axis ahead; z is up."),
     topic: options.Topic = None,
     rename: list[str] | None = Option(
-        None,
-        metavar="OLD=NEW",
-        help="Another name of a camera, as its folder in the dataset; may be repeated.",
+        None, metavar="OLD=NEW", help="Another name of a camera; may be repeated."
     ),
     lidar_frame: str | None = Option(
         None, metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"
@@ -78,9 +79,7 @@ def rig(
         help="Frame of a camera, where the names differ; may be repeated. A frame with "
         "'optical' in its name is x right, y down, z forward, others are x forward, z up.",
     ),
-    size: str | None = Option(
-        None, metavar="WIDTHxHEIGHT", help="Image size, for files that have none."
-    ),
+    size: str | None = Option(None, metavar="WIDTHxHEIGHT", help="Image size, if files have none."),
     tie_deg: float | None = Option(
         None,
         metavar="DEG",
@@ -108,38 +107,58 @@ def rig(
     """
     from calibgraph.files import require_new_file
     from calibgraph.io.bags.storage import is_bag
+    from calibgraph.io.formats.describe import describe_rig
+    from calibgraph.io.formats.rig_import import read_rig_parts
+    from calibgraph.model.lens_knowledge import state_calibrated
+    from calibgraph.model.plausibility import find_implausible
+    from calibgraph.trust.conventions import correct_guess
 
     given = {
         "mount": mount, "lens": lens, "dataset": dataset, "topic": topic, "rename": rename,
         "lidar_frame": lidar_frame, "camera_frame": camera_frame, "size": size, "tie_deg": tie_deg,
-        "tie_m": tie_m, "correct": correct,
+        "tie_m": tie_m, "correct": correct, "json": as_json or None,
     }  # fmt: skip
     path = Path(source[0])
-    is_of_bag = len(source) == 1 and is_bag(path) and not (mount or dataset)
     if len(source) == 1 and not correct and _is_to_fill_in(path):
-        _refuse(given, "files", but=("mount", "lens"))
+        _refuse_others("a folder of images and clouds", given)
         _write_template(path, out, mount, lens, forward=forward, force=force)
         return
     if out is not None:
         require_new_file(out, ".yaml", ".yml", force=force)
-    _refuse(given, "a folder of images and clouds", but=tuple(given.keys() - {"lens"}))
-    with checked_arguments():
+    is_of_bag = len(source) == 1 and is_bag(path) and not (mount or dataset)
+    _refuse_others("a bag alone" if is_of_bag else "files", given)
+    with checked_arguments(), progress_bar("reading") as progress:
         sigmas = _sigmas(tie_deg, tie_m)
-    if is_of_bag:
-        _refuse(given, "files", but=("topic", "tie_deg", "tie_m", "correct"))
-        made, notes, topics = _rig_of_bag(path, topic, sigmas)
-        guess = None
-    else:
-        _refuse(given, "a bag alone", but=tuple(given.keys() - {"topic"}))
-        topics = []
-        with checked_arguments(), progress_bar("reading") as progress:
-            parts = _parts(source, rename, lidar_frame, camera_frame)
+        if is_of_bag:
+            made, notes, topics = _rig_of_bag(path, topic, sigmas)
+            guess = None
+        else:
+            named = [_parse_file(text) for text in source]
+            parts = read_rig_parts(
+                [file for _, file in named], names={file: name for name, file in named if name},
+                rename=parse_names("--rename", rename), lidar_frame=lidar_frame,
+                camera_frames=parse_names("--camera-frame", camera_frame),
+            )  # fmt: skip
+            notes, topics = [f"note: {note}" for note in parts.notes], []
             made, guess = _rig_of_files(
                 parts, parse_names("--mount", mount), dataset, forward=forward,
                 size_px=_size_px(size), sigmas=sigmas, progress=progress
             )  # fmt: skip
-        notes = [f"note: {note}" for note in parts.notes]
-    _finish(made, guess, notes, topics, out=out, correct=correct or (), as_json=as_json)
+        made = state_calibrated(correct_guess(made, correct or ()))
+        guess = guess and replace(guess, rig=made)
+    if out is not None:
+        (guess or made).save(out)
+    notes += [f"warning: {line}" for line in find_implausible(made)]
+    if as_json:
+        found = {"topics": topics, "rig": made.model_dump(mode="json"), "notes": notes}
+        written = {"out": None if out is None else str(out)}
+        print_json(found | written | (guess.to_mapping() if guess else {}))
+        return
+    lines = [f"{each['topic']}  {each['type']}  {each['messages']}" for each in topics]
+    for line in [*lines, *(guess.lines if guess else describe_rig(made)), *notes]:
+        print_line(line)
+    end = f"{out}: written" if out is not None else "nothing was written; --out writes the rig"
+    print_line(f"{end}; check the sentences above against the vehicle")
 
 
 def _is_to_fill_in(path: Path) -> bool:
@@ -150,32 +169,12 @@ def _is_to_fill_in(path: Path) -> bool:
     return path.is_dir() and not is_bag(path) and find_rig_file(path) in (None, path / RIG_FILE)
 
 
-def _refuse(given: dict[str, Any], of: str, *, but: tuple[str, ...]) -> None:
+def _refuse_others(kind: str, given: dict[str, Any]) -> None:
     """Refuse options that would change nothing."""
-    from calibgraph.errors import CalibrationError
-
     for name, value in given.items():
-        if value is not None and name not in but:
-            raise CalibrationError(f"--{name.replace('_', '-')} is for {of} only; leave it out")
-
-
-def _parts(
-    source: list[str],
-    rename: list[str] | None,
-    lidar_frame: str | None,
-    camera_frame: list[str] | None,
-) -> RigParts:
-    """What the files hold."""
-    from calibgraph.io.formats.rig_import import read_rig_parts
-
-    named = [_parse_file(text) for text in source]
-    return read_rig_parts(
-        [path for _, path in named],
-        names={path: name for name, path in named if name},
-        rename=parse_names("--rename", rename),
-        lidar_frame=lidar_frame,
-        camera_frames=parse_names("--camera-frame", camera_frame),
-    )
+        if value is not None and name not in _TAKEN[kind]:
+            kinds = " or ".join(each for each, names in _TAKEN.items() if name in names)
+            raise CalibrationError(f"--{name.replace('_', '-')} is for {kinds} only; leave it out")
 
 
 def _parse_file(text: str) -> tuple[str, Path]:
@@ -253,50 +252,6 @@ def _rig_of_bag(
     return made, [*doubtful_axes(made), *read.notes], listed
 
 
-def _finish(
-    made: Rig,
-    guess: RigGuess | None,
-    notes: Sequence[str],
-    topics: list[dict[str, Any]],
-    *,
-    out: Path | None,
-    correct: Sequence[str],
-    as_json: bool,
-) -> None:
-    """Correct, write and print a rig."""
-    from calibgraph.io.formats.describe import describe_rig
-    from calibgraph.model.lens_knowledge import state_calibrated
-    from calibgraph.model.plausibility import find_implausible
-    from calibgraph.trust.conventions import correct_guess
-
-    with checked_arguments():
-        made = state_calibrated(correct_guess(made, correct))
-    guess = None if guess is None else replace(guess, rig=made)
-    if out is not None:
-        (made if guess is None else guess).save(out)
-    if as_json:
-        notes = [*notes, *(f"warning: {line}" for line in find_implausible(made))]
-        print_json(
-            {
-                "topics": topics,
-                "rig": made.model_dump(mode="json"),
-                "notes": notes,
-                "out": None if out is None else str(out),
-                **({} if guess is None else guess.to_mapping()),
-            }
-        )
-        return
-    for each in topics:
-        print_plain(terminal(), f"{each['topic']}  {each['type']}  {each['messages']}")
-    for line in describe_rig(made) if guess is None else guess.lines:
-        print_plain(terminal(), line)
-    for note in notes:
-        print_plain(terminal(), note)
-    print_doubts(made)
-    written = f"{out}: written" if out is not None else "nothing was written; --out writes the rig"
-    print_plain(terminal(), f"{written}; check the sentences above against the vehicle")
-
-
 def _write_template(
     folder: Path,
     out: Path | None,
@@ -319,14 +274,13 @@ def _write_template(
         )
         pairing = describe_pairing(folder)
     if pairing:
-        print_plain(terminal(), pairing)
+        print_line(pairing)
     left = "FILL_IN" in path.read_text(encoding="utf-8").partition("\nformat:")[2]
     where = f"{folder}" if out is None else f"{folder} --rig {out}"
     first = "replace every FILL_IN; then" if left else "next"
-    print_plain(terminal(), f"{path}: written; {first}: calibgraph doctor {where}")
+    print_line(f"{path}: written; {first}: calibgraph doctor {where}")
     if any(how != CALIBRATION for how in known.values()):
-        print_plain(
-            terminal(),
+        print_line(
             "a lens from a spec sheet or a field of view is known to 2 %, so estimate it: "
             f"calibgraph calibrate {where} --estimate lens",
         )

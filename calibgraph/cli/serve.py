@@ -1,12 +1,15 @@
-"""The command of the service."""
+"""The commands that serve pages: serve, pick."""
 
+import webbrowser
+from importlib import import_module
 from pathlib import Path
 
 from typer import Option
 
-from calibgraph.cli.arguments import require_service
-from calibgraph.cli.terminal import print_plain, terminal
-from calibgraph.errors import CalibrationError
+from calibgraph.cli import options
+from calibgraph.cli.arguments import dataset_from
+from calibgraph.cli.terminal import print_line
+from calibgraph.errors import CalibrationError, needs_extra
 
 _GB = 10**9
 
@@ -50,7 +53,9 @@ def serve(
 
     Ctrl-C and SIGTERM lose nothing: jobs that run wait for the next start, as after a crash.
     """
-    require_service()
+    with needs_extra("service", "the server needs fastapi, hypercorn and others"):
+        for package in ("fastapi", "hypercorn", "python_multipart", "sqlalchemy"):
+            import_module(package)
     from calibgraph.service.app import create_app
     from calibgraph.service.serve import require_safe
     from calibgraph.service.serve import serve as serve_app
@@ -83,7 +88,7 @@ def _announce(url: str, tokens: Path | None) -> None:
     needed = "no token is needed, and no other machine can reach it"
     if tokens is not None:
         needed = f"it asks for a token of {tokens} as the password; --new-token makes one"
-    print_plain(terminal(), f"open {url} in a browser: {needed}")
+    print_line(f"open {url} in a browser: {needed}")
 
 
 def _add_token(path: Path | None, scope: str) -> None:
@@ -95,6 +100,42 @@ def _add_token(path: Path | None, scope: str) -> None:
     for each in SCOPES:
         if scope == each:
             print(add_token(path, each))
-            print_plain(terminal(), f"{path}: a token with scope {scope} was added")
+            print_line(f"{path}: a token with scope {scope} was added")
             return
     raise CalibrationError(f"--new-token {scope}: known are {', '.join(SCOPES)}")
+
+
+def pick(
+    dataset: options.Datasets,
+    out: Path = Option(
+        ...,
+        metavar="DIR",
+        help="Folder of the session, which is continued if it is there, and of what it gives: "
+        "reference.yaml and picked.parquet.",
+    ),
+    rig: options.RigFile = None,
+    frames: options.Frames = None,
+    port: int = Option(0, min=0, max=65535, help="Of this machine. (default: any that is free)"),
+    show: bool = Option(True, "--show/--no-show", help="Open the page in the browser."),
+) -> None:
+    """Pick a reference by hand: a page on which pixels and LiDAR points are paired.
+
+    The server answers this machine only. Ends with Ctrl-C; every change is saved at once.
+    """
+    from calibgraph.file_sets import require_own_folder
+    from calibgraph.pick.server import PickServer
+    from calibgraph.pick.workspace import Workspace
+
+    require_own_folder(out, dataset)
+    workspace = Workspace(dataset_from(dataset, rig, frames), out)
+    try:
+        server = PickServer(workspace, port)
+    except OSError as error:
+        raise CalibrationError(
+            f"--port {port}: cannot be used ({error.strerror}); leave it out for a free one"
+        ) from error
+    with server:
+        print_line(f"{server.url}: pick there; end with Ctrl-C")
+        if show:
+            webbrowser.open(server.url)
+        server.serve_forever()

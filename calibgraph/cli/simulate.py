@@ -1,19 +1,13 @@
 """The command that makes data with a known truth."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.terminal import progress_bar, terminal
-
-if TYPE_CHECKING:
-    from calibgraph.model.rig import Rig
+from calibgraph.cli.terminal import print_line, progress_bar
 
 STREET = "street"
 RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # defaults of simulate_street, but for the rig
@@ -45,29 +39,24 @@ def simulate(
         None,
         metavar="16|32|64|128",
         rich_help_panel=_PANEL,
-        help=f"Of the LiDAR; 32: ahead and to the left only. (default: {BEAMS})",
+        help=f"Of the LiDAR. (default: {BEAMS})",
     ),
     step_m: float | None = Option(
         None, rich_help_panel=_PANEL, help=f"Mean distance between frames. (default: {STEP_M:g})"
     ),
     sensor_errors: float | None = Option(
-        None,
-        rich_help_panel=_PANEL,
-        help="Of the LiDAR: 0 for an ideal one, 1 for errors as real ones have them: beam "
-        "angles and widths, motion during a turn, ranges on dark surfaces. (default: 0)",
+        None, rich_help_panel=_PANEL, help="Of the LiDAR: 1 for those of real ones. (default: 0)"
     ),
     vary_layout: bool = Option(
-        False,
-        "--vary-layout",
-        rich_help_panel=_PANEL,
-        help="Draw also the street's width, curves, gardens and heights by the seed; "
-        "otherwise all streets are laid out alike.",
+        False, "--vary-layout", rich_help_panel=_PANEL, help="Draw the street's layout by the seed."
     ),
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
     from calibgraph.file_sets import require_own_folder
+    from calibgraph.io.rigs import load_rig
     from calibgraph.simulation.recording import simulate_street
-    from calibgraph.simulation.scenarios import simulate_table
+    from calibgraph.simulation.rigs import RIG_NAMES, rig_of
+    from calibgraph.simulation.scenarios import scenario_of, simulate_table
 
     common: dict[str, Any] = {
         "frames": frames, "rotation_deg": rotation_deg, "translation_m": translation_m, "seed": seed
@@ -80,31 +69,17 @@ def simulate(
     require_own_folder(out)
     with progress_bar() as progress, checked_arguments():
         if scenario == STREET:
-            truth = _rig(street.pop("rig", RIG))
+            name = street.pop("rig", RIG)
+            is_file = name not in RIG_NAMES and name and Path(name).exists()
+            truth = load_rig(name) if is_file else rig_of(name)
             written = simulate_street(out, truth, **street, **common, progress=progress)
+        elif street and scenario_of(scenario):
+            named = " and ".join(f"--{name.replace('_', '-')}" for name in street)
+            raise ValueError(
+                f"scenario {scenario!r} has its own rig and matcher, {named} would change nothing; "
+                f"leave it out, or simulate {STREET!r}"
+            )
         else:
-            _refuse_options_of_street(scenario, [*street])
             written = simulate_table(out, scenario, **common)
     for path in written:
-        terminal().print(f"{path}: written", soft_wrap=True, markup=False, highlight=False)
-
-
-def _refuse_options_of_street(scenario: str, given: Sequence[str]) -> None:
-    from calibgraph.simulation.scenarios import scenario_of
-
-    named = [f"--{name.replace('_', '-')}" for name in given]
-    if named and scenario_of(scenario):
-        raise ValueError(
-            f"scenario {scenario!r} has its own rig and matcher, {' and '.join(named)} "
-            f"would change nothing; leave it out, or simulate {STREET!r}"
-        )
-
-
-def _rig(name: str) -> Rig:
-    """A rig by its name, or from a file."""
-    from calibgraph.io.rigs import load_rig
-    from calibgraph.simulation.rigs import RIG_NAMES, rig_of
-
-    if name and name not in RIG_NAMES and Path(name).exists():
-        return load_rig(name)
-    return rig_of(name)
+        print_line(f"{path}: written")

@@ -1,19 +1,13 @@
 """The command that keeps a rig calibrated while driving: track."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.arguments import bag_options_from, checked_arguments, matcher_from
-from calibgraph.cli.terminal import print_plain, terminal
-
-if TYPE_CHECKING:
-    from calibgraph.matching.protocol import Matcher
+from calibgraph.cli.terminal import elapsed_s, print_line, terminal
 
 
 def track(
@@ -30,13 +24,9 @@ def track(
         metavar="DIR",
         help="Folder for the state, the result and a picture. A state in it is resumed.",
     ),
-    every: int = Option(1, min=1, help="Take every N-th frame only."),
-    follow: bool = Option(
-        False, "--follow", help="Wait for new files in the folder, until stopped."
-    ),
-    matcher: str | None = Option(
-        None, metavar="NAME", help="Match the frames of a dataset: structure or cmrnext."
-    ),
+    step: int = Option(1, min=1, help="Take every N-th frame only."),
+    follow: bool = Option(False, "--follow", help="Wait for new files in the folder."),
+    matcher: str | None = Option(None, metavar="NAME", help="Match frames: structure or cmrnext."),
     estimate: str | None = Option(
         None,
         metavar="offset",
@@ -61,9 +51,9 @@ def track(
     as wide. With --matcher structure places are found from the images.
     """
     from calibgraph.cli.settings import read_settings
-    from calibgraph.cli.tables import print_result
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.result_files import require_result_folder
+    from calibgraph.report.tables import print_result
     from calibgraph.tracking.command import Tracking, track
     from calibgraph.tracking.offsets import require_offset_alone
 
@@ -71,49 +61,36 @@ def track(
     with checked_arguments():
         settings, rare = read_settings(config, seed=seed, estimate=estimate)
         require_offset_alone(settings)
-        if not matcher:
-            _require_matcher_for(interval_s=interval_s, motion=motion)
-        chosen = _tracking_matcher(matcher, weights, source, settings.seed, rare.of_cmrnext)
-    console = terminal()
+        if matcher is None:
+            given = {"--interval-s": interval_s, "--motion": motion, "--weights": weights}
+            _require_matcher_for(source, given | rare.of_cmrnext)
+            chosen = None
+        else:
+            rare_ones = rare.of_cmrnext
+            chosen = matcher_from(matcher, weights, seed=settings.seed, of_cmrnext=rare_ones)
     wanted = Tracking(
         rig=load_rig(rig),
         config=settings,
         out=out,
-        every=every,
+        every=step,
         follow=follow,
         matcher=chosen,
         interval_s=interval_s,
         bag=bag_options_from(None, motion=motion, **rare.of_bags),
     )
-    result, written = track(wanted, source, notify=lambda text: print_plain(console, text))
-    print_result(console, result, written)
+    result, written = track(wanted, source, notify=print_line)
+    print_result(terminal(), result, written, elapsed_s())
     if result.verdict.status == "FAIL":
         raise typer.Exit(1)
 
 
-def _require_matcher_for(**given: float | str | None) -> None:
-    """Refuse options for clouds without a matcher: correspondences bring their motion."""
+def _require_matcher_for(source: list[Path], given: dict[str, object]) -> None:
+    """Refuse what is for clouds and images without a matcher: tables bring their motion."""
     for name, value in given.items():
         if value is not None:
-            option = f"--{name.replace('_', '-')}"
-            columns = "columns wx_rad_s to vz_m_s, lines have twist_per_s"
             raise ValueError(
-                f"{option} goes with --matcher only: for the motion, tables have {columns}"
+                f"{name} goes with --matcher only: for the motion, tables have columns wx_rad_s to "
+                "vz_m_s, lines have twist_per_s"
             )
-
-
-def _tracking_matcher(
-    name: str | None,
-    weights: list[Path] | None,
-    source: list[Path],
-    seed: int,
-    of_cmrnext: dict[str, Any],
-) -> Matcher | None:
-    """The matcher for the frames of datasets; None for a source of correspondences."""
-    if name:
-        return matcher_from(name, weights, seed=seed, of_cmrnext=of_cmrnext)
-    for what in ("--weights",) if weights else of_cmrnext:
-        raise ValueError(f"{what} is for --matcher cmrnext only")
     if len(source) > 1:
         raise ValueError(f"{len(source)} sources given; several go with --matcher only")
-    return None

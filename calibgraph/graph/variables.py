@@ -73,11 +73,3 @@ def cloud_at_key(place: int) -> int:
 def matched_at_key(place: int, camera: int) -> int:
     """Key of ``a_cp``."""
     return int(gtsam.symbol("a", place * MOST_CAMERAS + camera))
-
-
-def to_dot(graph: gtsam.NonlinearFactorGraph) -> str:
-    """A graph in Graphviz's language."""
-    values = gtsam.Values()
-    for key in graph.keyVector():
-        values.insert(key, gtsam.Pose3())
-    return graph.dot(values)

@@ -108,7 +108,7 @@ def test_a_result_that_was_doubtful_is_said_to_have_been(
 @pytest.mark.usefixtures("measured_once")
 def test_the_page_shows_the_answer(call: Call, tmp_path: Path) -> None:
     page = tmp_path / "check.html"
-    code, _, err = call("check", REFERENCE, SAMPLE, "--frames", "0", "--page", page)
+    code, _, err = call("check", REFERENCE, SAMPLE, "--frames", "0", "--out", page)
     assert code == 3
     assert err.rstrip().endswith(f"{page}: written")
     assert '<strong class="big">CANNOT TELL</strong>' in page.read_text()

@@ -39,7 +39,7 @@ def test_untrained_weights_fail_on_the_command_line(
     Rig(cameras={"front_left": left}).save(rig)
     config = tmp_path / "config.yaml"
     config.write_text("half_resolution: true\niterations: 2\n")
-    files = ("--weights", weights, weights, weights)
+    files = ("--weights", weights) * 3
     code, _, text = call(
         "calibrate", SAMPLE, "--rig", rig, "--frames", "0:1", "--matcher", "cmrnext", *files,
         "--out", out, "--config", config,

@@ -22,8 +22,9 @@ calibrate {sample} --matcher magic | unknown matcher 'magic'
 calibrate {sample} --frames 9: | frames '9:'
 calibrate nothing | no such folder
 calibrate {sample} --every-s 2 | are given without a bag
-calibrate {sample} --search-deg none --search-m 1.5 | give numbers, or none for no search
-calibrate {sample} --search-deg few | --search-deg few: give a number, or none
+calibrate {sample} --search-deg 0 --search-m 1.5 | per axis, found 0 deg and 1.5 m
+calibrate {sample} --search-deg few | '--search-deg': Input should be a valid number
+calibrate {sample} --search-deg nan | should be greater than or equal to 0
 calibrate {sample} --matcher t.csv --search-m 1 | --search-m is for --matcher structure only
 calibrate {sample} --weights a.tar | --weights is for --matcher cmrnext only
 calibrate {sample} --config joint.yaml | start_from is for --matcher cmrnext only
@@ -31,7 +32,8 @@ calibrate {sample} --matcher cmrnext | needs weights
 calibrate {sample} --matcher cmrnext --weights none.tar | no such file of weights
 calibrate {sample} --config both.yaml | start_from: Input should be 'frame' or 'joint'
 calibrate {sample} --config tpu.yaml | device: Input should be 'auto', 'cpu' or 'cuda'
-calibrate bag --topic lidar | expected NAME=/TOPIC
+calibrate bag --topic lidar | give NAME=/TOPIC
+calibrate bag --topic lidar=/a --topic lidar=/b | given 2 times
 calibrate bag --config stamps.yaml | stamps: Input should be 'header' or 'record'
 calibrate bag --config sync.yaml | set stamps: record in --config if the clocks differ
 solve nothing.yaml table.parquet | no such file
@@ -42,13 +44,12 @@ solve rig.yaml table.parquet --config negative.yaml | gate_px
 solve rig.yaml table.parquet --config preset.yaml | preset: Input should be 'kitti', 'walkley'
 solve rig.yaml table.parquet --terms all | terms: Input should be 'stage1'
 solve rig.yaml table.parquet --print-graph --json | both print; choose one
-solve rig.yaml table.parquet --graph graph.png | must end in .dot
 match {sample} --out table.txt | must end in .parquet or .csv
 evaluate nothing.yaml rig.yaml | no such file or folder; name a rig file
 evaluate empty rig.yaml | name a rig file, a result
 evaluate rig.yaml {sample}/reference.yaml | not in the reference
 perturb {sample} --out n.yaml --translation-m inf | a length >= 0 m, found 20.0 deg and inf m
-perturb {sample} --out n.yaml --rotation-deg nan | expected an angle within 0 to 180 deg
+perturb {sample} --out n.yaml --rotation-deg nan | should be greater than or equal to 0
 perturb {sample} --out {sample} | must end in .yaml
 export {sample} --out never --format ros | format 'ros'
 export {sample} --out never --format tf2 --camera rear | camera 'rear'
@@ -77,11 +78,12 @@ rig drive --mount rear=rear | --mount rear=...: no such camera
 rig drive --lens wide | lens 'wide'; expected calibration
 rig drive --lens rear=calibration | --lens rear=...: no such camera
 rig drive --size 3x4 | --size is for files only
+rig drive --json | --json is for a bag alone or files only
 check missing.yaml {sample} | missing.yaml
 check {sample} missing | missing
 check {sample} {sample} --tolerance-deg 0 | tolerance_deg must be positive
 check {sample} {sample} --tolerance-cm nan | tolerance_cm must be positive
-check {sample} {sample} --page check.txt | must end in .html
+check {sample} {sample} --out check.txt | must end in .html
 report nothing | no such file
 report {sample} | calibration.yaml: no such file
 simulate nowhere --out never | unknown scenario 'nowhere'; known are street
@@ -92,7 +94,7 @@ simulate walkley --rotation-deg 200 --out never | expected an angle within
 simulate kitti --beams 16 --rig fisheye --out never | --rig and --beams would change nothing
 simulate walkley --vary-layout --out never | --vary-layout would change nothing
 track rig.yaml table.parquet --motion scans | --motion goes with --matcher only
-track rig.yaml table.parquet --weights a.tar | --weights is for --matcher cmrnext only
+track rig.yaml table.parquet --weights a.tar | --weights goes with --matcher only
 track rig.yaml table.parquet table.parquet | several go with --matcher only
 weights bad.tar | bad.tar
 """

@@ -64,7 +64,7 @@ def test_the_folder_of_a_result_is_written_again_and_other_files_stay(
         ("export rig.yaml --format json --out truth.yaml", "is there already"),
         ("export rig.yaml --format camera_info --out infos", "is there already"),
         ("report out --out out/report.html", "is there already"),
-        ("check rig.yaml {sample} --page out/report.html", "is there already"),
+        ("check rig.yaml {sample} --out out/report.html", "is there already"),
     ],
 )
 def test_what_is_read_or_not_the_commands_own_stays(

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from calibgraph import compile_ahead
 from calibgraph.child_process import ChildEndedError, ChildProcess
-from calibgraph.cli import compile_ahead
-from calibgraph.cli.compile_ahead import ask_to_compile
+from calibgraph.compile_ahead import ask_to_compile
 from calibgraph.simulation.rigs import rig_of
 from tests.conftest import SAMPLE
 
@@ -21,13 +21,13 @@ import sys
 from pathlib import Path
 from calibgraph import simulate_correspondences, solve
 from calibgraph.child_process import ChildProcess
-from calibgraph.cli.compile_ahead import ask_to_compile
+from calibgraph.compile_ahead import ask_to_compile
 from calibgraph.simulation.rigs import rig_of
 from factors.compiled import is_kept
 
 rig, cache = rig_of("kitti"), Path(sys.argv[1])
 before = is_kept("factors.kernel")
-child = ChildProcess("calibgraph.cli.compile_ahead")
+child = ChildProcess("calibgraph.compile_ahead")
 ask_to_compile(child, rig)
 child.close()
 kept = set(cache.rglob("*.nbc"))
