@@ -33,7 +33,7 @@ def require_own_folder(folder: Path, read: Iterable[Path] = ()) -> None:
     if not any((folder / name).is_file() for name in INDEX_FILES):
         raise FileError(
             folder,
-            f"holds files, and none that calibgraph wrote there, such as {INDEX_FILES[0]}; choose "
+            f"holds files, but no {INDEX_FILES[0]} or other index file of calibgraph; choose "
             "another folder, or empty this one",
         )
     if any(path.is_dir() and path.samefile(folder) for path in read):

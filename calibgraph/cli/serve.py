@@ -9,7 +9,7 @@ from typer import Option
 from calibgraph.cli import options
 from calibgraph.cli.arguments import dataset_from
 from calibgraph.cli.terminal import print_line
-from calibgraph.errors import CalibrationError, needs_extra
+from calibgraph.errors import CalibrationError, FileError, needs_extra
 
 _GB = 10**9
 
@@ -123,10 +123,15 @@ def pick(
     The server answers this machine only. Ends with Ctrl-C; every change is saved at once.
     """
     from calibgraph.file_sets import require_own_folder
+    from calibgraph.io.rigs import REFERENCE_FILE
     from calibgraph.pick.server import PickServer
-    from calibgraph.pick.workspace import Workspace
+    from calibgraph.pick.session import SESSION_FILE
+    from calibgraph.pick.workspace import TABLE_FILE, Workspace
 
     require_own_folder(out, dataset)
+    for path in (out / REFERENCE_FILE, out / TABLE_FILE):
+        if path.exists() and not (out / SESSION_FILE).exists():
+            raise FileError(path, "is of no session of pick, and would be replaced; move it")
     workspace = Workspace(dataset_from(dataset, rig, frames), out)
     try:
         server = PickServer(workspace, port)

@@ -16,6 +16,7 @@ import pyarrow as pa
 from pyarrow import compute, parquet
 
 from calibgraph.errors import CalibrationError, FileError
+from calibgraph.file_sets import require_own_folder
 from calibgraph.files import require_place_for_folder, write_bytes
 from calibgraph.fleet.uris import in_arrow, is_local, locate
 
@@ -92,6 +93,8 @@ class RowStore:
         if not self._is_local:
             yield
             return
+        if not (Path(self._path) / _LOCK).exists():
+            require_own_folder(Path(self._path))
         Path(self._path).mkdir(parents=True, exist_ok=True)
         with (Path(self._path) / _LOCK).open("w") as file:
             try:

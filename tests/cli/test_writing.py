@@ -47,11 +47,13 @@ def test_the_folder_of_a_result_is_written_again_and_other_files_stay(
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("solve rig.yaml table.parquet --out .", "holds files, and none that calibgraph wrote"),
-        ("track rig.yaml table.parquet --out .", "holds files, and none that calibgraph wrote"),
-        ("doctor {sample} --out .", "holds files, and none that calibgraph wrote"),
-        ("pick {sample} --out .", "holds files, and none that calibgraph wrote"),
-        ("simulate kitti --out .", "holds files, and none that calibgraph wrote"),
+        ("solve rig.yaml table.parquet --out .", "holds files, but no calibration.yaml"),
+        ("track rig.yaml table.parquet --out .", "holds files, but no calibration.yaml"),
+        ("doctor {sample} --out .", "holds files, but no calibration.yaml"),
+        ("pick {sample} --out .", "holds files, but no calibration.yaml"),
+        ("fleet fleet.csv --out .", "holds files, but no calibration.yaml"),
+        ("pick {sample} --out out --no-show", "reference.yaml: is of no session of pick"),
+        ("simulate kitti --out .", "holds files, but no calibration.yaml"),
         ("calibrate {sample} --out rig.yaml", "is a file, expected a folder"),
         ("solve out table.parquet --out out", "is read by this command"),
         ("solve rig.yaml out/correspondences.parquet --out out", "is read by this command"),
@@ -72,6 +74,8 @@ def test_what_is_read_or_not_the_commands_own_stays(
 ) -> None:
     monkeypatch.chdir(folder)
     (folder / "infos").mkdir()
+    (folder / "out" / "reference.yaml").write_text("mine")
+    (folder / "fleet.csv").write_text("vehicle,recording,rig\na,table.parquet,rig.yaml\n")
     (folder / "infos" / "left.yaml").write_text("mine")
     before = contents(folder)
     assert said in error_line(*call(*line.format(sample=SAMPLE).split()))

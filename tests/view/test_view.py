@@ -52,7 +52,7 @@ def read_rerun(path: Path) -> Entities:
     from rerun.chunk import RrdReader
 
     reader = RrdReader(path)
-    assert [entry.application_id for entry in reader.recordings()] == ["calibgraph-view"]
+    assert [entry.application_id for entry in reader.recordings()] == ["calibgraph"]
     found: dict[tuple[str, int | None], dict[str, Any]] = {}
     for chunk in reader.stream().to_chunks():
         for row in chunk.to_record_batch().to_pylist():
