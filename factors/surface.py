@@ -125,16 +125,14 @@ def _sum_runs(  # type: ignore[no-untyped-def]
     """Fill (r, 13, 13): H, b in the last column, and c in the corner."""
     tile = np.empty((13, 2 * TILE))
     for run in range(len(edges) - 1):
-        at = run if len(T_a) > 1 else 0
-        M = _relative_pose(T_a[at], T_b[at if len(T_b) > 1 else 0])
+        T = T_a[run if len(T_a) > 1 else 0]
+        M = _relative_pose(T, T_b[run if len(T_b) > 1 else 0])
         for start in range(edges[run], edges[run + 1], TILE):
             n = min(TILE, edges[run + 1] - start)
             for i in range(n):
-                u, v = pixels[start + i]
                 sums[run, 12, 12] += _linearize(
-                    kind, lens, T_a[at], M, rays[start + i], planes[start + i], u, v,
-                    loss, scale, sigma, tile, 2 * i,
-                )  # fmt: skip
+                    kind, lens, T, M, rays, planes, pixels, start + i, loss, scale, sigma, tile, i
+                )
             for i in range(12):
                 first = tile[i]
                 for j in range(i, 13):
@@ -149,18 +147,19 @@ def _sum_runs(  # type: ignore[no-untyped-def]
 
 @compiled(part=True)
 def _linearize(  # type: ignore[no-untyped-def]
-    kind, lens, T_a, M, f, q, pixel_u, pixel_v, loss, scale, sigma, tile, at
+    kind, lens, T_a, M, rays, planes, pixels, number, loss, scale, sigma, tile, column
 ):
     """Fill two columns with derivatives by A and B, and residuals, times the weight's root.
 
     The loss.
     """
-    g0, g1, g2, k = _seen_from_a(T_a, q)
-    w = (g0 * f[0] + g1 * f[1] + g2 * f[2]) / k
-    y0, y1, y2 = _place(M, f, w)
+    f0, f1, f2, at = rays[number, 0], rays[number, 1], rays[number, 2], 2 * column
+    g0, g1, g2, k = _seen_from_a(T_a, planes, number)
+    w = (g0 * f0 + g1 * f1 + g2 * f2) / k
+    y0, y1, y2 = _place(M, f0, f1, f2, w)
     u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, y0, y1, y2)
-    ru = subtract_columns(kind, lens, u, pixel_u) / sigma
-    rv = (v - pixel_v) / sigma
+    ru = subtract_columns(kind, lens, u, pixels[number, 0]) / sigma
+    rv = (v - pixels[number, 1]) / sigma
     value, weight = loss_and_weight(loss, scale, ru * ru + rv * rv)
     root = math.sqrt(weight)
     over = root / sigma
@@ -172,9 +171,9 @@ def _linearize(  # type: ignore[no-untyped-def]
         a0 = jx * M[0, 0] + jy * M[1, 0] + jz * M[2, 0] + along * g0  # in A's axes
         a1 = jx * M[0, 1] + jy * M[1, 1] + jz * M[2, 1] + along * g1
         a2 = jx * M[0, 2] + jy * M[1, 2] + jz * M[2, 2] + along * g2
-        tile[0, n] = f[1] * a2 - f[2] * a1
-        tile[1, n] = f[2] * a0 - f[0] * a2
-        tile[2, n] = f[0] * a1 - f[1] * a0
+        tile[0, n] = f1 * a2 - f2 * a1
+        tile[1, n] = f2 * a0 - f0 * a2
+        tile[2, n] = f0 * a1 - f1 * a0
         tile[3, n], tile[4, n], tile[5, n] = w * a0, w * a1, w * a2
         tile[6, n] = jy * y2 - jz * y1
         tile[7, n] = jz * y0 - jx * y2
@@ -188,10 +187,10 @@ def _fill_residuals(kind, lens, T_a, T_b, rays, planes, pixels, out, visible):  
     """Fill (n, 2) residuals [px], and (n,) whether B sees the point where A's ray meets it."""
     M = _relative_pose(T_a, T_b)
     for i in range(len(rays)):
-        f = rays[i]
-        g0, g1, g2, k = _seen_from_a(T_a, planes[i])
-        w = (g0 * f[0] + g1 * f[1] + g2 * f[2]) / k
-        y0, y1, y2 = _place(M, f, w)
+        f0, f1, f2 = rays[i, 0], rays[i, 1], rays[i, 2]
+        g0, g1, g2, k = _seen_from_a(T_a, planes, i)
+        w = (g0 * f0 + g1 * f1 + g2 * f2) / k
+        y0, y1, y2 = _place(M, f0, f1, f2, w)
         found = project_one(kind, lens, y0, y1, y2)
         out[i, 0] = subtract_columns(kind, lens, found[0], pixels[i, 0])
         out[i, 1] = found[1] - pixels[i, 1]
@@ -211,20 +210,21 @@ def _relative_pose(T_a, T_b):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True)
-def _seen_from_a(T_a, q):  # type: ignore[no-untyped-def]
-    """The plane's g = R_a^T q, and k."""
-    g0 = T_a[0, 0] * q[0] + T_a[1, 0] * q[1] + T_a[2, 0] * q[2]
-    g1 = T_a[0, 1] * q[0] + T_a[1, 1] * q[1] + T_a[2, 1] * q[2]
-    g2 = T_a[0, 2] * q[0] + T_a[1, 2] * q[1] + T_a[2, 2] * q[2]
-    k = 1.0 - (q[0] * T_a[0, 3] + q[1] * T_a[1, 3] + q[2] * T_a[2, 3])
+def _seen_from_a(T_a, planes, number):  # type: ignore[no-untyped-def]
+    """A plane's g = R_a^T q, and k."""
+    q0, q1, q2 = planes[number, 0], planes[number, 1], planes[number, 2]
+    g0 = T_a[0, 0] * q0 + T_a[1, 0] * q1 + T_a[2, 0] * q2
+    g1 = T_a[0, 1] * q0 + T_a[1, 1] * q1 + T_a[2, 1] * q2
+    g2 = T_a[0, 2] * q0 + T_a[1, 2] * q1 + T_a[2, 2] * q2
+    k = 1.0 - (q0 * T_a[0, 3] + q1 * T_a[1, 3] + q2 * T_a[2, 3])
     return g0, g1, g2, k if abs(k) >= _LEAST_K else _LEAST_K
 
 
 @compiled(part=True)
-def _place(M, f, w):  # type: ignore[no-untyped-def]
+def _place(M, f0, f1, f2, w):  # type: ignore[no-untyped-def]
     """The point y in B's frame."""
     return (
-        M[0, 0] * f[0] + M[0, 1] * f[1] + M[0, 2] * f[2] + w * M[0, 3],
-        M[1, 0] * f[0] + M[1, 1] * f[1] + M[1, 2] * f[2] + w * M[1, 3],
-        M[2, 0] * f[0] + M[2, 1] * f[1] + M[2, 2] * f[2] + w * M[2, 3],
+        M[0, 0] * f0 + M[0, 1] * f1 + M[0, 2] * f2 + w * M[0, 3],
+        M[1, 0] * f0 + M[1, 1] * f1 + M[1, 2] * f2 + w * M[1, 3],
+        M[2, 0] * f0 + M[2, 1] * f1 + M[2, 2] * f2 + w * M[2, 3],
     )
