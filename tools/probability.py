@@ -137,7 +137,7 @@ def main() -> None:
         for which, samples in of_level.items():
             if samples:
                 tables += judged(f"{name}, {which}", models[name], samples)
-    ledger.publish_cases("accuracy.probability", tables, records, record=options.record)
+    ledger.publish_cases(tables, records)
     if options.write:
         text = {"format": "calibgraph-probability/2", "fitted_by": ledger.code(),
                 "results": {n: len(samples_of(each)) for n, each in sets.items()},

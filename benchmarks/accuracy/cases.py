@@ -24,6 +24,7 @@ from benchmarks.accuracy.scenes import (
     Case,
     Folders,
     Scene,
+    paint_images,
     with_clouds,
     with_images,
 )
@@ -443,25 +444,14 @@ def copies(scene: Scene, rng: Rng) -> Case:
     return replace(scene.data, frames=frames), scene.guess(), {}
 
 
-Painter = Callable[[Array, int, Camera, Rng], Array]
-"""An image, the number of its frame, its camera and a generator, to the changed image."""
-
-
-def painted(scene: Scene, rng: Rng, paint: Painter, one: bool = True) -> Case:
+def painted(
+    scene: Scene, rng: Rng, paint: Callable[[Array, int, Camera, Rng], Array], one: bool = True
+) -> Case:
     """The images of one camera drawn at random, or of all, are changed."""
     names = list(scene.truth.cameras)
     chosen = [str(rng.choice(names))] if one else names
-
-    def paths(index: int, frame: Frame) -> dict[str, Path]:
-        changed = dict(frame.image_paths)
-        for name in filter(chosen.__contains__, frame.image_paths):
-            camera = scene.truth.cameras[name]
-            image = paint(frame.load_image(name, camera), index, camera, rng)
-            changed[name] = scene.scratch / f"{name}_{index:06d}.png"
-            cv2.imwrite(str(changed[name]), image)
-        return changed
-
-    return with_images(scene.data, paths), scene.guess(), {"changed": chosen}
+    data = paint_images(scene, chosen, lambda *image: paint(*image, rng))
+    return data, scene.guess(), {"changed": chosen}
 
 
 def moved_halfway(scene: Scene, rng: Rng) -> Case:

@@ -194,7 +194,7 @@ def main() -> None:
             if not outcome.attributed or outcome.false_alarms:
                 print("   ", seed, outcome.reports, outcome.delay)
     table = Table("Simulated drives", COLUMNS, tuple(rows))
-    publish("accuracy.events", [table], record=options.record)
+    publish([table])
 
 
 if __name__ == "__main__":

@@ -57,7 +57,7 @@ def main() -> None:
     ]
     records = ledger.records_of(options, cases, partial(run_case, scenes=options.scenes))
     tables = [report(records), report_checks(records)]
-    ledger.publish_cases("accuracy.street_verdicts", tables, records, record=options.record)
+    ledger.publish_cases(tables, records)
 
 
 def run_case(case: Key, scenes: Path) -> Record:

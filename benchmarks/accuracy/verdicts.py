@@ -60,7 +60,7 @@ def main() -> None:
     records = ledger.records_of(options, cases, partial(run_case, folders=folders))
     counted = [record for record in records if record["kind"] not in options.uncounted]
     tables = [summary(records, counted), figures(counted)]
-    ledger.publish_cases("accuracy.verdicts", tables, records, record=options.record)
+    ledger.publish_cases(tables, records)
     print("\n".join(remarks(records, counted)))
 
 

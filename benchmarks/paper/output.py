@@ -1,28 +1,16 @@
-"""The experiment's report as Markdown and JSON, beside the numbers that the paper publishes."""
+"""The experiment's report in Markdown, beside the numbers that the paper publishes."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from benchmarks.paper.draws import HEADLINE, STAGE1, TRF_TERMS
-from benchmarks.paper.experiment import (
-    IMPROVEMENT,
-    REPROJECTION,
-    ROTATION,
-    TRANSLATION,
-    Block,
-    Report,
-    Row,
-)
+from benchmarks.paper.experiment import IMPROVEMENT, REPROJECTION, Report, Row
 from benchmarks.tables import Table
-from calibgraph.report.as_json import finite
 
+ROTATION, TRANSLATION = "rotation_error_deg", "translation_error_cm"
 AXES = (TRANSLATION, ROTATION, "x_cm", "y_cm", "z_cm", "roll_deg", "pitch_deg", "yaw_deg")
 _HEADS = {
     TRANSLATION: "E_t [cm]", ROTATION: "E_R [deg]", "x_cm": "x [cm]", "y_cm": "y [cm]",
@@ -74,24 +62,14 @@ def published(data: str, row: str, frames: int, which: int) -> dict[str, float]:
     return found | ({REPROJECTION: known[3][which]} if which < PAIR and known[3] else {})
 
 
-def write_report(report: Report, folder: Path) -> list[Path]:
-    """Write ``paper.md`` and ``paper.json``; returns their paths."""
-    written = [folder / f"paper.{kind}" for kind in ("md", "json")]
-    folder.mkdir(parents=True, exist_ok=True)
-    written[0].write_text(markdown(report), "utf-8")
-    content = finite(json.loads(json.dumps(to_mapping(report))))
-    written[1].write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf-8")
-    return written
-
-
-def worst_cameras(block: Block) -> Table:
+def worst_cameras(frames: int, draws: int, rows: Mapping[str, Row]) -> Table:
     """The errors of the worst camera of every row: the median and the 95 % quantile."""
     heads = ("worst camera", "E_R [deg]", "95 %", "E_t [cm]", "95 %", "failed")
-    rows = (
+    cells = (
         (name, *_worst(row, ROTATION, 3), *_worst(row, TRANSLATION, 2), str(row.failed or ""))
-        for name, row in block.rows.items()
+        for name, row in rows.items()
     )
-    return Table(f"{block.frames} frames, {block.draws} draws", heads, tuple(rows))
+    return Table(f"{frames} frames, {draws} draws", heads, tuple(cells))
 
 
 def _worst(row: Row, metric: str, digits: int) -> list[str]:
@@ -103,49 +81,51 @@ def _worst(row: Row, metric: str, digits: int) -> list[str]:
     return [f"{median:.{digits}f}", f"{high:.{digits}f}"]
 
 
-def to_mapping(report: Report) -> dict[str, Any]:
-    """As plain values; times in their own key, so that the rest only depends on the seed."""
-    content = asdict(report)
-    content["seconds"] = [
-        {"frames": block["frames"], **{n: row.pop("seconds") for n, row in block["rows"].items()}}
-        for block in content["blocks"]
-    ]
-    return content
+def markdown(head: str, published_as: str, draws: int, report: Report) -> str:
+    """The paper's two tables: errors per camera; between cameras and of reprojection.
 
-
-def markdown(report: Report) -> str:
-    """The paper's two tables: errors per camera; between cameras and of reprojection."""
-    settings = f"Settings of the paper's rows: preset {report.preset}. Seed {report.seed}."
-    parts = [f"# {report.data}", settings, _NOTES]
-    for block in report.blocks:
-        parts.append(f"## N = {block.frames} ({block.draws} draws)")
-        names = next((list(row.numbers) for row in block.rows.values() if row.numbers), [])
+    Args:
+        head: the first lines.
+        published_as: the paper's data set to compare with, or nothing.
+        draws: of each number of frames.
+        report: its rows.
+    """
+    parts = [head, _NOTES]
+    for frames, rows in report.items():
+        parts.append(f"## N = {frames} ({draws} draws)")
+        names = next((list(row.numbers) for row in rows.values() if row.numbers), [])
         cameras, pairs = ([n for n in names if ("->" in n) == pair] for pair in (False, True))
+
+        def paper(row: str, frames: int = frames) -> list[dict[str, float]]:
+            return [published(published_as, row, frames, which) for which in range(3)]
+
         for index, camera in enumerate(cameras):
             columns = [(camera, m) for m in AXES]
             theirs = [(index, m) for m in (TRANSLATION, ROTATION)]
-            parts += [f"### {camera}", "\n".join(_table(report, block, columns, theirs))]
+            table = _table(rows, {row: paper(row) for row in rows}, columns, theirs, draws)
+            parts += [f"### {camera}", "\n".join(table)]
         columns = [(pair, m) for pair in pairs for m in (ROTATION, TRANSLATION)]
         columns += [(camera, m) for camera in cameras for m in (REPROJECTION, IMPROVEMENT)]
         theirs = [(PAIR, ROTATION), (PAIR, TRANSLATION), (0, REPROJECTION), (1, REPROJECTION)]
-        parts += ["### Between cameras, and reprojection",
-                  "\n".join(_table(report, block, columns, theirs))]  # fmt: skip
+        table = _table(rows, {row: paper(row) for row in rows}, columns, theirs, draws)
+        parts += ["### Between cameras, and reprojection", "\n".join(table)]
     return "\n\n".join(parts) + "\n"
 
 
 def _table(
-    report: Report, block: Block, ours: Sequence[tuple[str, str]], theirs: Sequence[tuple[int, str]]
-) -> Iterator[str]:
+    rows: Mapping[str, Row], paper: Mapping[str, Sequence[Mapping[str, float]]],
+    ours: Sequence[tuple[str, str]], theirs: Sequence[tuple[int, str]], draws: int,
+) -> Iterator[str]:  # fmt: skip
     where = ("first", "second", "between")
     heads = ["method", *(f"{name}: {_HEADS[m]}" for name, m in ours),
              *(f"paper {where[c] if c < len(where) else ''} {_HEADS[m]}" for c, m in theirs),
              "failed", "s"]  # fmt: skip
     yield f"| {' | '.join(heads)} |\n|" + "---|" * len(heads)
-    for name, row in block.rows.items():
-        paper = (published(report.published_as, name, block.frames, c).get(m) for c, m in theirs)
-        failed = f"{row.failed} of {block.draws}" if row.failed else ""
+    for name, row in rows.items():
+        known = (paper[name][c].get(m) if c < len(where) else None for c, m in theirs)
+        failed = f"{row.failed} of {draws}" if row.failed else ""
         cells = [f"**{name}**" if name == HEADLINE else name, *(_cell(row, *at) for at in ours),
-                 *("" if v is None else _number(v) for v in paper), failed,
+                 *("" if v is None else _number(v) for v in known), failed,
                  f"{row.seconds:.2f}"]  # fmt: skip
         yield f"| {' | '.join(cells)} |"
 
