@@ -42,12 +42,12 @@ CASES = {  # data, degrees and metres from the reference; None: the guess of the
 RESULT, TIMES = "calibration.yaml", "times.json"
 
 
-def run(tree: Path, folder: Path, name: str, frames: str | None) -> None:
+def run(tree: Path, folder: Path, name: str) -> None:
     """Calibrate a case with the code of a tree from its guess, and keep the times."""
     where, offset = CASES[name]
     data = tree / where if name == "sample" else REALDATA / where
     folder.mkdir(parents=True, exist_ok=True)
-    words = [str(data), "--out", str(folder / name), *(["--frames", frames] if frames else [])]
+    words = [str(data), "--out", str(folder / name)]
     if offset:
         reference = data / "reference.yaml" if (data / "reference.yaml").is_file() else data
         guess = folder / f"{name}.yaml"
@@ -109,7 +109,6 @@ def main() -> None:
     runs = commands.add_parser("run")
     runs.add_argument("trees", nargs="+", metavar="TREE=FOLDER", help="source tree, its results")
     runs.add_argument("--cases", nargs="+", default=[*CASES], choices=[*CASES])
-    runs.add_argument("--frames", metavar="A:B:STEP", help="of each case (default: all)")
     runs.add_argument("--repeats", type=int, default=1, help="with 1, what is there is kept")
     compares = commands.add_parser("compare")
     compares.add_argument("before", type=Path)
@@ -121,7 +120,7 @@ def main() -> None:
     pairs = [[Path(part).resolve() for part in words.split("=")] for words in asked.trees]
     for name, _, (tree, folder) in product(asked.cases, range(asked.repeats), pairs):
         if asked.repeats > 1 or not (folder / name / RESULT).is_file():
-            run(tree, folder, name, asked.frames)
+            run(tree, folder, name)
 
 
 if __name__ == "__main__":

@@ -20,11 +20,10 @@ import ast
 import gc
 import importlib
 import json
+import multiprocessing
 import os
-import signal
 import sys
-import tempfile
-import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from functools import _lru_cache_wrapper, partial
 from hashlib import sha256
@@ -109,10 +108,10 @@ def _mutations(node: ast.AST, lines: list[str]) -> Iterator[tuple[int, int, str,
             yield line, column, *pair
 
 
-def draw(before: Path, after: Path, count: int, seed: int) -> list[Place]:
+def draw(before: Path, after: Path, count: int) -> list[Place]:
     """Mutants of both trees; their order does not depend on ``after``."""
     shared = places(before).keys() & places(after).keys()
-    return sorted(shared, key=lambda place: sha256(f"{seed} {place}".encode()).digest())[:count]
+    return sorted(shared, key=lambda place: sha256(f"0 {place}".encode()).digest())[:count]
 
 
 def mutate(tree: Path, place: Place, where: tuple[Path, int]) -> None:
@@ -181,7 +180,9 @@ class Trial:
             if place in wheres and place not in done:
                 path, line = wheres[place]
                 mine = tests_of(tests, place[0], str(path), line)
-                found = self.attempt(place, wheres[place], [items[name] for name in mine])
+                attempt = partial(self.attempt, place, wheres[place], [items[n] for n in mine])
+                found = in_fork(attempt, _SECONDS)
+                found = "a crash, or too long" if found is None else found
                 record = {"place": place, "file": str(path), "line": line, "tests": len(mine)}
                 with self.results.open("a", encoding="utf-8") as file:
                     file.write(json.dumps({**record, "found_by": found}) + "\n")
@@ -193,16 +194,13 @@ class Trial:
         for _, group in groupby(items, lambda item: item.path):
             own = [item for item in group if item.nodeid not in found]
             if own:
-                answer = in_fork(partial(self._record_file, own), _RECORD_SECONDS)
-                found |= json.loads(answer or "{}")
+                found |= in_fork(partial(self._record_file, own), _RECORD_SECONDS) or {}
                 path.write_text(json.dumps(found), "utf-8")
         return found
 
-    def _record_file(self, items: list[pytest.Item]) -> str:
-        sources = [str(self.tree / folder) for folder in FOLDERS]
-        tracer = coverage.Coverage(
-            data_file=None, config_file=False, include=[f"{one}/*" for one in sources]
-        )
+    def _record_file(self, items: list[pytest.Item]) -> dict[str, Any]:
+        sources = [f"{self.tree / folder}/*" for folder in FOLDERS]
+        tracer = coverage.Coverage(None, config_file=False, include=sources)
         tracer.set_option("run:disable_warnings", ["no-data-collected"])
         tracer.start()
         for item, after in zip(items, [*items[1:], None], strict=True):
@@ -219,67 +217,53 @@ class Trial:
                 str(Path(file).relative_to(self.tree)): lines
                 for file in data.measured_files() if (lines := data.lines(file))
             }  # fmt: skip
-        return json.dumps(self.ran)
+        return self.ran
 
     def attempt(self, place: Place, where: tuple[Path, int], items: list[pytest.Item]) -> str:
-        """The test that finds a mutant, or nothing."""
-
-        def work() -> str:
-            mutate(self.tree, place, where)
-            for item, after in zip(items, [*items[1:], None], strict=True):
-                item.ihook.pytest_runtest_protocol(item=item, nextitem=after)
-                if self.failed:
-                    return str(item.nodeid)
-            return ""
-
-        found = in_fork(work)
-        return "the process ended, or took too long" if found is None else found
+        """The test that finds a mutant in this fork, or nothing."""
+        mutate(self.tree, place, where)
+        for item, after in zip(items, [*items[1:], None], strict=True):
+            item.ihook.pytest_runtest_protocol(item=item, nextitem=after)
+            if self.failed:
+                return str(item.nodeid)
+        return ""
 
 
 def tests_of(tests: dict[str, Any], folder: str, file: str, line: int) -> list[str]:
     """Tests of the folder and of the pipeline that run a line, the fastest file first."""
     own = f"tests/{folder.removeprefix('calibgraph/')}/"
-    mine = [
-        name for name, test in tests.items()
+    mine = {
+        name: test["seconds"] for name, test in tests.items()
         if name.startswith((own, "tests/test_pipeline.py"))
         and test["passed"] and line in test["lines"].get(file, ())
-    ]  # fmt: skip
-    seconds: dict[str, float] = {}
-    for name in mine:
-        of = name.split("::")[0]
-        seconds[of] = seconds.get(of, 0.0) + tests[name]["seconds"]
-    return sorted(mine, key=lambda n: (seconds[n.split("::")[0]], n.split("::")[0],
-                                       tests[n]["seconds"]))  # fmt: skip
+    }  # fmt: skip
+    files = Counter[str]()
+    for name, seconds in mine.items():
+        files[name.split("::")[0]] += seconds
+    return sorted(mine, key=lambda n: (files[n.split("::")[0]], n.split("::")[0], mine[n]))
 
 
-def in_fork(work: Callable[[], str], most_s: float = _SECONDS) -> str | None:
-    """What a function returns in a fork of this process; None if it ends or takes too long.
+def in_fork(work: Callable[[], Any], most_s: float) -> Any:
+    """What a function returns in a fork of this process; None if that crashes or takes too long.
 
     Raises:
         RuntimeError: if the function fails.
     """
-    with tempfile.TemporaryFile("w+", encoding="utf-8") as answer:
-        child = os.fork()
-        if not child:
-            os.setsid()
-            try:
-                answer.write("=" + work())
-            except BaseException as error:  # noqa: BLE001 - of any kind: raised by the parent
-                answer.write(f"!{error!r}")
-            answer.flush()
-            os._exit(0)
-        end = time.monotonic() + most_s
-        while os.waitpid(child, os.WNOHANG)[0] == 0:
-            if time.monotonic() > end:
-                os.killpg(child, signal.SIGKILL)
-                os.waitpid(child, 0)
-                return None
-            time.sleep(0.02)
-        answer.seek(0)
-        text = answer.read()
-    if text.startswith("!"):
-        raise RuntimeError(text[1:])
-    return text[1:] if text else None
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=lambda: sender.send(work()))
+    child.start()
+    sender.close()
+    try:
+        return receiver.recv() if receiver.poll(most_s) else None
+    except EOFError:
+        child.join()
+        if child.exitcode == 1:
+            raise RuntimeError("a fork failed, as it says above") from None
+        return None
+    finally:
+        child.kill()
+        child.join()
 
 
 def try_all(tree: Path, mutants: list[Place], results: Path) -> int:
@@ -319,12 +303,11 @@ def main() -> None:
     parser.add_argument("command", choices=["draw", "try", "compare"])
     parser.add_argument("paths", type=Path, nargs=3)
     parser.add_argument("--count", type=int, default=150)
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--found-in", type=Path, help="only mutants that these results found")
     asked = parser.parse_args()
     first, second, third = (path.resolve() for path in asked.paths)
     if asked.command == "draw":
-        third.write_text(json.dumps(draw(first, second, asked.count, asked.seed), indent=0))
+        third.write_text(json.dumps(draw(first, second, asked.count), indent=0))
     elif asked.command == "try":
         mutants = [tuple(place) for place in json.loads(second.read_text())]
         if asked.found_in:

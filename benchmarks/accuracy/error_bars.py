@@ -28,6 +28,7 @@ import numpy as np
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.uncertainty import calibration
+from benchmarks.accuracy.verdicts import STATUSES, class_of
 from benchmarks.tables import ROOT, Table
 from calibgraph import (
     Config,
@@ -262,8 +263,6 @@ CHANGES: dict[str, Callable[[Streets, np.random.Generator], Streets]] = {
 }
 
 
-OFF = (0.5, 10.0)  # deg, cm
-STATUSES = ("PASS", "WARN", "FAIL")
 _CELLS = (
     "results", "mean NEES / 6", "in the 95 % region", "error, median [deg]", "largest", "[cm]",
     "largest", "PASS, WARN, FAIL", "of these off",
@@ -276,7 +275,7 @@ def _cells(found: Sequence[Record]) -> tuple[str, ...]:
     nees = [6 * one["normalised_squared"] for one in found if one["normalised_squared"]]
     sizes = f"{np.median(deg):.3f}", f"{deg.max():.2f}", f"{np.median(cm):.2f}", f"{cm.max():.1f}"
     judged = [one for one in found if one["status"]]
-    off = [one for one in judged if one["error_deg"] > OFF[0] or one["error_cm"] > OFF[1]]
+    off = [one for one in judged if class_of(one) == "off"]
     counts = (
         ", ".join(str(sum(one["status"] == status for one in of)) for status in STATUSES)
         for of in (judged, off)

@@ -11,6 +11,7 @@ import json
 import os
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -85,8 +86,11 @@ def records_of(
 
 
 def publish_cases(tables: Sequence[Table], records: Sequence[Record]) -> None:
-    """Print tables of cases, and how many of them other code has run."""
+    """Print tables of cases, crashes, and how many cases other code has run."""
     publish(tables)
+    crashes = Counter(one["crash"].strip().splitlines()[-1] for one in records if "crash" in one)
+    for what, count in crashes.items():
+        print(f"CRASHED, {count}: {what}")
     others = sum(one.get("code") != code() for one in records)
     if others:
         print(f"\n{others} of {len(records)} cases were run by other code")

@@ -105,8 +105,8 @@ class Scene:
         return first, second
 
 
-Case = tuple[Dataset, Rig, dict[str, Any]]
-"""The data, the rig with its guess, and what was drawn for this kind of case."""
+Case = tuple[Any, Rig, dict[str, Any]]
+"""Data or a table, the rig with its guess, and what was drawn for this kind of case."""
 
 
 def with_images(data: Dataset, paths: Callable[[int, Frame], dict[str, Path]]) -> Dataset:

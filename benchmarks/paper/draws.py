@@ -31,6 +31,8 @@ from calibgraph.solver.objective import Transforms
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.solver.stage1 import Stage1, aggregate, estimate_stage1
 
+GUESS_DEG, GUESS_M = 20.0, 1.5
+"""Exact displacement of every guess, the paper's T_delta."""
 KITTI_PREFIX = "kitti:"
 STAGE1 = "Stage 1: PnP, median"
 _TERMS: dict[str, Terms] = {
@@ -51,13 +53,10 @@ class Source:
     Attributes:
         name: of a scenario, or those of the folders.
         folders: of recordings of one rig; none of a scenario.
-        rotation_deg, translation_m: exact displacement of every guess, the paper's T_delta.
     """
 
     name: str
     folders: tuple[Path, ...] = ()
-    rotation_deg: float = 20.0
-    translation_m: float = 1.5
 
     @property
     def preset(self) -> PresetName:
@@ -92,8 +91,7 @@ class Source:
         state = np.random.SeedSequence([seed, 0]).generate_state(2)
         own_seed, guess_seed = int(state[0] >> 1), int(state[1] >> 1)
         reference = self.reference()
-        shift = {"rotation_deg": self.rotation_deg, "translation_m": self.translation_m}
-        guess = perturb(reference, **shift, seed=guess_seed)
+        guess = perturb(reference, rotation_deg=GUESS_DEG, translation_m=GUESS_M, seed=guess_seed)
         if not self.folders:
             table = scenario_of(self.name).draw(frames, own_seed)
             return Draw(guess, table, reference, theirs, seed)
@@ -107,28 +105,21 @@ class Source:
         return Draw(rig, run.correspondences, reference, theirs, seed, matched=True)
 
 
-def source_from(data: str, rotation_deg: float = 20.0, translation_m: float = 1.5) -> Source:
-    """The source that the argument DATA names.
-
-    Args:
-        data: a scenario's name; a dataset folder with a ``reference.yaml``, or a KITTI odometry
-            sequence; ``kitti:DIR,DIR``: KITTI sequences of one rig, as one recording.
-        rotation_deg: of the guesses.
-        translation_m: of the guesses.
+def source_from(data: str) -> Source:
+    """The source that the argument DATA of the command names.
 
     Raises:
-        ValueError: if it is none of these.
-        FileError, DatasetError: if the data cannot be read.
+        ValueError, CalibrationError: if it is none, or cannot be read.
     """
     if data in SCENARIOS:
-        return Source(data, (), rotation_deg, translation_m)
+        return Source(data)
     folders = tuple(Path(part) for part in data.removeprefix(KITTI_PREFIX).split(",") if part)
     if not folders or not folders[0].is_dir():
         raise ValueError(
             f"{data!r} is no scenario ({', '.join(SCENARIOS)}), no folder, and no kitti:DIR,DIR"
         )
     name = "+".join(folder.name for folder in folders)
-    source = Source(name, folders, rotation_deg, translation_m)
+    source = Source(name, folders)
     source.frame_count(1)  # raises before the first draw if the data cannot be read
     return source
 
@@ -205,7 +196,7 @@ class Draw:
 
     def solve_each_camera(self) -> Transforms:
         """Bundle adjustment of each camera alone, with the paper's scales."""
-        known, found = self.stage1(self.theirs), {}
+        known, found = self.stage1(self.theirs), Transforms()
         for name, camera in self.rig.cameras.items():
             alone = Rig(lidar=self.rig.lidar, cameras={name: camera})
             own = self.table.of_camera(name)

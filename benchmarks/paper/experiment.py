@@ -12,7 +12,7 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from benchmarks.paper.draws import METHODS, STAGE1, TRF_TERMS, Source, run_methods
+from benchmarks.paper.draws import METHODS, TRF_TERMS, Source, run_methods
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config
 from calibgraph.model.metrics import evaluate
@@ -26,7 +26,6 @@ Result = dict[str, tuple[Numbers | None, float]]
 """Of a draw, per row its errors, None if it failed, and its seconds."""
 
 QUANTILES = (0.05, 0.5, 0.95)
-IMPROVEMENT = "reprojection_improvement_px"
 REPROJECTION = "reprojection_px"
 
 
@@ -61,14 +60,7 @@ def run_experiment(
 ) -> Report:
     """Run the paper's protocol: draws with a new guess each, evaluated by its metrics.
 
-    Args:
-        source: of the draws.
-        frames: numbers of frames N.
-        draws: of each N.
-        config: the paper's settings, for its solver and for the per-camera adjustment.
-        seed: of everything random; the same seed gives the same numbers.
-        jobs: processes.
-        trf: whether to run the paper's own solver, which takes minutes at N = 100.
+    Arguments are the options of the command; the same seed gives the same numbers.
 
     Raises:
         ValueError: if there is no draw, no frame or no process.
@@ -76,18 +68,14 @@ def run_experiment(
     if draws < 1 or jobs < 1 or not frames or min(frames) < 1:
         raise ValueError(f"nothing to do: {draws} draws of {list(frames)} frames in {jobs} jobs")
     sizes = [*dict.fromkeys(source.frame_count(n) for n in frames)]
-    tasks = [(n, draw_seed(seed, n, index)) for n in sizes for index in range(draws)]
+    states = {(n, k): np.random.SeedSequence([seed, n, k]) for n in sizes for k in range(draws)}
+    tasks = [(n, int(state.generate_state(1)[0] >> 1)) for (n, _), state in states.items()]
     run, found = partial(run_draw, source, config=config, trf=trf), list[Result]()
     with ProcessPoolExecutor(min(jobs, len(tasks)), get_context("spawn")) as pool:
         for result in pool.map(run, tasks) if jobs > 1 else map(run, tasks):
             found.append(result)
             print(f"draws: {len(found)} of {len(tasks)}", file=sys.stderr)
     return {n: _summarize(found[k * draws : (k + 1) * draws]) for k, n in enumerate(sizes)}
-
-
-def draw_seed(seed: int, frames: int, index: int) -> int:
-    """The seed of one draw."""
-    return int(np.random.SeedSequence([seed, frames, index]).generate_state(1)[0] >> 1)
 
 
 def run_draw(source: Source, task: tuple[int, int], *, config: Config, trf: bool) -> Result:
@@ -97,7 +85,6 @@ def run_draw(source: Source, task: tuple[int, int], *, config: Config, trf: bool
     except CorrespondenceError:
         return {row: (None, 0.0) for row in METHODS if trf or row not in TRF_TERMS}
     blocks = camera_blocks(draw.rig, draw.kept, config)
-    medians_px: dict[str, dict[str, float]] = {}
     found: Result = {}
     pairs = {f"{a}->{b}" for a, b in pairwise(draw.rig.cameras)}
     for row, T, seconds in run_methods(draw, trf=trf):
@@ -108,14 +95,9 @@ def run_draw(source: Source, task: tuple[int, int], *, config: Config, trf: bool
         kept = {n: e for n, e in errors.pairs.items() if n in pairs}
         metrics = {name: {metric: abs(value) for metric, value in asdict(error).items()}
                    for name, error in {**errors.cameras, **kept}.items()}  # fmt: skip
-        medians_px[row] = {n: float(np.median(b.errors_px(T[n])[0])) for n, b in blocks.items()}
-        for name, median in medians_px[row].items():
-            metrics[name][REPROJECTION] = median
+        for name, block in blocks.items():
+            metrics[name][REPROJECTION] = float(np.median(block.errors_px(T[name])[0]))
         found[row] = metrics, seconds
-    for row, medians in medians_px.items():
-        for name, median in medians.items():
-            before = medians_px.get(STAGE1, {}).get(name, np.nan)
-            (found[row][0] or {})[name][IMPROVEMENT] = before - median
     return found
 
 

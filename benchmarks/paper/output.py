@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
 from benchmarks.paper.draws import HEADLINE, STAGE1, TRF_TERMS
-from benchmarks.paper.experiment import IMPROVEMENT, REPROJECTION, Report, Row
-from benchmarks.tables import Table
+from benchmarks.paper.experiment import REPROJECTION, Report, Row
 
 ROTATION, TRANSLATION = "rotation_error_deg", "translation_error_cm"
 AXES = (TRANSLATION, ROTATION, "x_cm", "y_cm", "z_cm", "roll_deg", "pitch_deg", "yaw_deg")
 _HEADS = {
     TRANSLATION: "E_t [cm]", ROTATION: "E_R [deg]", "x_cm": "x [cm]", "y_cm": "y [cm]",
     "z_cm": "z [cm]", "roll_deg": "roll [deg]", "pitch_deg": "pitch [deg]",
-    "yaw_deg": "yaw [deg]", REPROJECTION: "reproj. [px]", IMPROVEMENT: "better than Stage 1 [px]",
+    "yaw_deg": "yaw [deg]", REPROJECTION: "reproj. [px]",
 }  # fmt: skip
 _NOTES = """\
 Medians over the draws in which the method found extrinsics, in brackets the 5 % and 95 % quantiles.
@@ -62,59 +62,32 @@ def published(data: str, row: str, frames: int, which: int) -> dict[str, float]:
     return found | ({REPROJECTION: known[3][which]} if which < PAIR and known[3] else {})
 
 
-def worst_cameras(frames: int, draws: int, rows: Mapping[str, Row]) -> Table:
-    """The errors of the worst camera of every row: the median and the 95 % quantile."""
-    heads = ("worst camera", "E_R [deg]", "95 %", "E_t [cm]", "95 %", "failed")
-    cells = (
-        (name, *_worst(row, ROTATION, 3), *_worst(row, TRANSLATION, 2), str(row.failed or ""))
-        for name, row in rows.items()
-    )
-    return Table(f"{frames} frames, {draws} draws", heads, tuple(cells))
-
-
-def _worst(row: Row, metric: str, digits: int) -> list[str]:
-    """Median and 95 % quantile of the camera with the largest median error."""
-    found = [metrics[metric] for name, metrics in row.numbers.items() if "->" not in name]
-    if not found:
-        return ["-", "-"]
-    _, median, high = max(found, key=lambda interval: interval[1])
-    return [f"{median:.{digits}f}", f"{high:.{digits}f}"]
-
-
-def markdown(head: str, published_as: str, draws: int, report: Report) -> str:
+def markdown(published_as: str, draws: int, report: Report) -> Iterator[str]:
     """The paper's two tables: errors per camera; between cameras and of reprojection.
 
     Args:
-        head: the first lines.
         published_as: the paper's data set to compare with, or nothing.
         draws: of each number of frames.
         report: its rows.
     """
-    parts = [head, _NOTES]
+    yield _NOTES
     for frames, rows in report.items():
-        parts.append(f"## N = {frames} ({draws} draws)")
+        yield f"## N = {frames} ({draws} draws)"
         names = next((list(row.numbers) for row in rows.values() if row.numbers), [])
         cameras, pairs = ([n for n in names if ("->" in n) == pair] for pair in (False, True))
-
-        def paper(row: str, frames: int = frames) -> list[dict[str, float]]:
-            return [published(published_as, row, frames, which) for which in range(3)]
-
+        table = partial(_table, rows, draws, partial(published, published_as, frames=frames))
         for index, camera in enumerate(cameras):
-            columns = [(camera, m) for m in AXES]
             theirs = [(index, m) for m in (TRANSLATION, ROTATION)]
-            table = _table(rows, {row: paper(row) for row in rows}, columns, theirs, draws)
-            parts += [f"### {camera}", "\n".join(table)]
+            yield f"### {camera}\n\n" + "\n".join(table([(camera, m) for m in AXES], theirs))
         columns = [(pair, m) for pair in pairs for m in (ROTATION, TRANSLATION)]
-        columns += [(camera, m) for camera in cameras for m in (REPROJECTION, IMPROVEMENT)]
+        columns += [(camera, REPROJECTION) for camera in cameras]
         theirs = [(PAIR, ROTATION), (PAIR, TRANSLATION), (0, REPROJECTION), (1, REPROJECTION)]
-        table = _table(rows, {row: paper(row) for row in rows}, columns, theirs, draws)
-        parts += ["### Between cameras, and reprojection", "\n".join(table)]
-    return "\n\n".join(parts) + "\n"
+        yield "### Between cameras, and reprojection\n\n" + "\n".join(table(columns, theirs))
 
 
 def _table(
-    rows: Mapping[str, Row], paper: Mapping[str, Sequence[Mapping[str, float]]],
-    ours: Sequence[tuple[str, str]], theirs: Sequence[tuple[int, str]], draws: int,
+    rows: Mapping[str, Row], draws: int, paper: Callable[..., dict[str, float]],
+    ours: Sequence[tuple[str, str]], theirs: Sequence[tuple[int, str]],
 ) -> Iterator[str]:  # fmt: skip
     where = ("first", "second", "between")
     heads = ["method", *(f"{name}: {_HEADS[m]}" for name, m in ours),
@@ -122,7 +95,7 @@ def _table(
              "failed", "s"]  # fmt: skip
     yield f"| {' | '.join(heads)} |\n|" + "---|" * len(heads)
     for name, row in rows.items():
-        known = (paper[name][c].get(m) if c < len(where) else None for c, m in theirs)
+        known = (paper(row=name, which=c).get(m) for c, m in theirs)
         failed = f"{row.failed} of {draws}" if row.failed else ""
         cells = [f"**{name}**" if name == HEADLINE else name, *(_cell(row, *at) for at in ours),
                  *("" if v is None else _number(v) for v in known), failed,

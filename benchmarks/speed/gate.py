@@ -1,6 +1,5 @@
 """Processor time as ratios against well-known baselines, all of one run; fails if one has grown.
 
-    python -m benchmarks.speed.gate                   print, and write out/ratios.json
     python -m benchmarks.speed.gate --against FILE    fail where one is over 1.25 times that of FILE
     python -m benchmarks.speed.gate --write           keep them as those of this release
 
@@ -12,7 +11,6 @@ GTSAM factor per correspondence, a copy of memory as large as the table.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import inspect
 import json
@@ -34,7 +32,7 @@ from numpy.typing import NDArray
 
 from benchmarks.paper.baselines import minimize_trf, prior_rows
 from benchmarks.speed.incremental import GUESS, frames
-from benchmarks.tables import ROOT, Table
+from benchmarks.tables import ROOT, Table, parser_of
 from calibgraph import (
     Correspondences,
     Dataset,
@@ -110,12 +108,9 @@ class Pair:
 
 def main() -> int:
     """Measure, print, write, compare."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--against", type=Path, help="ratios of a release")
     parser.add_argument("--write", action="store_true", help=f"to {RELEASE.relative_to(ROOT)}")
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "ratios.json")
     options = parser.parse_args()
     if not _ENVIRONMENT.items() <= os.environ.items():
         command = [sys.executable, "-m", __spec__.name, *sys.argv[1:]]
@@ -123,9 +118,8 @@ def main() -> int:
     former = json.loads(options.against.read_text("utf-8")) if options.against else {}
     with tempfile.TemporaryDirectory() as folder:
         found = {pair.name: measure(pair, former) for pair in all_pairs(Path(folder))}
-    for path in (options.out, *([RELEASE] if options.write else [])):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    if options.write:
+        RELEASE.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
     print(compare(found, former).text())
     worse = slower(found, former)
     for name in worse:
