@@ -34,9 +34,7 @@ def main() -> None:
     try:
         source = source_from(options.data)
         draws = options.draws or (3 if source.folders else 50)
-        config = preset(
-            options.preset or ("walkley" if source.name == "walkley" else "kitti")
-        ).changed(seed=options.seed)
+        config = preset(source.preset).changed(seed=options.seed)
         report = run_experiment(
             source, frames=options.frames, draws=draws, config=config, seed=options.seed,
             jobs=options.jobs, trf=not options.no_trf,
