@@ -1,6 +1,6 @@
 """Frames to many trackers at a rate: what is lost, how long it takes, processor time and memory.
 
-    python -m benchmarks.service.tracker_load [--trackers 200] [--hz 10] [--seconds 300]
+    python -m benchmarks.speed.tracker_load [--trackers 200] [--hz 10] [--seconds 300]
 
 Each tracker gets a frame every 1 / hz seconds; a frame counts when it is acknowledged. Before, the
 processor time of a frame, of trackers that send without a pause. Clients and server share cores.
@@ -11,18 +11,22 @@ from __future__ import annotations
 import asyncio
 import json
 import secrets
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
+import psutil
 
-from benchmarks.service.server import Server
 from benchmarks.tables import Table, parser_of, publish
-from calibgraph import Correspondences, MatcherErrors, Rig, perturb, simulate_correspondences
+from calibgraph import MatcherErrors, Rig, perturb, simulate_correspondences
 from calibgraph.arrays import Array
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.yaml_text import yaml_text
@@ -30,8 +34,53 @@ from calibgraph.yaml_text import yaml_text
 _FRAMES = 20
 _MATCHES = 20
 _MOST_AT_ONCE = 10  # frames: a robot that has waited for long drops older ones
+_READY_S = 120.0
+_COLUMNS = ("u_px", "v_px", "x_m", "y_m", "z_m")
 BEFORE = 30  # frames, after which a tracker has started
 CASES = ((1, 1, 100), (1, 10, 200), (20, 1, 50), (20, 10, 100), (200, 1, 10), (200, 10, 50))
+
+
+class Server:
+    """``calibgraph serve`` in a process of its own, on a port of loopback.
+
+    Args:
+        data: its folder.
+        port: number.
+    """
+
+    def __init__(self, data: Path, port: int) -> None:
+        self.url = f"http://127.0.0.1:{port}"
+        words = ["serve", "--data", str(data), "--port", str(port), "--free-gb", "0"]
+        command, path = [sys.executable, "-m", "calibgraph", *words], data.with_suffix(".log")
+        with path.open("ab") as log:
+            self.process = psutil.Popen(command, stdout=log, stderr=subprocess.STDOUT)
+        end = time.monotonic() + _READY_S
+        while time.monotonic() < end:
+            if self.process.poll() is not None:
+                raise RuntimeError(f"the server has ended: {path.read_text('utf-8')}")
+            with suppress(httpx.HTTPError):
+                if httpx.get(f"{self.url}/healthz", timeout=5).status_code == httpx.codes.OK:
+                    return
+            time.sleep(0.05)
+        raise TimeoutError(f"no server at {self.url}: {path.read_text('utf-8')}")
+
+    def stop(self) -> None:
+        """End it as SIGTERM does."""
+        self.process.terminate()
+        self.process.wait(60)
+
+    def memory_mb(self) -> tuple[float, float]:
+        """Resident memory of the server and of the largest worker."""
+        workers = self.process.children(recursive=True)
+        largest = max((one.memory_info().rss for one in workers), default=0)
+        return self.process.memory_info().rss / 1e6, largest / 1e6
+
+    def processor_s(self) -> Array:
+        """Of the workers, of those too that have ended, the server and this process so far."""
+        own = self.process.cpu_times()
+        workers = [one.cpu_times() for one in self.process.children(recursive=True)]
+        of_workers = sum(sum(each[:4]) for each in workers) + sum(own[2:4])
+        return np.array([of_workers, sum(own[:2]), time.process_time()])
 
 
 @dataclass
@@ -53,11 +102,6 @@ class Counts:
     refused: int = 0
     memory_mb: list[tuple[float, float]] = field(default_factory=list)
     last: dict[str, int] = field(default_factory=dict)
-
-
-def track(server: Server, trackers: int, hz: float, seconds: float) -> Table:
-    """Send frames to trackers for some time; a frame that is late does not delay the others."""
-    return asyncio.run(_track(server, trackers, hz, seconds))
 
 
 def measure_costs(server: Server, cases: Sequence[tuple[int, int, int]] = CASES) -> Table:
@@ -87,9 +131,9 @@ async def _measure_cost(
     async with httpx.AsyncClient(base_url=server.url, timeout=120, limits=limits) as http:
         places = [await _begin(http, guess) for _ in range(trackers)]
         await asyncio.gather(*(send(place, 0, BEFORE) for place in places))
-        begun, start = _processor_s(server), time.monotonic()
+        begun, start = server.processor_s(), time.monotonic()
         await asyncio.gather(*(send(place, BEFORE, BEFORE + frames) for place in places))
-        used, wall_s = _processor_s(server) - begun, time.monotonic() - start
+        used, wall_s = server.processor_s() - begun, time.monotonic() - start
         for place in places:
             (await http.delete(place)).raise_for_status()
     each_ms = 1e3 * used / (trackers * frames)
@@ -97,13 +141,8 @@ async def _measure_cost(
     return str(trackers), str(together), rate, *(f"{ms:.2f}" for ms in each_ms)
 
 
-def _processor_s(server: Server) -> Array:
-    """Of the workers, the server and this process so far."""
-    own_s = server.own_processor_s()
-    return np.array([server.processor_s() - own_s, own_s, time.process_time()])
-
-
 async def _track(server: Server, trackers: int, hz: float, seconds: float) -> Table:
+    """Send frames to trackers for some time; a frame that is late does not delay the others."""
     truth = rig_of("kitti")
     guess = perturb(truth, rotation_deg=0.5, translation_m=0.05, seed=1)
     bodies = frame_bodies(truth)
@@ -123,27 +162,17 @@ async def _track(server: Server, trackers: int, hz: float, seconds: float) -> Ta
     return _table(counts, lost, trackers, hz, wall_s)
 
 
-def frame_bodies(truth: Rig) -> list[dict[str, object]]:
+def frame_bodies(truth: Rig) -> list[Any]:
     """``cameras`` of some frames of a rig, as a line of JSON has them."""
     table = simulate_correspondences(
         truth, frames=_FRAMES, matches=_MATCHES, errors=MatcherErrors(noise_px=1.0), seed=1
     )
-    return [_cameras(table, frame) for frame in range(_FRAMES)]
-
-
-def _cameras(table: Correspondences, frame: int) -> dict[str, object]:
-    cameras: dict[str, object] = {}
-    rows = table.to_arrow().to_pylist()
-    for row in rows:
-        if row["frame"] == frame:
-            columns = cameras.setdefault(row["camera"], {n: [] for n in _COLUMNS})
-            assert isinstance(columns, dict)
-            for name in _COLUMNS:
-                columns[name].append(row[name])
-    return cameras
-
-
-_COLUMNS = ("u_px", "v_px", "x_m", "y_m", "z_m")
+    bodies: list[dict[str, dict[str, list[float]]]] = [{} for _ in range(_FRAMES)]
+    for row in table.to_arrow().to_pylist():
+        columns = bodies[row["frame"]].setdefault(row["camera"], {n: [] for n in _COLUMNS})
+        for name in _COLUMNS:
+            columns[name].append(row[name])
+    return bodies
 
 
 async def _begin(http: httpx.AsyncClient, rig: Rig) -> str:
@@ -154,7 +183,7 @@ async def _begin(http: httpx.AsyncClient, rig: Rig) -> str:
 
 
 async def _drive(
-    http: httpx.AsyncClient, place: str, bodies: list[dict[str, object]], start: float,
+    http: httpx.AsyncClient, place: str, bodies: list[Any], start: float,
     hz: float, seconds: float, counts: Counts,
 ) -> None:  # fmt: skip
     """Send what has come up since the last answer, the newest of it if that is much."""
@@ -219,13 +248,13 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         server = Server(Path(temporary) / "data", options.port)
-        server.start()
         try:
             tables = [measure_costs(server)]
-            tables.append(track(server, options.trackers, options.hz, options.seconds))
+            run = _track(server, options.trackers, options.hz, options.seconds)
+            tables.append(asyncio.run(run))
         finally:
             server.stop()
-    publish("service.tracker_load", tables, record=options.record)
+    publish(tables)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What a fleet's model finds, on simulated fleets whose deviations are known.
 
-    python -m benchmarks.fleet.model [--fleets 10] [--vehicles 500]
+    python -m benchmarks.accuracy.fleet [--fleets 10] [--vehicles 500]
 
 Two models of vehicle, ten batches each, six cameras; vehicles scatter by 0.15 degrees and 4 mm per
 axis, batches by a fifth of that. 30 % of the vehicles are poorly observed: their error bars are 10
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,21 +24,8 @@ from calibgraph.audit.observations import observe
 from calibgraph.model.geometry import twists_between
 from tests.draws.fleets import Fleet, errors_of, simulate_fleet
 
-
-@dataclass
-class Sums:
-    """Sums over fleets."""
-
-    squares: dict[str, list[float]] = field(default_factory=dict)
-    counts: Counter[str] = field(default_factory=Counter)
-
-    def add(self, name: str, values: np.ndarray) -> None:
-        """Further values of one kind."""
-        self.squares.setdefault(name, []).extend(values.tolist())
-
-    def mean(self, name: str) -> float:
-        """Of all values of one kind."""
-        return float(np.mean(self.squares[name]))
+Sums = dict[str, list[float]]
+"""Values over fleets, by kind."""
 
 
 def main() -> None:
@@ -48,19 +34,19 @@ def main() -> None:
     parser.add_argument("--fleets", type=int, default=10)
     parser.add_argument("--vehicles", type=int, default=500)
     options = parser.parse_args()
-    sums, begun = Sums(), time.perf_counter()
+    sums, counts, begun = Sums(), Counter[str](), time.perf_counter()
     for seed in range(options.fleets):
         late = {"mileage_deg": 0.15, "step_deg": 0.5} if seed % 2 else {}
         truth = simulate_fleet(np.random.default_rng(seed), options.vehicles, **late)
         model = fit_fleet(observe(truth.rows))
-        measure(truth, model, sums)
-        count_findings(find_changes(model), truth, bool(late), sums.counts)
+        measure(truth, model, sums, counts)
+        count_findings(find_changes(model), truth, bool(late), counts)
     seconds = (time.perf_counter() - begun) / options.fleets
-    tables = [errors_table(sums), detection_table(sums.counts, seconds)]
-    publish("fleet.model", tables, record=options.record)
+    tables = [errors_table(sums), detection_table(counts, seconds)]
+    publish(tables)
 
 
-def measure(truth: Fleet, model: FleetModel, sums: Sums) -> None:
+def measure(truth: Fleet, model: FleetModel, sums: Sums, counts: Counter[str]) -> None:
     """Errors of single and of shrunk estimates, and what stands apart."""
     xi = twists_between(truth.T_camera_lidar, model.T_camera_lidar)
     alone = errors_of(model.observations.T_camera_lidar, truth.T_camera_lidar)
@@ -68,13 +54,11 @@ def measure(truth: Fleet, model: FleetModel, sums: Sums) -> None:
     nees = np.einsum("ni,nij,nj->n", xi, np.linalg.inv(model.covariance), xi) / 6
     for name, chosen in (("poor", truth.poor), ("good", ~truth.poor)):
         for what, values in (("alone", alone**2), ("shrunk", shrunk**2), ("nees", nees)):
-            sums.add(f"{name} {what}", values[chosen])
+            sums.setdefault(f"{name} {what}", []).extend(values[chosen].tolist())
         hit = model.apart & truth.moved & chosen
-        sums.counts.update({f"{name} moved": int((truth.moved & chosen).sum()),
+        counts.update({f"{name} moved": int((truth.moved & chosen).sum()),
                             f"{name} found": int(hit.sum())})  # fmt: skip
-    sums.counts.update(
-        {"false": int((model.apart & ~truth.moved).sum()), "cameras": len(truth.moved)}
-    )
+    counts.update({"false": int((model.apart & ~truth.moved).sum()), "cameras": len(truth.moved)})
 
 
 def count_findings(found: list[Finding], truth: Fleet, late: bool, counts: Counter[str]) -> None:
@@ -97,8 +81,8 @@ def errors_table(sums: Sums) -> Table:
     """Root mean squares and NEES."""
     rows = []
     for label, name in (("poorly observed", "poor"), ("others", "good")):
-        degrees = [np.degrees(np.sqrt(sums.mean(f"{name} {w}"))) for w in ("alone", "shrunk")]
-        nees = sums.mean(f"{name} nees")
+        degrees = [np.degrees(np.sqrt(np.mean(sums[f"{name} {w}"]))) for w in ("alone", "shrunk")]
+        nees = np.mean(sums[f"{name} nees"])
         rows.append((label, *(f"{value:.3f}" for value in degrees), f"{nees:.2f}"))
     head = ("vehicles", "alone [deg]", "with the fleet [deg]", "NEES")
     return Table("Rotation error (root mean square) and normalised squared error", head, (*rows,))
