@@ -24,7 +24,7 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.audit.result import AuditStatus, CameraAudit, LidarAudit
+from calibgraph.audit.result import CameraAudit, LidarAudit
 from calibgraph.audit.significance import (
     CONFIDENCE,
     DISPLAY,
@@ -143,7 +143,7 @@ def judge_deviation(
     tolerance: Tolerance,
     *,
     least: Array | float = 0.0,
-) -> tuple[AuditStatus, str]:
+) -> tuple[str, str]:
     """The status of a trusted measurement, and its reason.
 
     Args:

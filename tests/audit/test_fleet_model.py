@@ -10,9 +10,8 @@ import pyarrow as pa
 import pytest
 
 from calibgraph.audit.findings import Finding, find_changes, moved_lidars
-from calibgraph.audit.fleet_model import FleetModel, fit_fleet
+from calibgraph.audit.fleet_model import FleetModel, Mount, fit_fleet, solve_centers
 from calibgraph.audit.model import weighted_mean
-from calibgraph.audit.mounts import Centers, solve_centers
 from calibgraph.audit.observations import newest_rows, observe
 from calibgraph.model.geometry import retract_all, to_T_lidar_camera, twists_between
 from tests.draws.fleets import CAMERAS, SPREAD, Fleet, errors_of, simulate_fleet
@@ -63,7 +62,7 @@ def test_moved_cameras_stand_apart_and_others_do_not(fitted: Fitted) -> None:
 
 def test_the_spread_of_vehicles_is_learnt(fitted: Fitted) -> None:
     """Of about 230 vehicles a standard deviation is known to 1 / sqrt(2 * 230), 4.7 %."""
-    mounts = [mount for model in fitted.model.models.values() for mount in model.mounts.values()]
+    mounts = [mount for each in fitted.model.mounts.values() for mount in each.values()]
     spreads = [mount.spread for mount in mounts if mount.camera not in ("rear", "right")]
     ratios = np.sqrt(np.array([np.diag(spread) for spread in spreads])) / SPREAD
     assert np.abs(ratios - 1).max() < 3.5 * 0.047
@@ -88,7 +87,7 @@ def test_a_camera_without_a_result_has_its_batchs_pose_with_the_spread_of_vehicl
 def test_few_vehicles_of_a_model_stay_as_they_are() -> None:
     rows = simulate_fleet(np.random.default_rng(0), 4).rows
     model = fit_fleet(observe(rows))
-    assert model.models == {}
+    assert model.mounts == {}
     assert np.array_equal(model.T_camera_lidar, model.observations.T_camera_lidar)
     assert np.isnan(model.deviation).all()
 
@@ -101,13 +100,14 @@ def test_sums_over_vehicles_are_the_graph_with_a_variable_per_vehicle() -> None:
     small = rng.normal(size=(8, 6)) * np.sqrt(np.diag(spread)) * 1e-3  # to first order
     T = retract_all(np.repeat(nominal[None], 8, axis=0), small)
     between = np.repeat(0.3 * spread[None], 2, axis=0)
-    start = Centers(nominal, spread, np.repeat(nominal[None], 2, axis=0), between)
+    seen, both = observe(simulate_fleet(rng, 1).rows), np.repeat(nominal[None], 2, axis=0)
+    start = Mount("", "", ("a", "b"), batch, seen, nominal, spread, both, between, spread)
 
     information, y = np.linalg.inv(noise + spread), twists_between(T, nominal)
     means, bars = zip(
         *(weighted_mean(y[batch == b], information[batch == b]) for b in (0, 1)), strict=True
     )
-    T_measured = retract_all(start.batches, -np.array(means))
+    T_measured = retract_all(both, -np.array(means))
     measured = np.arange(2), T_measured, np.array(bars)
     found = solve_centers(start, measured, between)
 
@@ -125,7 +125,7 @@ def test_sums_over_vehicles_are_the_graph_with_a_variable_per_vehicle() -> None:
     stock = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     marginals = gtsam.Marginals(graph, stock)
     for key, pose, bar in zip(
-        range(3), [found.nominal, *found.batches],
+        range(3), [found.nominal, *found.T_batch],
         [found.nominal_covariance, *found.batch_covariance], strict=True,
     ):  # fmt: skip
         assert np.allclose(to_T_lidar_camera(pose).matrix(), stock.atPose3(key).matrix(), atol=1e-9)

@@ -6,10 +6,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from calibgraph.audit.fleet_model import fit_fleet
 from calibgraph.audit.observations import observe
 from calibgraph.errors import CalibrationError
-from calibgraph.fleet.page import STATES, FleetReport, assess_status, payload
+from calibgraph.fleet.page import STATES, payload, report_of
 from calibgraph.fleet.rows import SCHEMA
 
 
@@ -34,11 +33,10 @@ def test_rows_without_a_result_measure_nothing() -> None:
     assert of.measured.tolist() == [True, False, False]
     assert np.isnan(of.day).all()
     assert of.covariates == {}
-    report = FleetReport(fit_fleet(of), [], [])
-    standing = assess_status(rows, report)
-    assert [STATES[s] for s in standing.state] == ["PASS", "WARN", "NO RESULT"]
-    assert standing.reasons == ["", "no error bar; few frames", "no images"]
-    assert payload(report, standing)["vehicles"] == ["a", "b"]
+    report = report_of(rows)
+    assert [STATES[s] for s in report.state] == ["PASS", "WARN", "NO RESULT"]
+    assert report.reasons == ["", "no error bar; few frames", "no images"]
+    assert payload(report)["vehicles"] == ["a", "b"]
 
 
 def test_columns_of_the_manifest_are_understood() -> None:
