@@ -36,7 +36,7 @@ from calibgraph.audit.significance import (
     tail_of_axis,
 )
 from calibgraph.model.error_components import UNKNOWN, error_components
-from calibgraph.model.error_sources import MOST_TIMES, ErrorSources
+from calibgraph.model.error_sources import MOST_TIMES
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
 from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
 from calibgraph.tracking.cause import Steps, find_cause
@@ -75,11 +75,16 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
         return CameraAudit("CANNOT TELL", doubt or _NO_ERROR_BAR, deviation, z_score=z_score)
     if has_too_few_frames(evidence, name):
         return CameraAudit("CANNOT TELL", _TOO_FEW_FRAMES, deviation, z_score=z_score)
-    if not evidence.findings.states_common_error:
-        covariance = covariance + _unstated_error()
+    if not evidence.findings.states_common_error:  # the prior, for a matcher that states none
+        prior = error_components().matchers[UNKNOWN]
+        rad, metres = prior.systematic_rotation_rad, prior.systematic_translation_m
+        covariance = covariance + np.diag(pose_sigmas(rotation_rad=rad, translation_m=metres) ** 2)
     sigma = np.sqrt(np.diag(covariance))
     quantiles = _quantiles(evidence, name, covariance)
-    least = _least_share(evidence.error_sources.get(name))
+    least, sources = np.zeros(6), evidence.error_sources.get(name)
+    if sources is not None:
+        now = np.array([sources.rotation_deg, sources.translation_cm])
+        least = np.repeat(sources.forecast[MOST_TIMES] / now, 3)
     status, reason = judge_deviation(deviation, covariance, quantiles, tolerance, least=least)
     if status == "WRONG" and name in evidence.posteriors:
         posterior = evidence.posteriors[name]
@@ -93,23 +98,6 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
         reason += SINGLE_CAMERA
     smallest = detectable(sigma, quantiles.confident)
     return CameraAudit(status, reason, deviation, sigma, smallest, z_score)
-
-
-def _least_share(sources: ErrorSources | None) -> Array | float:
-    """(6,) share of an error bar that remains with any number of frames; 0 if unknown."""
-    if sources is None:
-        return 0.0
-    now = np.array([sources.rotation_deg, sources.translation_cm])
-    return np.repeat(sources.forecast[MOST_TIMES] / now, 3)
-
-
-def _unstated_error() -> Array:
-    """(6, 6) prior of the error that all frames share, for a matcher that states none."""
-    prior = error_components().matchers[UNKNOWN]
-    sigmas = pose_sigmas(
-        rotation_rad=prior.systematic_rotation_rad, translation_m=prior.systematic_translation_m
-    )
-    return np.asarray(np.diag(sigmas**2))
 
 
 def has_too_few_frames(evidence: Evidence, name: str) -> bool:

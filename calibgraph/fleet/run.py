@@ -18,7 +18,8 @@ from calibgraph.errors import CalibrationError, FileError, needs_extra
 from calibgraph.fleet.job import end_children, interrupt_jobs, run_job
 from calibgraph.fleet.manifest import Job, Key, load_manifest
 from calibgraph.fleet.rows import ROWS, SCHEMA, Store, read_rows
-from calibgraph.fleet.task import Limits, Outcome, Task, release, versions_text
+from calibgraph.fleet.task import Limits, Outcome, Task, release
+from calibgraph.model.versions import package_versions
 from calibgraph.parallel import count_cores
 from calibgraph.progress import Progress, no_progress
 
@@ -154,7 +155,7 @@ def _rows_of(job: Job, outcome: Outcome, input_hash: str) -> list[dict[str, Any]
     """A row per camera, or one of the failure."""
     common = dict.fromkeys(_STATE) | {
         "vehicle": job.vehicle, "recording": job.recording, "seconds": outcome.seconds,
-        "input_hash": input_hash, "versions": versions_text(),
+        "input_hash": input_hash, "versions": json.dumps(package_versions()),
     }  # fmt: skip
     if outcome.error_kind is None:
         return [{**common, "status": "done", **cells} for cells in outcome.cameras]
