@@ -76,10 +76,7 @@ def drift(
     cameras = [*loaded[0].rig.cameras]
     limits = Limits(FALSE_ALARM_RATE / (2 * 6 * len(cameras) * (count + 1)), tolerance.twist)
     found = {name: _deviations(loaded, name, limits) for name in cameras}
-    judged = {
-        name: _judge(opened, name, each, limits=limits, tolerance=tolerance)
-        for name, each in found.items()
-    }
+    judged = {name: _judge(opened, name, each, limits) for name, each in found.items()}
     compared = {name: each for name, each in found.items() if each is not None}
     unit = "result" if days is None else "day"
     trends = {name: _trend(each, at, unit, limits) for name, each in compared.items()}
@@ -125,12 +122,7 @@ def _deviations(results: Sequence[Calibration], name: str, limits: Limits) -> De
 
 
 def _judge(
-    results: Mapping[str, Calibration],
-    camera: str,
-    found: Deviations | None,
-    *,
-    limits: Limits,
-    tolerance: Tolerance,
+    results: Mapping[str, Calibration], camera: str, found: Deviations | None, limits: Limits
 ) -> tuple[CameraAudit, ...]:
     """The status of one camera in every result."""
     names = [*results]
@@ -142,7 +134,9 @@ def _judge(
     for row, place in enumerate(found.poses.results):
         deviation, sigma, freedom = found.deviation[row], found.sigma[row], found.freedom[row]
         quantiles = Quantiles.from_freedom(freedom, limits.tail)
-        status, reason = judge_deviation(deviation, found.covariance[row], quantiles, tolerance)
+        status, reason = judge_deviation(
+            deviation, found.covariance[row], quantiles, limits.tolerance
+        )
         axes: tuple[int, ...] = ()
         if status == "WRONG":
             status = "CHANGED"
@@ -233,12 +227,8 @@ def _trend(found: Deviations, at: Array, unit: str, limits: Limits) -> Trend | N
     beyond = bool(limits.exceeded(whole, sigma, freedom).any())
     changed = beyond and bool(by_slope < by_changes)
     clear = np.abs(whole) > limits.sigmas(freedom) * sigma
-    reason = "no significant trend"
-    if clear.any():
-        motion = describe_motion(whole, sigma, clear, CAMERA_AXES)
-        reason = f"{motion} from the first to the last result"
-        if not beyond:
-            reason += ", within the tolerance"
-        elif not changed:
-            reason += "; changes of single results explain it better"
+    why = "; changes of single results explain it better" if beyond else ", within the tolerance"
+    reason = describe_motion(whole, sigma, clear, CAMERA_AXES)
+    reason += f" from the first to the last result{'' if changed else why}"
+    reason = reason if clear.any() else "no significant trend"
     return Trend(changed, reason, change, sigma / span, unit, span)

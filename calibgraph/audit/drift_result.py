@@ -8,14 +8,7 @@ from typing import Any, TypeAlias
 
 from calibgraph.arrays import Array
 from calibgraph.audit.judgement import CAMERA_AXES
-from calibgraph.audit.result import (
-    ORDER,
-    CameraAudit,
-    LidarAudit,
-    by_unit,
-    freeze,
-    lidar_summary,
-)
+from calibgraph.audit.result import ORDER, CameraAudit, LidarAudit, by_unit, lidar_summary
 from calibgraph.errors import CalibrationError
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.model.calibration import Calibration
@@ -43,9 +36,6 @@ class Trend:
     sigma: Array
     unit: str
     span: float
-
-    def __post_init__(self) -> None:
-        freeze(self.slope, self.sigma)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,21 +1,13 @@
 """From a measured rig and its covariance to OK, WRONG or CANNOT TELL, per camera.
 
-Statements about the turn and the shift of a camera, and about their axes with deviation d and
-standard deviation sigma:
+An axis with deviation d and standard deviation sigma is significant if |d| > q sigma; of 1000 rigs
+without any deviation one has such an axis. Quantiles are of Student's t: sigma is itself estimated,
+from the scatter of few frames; its stated part, of the error that all frames share, is known.
 
-* an axis is significant: |d| > q sigma, with q such that one of 1000 rigs without any deviation has
-  a significant axis;
-* a turn or a shift is beyond the tolerance: the length of its significant axes exceeds it;
-* it is certainly within: its length exceeds the tolerance with a probability of at most 5 %, given
-  d and the covariance.
-* these data would show a change as large as the tolerance: the smallest detectable one is below it
-  on every axis.
-
-Quantiles are of Student's t: sigma is itself estimated, from the scatter of few frames. The stated
-part of it, for the error that all frames share, is taken as known.
-
-WRONG: a turn or shift is beyond the tolerance. OK: both are certainly within, and the smallest
-detectable changes are below the tolerance. Else the data cannot tell.
+* WRONG: the length of the significant axes of a turn or a shift exceeds the tolerance.
+* OK: each exceeds it with a probability of at most 5 %, given d and the covariance, and a change as
+  large as the tolerance would be detected on every axis.
+* CANNOT TELL: neither.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -81,16 +73,16 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
         covariance = covariance + np.diag(pose_sigmas(rotation_rad=rad, translation_m=metres) ** 2)
     sigma = np.sqrt(np.diag(covariance))
     quantiles = _quantiles(evidence, name, covariance)
-    least, sources = np.zeros(6), evidence.error_sources.get(name)
+    most, least, sources = tolerance.twist, np.zeros(6), evidence.error_sources.get(name)
     if sources is not None:
         now = np.array([sources.rotation_deg, sources.translation_cm])
         least = np.repeat(sources.forecast[MOST_TIMES] / now, 3)
-    status, reason = judge_deviation(deviation, covariance, quantiles, tolerance, least=least)
+    status, reason = judge_deviation(deviation, covariance, quantiles, most, least=least)
     if status == "WRONG" and name in evidence.posteriors:
         posterior = evidence.posteriors[name]
         widest = posterior.widest(covariance)
         allowed = posterior.log_ratio < quantiles.significant.max() ** 2
-        if allowed or judge_deviation(deviation, widest, quantiles, tolerance)[0] != "WRONG":
+        if allowed or judge_deviation(deviation, widest, quantiles, most)[0] != "WRONG":
             status, reason = "CANNOT TELL", f"{_IMAGES_ALLOW}; {reason}"
     if doubt:
         status, reason = "CANNOT TELL", doubt
@@ -108,7 +100,6 @@ def has_too_few_frames(evidence: Evidence, name: str) -> bool:
 
 
 def _quantiles(evidence: Evidence, name: str, covariance: Array) -> Quantiles:
-    """Quantiles of a camera's error bar: Student's t for the scatter, normal for stated errors."""
     tail = tail_of_axis(len(evidence.cameras))
     known = Quantiles.from_freedom(np.inf, tail)
     block, scatter = evidence.solution.inliers.blocks.get(name), evidence.scatter_of(name)
@@ -128,7 +119,7 @@ def judge_deviation(
     deviation: Array,
     covariance: Array,
     quantiles: Quantiles,
-    tolerance: Tolerance,
+    tolerance: Array,
     *,
     least: Array | float = 0.0,
 ) -> tuple[str, str]:
@@ -138,15 +129,15 @@ def judge_deviation(
         deviation: (6,) of all axes.
         covariance: (6, 6) of it.
         quantiles: of its standard deviations.
-        tolerance: of the turn and of the shift.
+        tolerance: (2,) of the turn [rad] and of the shift [m].
         least: (6,) share of sigma that remains however many frames are recorded.
     """
     sigma, size = np.sqrt(np.diag(covariance)), np.abs(deviation)
     significant = size > quantiles.significant * sigma
-    wrong = axes_beyond(deviation, significant, tolerance.twist)
+    wrong = axes_beyond(deviation, significant, tolerance)
     if wrong.any():
         return "WRONG", describe_motion(deviation, sigma, wrong, CAMERA_AXES)
-    needed, most = detectable(sigma, quantiles.confident), np.repeat(tolerance.twist, 3)
+    needed, most = detectable(sigma, quantiles.confident), np.repeat(tolerance, 3)
     blind = needed > most
     unsure = blind | _may_be_beyond(deviation, covariance, quantiles, tolerance)
     if unsure.any():
@@ -161,14 +152,14 @@ def judge_deviation(
 
 
 def _may_be_beyond(
-    deviation: Array, covariance: Array, quantiles: Quantiles, tolerance: Tolerance
+    deviation: Array, covariance: Array, quantiles: Quantiles, tolerance: Array
 ) -> Mask:
     """(6,) the largest axes of a turn or shift that is not certainly within the tolerance."""
     wider = quantiles.confident / ndtri(CONFIDENCE)  # as few frames have it
     covariance = covariance * np.outer(wider, wider)
     reach = np.abs(deviation) + quantiles.confident * np.sqrt(np.diag(covariance))
     unsure = np.zeros(6, np.bool_)
-    for part, most in zip((slice(0, 3), slice(3, 6)), tolerance.twist, strict=True):
+    for part, most in zip((slice(0, 3), slice(3, 6)), tolerance, strict=True):
         beyond = probability_outside(deviation[part], covariance[part, part], most)
         if beyond > 1 - CONFIDENCE:
             unsure[part] = reach[part] > 0.5 * reach[part].max()
@@ -192,14 +183,14 @@ def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> Lidar
 
     None where no camera is WRONG, or with a single camera, which cannot be told from the LiDAR.
     """
-    wrong = [place for place, each in enumerate(cameras.values()) if each.status == "WRONG"]
     if evidence.joint_covariance is None:
         return None
-    deviation = np.concatenate([_deviation(evidence, name) for name in cameras])
-    T_camera_lidar = [evidence.guess.T_camera_lidar[name] for name in cameras]
-    quantile = float(ndtri(1 - tail_of_axis(len(cameras))))
     return find_lidar_motion(
-        deviation, evidence.joint_covariance, T_camera_lidar, moved=wrong, quantile=quantile
+        np.concatenate([_deviation(evidence, name) for name in cameras]),
+        evidence.joint_covariance,
+        [evidence.guess.T_camera_lidar[name] for name in cameras],
+        moved=[k for k, each in enumerate(cameras.values()) if each.status == "WRONG"],
+        quantile=float(ndtri(1 - tail_of_axis(len(cameras)))),
     )
 
 
@@ -248,8 +239,7 @@ def describe_motion(motion: Array, sigma: Array, which: Mask, axes: tuple[str, .
         axes: (6) their names.
     """
     values, errors = motion * DISPLAY, sigma * DISPLAY
-    verbs = ["turned about"] * 3 + ["moved along"] * 3
-    units = ["deg"] * 3 + ["cm"] * 3
+    verbs, units = np.repeat([["turned about", "moved along"], ["deg", "cm"]], 3, axis=1)
     return ", ".join(
         f"{verbs[k]} {axes[k]} by {values[k]:+.2f} {units[k]} (sigma {errors[k]:.2f})"
         for k in np.flatnonzero(which)

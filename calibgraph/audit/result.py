@@ -42,9 +42,6 @@ class CameraAudit:
     z_score: float | None = None
     axes: tuple[int, ...] = ()
 
-    def __post_init__(self) -> None:
-        freeze(self.deviation, self.sigma, self.detectable)
-
     def summary(self, **own: object) -> dict[str, Any]:
         """As plain values, with those of a kind of comparison."""
         return {
@@ -71,9 +68,6 @@ class LidarAudit:
     reason: str
     motion: Array
     sigma: Array
-
-    def __post_init__(self) -> None:
-        freeze(self.motion, self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,13 +137,6 @@ class Audit:
             f"This result was {self.deployed_verdict} when it was made, and its report says why. A "
             "lens and an extrinsic that are wrong together would look right here."
         )
-
-
-def freeze(*arrays: Array | None) -> None:
-    """Make arrays read-only."""
-    for array in arrays:
-        if array is not None:
-            array.setflags(write=False)
 
 
 def audit_summary(audit: Audit) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What the fleet's model learns from 500 vehicles whose deviations are known, and finds there."""
+"""What the fleet's model learns from vehicles whose deviations are known, from rows of any run."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ import pytest
 
 from calibgraph.audit.findings import Finding, find_changes, moved_lidars
 from calibgraph.audit.fleet_model import FleetModel, Mount, fit_fleet, solve_centers
-from calibgraph.audit.model import weighted_mean
+from calibgraph.audit.model import Limits, compare, poses_of, weigh, weighted_mean
 from calibgraph.audit.observations import newest_rows, observe
+from calibgraph.errors import CalibrationError
+from calibgraph.fleet.page import STATES, payload, report_of
+from calibgraph.fleet.rows import SCHEMA
 from calibgraph.model.geometry import retract_all, to_T_lidar_camera, twists_between
 from tests.draws.fleets import CAMERAS, SPREAD, Fleet, errors_of, simulate_fleet
 
@@ -216,3 +219,88 @@ def test_findings_of_quiet_fleets_are_as_rare_as_promised() -> None:
         truth = simulate_fleet(np.random.default_rng(seed), 200, change_deg=0.0)
         wrong += bool(find_changes(fit_fleet(observe(truth.rows))))
     assert wrong <= 3
+
+
+BAR = np.array([np.radians(0.05)] * 3 + [0.005] * 3)
+
+
+@pytest.mark.parametrize("moved", range(5))
+def test_a_spread_of_zero_finds_the_result_that_drift_finds(moved: int) -> None:
+    """By the posterior of the cases and by the test: the same one, the same centre, for one."""
+    rng = np.random.default_rng(moved)
+    y = rng.normal(size=(5, 6)) * BAR
+    y[moved, moved] += 12 * BAR[moved]
+    noise = np.tile(np.diag(BAR**2), (5, 1, 1))
+    T = retract_all(np.tile(np.eye(4), (5, 1, 1)), -y)
+    poses = poses_of([*range(5)], T, noise, np.full(5, 1e6))
+    found = compare(poses, Limits(1e-4, np.full(2, 1e-9)))
+    center, _ = weighted_mean(poses.twist[found.agreeing], poses.information[found.agreeing])
+    spread = np.array([np.zeros((6, 6)), 1e4 * np.diag(BAR**2)])
+    posterior = weigh(poses.twist - center, noise, spread, 0.02)
+    assert (posterior.share[0] > 0.5).tolist() == found.agreeing.tolist()
+    assert np.flatnonzero(~found.agreeing).tolist() == [moved]
+    same, covariance = weighted_mean(poses.twist, posterior.information)
+    np.testing.assert_allclose(same, center, atol=0.01 * BAR.min())
+    expected = noise[0] + noise[0] / 4  # of the moved one: its own, and that of four others
+    np.testing.assert_allclose(found.covariance[moved], expected, rtol=1e-9)
+    np.testing.assert_allclose(covariance, noise[0] / 4, rtol=1e-3, atol=1e-12)
+
+
+def rows_of(**columns: list[object]) -> pa.Table:
+    """Three rows as `fleet` writes them: a result, one without an error bar, a failed vehicle."""
+    given: dict[str, list[object]] = {
+        "vehicle": ["a", "a", "b"], "camera": ["front", "rear", ""],
+        "status": ["done", "done", "failed"], "verdict": ["PASS", "WARN", None],
+        "reasons": [[], ["few frames"], None], "error": [None, None, "no images"],
+        "T_camera_lidar": [np.eye(4).ravel().tolist()] * 2 + [None],
+        "covariance": [np.eye(6).ravel().tolist(), None, None],
+        **columns,
+    }  # fmt: skip
+    fields = [field for field in SCHEMA if field.name in given]
+    arrays = {field.name: pa.array(given.pop(field.name), field.type) for field in fields}
+    return pa.table({**arrays, **{name: pa.array(values) for name, values in given.items()}})
+
+
+def test_rows_without_a_result_measure_nothing() -> None:
+    rows = rows_of()
+    of = observe(rows)
+    assert of.measured.tolist() == [True, False, False]
+    assert np.isnan(of.day).all()
+    assert of.covariates == {}
+    report = report_of(rows)
+    assert [STATES[s] for s in report.state] == ["PASS", "WARN", "NO RESULT"]
+    assert report.reasons == ["", "no error bar; few frames", "no images"]
+    assert payload(report)["vehicles"] == ["a", "b"]
+
+
+def test_columns_of_the_manifest_are_understood() -> None:
+    of = observe(
+        rows_of(
+            model=[2024, 2024, None], date=["2026-03-01", "2026-03-02T12:00:00", None],
+            mileage_km=[10, None, 30], seconds=[1.0, 2.0, 3.0],
+            probability_off=[0.1, 0.2, None],
+        )
+    )  # fmt: skip
+    assert of.model.tolist() == ["2024", "2024", ""]
+    assert of.day[1] - of.day[0] == 1.5
+    assert [*of.covariates] == ["mileage_km"]
+    assert np.isnan(of.covariates["mileage_km"]).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (pa.table({"vehicle": ["a"]}), "has no column 'camera', found vehicle; give the folder"),
+        (rows_of(date=["yesterday", "", ""]), "column 'date' holds what is no date"),
+    ],
+)
+def test_wrong_tables_are_one_line(rows: pa.Table, message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        observe(rows)
+
+
+def test_mounts_are_not_mixed_with_alignments() -> None:
+    """Rows without the column are alignments; a failed row is neither."""
+    assert observe(rows_of(of=["mount", "mount", None])).measured.any()
+    with pytest.raises(CalibrationError, match="vehicle 'a' are of mounts, those of 'a' of align"):
+        observe(rows_of(of=["mount", None, None]))
