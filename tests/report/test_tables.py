@@ -14,7 +14,7 @@ from rich.table import Table
 
 import calibgraph
 from calibgraph import Rig, simulate_correspondences
-from calibgraph.audit import Audit, CameraAudit, CameraDrift, Drift, Trend
+from calibgraph.audit import Audit, CameraAudit, Drift, Trend
 from calibgraph.audit import tables as audit_tables
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.lens_estimate import LensEstimate
@@ -77,7 +77,7 @@ def audit(extreme: Calibration) -> Audit:
 
 def drift() -> Drift:
     """Of two results with long names."""
-    one = CameraDrift("CANNOT TELL", "a reason", TWIST.copy(), -TWIST, -TWIST)
+    one = CameraAudit("CANNOT TELL", "a reason", TWIST.copy(), -TWIST, -TWIST)
     trend = Trend(True, "a reason", TWIST.copy(), -TWIST, "result", 1.0)
     results = ("recordings/2026-03-01_monday_morning", "recordings/2026-03-02_tuesday")
     return Drift(results, np.arange(2.0), dict.fromkeys(NAMES, (one, one)),
