@@ -22,7 +22,6 @@ def track(
     every: Annotated[int, typer.Option(min=1)] = 1,
     follow: bool = False,
     matcher: str | None = None,
-    estimate: str | None = None,
     interval_s: float | None = None,
     motion: options.MotionOption = None,
     config: Path | None = None,
@@ -51,20 +50,18 @@ def track(
         every: Take every N-th frame only.
         follow: Wait for new files in the folder, until stopped.
         matcher (NAME): Match the frames of a dataset: structure or cmrnext.
-        estimate (offset): Follow the time offset of each camera: how long after its points an image
-            is taken. The motion of the LiDAR must be known.
         interval_s (SECONDS): Time between neighbouring clouds of a folder, with --matcher: the
-            motion of the LiDAR is found by their registration. For --estimate offset. (default:
-            unknown)
+            motion of the LiDAR is found by their registration. For cameras whose rig states a
+            time offset or read-out. (default: unknown)
     """
     from calibgraph.cli.tables import print_result
     from calibgraph.io.rigs import load_rig
     from calibgraph.tracking.command import Tracking, track
-    from calibgraph.tracking.offsets import require_offset_alone
+    from calibgraph.tracking.state import require_poses_alone
 
     with checked_arguments():
-        settings = config_from(config, preset, seed=seed, estimate=estimate)
-        require_offset_alone(settings)
+        settings = config_from(config, preset, seed=seed)
+        require_poses_alone(settings)
         if not matcher:
             _require_matcher_for(interval_s=interval_s, motion=motion)
         chosen = _tracking_matcher(matcher, weights, source, seed=settings.seed, device=device)

@@ -58,7 +58,7 @@ def load_calibration(path: Path | str) -> Calibration:
     found = Calibration(
         rig=checked_model(Rig, parts.rig, path),
         initial_rig=checked_model(Rig, parts.initial_rig, path),
-        config=checked_model(Config, parts.config, path),
+        config=checked_model(Config, _without_former(parts.config), path),
         camera_verdicts={
             k: Verdict(v.checks, v.error_probability) for k, v in parts.camera_verdicts.items()
         },
@@ -307,6 +307,13 @@ def error_bars(path: Path) -> dict[str, Array | None] | None:
         name: covariance if found.error_bar_holds.get(name) else None
         for name, covariance in found.covariance.items()
     }
+
+
+def _without_former(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings without those that only earlier versions had."""
+    tracking = dict(settings.get("tracking", {}))
+    tracking.pop("walk_time_offset_s", None)
+    return {**settings, "tracking": tracking}
 
 
 def _require_whole(content: Mapping[str, Any], path: Path) -> None:

@@ -37,8 +37,6 @@ class Tracking(StrictNumbers):
             makes from one frame to the next. The model of a camera is constant until the residuals
             favour a walk: this one, a fifth of it, or five times it.
         walk_translation_m: the same of its position.
-        walk_time_offset_s: standard deviation of the random walk of a time offset, if that is
-            estimated, from one frame to the next: 1e-4 is 19 ms in an hour at 10 Hz; 0 is none.
         step_frames: frames that must agree on a new extrinsic before a step is reported.
         blind_frames: frames without usable matches before a camera is reported as blind.
     """
@@ -50,7 +48,6 @@ class Tracking(StrictNumbers):
     live_epochs: Annotated[int, Field(ge=1, le=100)] = 8
     walk_rotation_deg: Annotated[float, Field(gt=0, le=10)] = 1e-3
     walk_translation_m: Annotated[float, Field(gt=0, le=1)] = 5e-5
-    walk_time_offset_s: Annotated[float, Field(ge=0, le=1)] = 1e-4
     step_frames: Annotated[int, Field(ge=2, le=1000)] = 3
     blind_frames: Annotated[int, Field(ge=2, le=100_000)] = 20
 

@@ -46,16 +46,15 @@ class EpochSummary:
     ungated: Sums
 
     @staticmethod
-    def empty(width: int = 6) -> EpochSummary:
+    def empty() -> EpochSummary:
         """Over no epochs."""
         w = len(STRENGTHS)
-        walks, halves = Sums.zeros(w, width=width), Sums.zeros(2, width=width)
-        return EpochSummary(walks, np.zeros(w), 0, halves, 0, Sums.zeros())
+        return EpochSummary(Sums.zeros(w), np.zeros(w), 0, Sums.zeros(2), 0, Sums.zeros())
 
     def shift_reference(self, step: Array) -> EpochSummary:
         """The sums about a reference that is moved by a tangent step."""
         walks, halves = (sums.shift_reference(step) for sums in (self.walks, self.halves))
-        ungated = self.ungated.shift_reference(step[: self.ungated.width])
+        ungated = self.ungated.shift_reference(step)
         return changed(self, walks=walks, halves=halves, ungated=ungated)
 
     def add(self, epoch: Sums, ungated: Sums) -> EpochSummary:
@@ -72,21 +71,21 @@ class EpochSummary:
         """The sums after the random walk of an epoch.
 
         Args:
-            variance: (w, d) of the walks over the epoch.
+            variance: (w, 6) of the walks over the epoch.
             overconfidence: of the Hessian, see ``calibgraph.tracking.sums``.
         """
         walks, kept = self.walks.after_walk(variance, overconfidence)
         by = kept[self.walk]
         return changed(self, walks=walks, halves=self.halves * by, ungated=self.ungated * by)
 
-    def update_evidence(self, walks: Sums, epoch: Sums, noise: Array) -> EpochSummary:
+    def update_evidence(self, epoch: Sums, noise: Array) -> EpochSummary:
         """The summary with the walks' evidence updated by how well each predicts an epoch.
 
         Args:
-            walks: (w,) the sums of the pose.
-            epoch: its sums, of the pose.
+            epoch: its sums.
             noise: (6, 6) covariance of such a gradient at the true extrinsic.
         """
+        walks = self.walks
         if not (walks.frames >= _LEAST_FRAMES).all():
             return self
         steps = np.linalg.solve(walks.hessian, -walks.gradient[..., None])[..., 0]

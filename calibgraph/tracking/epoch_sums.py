@@ -15,17 +15,12 @@ from calibgraph.tracking.sums import Sums
 
 
 def sum_epochs(state: State, before: int | None = None) -> Sums:
-    """(n,) over all frames, or those before a frame's number, of the poses alone."""
-    return state.of_poses(sum_all_epochs(state, before))
-
-
-def sum_all_epochs(state: State, before: int | None = None) -> Sums:
-    """The same with the time offsets, where they are estimated."""
+    """(n,) over all frames, or those before a frame's number."""
     return sum_closed_epochs(state, before) + _until(state.epochs[-1], before)
 
 
 def sums_before_epochs(state: State) -> Iterator[Sums]:
-    """(n,) over the frames before each live epoch, with the time offsets that are estimated."""
+    """(n,) over the frames before each live epoch."""
     sums = Sums.stack([one.summary.selected for one in state.cameras])
     for epoch in state.epochs:
         yield sums
@@ -58,7 +53,7 @@ def in_its_half(state: State, epoch: Epoch, age: int) -> Sums:
 def estimates_of_halves(state: State, halves: Sums) -> dict[int, tuple[Array, Array]]:
     """Two (4, 4) T_camera_lidar of each camera where both are determined."""
     known = np.flatnonzero(halves.are_determined.all(axis=1))
-    sums, found = halves[known].pose, {}
+    sums, found = halves[known], {}
     steps = np.linalg.solve(sums.hessian, -sums.gradient[..., None])[..., 0]
     for camera, (first, second) in zip(known.tolist(), steps, strict=True):
         poses = map(state.references[camera].retract, (first, second))
@@ -70,7 +65,7 @@ def estimates_of_halves(state: State, halves: Sums) -> dict[int, tuple[Array, Ar
 def _after_epoch(state: State, sums: Sums, epoch: Epoch) -> Sums:
     """The sums after the random walk of an epoch."""
     walks = [one.summary.walk for one in state.cameras]
-    if not any(walks) and state.offsets is None:
+    if not any(walks):
         return sums
     variance = state.walk_variance(STRENGTHS[walks], len(epoch.frames))
     return sums.after_walk(variance, state.all_overconfidence)[0]
