@@ -18,7 +18,6 @@ from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.contradictions import contradicting, pairs_without
-from calibgraph.tracking.epoch_sums import estimates_of_halves, in_its_half
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.shown_frames import groups_by_frames
@@ -78,7 +77,6 @@ def assess(state: State, closed: ClosedPlaces, window: AnyWindow | None) -> Asse
         window: of the frame before, if of the same epoch.
     """
     sums = closed.all_sums(state)
-    halves = closed.halves + in_its_half(state, state.epochs[-1], len(state.epochs) - 1)
     window, conflicts = closed.graph(state, window)
     keys, estimates = window.model.reported_keys, state.T_lidar_camera
     if state.config.preset == "auto":
@@ -86,12 +84,9 @@ def assess(state: State, closed: ClosedPlaces, window: AnyWindow | None) -> Asse
     covariance, few = window.covariance(keys), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
     verdicts = {}
-    apart = estimates_of_halves(state, halves)
     for camera, name in enumerate(state.names):
         own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
-        verdicts[name] = _verdict(
-            state, sums, camera, covariance, conflicts=own, halves=apart.get(camera)
-        )
+        verdicts[name] = _verdict(state, sums, camera, covariance, conflicts=own)
     pairs = pairs_without(state, contradicting(conflicts))
     return Assessment(estimates, covariance, verdicts, window, pairs)
 
@@ -131,7 +126,6 @@ def _verdict(
     covariance: Array,
     *,
     conflicts: tuple[Conflict, ...],
-    halves: tuple[Array, Array] | None,
 ) -> Verdict:
     name, one = state.names[camera], state.cameras[camera]
     if not one.started:
@@ -145,7 +139,6 @@ def _verdict(
         frames=int(sums.frames[camera]),
         covariance=None if np.isnan(own).any() else own,
         data_sigmas=sigmas_of_hessian(sums.hessian[camera]),
-        halves=halves,
         conflicts=conflicts,
         pull=None,
         converged=True,

@@ -26,7 +26,7 @@ from calibgraph.tracking.contradictions import (
     pose_priors,
     poses_by_name,
 )
-from calibgraph.tracking.epoch_sums import split_halves, sum_closed_epochs
+from calibgraph.tracking.epoch_sums import sum_closed_epochs
 from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
@@ -126,11 +126,6 @@ class ClosedPlaces:
     def marginals(self) -> list[gtsam.GaussianFactorGraph]:
         """Per place, on what all places share."""
         return marginals_of_places(self.fit)
-
-    @cached_property
-    def halves(self) -> Sums:
-        """(n, 2) sums over every other closed epoch."""
-        return split_halves(self.state)
 
     @cached_property
     def _closed_sums(self) -> Sums:

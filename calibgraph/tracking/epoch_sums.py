@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
-from calibgraph.arrays import Array
-from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.live_frames import Epoch
 from calibgraph.tracking.state import State
@@ -33,33 +29,6 @@ def sum_closed_epochs(state: State, before: int | None = None) -> Sums:
     for epoch in state.epochs[:-1]:
         sums = _after_epoch(state, sums + _until(epoch, before), epoch)
     return sums
-
-
-def split_halves(state: State) -> Sums:
-    """(n, 2) sums over every other closed epoch; those of the open one are the next half's."""
-    halves = Sums.stack([one.summary.halves for one in state.cameras])
-    for age, epoch in enumerate(state.epochs[:-1]):
-        halves = halves + in_its_half(state, epoch, age)
-    return halves
-
-
-def in_its_half(state: State, epoch: Epoch, age: int) -> Sums:
-    """(n, 2) the sums of a live epoch, so many after the oldest, in the half that has it."""
-    half = np.array([one.summary.next_half + age for one in state.cameras])
-    weights: Array = np.eye(2)[half % 2]
-    return epoch.sums[:, None] * weights
-
-
-def estimates_of_halves(state: State, halves: Sums) -> dict[int, tuple[Array, Array]]:
-    """Two (4, 4) T_camera_lidar of each camera where both are determined."""
-    known = np.flatnonzero(halves.are_determined.all(axis=1))
-    sums, found = halves[known], {}
-    steps = np.linalg.solve(sums.hessian, -sums.gradient[..., None])[..., 0]
-    for camera, (first, second) in zip(known.tolist(), steps, strict=True):
-        poses = map(state.references[camera].retract, (first, second))
-        one, two = map(to_T_camera_lidar, poses)
-        found[camera] = one, two
-    return found
 
 
 def _after_epoch(state: State, sums: Sums, epoch: Epoch) -> Sums:
