@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.paper.aggregates import aggregate
 from benchmarks.paper.baselines import paper_solve
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.io.dataset import load_dataset
@@ -29,7 +30,7 @@ from calibgraph.simulation.scenarios import MAX_FRAMES, SCENARIOS, scenario_of
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.objective import Transforms
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.solver.stage1 import Stage1, aggregate, estimate_stage1
+from calibgraph.solver.stage1 import Stage1, estimate_stage1
 
 KITTI_PREFIX = "kitti:"
 STAGE1 = "Stage 1: PnP, median"

@@ -122,8 +122,8 @@ class SolveOptions:
         tolerance_cm (CM): Distance by which a PASS may be off; by default 10.
         of (alignment|mount): Poses to report. alignment: for projecting points. mount: the physical
             pose, with a wider error bar. (default: alignment)
-        estimate (PART,...): Estimate each camera's lens and clock too: focal, aspect, centre,
-            distortion, or lens for all but aspect; offset, readout, or clock for both. The rig may
+        estimate (PART,...): Estimate each camera's lens and clock too: focal, centre,
+            distortion, or lens for all; offset, readout, or clock for both. The rig may
             state how well they are known.
     """
 

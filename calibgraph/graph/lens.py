@@ -34,7 +34,7 @@ from factors import (
     linear_factor,
     robust_noise,
 )
-from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
+from factors.free_lens import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
 from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
 
 TANGENTIAL_SHARE = 0.1
@@ -114,7 +114,6 @@ def _prior_sigmas(camera: Camera, default: LensSigmas) -> dict[LensPart, dict[st
     size = len(camera.distortion) or _PLAIN
     return {
         "focal": {FOCAL: focal},
-        "aspect": {ASPECT: default.aspect},
         "centre": {CENTRE_X: centre, CENTRE_Y: centre},
         "distortion": {
             name: radial if name[0] == "k" else TANGENTIAL_SHARE * radial

@@ -37,6 +37,9 @@ _MEASURED = (
 )  # fmt: skip
 _ROUNDING = 1e-6  # of correlations: other programs may write fewer digits
 
+_FORMER = {"walk_time_offset_s", "relative_prior_pairs", "aggregate"}
+"""Settings of earlier versions."""
+
 
 def load_calibration(path: Path | str) -> Calibration:
     """Read a result, from its folder or its file, with the correspondences beside it.
@@ -311,9 +314,10 @@ def error_bars(path: Path) -> dict[str, Array | None] | None:
 
 def _without_former(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings without those that only earlier versions had."""
-    tracking = dict(settings.get("tracking", {}))
-    tracking.pop("walk_time_offset_s", None)
-    return {**settings, "tracking": tracking}
+    kept = {key: value for key, value in settings.items() if key not in _FORMER}
+    kept["tracking"] = {k: v for k, v in kept.get("tracking", {}).items() if k not in _FORMER}
+    kept["estimate"] = [part for part in kept.get("estimate", ()) if part != "aspect"]
+    return kept
 
 
 def _require_whole(content: Mapping[str, Any], path: Path) -> None:

@@ -27,7 +27,6 @@ _ESTIMATED_AS = {
     "focal_length": "focal",
     "distortion": "distortion",
     "principal_point": "centre",
-    "aspect_ratio": "aspect",
 }
 
 # fmt: off
@@ -85,7 +84,7 @@ CAUSES: dict[str, Cause] = {
             **{f"{by}{name}": "Check that intrinsics and image size belong to these images, or "
                f"estimate the lens: --estimate {part}."
                for by in ("lens_", "") for name, part in _ESTIMATED_AS.items()},
-            "lens_skew": "", "skew": "",
+            "lens_aspect_ratio": "", "aspect_ratio": "",
             "lens_prior": "Check that the lens belongs to these images; then correct the named "
             "value in the rig, or state intrinsics_sigma_px and distortion_sigma.",
             "focal_sensitivity": "Verify the focal length: here the position depends on it.",

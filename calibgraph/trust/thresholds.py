@@ -131,12 +131,12 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "Above half, it shows the priors more than the data."),
     # the lens, from the residuals and the images
     Threshold("lens", "probability of a wrong one", "at most", 0.005, 0.2, "share",
-              "Is focal length, principal point, distortion, fx / fy, skew or time of the images "
+              "Is focal length, principal point, distortion, fx / fy or time of the images "
               "wrong, so that the camera is off by more than the tolerance?",
               "The verdict's own cuts. By the posterior of a free lens or clock, once from the "
               "residuals and once from the images, and by `lens_wrong` etc.",
               "check the intrinsics, the image size, and that images are not undistorted twice, "
-              "cropped, scaled or sheared"),
+              "cropped or scaled"),
     Threshold("focal_sensitivity", "motion of the camera per 1 % of the focal length",
               "at most", 15.0, math.inf, "cm", "How much depends on the focal length?", _COUNTED,
               "verify the intrinsics, or give matches at more distances",
@@ -219,7 +219,7 @@ LIMITS: tuple[Limit, ...] = (
     Limit("pull_sigmas", 4.0, "sigma",
           "A pull within this of what a camera's own solution leaves open is zero."),
     Limit("lens_wrong", _WRONG_SIGMAS, "sigma", "The error of a wrong lens parameter, in standard "
-          "deviations of a calibrated one: 0.2 % of the focal length, fx / fy and the skew, "
+          "deviations of a calibrated one: 0.2 % of the focal length and of fx / fy, "
           "0.002 focal lengths of the principal point, 0.002 of k1, 2 ms of the time of "
           "an image, or as the rig states."),
     Limit("lens_wrong_share", _WRONG_SHARE, "share", "So many are taken for wrong."),
