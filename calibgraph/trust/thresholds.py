@@ -27,13 +27,10 @@ _BEYOND = [NormalDist().inv_cdf(1 - PASS_BELOW / share / 2) for share in (_WRONG
 # fmt: off
 THRESHOLDS: tuple[Threshold, ...] = (
     # the guess
-    Threshold("guess_rotation", "distance from the guess", "at most", 30.0, 360.0, "deg",
+    Threshold("guess_translation", "distance from the guess", "at most", 2.0, math.inf, "m",
               "How far is the result from the guess?",
               "Farther, and beyond sqrt(3) times the matcher's range, the guess follows another "
               "convention.", "is T_camera_lidar inverted, or of other axes?"),
-    Threshold("guess_translation", "distance from the guess", "at most", 2.0, math.inf, "m",
-              "How far is the result from the guess?", "As for its rotation.",
-              "is T_camera_lidar inverted, or of other axes?"),
     Threshold("guess_length", "translation of the guess", "at most", 20.0, 100.0, "m",
               "Can the translation of the guess be in metres?", "Vehicles are shorter.",
               "is the translation of T_camera_lidar in millimetres?"),
@@ -232,6 +229,8 @@ LIMITS: tuple[Limit, ...] = (
           "next row, is the same solution: nearer ones differ in the matches at the gate alone.",
           of_tolerance=True),
     Limit("competing_translation", 10.0, "cm", "See the row above.", of_tolerance=True),
+    Limit("guess_rotation", 30.0, "deg", "A result that is turned farther from its guess, and "
+          "beyond sqrt(3) times the matcher's range, is compared with its convention errors."),
     Limit("swap_slack", 0.05, "m, rad", "Added in quadrature to the distances of swapped cameras: "
           "the usual error of a result is no evidence of a swap."),
     Limit("convention_rotation", 30.0, "deg", "A convention error explains a guess if, undone, it "
