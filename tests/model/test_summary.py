@@ -42,7 +42,7 @@ def of_z_score(value: float) -> Verdict:
 
 
 def test_a_fail_comes_before_what_explains_it_if_that_only_warns() -> None:
-    verdict = of_kinds("competing_solution", "frames", "lens", "own_clouds", "guess_rotation")
+    verdict = of_kinds("competing_solution", "frames", "lens", "own_clouds", "guess_translation")
     summary = summarize({"left": Verdict((*verdict.checks, FAILED))}, {"left": ("loose height",)})
     assert [reason.cause for reason in summary.reasons] == ["solver", "guess", "time"]
     assert len(summary.reasons) == len(summary.actions) == LEAST

@@ -86,12 +86,20 @@ def test_wrong_input_is_left_out_with_a_line_each_and_leaves_no_trace(
 
 
 @pytest.mark.parametrize("option", [("--interval-s", 0.1), ("--motion", "scans")])
-@pytest.mark.parametrize("estimate", [(), ("--estimate", "offset")])
 def test_options_for_clouds_are_refused_without_a_matcher(
-    world: World, call: Call, tmp_path: Path, option: tuple[object, ...], estimate: tuple[str, ...]
+    world: World, call: Call, tmp_path: Path, option: tuple[object, ...]
 ) -> None:
     out = tmp_path / "out"
-    code, text, err = call("track", world.rig, world.source, "--out", out, *option, *estimate)
+    code, text, err = call("track", world.rig, world.source, "--out", out, *option)
     assert (code, text) == (2, "")
     assert f"{option[0]} goes with --matcher only" in err and err.count("\n") == 1
+    assert not out.exists()
+
+
+def test_a_lens_or_clock_is_refused_while_driving(world: World, call: Call, tmp_path: Path) -> None:
+    settings, out = tmp_path / "config.yaml", tmp_path / "out"
+    settings.write_text("estimate: [offset]\n")
+    code, text, err = call("track", world.rig, world.source, "--out", out, "--config", settings)
+    assert (code, text) == (2, "") and err.count("\n") == 1
+    assert "found offset: estimate them with `calibgraph solve`" in err
     assert not out.exists()
