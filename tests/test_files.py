@@ -22,7 +22,7 @@ from calibgraph.files import (
 )
 from calibgraph.yaml_text import parse_yaml
 from tests.conftest import SAMPLE
-from tests.model.rig_files import written
+from tests.model.test_rig import written
 
 
 @pytest.mark.parametrize("text", ["", "- a\n- b\n", "{unclosed", "\x00\x01", "just words"])

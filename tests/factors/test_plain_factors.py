@@ -62,9 +62,6 @@ def test_projection_factor_equals_gtsams_stock_factor() -> None:
         np.testing.assert_allclose(b, right, rtol=1e-9, atol=1e-9)
 
 
-# The pose factors mean what the paper's formulas say, evaluated directly.
-
-
 SIZES = [1e-7, 0.01, 0.5, 1.0]
 
 
@@ -125,9 +122,6 @@ def test_relative_pose_is_exact_at_the_truth_and_costs_one_at_one_sigma() -> Non
 
 def test_sigmas_are_rotation_first() -> None:
     assert pose_sigmas(rotation_rad=1.0, translation_m=2.0).tolist() == [1, 1, 1, 2, 2, 2]
-
-
-# Scaling to a unit diagonal: units do not matter, free directions show.
 
 
 def random_hessian(seed: int = 0) -> np.ndarray:

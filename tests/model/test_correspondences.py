@@ -1,3 +1,5 @@
+"""Tables of matches with points and between cameras: bad values are named, joined tables."""
+
 from __future__ import annotations
 
 import math
@@ -6,11 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibgraph import (
-    CorrespondenceError,
-    concatenate,
-)
-from tests.model.tables import table
+from calibgraph import CorrespondenceError, concatenate
+from tests.model.tables import NAN, camera_matches, table
 
 
 @pytest.mark.parametrize(
@@ -75,3 +74,29 @@ def test_a_common_error_is_stated_if_all_joined_tables_state_it_as_the_largest()
         assert not concatenate([unstated, none]).findings.states_common_error
     without_rows = table().select(slice(0))
     assert concatenate([without_rows, small]).findings.systematic_sigmas == (0.002, 0.01)
+
+
+def with_entry(name: str, place: tuple[int, ...], value: float) -> dict[str, Any]:
+    """A column of the good table with one wrong entry."""
+    column = getattr(camera_matches(), name).copy()
+    column[place] = value
+    return {name: column}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (with_entry("pixels_px", (1, 0, 0), NAN), "row 1: pixel must be finite"),
+        (with_entry("pixels_px", (2, 1, 0), 1e7), "row 2: pixel"),
+        (with_entry("planes_lidar_per_m", (0, 1, 2), NAN), "row 0: planes_lidar_per_m"),
+        (with_entry("planes_lidar_per_m", (0, 1, 2), np.inf), "row 0: planes_lidar_per_m"),
+        ({"planes_lidar_per_m": np.zeros((3, 2, 3))}, "not zero"),
+        (with_entry("camera_index", (1, 0), 1), "row 1: camera_index .*A before B"),
+        (with_entry("camera_index", (1, 0), -1), "row 1: camera_index"),
+        (with_entry("camera_index", (2, 1), 3), "row 2: camera_index"),
+        ({"frame": np.array([1, 2])}, "shape"),
+    ],
+)
+def test_bad_values_of_camera_matches_are_named(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(CorrespondenceError, match=message):
+        camera_matches(**changes)
