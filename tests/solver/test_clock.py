@@ -156,32 +156,6 @@ def test_lens_and_clock_are_told_apart() -> None:
             assert abs(one.value - right) < FIVE_SIGMAS * one.sigma
 
 
-@pytest.mark.statistics
-@pytest.mark.parametrize(("offset_s", "readout_s"), [(0.005, 0.0), (0.1, 0.03)])
-def test_errors_are_as_large_as_the_error_bar_says(offset_s: float, readout_s: float) -> None:
-    """Mean NEES over 6: 0.8 to 1.25, give or take three standard deviations of its draws."""
-    squared, draws = [], 40
-    for seed in range(draws):
-        truth, table = late(offset_s, readout_s, seed)
-        squared += squared_errors(solve_joint(truth, table, Config(estimate="clock")), truth)
-    scatter = 3 * np.sqrt(2 / 6 / draws)
-    assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter
-
-
-@pytest.mark.statistics
-def test_alignments_err_as_their_error_bar_says_with_the_stated_error_of_a_clock() -> None:
-    """Mean NEES over 6: 0.8 to 1.25, give or take three standard deviations of its draws."""
-    squared, draws, sigma_s = [], 40, 0.01
-    for seed in range(draws):
-        offset_s = sigma_s * np.random.default_rng([seed, 1]).standard_normal()
-        truth, table = late(offset_s, 0.0, seed, np.tile(STRAIGHT, (30, 1)))
-        squared += squared_errors(
-            solve_joint(with_times(truth, time_offset_sigma_s=sigma_s), table), truth
-        )
-    scatter = 3 * np.sqrt(2 / 6 / draws)
-    assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter
-
-
 def test_a_lidar_that_turns_about_its_way_is_told() -> None:
     rig, table = late(0.0, 0.0)
     assert table.twist_per_s is not None

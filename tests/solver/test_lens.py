@@ -21,7 +21,6 @@ from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.variables import aligned_key, body_key, lens_key
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import twist_between
-from calibgraph.model.lens_knowledge import LensSigmas
 from calibgraph.model.rig import IntrinsicsSigma
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
@@ -253,40 +252,3 @@ def test_the_rig_states_how_well_its_new_lens_is_known(
     next_prior = LensVariable.of(found.rig.cameras["image_2"], ("focal",)).free.sigmas
     focal = found.lens["image_2"][0]
     assert next_prior[0] == pytest.approx(focal.sigma / focal.value, rel=1e-9)
-
-
-@pytest.mark.statistics
-def test_mounts_err_as_their_error_bar_says_with_lenses_of_good_calibrations() -> None:
-    """Mean NEES over 6: 0.8 to 1.25, give or take three standard deviations of its draws."""
-    squared, draws = [], 60
-    for seed in range(draws):
-        truth, table = simulated(seed, frames=30, matches=100)
-        found = solve_joint(with_usual_lenses(truth, seed), table, Config(of="mount"))
-        squared += squared_errors(found, truth)
-    scatter = 3 * np.sqrt(2 / 6 / (2 * draws))
-    assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter
-
-
-def with_usual_lenses(rig: Rig, seed: int) -> Rig:
-    rng, cameras = np.random.default_rng([seed, 1]), {}
-    for name, camera in rig.cameras.items():
-        sigmas = LensSigmas.calibrated(camera)
-        lens = LensVariable.of(camera, ("focal", "centre", "distortion"), sigmas)
-        cameras[name] = lens.put_into(camera, rng.standard_normal(len(lens.free)))
-    return rig.model_copy(update={"cameras": cameras})
-
-
-@pytest.mark.statistics
-@pytest.mark.parametrize(
-    ("part", "error"),
-    [("focal", 0.003), ("focal", 0.05), ("centre", 10.0), ("distortion", 0.1), ("lens", 0.0)],
-)
-def test_errors_are_as_large_as_the_error_bar_says(part: str, error: float) -> None:
-    """Mean NEES over 6: 0.8 to 1.25, give or take three standard deviations of its draws."""
-    squared, draws = [], 40
-    for seed in range(draws):
-        truth, table = simulated(seed, frames=30, matches=100)
-        found = solve_joint(put_lens_error(truth, part, error), table, Config(estimate=part))
-        squared += squared_errors(found, truth)
-    scatter = 3 * np.sqrt(2 / 6 / draws)  # as if both cameras erred alike
-    assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter

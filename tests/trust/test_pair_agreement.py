@@ -21,7 +21,7 @@ from calibgraph.model.config import Config
 from calibgraph.solver.pair_refinement import fit_pairs
 from calibgraph.trust.pair_agreement import PairAgreement, check_agreement, pair_agreement
 from factors import pose_sigmas
-from tests.solver.pairs import simulated_pairs
+from tests.solver.test_camera_pairs import simulated_pairs
 from tests.trust.conftest import named
 
 SIGMAS = pose_sigmas(rotation_rad=np.radians(0.05), translation_m=0.01)
