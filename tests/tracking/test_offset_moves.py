@@ -11,9 +11,8 @@ from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.tracking.assessment import _recent_checks
 from calibgraph.tracking.state import State
-from tests.tracking.drives import moved_later
+from tests.tracking.drives import moved, moved_later, step_of
 from tests.tracking.late_drives import OFFSET, late, town, track
-from tests.tracking.steps import moved, step_of
 
 
 @pytest.mark.slow

@@ -39,7 +39,7 @@ from calibgraph.trust.evidence import Evidence
 from tests.conftest import stereo_relative_pose
 from tests.draws.places import Drawn, draw_places, tied
 from tests.tracking.drives import drive, pair_of, track_draw
-from tests.tracking.test_place_sums import part
+from tests.tracking.test_sums import part
 
 Array = np.ndarray
 

@@ -1,8 +1,9 @@
-"""The error bar of a result."""
+"""The error bar of a result, and images of two cameras against their calibration."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -10,11 +11,28 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calibgraph import Config, Correspondences, RelativePose, Rig, concatenate, solve
+import calibgraph
+from calibgraph import (
+    Calibration,
+    Config,
+    Correspondences,
+    MatcherErrors,
+    RelativePose,
+    Rig,
+    concatenate,
+    perturb,
+    simulate_correspondences,
+    solve,
+)
+from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.geometry import relative_transform
 from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.pair_refinement import fit_pairs
 from calibgraph.trust.evidence import Evidence
-from tests.trust.conftest import simulated
+from calibgraph.trust.pair_agreement import PairAgreement, check_agreement, pair_agreement
+from factors import pose_sigmas
+from tests.solver.test_camera_pairs import simulated_pairs
+from tests.trust.conftest import named, simulated
 
 Array = NDArray[np.float64]
 
@@ -108,3 +126,121 @@ def test_a_relative_pose_ties_cameras_unless_matches_contradict_it(
     evidence = Evidence(solve_joint(rig, simulated(rig, frames=10), Config()), rig, measure)
     assert not evidence.posteriors
     assert seen == [groups or [("left",), ("right",)]]
+
+
+SIGMAS = pose_sigmas(rotation_rad=np.radians(0.05), translation_m=0.01)
+COVARIANCE = np.diag(np.tile(SIGMAS**2, 2))
+
+
+def agreement(rig: Rig, table: CameraMatches, covariance: np.ndarray | None) -> PairAgreement:
+    each = np.diag(SIGMAS**2) if covariance is None else covariance[:6, :6]
+    (fit,) = fit_pairs(rig, table, Config(), np.array([each, each]))
+    return pair_agreement(rig, fit, covariance)
+
+
+def test_a_right_calibration_agrees(pair: Rig) -> None:
+    """Differences are within the sigmas that went in: 0.05 deg and 1 cm per camera and axis."""
+    rng = np.random.default_rng(0)
+    table = simulated_pairs(pair)
+    sigmas = []
+    for _ in range(10):
+        twists = rng.normal(0, np.tile(SIGMAS, 2)).reshape(2, 6)
+        moved = {
+            name: gtsam.Pose3.Expmap(twist).matrix() @ T
+            for twist, (name, T) in zip(twists, pair.T_camera_lidar.items(), strict=True)
+        }
+        found = agreement(pair.moved_to(moved), table, COVARIANCE)
+        sigmas.append(found.sigmas)
+        assert found.degrees < 0.4 and found.centimetres < 6
+    # The largest of six standard Gaussians is 0.5 to 3 in 99 of 100 draws.
+    assert 0.5 < np.median(sigmas) < 2.2 and max(sigmas) < 3.5
+
+
+def test_a_moved_camera_disagrees_by_its_motion(pair: Rig) -> None:
+    moved = perturb(pair, rotation_deg=0.5, translation_m=0.1, seed=4).T_camera_lidar["right"]
+    found = agreement(pair.moved_to({"right": moved}), simulated_pairs(pair), COVARIANCE)
+    assert found.degrees == pytest.approx(0.5, abs=0.1)
+    assert found.sigmas > 4
+    assert found.residual_px > 5 * found.least_px
+
+
+def test_swapped_images_disagree_by_twice_the_baseline(pair: Rig) -> None:
+    table = simulated_pairs(pair)
+    swapped = replace(table, pixels_px=np.ascontiguousarray(table.pixels_px[:, ::-1]))
+    found = agreement(pair, swapped, COVARIANCE)
+    assert found.centimetres == pytest.approx(100, abs=10)
+    assert found.sigmas > 10
+
+
+def test_wrong_intrinsics_leave_residuals_that_no_place_explains(pair: Rig) -> None:
+    table, right = simulated_pairs(pair), pair.cameras["right"]
+    k = right.intrinsics_px
+    zoomed = right.model_copy(
+        update={"intrinsics_px": k.model_copy(update={"fx": 1.03 * k.fx, "fy": 1.03 * k.fy})}
+    )
+    wrong = pair.model_copy(update={"cameras": {**pair.cameras, "right": zoomed}})
+    assert agreement(wrong, table, None).least_px > 1.5 * agreement(pair, table, None).least_px
+
+
+def judged(truth: Rig, seen: Rig, matches: CameraMatches | None) -> Calibration:
+    """A result of correspondences that fit one rig, and of images of another, the true one."""
+    shared = {"systematic_rotation_rad": np.radians(0.09), "systematic_translation_m": 0.02}
+    table = simulate_correspondences(seen, frames=8, errors=MatcherErrors(outlier_share=0.1))
+    table = replace(table, metadata={**table.metadata, **shared})
+    return calibgraph.solve(truth, table, camera_matches=matches)
+
+
+def test_the_verdict_names_a_pair_whose_images_disagree(pair: Rig) -> None:
+    right = judged(pair, pair, simulated_pairs(pair))
+    moved = perturb(pair, rotation_deg=0.8, translation_m=0.0, seed=1).T_camera_lidar["right"]
+    wrong = judged(pair, pair.moved_to({"right": moved}), simulated_pairs(pair))
+    for name in pair.cameras:
+        (passed,) = named(right, name, "by images")
+        assert passed.status == "PASS" and passed.value is not None and passed.value < 1
+        (failed,) = named(wrong, name, "by images")
+        assert failed.status != "PASS"
+        assert "contradict each other on the pose of left to right" in failed.text
+
+
+def disagreement(a: str, b: str, sigmas: float) -> PairAgreement:
+    return PairAgreement(a, b, 0.3, 10.0, sigmas, 1.0, 0.5, 100)
+
+
+def test_a_camera_that_disagrees_with_all_its_neighbours_is_the_one_that_is_wrong() -> None:
+    found = [disagreement("a", "b", 4.2), disagreement("b", "c", 3.8), disagreement("c", "d", 0.5)]
+    blamed, spared = (check_agreement(found[0], name, found) for name in ("b", "a"))
+    assert blamed.status == "FAIL" and blamed.severity > 2
+    assert spared.status == "WARN" and spared.severity == 1.0  # never PASS: nobody vouches for it
+    assert "by its other pairs (3.8 sigma) it is b that is wrong" in spared.text
+    assert check_agreement(found[1], "c", found).severity == 1.0
+    assert check_agreement(found[2], "d", found).status == "PASS"
+
+
+def test_of_two_cameras_either_may_be_wrong() -> None:
+    found = [disagreement("a", "b", 4.2)]
+    assert [check_agreement(found[0], name, found).status for name in "ab"] == ["FAIL", "FAIL"]
+    nearly = [*found, disagreement("b", "c", 1.5)]  # a neighbour of b agrees
+    assert check_agreement(nearly[0], "a", nearly).status == "FAIL"
+
+
+@pytest.mark.parametrize(("tied", "metres"), [(False, 0.0), (False, 0.02), (True, 0.0)])
+def test_cameras_that_end_at_one_pose_are_no_pass_unless_the_rig_ties_them(
+    pair: Rig, tied: bool, metres: float
+) -> None:
+    T = pair.T_camera_lidar["left"].copy()
+    T[0, 3] += metres
+    rig = pair.moved_to({"right": T})
+    table = simulate_correspondences(rig, frames=8, matches=200)
+    if tied:
+        tie = RelativePose(
+            a="left", b="right", T_a_b=np.eye(4),
+            rotation_sigma_rad=0.001, translation_sigma_m=0.001,
+        )  # fmt: skip
+        rig = rig.model_copy(update={"relative_poses": (tie,)})
+    verdicts = calibgraph.solve(rig, table).camera_verdicts
+    asked = not tied and metres == 0
+    for verdict in verdicts.values():
+        assert [check.kind for check in verdict.checks if check.kind == "one_pose"] == (
+            ["one_pose"] if asked else []
+        )
+        assert not (asked and verdict.status != "WARN")
