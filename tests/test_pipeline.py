@@ -61,7 +61,6 @@ def table_of(rig: Rig, *, places: bool = True) -> Correspondences:
 
 def solve_again(saved: Calibration) -> Calibration:
     """The saved table, from the saved result, with its settings."""
-    assert saved.correspondences is not None
     return calibgraph.solve(
         saved.rig,
         saved.correspondences,
@@ -192,7 +191,6 @@ def test_places_of_the_table_count_in_the_solve(guess: Rig, truth: Rig) -> None:
     one, two = (calibgraph.solve(guess, each) for each in (table, named))
     for name in truth.cameras:
         a, b = one.covariance[name], two.covariance[name]
-        assert a is not None and b is not None
         assert np.trace(b[:3, :3]) < 0.9 * np.trace(a[:3, :3])
 
 
@@ -255,7 +253,6 @@ def test_the_result_is_the_optimum_of_its_graph(truth: Rig, guess: Rig, config: 
     parameters.setAbsoluteErrorTol(0.0)
     values = gtsam.LevenbergMarquardtOptimizer(result.graph, values, parameters).optimize()
     covariance = result.joint_covariance
-    assert covariance is not None
     of = aligned_key if config.preset == "auto" else camera_key
     keys = [of(number) for number in range(len(truth.cameras))]
     for number, (name, T) in enumerate(result.T_camera_lidar.items()):

@@ -219,7 +219,6 @@ def test_a_camera_whose_matches_are_displaced_comes_back_to_its_neighbour(
     off = perturb(truth, rotation_deg=0.3, translation_m=0.0, seed=1).T_camera_lidar
     run = matched(data, table_of(truth.moved_to({PAIR[1]: off[PAIR[1]]})))
     tied = refine_with_camera_pairs(run, no_progress)
-    assert tied.solution.camera_matches is not None
     assert tied.solution.camera_matches.pairs() == [PAIR]
     before, after = (pair_error(each.solution.solved_rig, truth) for each in (run, tied))
     assert before[0] > 0.25
@@ -248,7 +247,6 @@ def test_cameras_are_matched_through_the_lenses_that_were_estimated(
     run = match_in_rounds(data, guess, table_of(truth), config, progress=no_progress)
     found = refine_with_camera_pairs(run, no_progress).solution
     right = refine_with_camera_pairs(matched(data, table_of(truth)), no_progress).solution
-    assert found.camera_matches is not None and right.camera_matches is not None
     assert len(found.camera_matches) == pytest.approx(len(right.camera_matches), rel=0.05)
     assert pair_error(found.solved_rig, truth)[1] < 1.0
 
@@ -271,10 +269,8 @@ def test_without_time_terms_or_files_the_run_stays_as_it_is(
 @pytest.mark.usefixtures("no_image_checks")
 def test_a_result_keeps_its_camera_matches(data: Dataset, truth: Rig, tmp_path: Path) -> None:
     result = calibgraph.calibrate(data, truth, table_of(truth))
-    assert result.camera_matches is not None
     result.save(tmp_path)
     read = calibgraph.load_calibration(tmp_path)
-    assert read.camera_matches is not None
     assert len(read.camera_matches) == len(result.camera_matches)
     sigmas = result.sigmas("->".join(PAIR))
     assert sigmas is not None and sigmas[0].max() < 0.1 and sigmas[1].max() < 1.5

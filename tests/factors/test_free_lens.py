@@ -224,7 +224,6 @@ def test_points_that_have_been_moved_are_moved_on() -> None:
     free = FreeLens(LENSES["radtan"], ("offset", "readout"), (0.1, 0.1), Clock(0, 0, HEIGHT_PX))
     block, values, T = moving("radtan", 40), np.array([0.4, -0.3]), TRUTH.inverse().matrix()
     times_s = free.clock_at(values).times_s(block.pixels_px[:, 1])
-    assert block.motion is not None
     points = displace(block.points_lidar_m, block.motion[:, :6], -times_s)
     motion = np.column_stack([block.motion[:, :6], times_s])
     moved = replace(block, points_lidar_m=points, motion=motion)
@@ -252,7 +251,6 @@ def test_without_motion_or_at_rest_the_clock_is_not_observable() -> None:
 
 def test_the_motion_stays_with_its_correspondences() -> None:
     block, rows = moving("pinhole", 12), np.array([7, 2, 5])
-    assert block.motion is not None
     parts = [block.select(rows), block.select(np.arange(3)).rewhiten(None)]
     expected = block.motion[[*rows, 0, 1, 2]]
     joined = ProjectionBlock.join(parts)

@@ -173,7 +173,6 @@ def test_a_calibrated_lens_is_known_to_a_500th_of_its_focal_length() -> None:
     rig = state_calibrated(make_pair())
     for camera in rig.cameras.values():
         sigma, fx = camera.intrinsics_sigma_px, camera.intrinsics_px.fx
-        assert sigma is not None
         assert sigma.focal == pytest.approx(0.002 * fx, abs=0.006)  # written to 0.01 px
         assert sigma.centre == pytest.approx(0.002 * fx, abs=0.006)
         assert camera.distortion_sigma == 0.002

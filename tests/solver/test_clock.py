@@ -101,7 +101,6 @@ def test_a_stated_error_of_the_clock_is_one_of_the_pose() -> None:
         ("mount", table, 0.1), ("alignment", table, 0.1), ("alignment", still, 0.0)
     ):  # fmt: skip
         known, unknown = (solve_joint(rig, matches, Config(of=of)) for rig in (truth, doubted))
-        assert known.covariance is not None and unknown.covariance is not None
         added = np.diag(unknown.covariance - known.covariance).reshape(-1, 2, 3).sum(axis=2)
         np.testing.assert_allclose(np.sqrt(np.abs(added[:, 1])), added_m, rtol=0.02, atol=1e-6)
         for name, T in known.T_camera_lidar.items():
@@ -117,7 +116,6 @@ def test_a_saved_result_is_solved_again(tmp_path: Path) -> None:
     for name, camera in result.rig.cameras.items():
         assert saved.rig.cameras[name].time_offset_s == camera.time_offset_s
     for name in ("correspondences.parquet", "table.csv"):
-        assert result.correspondences is not None
         if name.endswith("csv"):
             result.correspondences.save(tmp_path / name)
         again = solve(saved.rig, load_correspondences(tmp_path / name))
@@ -140,7 +138,6 @@ def test_at_rest_or_straight_ahead_the_offset_stays_at_its_prior(twists: np.ndar
         if twists.any():
             assert (one.direction, round(one.correlation, 1)) == ("z", 1.0)
     if twists.any():
-        assert found.covariance is not None
         ahead_m = found.covariance[5, 5] ** 0.5
         assert ahead_m == pytest.approx(10.0 * one.sigma, rel=0.05)
 
@@ -158,7 +155,6 @@ def test_lens_and_clock_are_told_apart() -> None:
 
 def test_a_lidar_that_turns_about_its_way_is_told() -> None:
     rig, table = late(0.0, 0.0)
-    assert table.twist_per_s is not None
     swapped = replace(table, twist_per_s=table.twist_per_s[:, [2, 1, 0, 3, 4, 5]])
     (text,) = solve(rig, swapped).warnings
     assert "turns about its direction of travel" in text

@@ -146,7 +146,6 @@ def solve_model(rig: Rig, table: Correspondences, *, pairs: bool) -> ErrorFit:
     matches = simulated_pairs(rig, count=40) if pairs else None
     solution = solve_joint(rig, table, Config(learnt_weights=False), camera_matches=matches)
     errors = solution.errors or fit_errors(solution.fitted, table.findings, table.places)
-    assert errors is not None
     return errors
 
 
@@ -191,7 +190,6 @@ def test_a_pair_of_which_the_gate_has_left_nothing_takes_no_part(pair: Rig) -> N
         fit_errors(replace(solution.fitted, objective=inliers), table.findings, table.places)
         for inliers in (more, solution.inliers)
     )
-    assert found is not None and expected is not None
     np.testing.assert_array_equal(found.fit.covariance, expected.fit.covariance)
 
 
@@ -228,7 +226,6 @@ def test_matches_of_one_place_decide_by_themselves(pair: Rig) -> None:
     solution = solve_joint(pair, table, config)
     assert solution.errors is None
     errors = fit_errors(solution.fitted, table.findings, table.places)
-    assert errors is not None
     for name, T in errors.T_camera_lidar.items():
         np.testing.assert_allclose(T, solution.T_camera_lidar[name], rtol=0, atol=1e-7)
 
@@ -240,7 +237,6 @@ def test_a_continued_fit_is_that_of_its_start(pair: Rig) -> None:
     for model in (errors.model, other):
         starts = errors.fit, errors.fit.linear.values
         found, expected = (fit_latent_poses(model, start) for start in starts)
-        assert found is not None and expected is not None
         for name, T in found.T_camera_lidar.items():
             np.testing.assert_allclose(T, expected.T_camera_lidar[name], rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-9, atol=1e-15)

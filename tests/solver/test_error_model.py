@@ -74,7 +74,6 @@ def test_a_known_matcher_has_its_usual_one(pair: Rig, matcher: str) -> None:
         solve(pair, stating(pair, metadata)).sigmas("left")
         for metadata in ({}, {"matcher": matcher})
     )
-    assert silent is not None and known is not None
     assert known[0].max() > 3 * silent[0].max() and known[1].max() > 3 * silent[1].max()
     own = MatcherFindings.from_metadata({"matcher": matcher, **ZERO})
     assert own.systematic_sigmas == (0.0, 0.0) and own.place_variance == 0.0
@@ -164,7 +163,6 @@ def test_what_all_frames_share_is_the_share_that_its_size_has(pair: Rig, config:
 def test_the_shares_are_those_of_independent_errors_and_add_up(pair: Rig) -> None:
     """The part that is left to the matches is the one that their own equations give."""
     errors = evidence(pair, table_of_places(pair, 3, OF_A_SENSOR)).solution.marginals.errors
-    assert errors is not None
     parts = variances_by_source(errors)
     matches = np.diag(errors.fit.covariance) - sum(parts.values())
     assert matches == pytest.approx(of_matches(errors), rel=1e-6)
@@ -329,7 +327,6 @@ def test_a_displaced_camera_widens_the_error_bars(pair: Rig) -> None:
         solution = solve_joint(pair, given, camera_matches=simulated_pairs(pair))
         evidence = Evidence(solution, guess=pair)
         covariance = evidence.covariance_of("right")
-        assert covariance is not None
         widths.append(float(np.sqrt(covariance[3, 3])))
         errors = [
             np.linalg.norm(solution.T_camera_lidar[n][:3, 3] - pair.T_camera_lidar[n][:3, 3])
@@ -362,7 +359,6 @@ def table_of(rig: Rig, places: int, size: float, seed: int) -> Correspondences:
 def errors_of(rig: Rig, table: Correspondences) -> ErrorFit:
     solution = solve_joint(rig, table, Config(learnt_weights=False))
     found = solution.errors or fit_errors(solution.fitted, table.findings, table.places)
-    assert found is not None
     return found
 
 

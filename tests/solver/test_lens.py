@@ -49,7 +49,6 @@ def simulated(seed: int, frames: int, matches: int) -> tuple[Rig, Correspondence
 
 def squared_errors(found: Solution, truth: Rig) -> list[float]:
     """Per camera, the squared error of its pose in the metric of its covariance."""
-    assert found.covariance is not None
     squared = []
     for number, (name, T) in enumerate(found.T_camera_lidar.items()):
         own = found.covariance[6 * number : 6 * number + 6, 6 * number : 6 * number + 6]
@@ -100,8 +99,6 @@ def test_a_lens_that_is_known_exactly_changes_nothing(drawn: tuple[Rig, Correspo
     truth, table = drawn
     fixed = solve_joint(truth, table, Config())
     free = solve_joint(known_to(truth, 1e-4), table, Config(estimate=("focal",)))
-    assert fixed.covariance is not None
-    assert free.covariance is not None
     sigmas = np.sqrt(np.diag(fixed.covariance))
     for number, name in enumerate(truth.cameras):
         twist = twist_between(free.T_camera_lidar[name], fixed.T_camera_lidar[name])
@@ -123,7 +120,6 @@ def test_an_uncertain_lens_widens_the_error_bar(drawn: tuple[Rig, Correspondence
         ahead = 6 * number + 5
         assert unknown.covariance[ahead, ahead] > 1.1 * known.covariance[ahead, ahead]
         assert known.lens[name][0].describe().startswith("not determined by these data")
-        assert unknown.errors is not None
         assert known.marginals.error_sources(known.covariance)[name]
 
 
@@ -154,7 +150,6 @@ def test_the_covariance_of_a_mount_is_that_of_its_graph(
 ) -> None:
     truth, table = drawn
     found = solve_joint(truth, table, Config(of="mount"))
-    assert found.marginals.errors is not None
     fit = found.marginals.errors.fit
     marginals = gtsam.Marginals(found.graph(), fit.linear.values)
     for number in range(len(truth.cameras)):
@@ -171,7 +166,6 @@ def test_estimate_and_sigma_are_those_of_the_whole_graph(
     stated = table.with_findings(replace(table.findings, **STATED))
     wrong = put_lens_error(truth, "focal", 0.01)
     found = solve_joint(wrong, stated, Config(estimate=("focal", "centre")))
-    assert found.errors is not None
     fit, graph = found.errors.fit, latent_pose_graph(found.errors.model)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-14)

@@ -102,7 +102,6 @@ def test_what_the_cameras_show_of_the_bends_moves_them_back() -> None:
     config = Config(learnt_weights=False, prior_weight=0.0, relative_prior_weight=0.0)
     without = solve_joint(rig, replace(bent, metadata=table.metadata), config)
     solution = solve_joint(rig, bent, config)
-    assert solution.errors is not None
     values, sigmas = solution.errors.scan_distortion(bent.findings.bend_sigmas)
     assert abs(values[2] - 0.1) < 3 * sigmas[2] < 0.06
     mounts = solution.errors.fit.of_mount.T_camera_lidar
@@ -172,7 +171,6 @@ def test_the_fit_is_exact_without_noise() -> None:
     pixels, jacobian = project_with_jacobian(camera, points)
     table = table_of(pixels + jacobian @ twist + 0.7 * field[0].T, points, 5)
     fit = fit_table(camera, table, field)
-    assert fit is not None
     freed = fit.free(0)
     np.testing.assert_allclose(freed.values, [0.7], rtol=1e-6)  # the weak prior is 1e-7 of it
     np.testing.assert_allclose(freed.twist, twist, atol=1e-9)
@@ -185,7 +183,6 @@ def test_an_unknown_that_the_pose_compensates_is_not_observable() -> None:
     pixels, jacobian = project_with_jacobian(make_camera(), points)
     field = jacobian[:, :, :1].transpose(2, 1, 0)
     fit = fit_table(make_camera(), table_of(pixels, points, 4), field)
-    assert fit is not None
     assert fit.free(0).sigmas[0] > 0.99  # as the prior of the pose: a radian
 
 
@@ -208,7 +205,6 @@ def test_compensating_twist_undoes_what_an_unknown_displaces() -> None:
     pixels, jacobian = project_with_jacobian(camera, points)
     twist = rng.standard_normal(6)
     fit = fit_table(camera, table_of(pixels, points, 4), (jacobian @ twist).T[None])
-    assert fit is not None
     np.testing.assert_allclose(fit.free(0).compensating[:, 0], -twist, rtol=1e-5)
 
 
@@ -223,7 +219,6 @@ def test_sigmas_are_the_scatter_of_the_values(outliers: int) -> None:
         pixels = exact + rng.standard_normal((300, 2))
         pixels[:outliers] += rng.uniform(-300, 300, (outliers, 2))
         fit = fit_table(camera, table_of(pixels, points, 30), field)
-        assert fit is not None
         values.append(fit.free(0).values[0])
         sigmas.append(fit.free(0).sigmas[0])
     assert 0.7 < np.mean(sigmas) / np.sqrt(np.mean(np.square(values))) < 1.5
@@ -241,7 +236,6 @@ def test_what_is_considered_widens_an_unknown_by_its_scatter() -> None:
         table = table_of(exact + shifts + 0.1 * rng.standard_normal((300, 2)), points, 30)
         rows = np.argsort(table.frame, kind="stable")
         fit = fit_camera(camera, block_of(camera, table), fields[:, :, rows], considered=2)
-        assert fit is not None
         values.append(fit.free(0).values[0])
         sigmas.append(fit.free(0).sigmas[0])
     assert np.mean(sigmas) == pytest.approx(np.std(values), rel=0.2)

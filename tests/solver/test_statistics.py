@@ -46,7 +46,6 @@ def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> Non
         solved = solve_joint(pair, table)  # without the checks, which take most of a solve's time
         found, true = solved.T_camera_lidar, pair.T_camera_lidar
         joint = solved.marginals.scatter
-        assert joint is not None
         T_right_left = found["right"] @ np.linalg.inv(found["left"])
         xi_pair = error(T_right_left, true["right"] @ np.linalg.inv(true["left"]))
         for name, xi, covariance in (
@@ -98,7 +97,6 @@ def test_the_reported_covariance_covers_draws_of_data(
         truth = drawn.aligned if of == "alignment" else drawn.rig.T_camera_lidar
         for name, T in truth.items():
             covariance = result.covariance[name]
-            assert covariance is not None
             xi = error(result.T_camera_lidar[name], T)
             found.setdefault(name, []).append(float(xi @ np.linalg.solve(covariance, xi)))
     for name, values in found.items():

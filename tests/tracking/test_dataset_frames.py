@@ -142,7 +142,6 @@ def test_flat_images_widen_the_result_at_the_end_and_its_verdict(
         np.testing.assert_array_equal(rig.T_camera_lidar[name], T)
     wider = {n: wide.sigmas(n)[1] / narrow.sigmas(n)[1] for n in ("left", "right")}
     assert wider["left"].min() > 3 and wider["right"].max() == pytest.approx(1)
-    assert wide.joint_covariance is not None
     np.testing.assert_array_equal(wide.joint_covariance[:6, :6], wide.covariance["left"])
     kinds = {check.kind: check for check in wide.camera_verdicts["left"].checks}
     beyond = kinds["beyond_tolerance"]

@@ -56,7 +56,6 @@ def test_curves_end_at_zero_and_bring_the_newest_estimate_to_the_older_ones():
     for frame, xi in enumerate(xis):
         history.add(update(frame, {"left": xi}))
     curve = history.curves()["left"]
-    assert curve is not None
     np.testing.assert_array_equal(curve.xi[-1], 0)
     for xi, difference in zip(xis, curve.xi, strict=True):
         np.testing.assert_allclose(

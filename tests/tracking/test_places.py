@@ -57,7 +57,6 @@ STATED = {
 def batch_of(drawn: Drawn, **config: object) -> tuple[dict[str, Array], Array]:
     solved = solve_joint(drawn.rig, drawn.table, Config(learnt_weights=False, **config))
     joint = Evidence(solved, guess=drawn.rig).joint_covariance
-    assert joint is not None
     return solved.T_camera_lidar, joint
 
 
@@ -85,7 +84,6 @@ def test_places_give_what_a_batch_gives(places: int, frames: int, rounds: int, t
     T, joint = batch_of(drawn)
     result = track_draw(drawn)
     found = result.joint_covariance
-    assert found is not None
     apart = [twist_between(result.T_camera_lidar[name], T[name]) for name in T]
     sigmas = np.sqrt(np.diag(joint))
     assert np.sqrt(np.mean(np.square(np.concatenate(apart) / sigmas))) < 0.1
@@ -128,7 +126,6 @@ def test_relative_poses_share_the_error_of_the_cloud() -> None:
     for frame, table in enumerate(tables):
         tracker.update(table, place=frame // 2)
     result = tracker.calibration()
-    assert result.joint_covariance is not None
     variance = np.square(sigmas_of_pair(result.T_camera_lidar, result.joint_covariance)[:3])
     expected = 2 * 0.6 * STATED["systematic_rotation_rad"] ** 2
     assert (variance > expected).all() and (variance < 1.5 * expected).all()
@@ -175,7 +172,6 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     data = PlaceData.of(state, quadratics_of(state, sums), (), {"a": 1})
     model = place_model(state, sums, seen, data, times={})
     found = fit_latent_poses(model, start_values(model, rig.T_camera_lidar))
-    assert found is not None
     parts, A = model.components, [*map(adjoint_camera_lidar, tracker._state.references)]
     flat, bent = np.concatenate(A), 0.2 * shifts[:, :, 2].ravel()
     expected = np.kron(np.eye(2), parts.camera) + np.outer(bent, bent)
@@ -206,7 +202,6 @@ def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:
     marginals = gtsam.Marginals(graph, values)
     for camera, name in enumerate(("left", "right")):
         reported = update.covariance[name]
-        assert reported is not None
         found = marginals.marginalCovariance(keys[camera])
         np.testing.assert_allclose(
             found,
@@ -230,7 +225,6 @@ def test_with_a_preset_of_the_paper_the_graph_is_equation_5() -> None:
             to_T_camera_lidar(found.atPose3(camera_key(camera))),
             update.covariance[name],
         )
-        assert covariance is not None
         assert np.abs(twist_between(own, T) / np.sqrt(np.diag(covariance))).max() < 0.01
 
 
@@ -247,7 +241,6 @@ def test_an_update_is_the_optimum_of_the_graph_with_all_places() -> None:
     model = place_model(state, places, FrameSpread.of(state, places), data, times={})
     model = replace(model, pose_graph=pose_priors(state))
     whole = fit_latent_poses(model, start_values(model, update.T_camera_lidar))
-    assert whole is not None
     sigmas = np.sqrt(np.diag(whole.covariance)).reshape(2, 6)
     for own, (name, T) in zip(sigmas, whole.T_camera_lidar.items(), strict=True):
         apart = twist_between(update.T_camera_lidar[name], T)
@@ -383,7 +376,6 @@ def test_bends_widen_the_error_bar_as_in_a_batch_and_survive_a_restart(tmp_path:
             result = tracker.tracker.calibration()
         with DurableCalibrator(tmp_path / str(motion_m), rig, MOUNT) as tracker:
             again = tracker.tracker.calibration()
-        assert result.joint_covariance is not None and again.joint_covariance is not None
         np.testing.assert_array_equal(again.joint_covariance, result.joint_covariance)
         sigmas[motion_m] = sigmas_of_pair(result.T_camera_lidar, result.joint_covariance)
         T, joint = batch_of(

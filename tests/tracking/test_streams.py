@@ -191,13 +191,9 @@ def test_a_json_line_is_a_frame() -> None:
     left_rows, right_rows = item.table.of_camera("left"), item.table.of_camera("right")
     assert left_rows.pixels_px.tolist() == [[1, 1.5], [2, 1.5]]
     assert left_rows.confidence.tolist() == [0.5, 1]
-    assert left_rows.point_index is not None
     assert left_rows.point_index.tolist() == [3, -1]
-    assert left_rows.information_px is not None
     assert left_rows.information_px.tolist() == [[1, 0, 1]] * 2
-    assert right_rows.information_px is not None
     assert right_rows.information_px.tolist() == [[2, 0.5, 1]]
-    assert right_rows.point_index is not None
     assert right_rows.point_index.tolist() == [-1]
     assert right_rows.confidence.tolist() == [1]
 

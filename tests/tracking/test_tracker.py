@@ -66,7 +66,6 @@ def test_a_static_rig_gives_what_a_batch_gives(mixed_rig: Rig) -> None:
     apart = []
     for name in mixed_rig.cameras:
         expected, found = batch.covariance[name], last.covariance[name]
-        assert expected is not None and found is not None
         sigmas = np.sqrt(np.diag(expected))
         apart.append(difference(last.T_camera_lidar[name], batch.T_camera_lidar[name]) / sigmas)
         np.testing.assert_allclose(np.diag(found), np.diag(expected), rtol=0.1)
@@ -85,11 +84,9 @@ def test_a_step_of_one_camera_is_found_within_3_frames_and_named(pair: Rig, who:
     assert event.detected_frame <= 27
     for one in (tracker, IncrementalCalibrator.from_bytes(tracker.to_bytes())):
         assert one.calibration().summary.moves == (str(event),)
-    assert event.size is not None
     assert abs(event.size.rotation_deg - 0.5) < 4 * event.size.rotation_sigma_deg
     for name, T in updates[-1].T_camera_lidar.items():
         covariance = updates[-1].covariance[name]
-        assert covariance is not None
         xi = difference(T, after.T_camera_lidar[name])
         # 6 degrees of freedom, of which few are estimated from 25 frames: 50 is beyond 1e-7.
         assert xi @ np.linalg.solve(covariance, xi) < 50
@@ -140,7 +137,6 @@ def test_failed_matches_are_left_out_and_counted(pair: Rig) -> None:
     assert tracker.calibration().counts["left"]["left_out"] == left_out
     xi = difference(updates[-1].T_camera_lidar["left"], pair.T_camera_lidar["left"])
     covariance = updates[-1].covariance["left"]
-    assert covariance is not None
     assert xi @ np.linalg.solve(covariance, xi) < 50
 
 
@@ -175,7 +171,6 @@ def test_a_drift_is_followed_with_an_honest_error_bar(pair: Rig) -> None:
     assert len(events) <= 2
     xi = difference(updates[-1].T_camera_lidar["left"], rig_at(499).T_camera_lidar["left"])
     covariance = updates[-1].covariance["left"]
-    assert covariance is not None
     assert np.degrees(np.linalg.norm(xi[:3])) < 0.057
     assert abs(xi[1]) < 4 * np.sqrt(covariance[1, 1])
 
@@ -255,14 +250,12 @@ def test_a_frozen_sensor_adds_nothing_and_is_blind(pair: Rig, noise_px: float) -
     tables, rng = drive_at(lambda _: pair, 12), np.random.default_rng(0)
     tracker, updates = tracked(pair, tables)
     before = updates[-1].covariance["left"]
-    assert before is not None
     for number in range(12, 50):
         frame = np.full(len(tables[-1]), number, dtype=np.int64)
         noise = noise_px * rng.standard_normal(tables[-1].pixels_px.shape)
         pixels_px = tables[-1].pixels_px + noise
         update = tracker.update(replace(tables[-1], frame=frame, pixels_px=pixels_px))
     after = update.covariance["left"]
-    assert after is not None
     assert (np.diag(after) > 0.9 * np.diag(before)).all()  # 38 new frames would leave a quarter
     (check,) = [c for c in update.verdicts["left"].checks if c.name in ("stuck", "blind frames")]
     assert check.text.startswith("the last 39 frames with matches have the same points")
@@ -310,7 +303,6 @@ def test_the_cause_of_a_step_follows_from_the_steps_of_all_cameras(mixed_rig: Ri
     D = gtsam.Pose3.Expmap(step_of(0.3, 2))
     by_lidar = [np.asarray(p.localCoordinates(D.compose(p))) for p in T_lidar_cameras]
     cause = find_cause(steps_of(mixed_rig, by_lidar, 1e-4))
-    assert cause.lidar is not None
     np.testing.assert_allclose(cause.lidar[0], step_of(0.3, 2), atol=1e-9)
     still = np.zeros(6)
     assert find_cause(steps_of(mixed_rig, [still, by_lidar[1], still], 1e-4)).cameras == (1,)

@@ -58,7 +58,6 @@ def with_frames_of_right(table: Correspondences, frames: int) -> Correspondences
 
 def test_the_covariance_has_full_rank_with_fewer_frames_than_numbers(mixed_rig: Rig) -> None:
     result = solve(mixed_rig, simulated(mixed_rig, frames=5))
-    assert result.joint_covariance is not None
     assert np.linalg.eigvalsh(result.joint_covariance)[0] > 0
 
 
@@ -68,7 +67,6 @@ def test_the_error_bar_of_few_frames_is_wide(pair: Rig, frames: int) -> None:
     few, many = (solve(pair, simulated(pair, frames=n)) for n in (frames, 40))
     for name in pair.cameras:
         narrow, wide = (result.sigmas(name) for result in (many, few))
-        assert narrow is not None and wide is not None
         for one, other in zip(narrow, wide, strict=True):
             assert np.exp(np.log(other / one).mean()) > 0.8 * np.sqrt(40 / frames)
     assert few.verdict.status != "PASS"
@@ -80,7 +78,6 @@ def test_the_sigmas_of_a_relative_pose_are_in_the_error_bar(pair: Rig) -> None:
     table = simulated(pair, frames=10).of_camera("left")
     result = solve(tied(pair, rotation_deg=2.9, translation_m=0.3), table)
     sigmas = result.sigmas("right")
-    assert sigmas is not None
     assert sigmas[0] == pytest.approx([2.9] * 3, rel=0.01)
     assert sigmas[1] == pytest.approx([30] * 3, rel=0.1)
     of_left = result.sigmas("left")
@@ -90,7 +87,6 @@ def test_the_sigmas_of_a_relative_pose_are_in_the_error_bar(pair: Rig) -> None:
 def test_a_camera_with_few_frames_has_a_wider_error_bar_than_one_with_many(pair: Rig) -> None:
     result = solve(pair, with_frames_of_right(simulated(pair, frames=40), 6))
     left, right = (result.sigmas(name) for name in ("left", "right"))
-    assert left is not None and right is not None
     assert (right[0] > 1.5 * left[0]).all()
 
 
@@ -103,7 +99,6 @@ def test_an_error_shared_by_all_frames_moves_a_camera_without_correspondences_wi
     table = table.with_metadata(findings)
     evidence = Evidence(solve_joint(rig, table), guess=rig)
     covariance = evidence.joint_covariance
-    assert covariance is not None
     sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 6)
     assert sigmas[1, :3] == pytest.approx([0.01] * 3, rel=0.05)  # not more: the pair is rigid
     assert sigmas[1, 3:] == pytest.approx([0.1] * 3, rel=0.05)

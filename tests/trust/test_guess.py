@@ -225,7 +225,6 @@ def test_a_mistake_is_recognised_by_the_images_at_a_rough_guess(error: str, seed
     T = {name: mistaken(error, T) for name, T in rough.T_camera_lidar.items()}
     wrong = rough.moved_to(T)
     found = likely_intended_guess(one_frame(), wrong)
-    assert found is not None
     assert f"fit clearly better if {in_words(error)}; undo it" in found
     assert f"--correct {error} " in found
     undone = correct_guess(wrong, [error])

@@ -154,7 +154,6 @@ def test_flat_evidence_is_doubt_of_the_error_bar_alone_and_no_check_fails(pair: 
     found = to_calibration(
         evidence, RunChecks(assess(evidence), unseen=evidence.cameras)
     ).camera_verdicts["left"]
-    assert found.error_probability is not None
     assert found.error_probability.by_error_bar > 0.1
     assert found.error_probability.by_checks < 0.01
     assert found.status == "WARN" and found.cannot_tell
@@ -169,7 +168,6 @@ def test_a_wider_surface_is_a_finding_that_changes_no_verdict(
     """The check states how much wider; the verdict is the one without it."""
     solution = solve_joint(pair, simulated(pair, frames=20))
     covariance = Evidence(solution, pair).covariance_of("left")
-    assert covariance is not None
     evidence = Evidence(solution, pair, lambda *_: {"left": certain(wider**2 * covariance)})
     found = to_calibration(
         evidence, RunChecks(assess(evidence), unseen=evidence.cameras)
@@ -178,7 +176,6 @@ def test_a_wider_surface_is_a_finding_that_changes_no_verdict(
     assert check.status == status
     assert check.value == pytest.approx(wider)
     others = tuple(each for each in found.checks if each is not check)
-    assert found.error_probability is not None
     without = judge(others, found.error_probability.by_error_bar, TOLERANCE, TABLES)
     assert (without.status, without.cannot_tell) == (found.status, found.cannot_tell)
     assert without.error_probability == found.error_probability
