@@ -129,15 +129,9 @@ def require_equal(
     keys: list[int],
     chain: np.ndarray,
 ) -> None:
-    """The error and the linearization are those of GTSAM's factors on fixed points.
+    """Error and linearization at ``ours`` are those of GTSAM's factors, one for each fixed point.
 
-    Args:
-        block: of our factor.
-        ours: pose and lens.
-        factors: of GTSAM, one for each point.
-        theirs: the values of ``keys``; the points are added.
-        keys: of their variables but the points.
-        chain: the derivatives of these by pose and lens.
+    ``chain`` has the derivatives of their variables ``keys`` by pose and lens.
     """
     one, many = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
     one.add(free_lens_factor([KEY, KEY_LENS], block))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import gtsam
 import numpy as np
 import pytest
@@ -74,24 +76,23 @@ def test_angles_and_distances_of_extrinsics_are_those_of_the_cameras() -> None:
     assert angle_deg(QUARTER[:3, :3]) == pytest.approx(90.0)
 
 
+def differences(function: Callable[[np.ndarray], np.ndarray], size: int) -> np.ndarray:
+    """The Jacobian at zero, by central differences: exact to eps / step = 1e-10."""
+    steps = 1e-6 * np.eye(size)
+    return np.column_stack([(function(xi) - function(-xi)) / 2e-6 for xi in steps])
+
+
 def test_the_covariance_of_a_pair_follows_from_finite_differences() -> None:
     """Of xi in T_b_a = exp(xi) estimate, by perturbing both extrinsics on the left."""
     T_a, T_b = random_transform(1), random_transform(2)
     T_b_a = relative_transform(T_b, T_a)
-    step = 1e-6
-    jacobian = np.zeros((6, 12))
-    for axis in range(12):
-        ends = []
-        for sign in (1, -1):
-            xi = np.zeros(12)
-            xi[axis] = sign * step
-            moved = relative_transform(exp(xi[6:]) @ T_b, exp(xi[:6]) @ T_a)
-            ends.append(twist_between(moved, T_b_a))
-        jacobian[:, axis] = (ends[0] - ends[1]) / (2 * step)
+    jacobian = differences(
+        lambda xi: twist_between(relative_transform(exp(xi[6:]) @ T_b, exp(xi[:6]) @ T_a), T_b_a),
+        12,
+    )
     root = np.random.default_rng(3).standard_normal((12, 12))
     joint = root @ root.T
     expected = jacobian @ joint @ jacobian.T
-    # Central differences: rounding eps / step = 1e-10, truncation step^2 = 1e-12, times |joint|.
     tolerance = 1e-8 * np.abs(expected).max()
     np.testing.assert_allclose(
         relative_covariance(joint, 0, 1, T_b_a), expected, rtol=0, atol=tolerance
@@ -125,19 +126,16 @@ def test_many_poses_move_as_gtsam_moves_each(size: float) -> None:
 def test_the_covariance_of_ros_is_that_of_the_moved_pose() -> None:
     """By finite differences of the pose in the LiDAR frame, over each direction of xi."""
     T = make_camera((0.3, 0.2, -0.1), yaw_deg=35).T_camera_lidar
-    step = 1e-6
-    jacobian = np.empty((6, 6))
-    for k in range(6):
-        poses = []
-        for sign in (1, -1):
-            xi = np.zeros(6)
-            xi[k] = sign * step
-            poses.append(np.linalg.inv(gtsam.Pose3.Expmap(xi).matrix() @ T))
-        plus, minus = poses
-        turn = (plus[:3, :3] @ minus[:3, :3].T) / (2 * step)
+    here = np.linalg.inv(T)
+
+    def moved(xi: np.ndarray) -> np.ndarray:
+        """Shift and turn of the camera, in axes of the LiDAR."""
+        there = np.linalg.inv(exp(xi) @ T)
+        turn = there[:3, :3] @ here[:3, :3].T
         axis = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
-        jacobian[:3, k] = (plus[:3, 3] - minus[:3, 3]) / (2 * step)
-        jacobian[3:, k] = 0.5 * np.array(axis)
+        return np.concatenate([there[:3, 3] - here[:3, 3], 0.5 * np.array(axis)])
+
+    jacobian = differences(moved, 6)
     root = np.random.default_rng(3).normal(size=(6, 6))
     covariance = root @ root.T
     expected = jacobian @ covariance @ jacobian.T

@@ -40,10 +40,6 @@ BAD = {
         {"intrinsics_px": {"fx": -1, "fy": 700, "cx": 1, "cy": 1}},
         r"intrinsics_px.fx.*-1",
     ),
-    "text for a number": (
-        {"intrinsics_px": {"fx": "wide", "fy": 700, "cx": 1, "cy": 1}},
-        r"fx.*'wide'",
-    ),
     "missing key": ({"intrinsics_px": {"fx": 700, "fy": 700, "cx": 1}}, r"cy' is missing"),
     "not finite": ({"T_camera_lidar": [[math.nan] * 4] * 4}, r"not finite"),
     "far away": (
@@ -56,7 +52,6 @@ BAD = {
     ),
     "large coefficient": ({"distortion": [1e300] * 5}, r"distortion.0.*1e\+300"),
     "shape": ({"T_camera_lidar": [[1, 0], [0, 1]]}, r"4x4.*\(2, 2\)"),
-    "ragged": ({"T_camera_lidar": [[1, 0], [0]]}, r"4x4"),
     "not a rotation": ({"T_camera_lidar": (2 * np.eye(4)).tolist()}, r"last row"),
     "scaled": ({"T_camera_lidar": np.diag([2.0, 2, 2, 1]).tolist()}, r"not a rotation"),
     "mirrored": ({"T_camera_lidar": np.diag([-1.0, 1, 1, 1]).tolist()}, r"determinant -1"),

@@ -13,7 +13,6 @@ from calibgraph import (
     Config,
     Correspondences,
     MatcherErrors,
-    RelativePose,
     Rig,
     simulate_correspondences,
 )
@@ -27,12 +26,13 @@ from calibgraph.graph.variables import (
     matched_key,
     paired_key,
 )
-from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
+from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_pairs import pair_terms
 from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.joint import solve_joint
 from factors import ProjectionBlock, pair_sums, placed_pair_factor
+from tests.conftest import stereo_relative_pose
 from tests.solver.test_camera_pairs import simulated_pairs
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
@@ -123,13 +123,9 @@ def minimize(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Va
 
 def tie(rig: Rig) -> Rig:
     """The first two cameras, 0.1 deg and 1 cm off."""
-    a, b = list(rig.cameras)[:2]
-    T = rig.T_camera_lidar
+    exact = stereo_relative_pose(rig, *list(rig.cameras)[:2], sigmas=(1e-3, 0.005))
     off = gtsam.Pose3.Expmap(np.repeat([1e-3, 0.006], 3)).matrix()
-    measured = RelativePose(
-        a=a, b=b, T_a_b=relative_transform(T[a], T[b]) @ off,
-        rotation_sigma_rad=1e-3, translation_sigma_m=0.005,
-    )  # fmt: skip
+    measured = exact.model_copy(update={"T_a_b": exact.T_a_b @ off})
     return rig.model_copy(update={"relative_poses": (measured,)})
 
 

@@ -96,29 +96,18 @@ def test_simulated_matchers_state_it_where_they_have_none(pair: Rig) -> None:
         assert kept.states_common_error == states
 
 
-def test_pseudo_frames_add_the_scatter_without_its_correlations() -> None:
-    rng = np.random.default_rng(0)
-    hessian = np.diag([4.0, 3.0, 2.0, 1.0])
-    gradients = rng.standard_normal((10, 4)) @ rng.standard_normal((4, 4))
-    scatter = gradients.T @ gradients
-    found = with_pseudo_frames(scatter, hessian, np.full(4, 10.0))
-    np.testing.assert_allclose(found, scatter + 6 / 9 * np.diag(np.diag(scatter)))
-
-
-def test_of_one_frame_the_scatter_is_what_is_usual() -> None:
-    """Its own gradient is zero at the solution; along the axes of the Hessian, usual remains."""
-    hessian, usual = np.diag([4.0, 3.0, 2.0, 1.0]), np.diag([9.0, 8.0, 7.0, 6.0])
+def test_few_frames_add_what_is_usual_and_many_keep_their_own_scatter() -> None:
+    """The gradient of one frame is zero at the solution; of ten, pseudo frames add a diagonal."""
+    rng, hessian = np.random.default_rng(0), np.diag([4.0, 3.0, 2.0, 1.0])
+    usual = np.diag([9.0, 8.0, 7.0, 6.0])
     found = with_pseudo_frames(np.zeros((4, 4)), hessian, np.ones(4), usual)
     np.testing.assert_allclose(found, usual)
-
-
-def test_of_many_frames_their_own_scatter_remains() -> None:
-    rng = np.random.default_rng(0)
-    gradients = rng.standard_normal((4000, 4))
-    scatter = gradients.T @ gradients
-    found = with_pseudo_frames(
-        scatter, np.diag([4.0, 3.0, 2.0, 1.0]), np.full(4, 4000.0), 100 * scatter
-    )
+    few, many = (rng.standard_normal((frames, 4)) for frames in (10, 4000))
+    scatter = few.T @ few
+    found = with_pseudo_frames(scatter, hessian, np.full(4, 10.0))
+    np.testing.assert_allclose(found, scatter + 6 / 9 * np.diag(np.diag(scatter)))
+    scatter = many.T @ many
+    found = with_pseudo_frames(scatter, hessian, np.full(4, 4000.0), 100 * scatter)
     np.testing.assert_allclose(found, scatter, rtol=0.02, atol=0.02 * scatter[0, 0])
 
 

@@ -15,9 +15,8 @@ from calibgraph import Config, Correspondences, MatcherErrors, Rig, simulate_cor
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import relative_covariance
 from calibgraph.model.lens_knowledge import LensSigmas
-from calibgraph.model.rig import IntrinsicsSigma
 from calibgraph.solver.joint import solve_joint
-from tests.draws.lenses import put_lens_error
+from tests.draws.lenses import put_lens_error, with_known_lenses
 from tests.draws.places import draw_places
 from tests.solver.test_clock import STRAIGHT, late, with_times
 from tests.solver.test_lens import simulated, squared_errors
@@ -65,16 +64,6 @@ def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> Non
         else:
             assert 0.5 < np.mean(values) / 6 < 1.4, name
             assert inside >= 0.9, name
-
-
-def with_known_lenses(rig: Rig) -> Rig:
-    """No lens is wrong in the draws; the error bar of a mount has the usual errors of lenses."""
-    exact = {
-        "intrinsics_sigma_px": IntrinsicsSigma(focal=1e-4, centre=1e-4),
-        "distortion_sigma": 1e-7,
-    }
-    cameras = {name: camera.model_copy(update=exact) for name, camera in rig.cameras.items()}
-    return rig.model_copy(update={"cameras": cameras})
 
 
 @pytest.mark.parametrize("places", [1, 5])

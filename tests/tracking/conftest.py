@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -58,11 +57,3 @@ def piped(monkeypatch: pytest.MonkeyPatch, call: Call) -> Callable[..., tuple[in
         return call("track", rig, "-", *options)
 
     return run
-
-
-@pytest.fixture
-def memory() -> Iterator[Path]:
-    """A folder in memory, where thousands of databases are opened: syncing costs nothing there."""
-    place = "/dev/shm" if Path("/dev/shm").is_dir() else None
-    with tempfile.TemporaryDirectory(dir=place) as folder:
-        yield Path(folder)

@@ -16,20 +16,17 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from calibgraph import Config, Correspondences, Rig, concatenate, perturb
-from calibgraph.io.rigs import load_rig
+from calibgraph import Config, Correspondences, concatenate
 from calibgraph.tracking import command
 from calibgraph.tracking.command import Tracking, track
-from tests.conftest import Call, make_camera, stereo_relative_pose
+from tests.conftest import Call
 from tests.tracking.drives import (
     FRAMES,
     World,
     as_lines,
     content_of,
-    drive,
     file_lines,
     frames_in,
-    pair_of,
 )
 
 to_arrow = Correspondences.to_arrow
@@ -132,29 +129,6 @@ def test_a_number_far_beyond_the_last_one_does_not_make_all_others_late(
     assert code == 0
     assert frames_in(out) == [content["frame"] for content in contents]
     assert reason in err
-
-
-@pytest.mark.parametrize("kind", ["one", "mixed", "tied"])
-def test_any_rig_continues_with_the_same_lines(
-    kind: str, mixed_rig: Rig, call: Call, tmp_path: Path
-) -> None:
-    tied = pair_of()
-    truth = {
-        "one": Rig(cameras={"only": make_camera()}),
-        "mixed": mixed_rig,
-        "tied": tied.model_copy(update={"relative_poses": (stereo_relative_pose(tied),)}),
-    }[kind]
-    guess = perturb(truth, rotation_deg=1, translation_m=0.1, seed=2)
-    guess.save(tmp_path / "rig.yaml")
-    guess = load_rig(tmp_path / "rig.yaml")
-    tables = drive(truth)
-    concatenate(tables[:9]).save(tmp_path / "begin.parquet")
-    concatenate(tables).save(tmp_path / "whole.parquet")
-    arguments = ("--out", tmp_path / "out")
-    _, first, _ = call("track", tmp_path / "rig.yaml", tmp_path / "begin.parquet", *arguments)
-    code, second, _ = call("track", tmp_path / "rig.yaml", tmp_path / "whole.parquet", *arguments)
-    assert code == 0
-    assert (first + second).splitlines() == file_lines(guess, tables[:9], tables[9:])
 
 
 def test_a_reader_that_goes_away_ends_it_with_all_saved(

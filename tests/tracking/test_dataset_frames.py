@@ -25,12 +25,11 @@ from calibgraph import (
 from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.model.config import Tracking as Settings
-from calibgraph.model.geometry import relative_transform
-from calibgraph.model.rig import RelativePose
 from calibgraph.tracking import command, dataset_frames
 from calibgraph.tracking.command import Tracking, track
 from calibgraph.trust.pose_posterior import PosePosterior, no_posteriors
 from calibgraph.trust.run_evidence import RunEvidence
+from tests.conftest import stereo_relative_pose
 from tests.tracking.drives import FRAMES, Crashed, World, drive, flat, pair_of
 
 pytestmark = pytest.mark.usefixtures("no_picture")
@@ -158,15 +157,8 @@ SHORT = Config(tracking=Settings(epoch_frames=4, live_epochs=2))
 
 def rig_of(*, tied: bool) -> Rig:
     rig = pair_of()
-    T = rig.T_camera_lidar
-    pair = RelativePose(
-        a="left",
-        b="right",
-        T_a_b=relative_transform(T["left"], T["right"]),
-        rotation_sigma_rad=1e-3,
-        translation_sigma_m=1e-2,
-    )
-    return rig.model_copy(update={"relative_poses": (pair,) if tied else ()})
+    known = stereo_relative_pose(rig, sigmas=(1e-3, 1e-2))
+    return rig.model_copy(update={"relative_poses": (known,) if tied else ()})
 
 
 class Scorer:

@@ -22,14 +22,12 @@ from calibgraph import (
     concatenate,
     perturb,
 )
-from calibgraph.tracking import command, durable, tracker
+from calibgraph.tracking import durable, tracker
 from calibgraph.tracking.state_bytes import Kind, StateError, decode, encode
 from calibgraph.tracking.state_database import DATABASE, StateDatabase
 from calibgraph.tracking.update import json_line
 from tests.conftest import KANNALA, Call
 from tests.tracking.drives import (
-    FRAMES,
-    Crashed,
     World,
     drive_at,
     file_lines,
@@ -193,37 +191,6 @@ def test_of_updates_in_one_write_a_kill_leaves_all_or_none(
         assert [json_line(update) for update in resumed.repeated[3:]] == (
             world.lines[3:9] if done else []
         )
-
-
-@pytest.mark.parametrize(
-    ("at", "begin", "end"), [(0, 0, 1), (4, 4, 5), (9, 5, 14), (10, 5, 14), (13, 5, 14)]
-)
-def test_after_a_crash_the_lines_of_the_last_write_come_again(  # noqa: PLR0913
-    at: int,
-    begin: int,
-    end: int,
-    world: World,
-    call: Call,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
-    """Between the disk and the line: the line was not printed. The snapshots are every 5 frames."""
-    monkeypatch.setattr(durable, "_SNAPSHOT_EVERY", 5)
-    given: list[str] = []
-
-    def write(line: str) -> None:
-        if len(given) == at:
-            raise Crashed
-        given.append(line)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(command, "print_line", write)
-        with pytest.raises(Crashed):
-            call("track", world.rig, world.source, "--out", tmp_path)
-    code, out, err = call("track", world.rig, world.source, "--out", tmp_path)
-    assert code == 0
-    assert given == world.file_lines[:at] and out.splitlines() == world.file_lines[begin:]
-    assert f"{FRAMES - end} updates" in err
 
 
 def test_a_saved_tracker_continues_with_the_same_numbers(pair: Rig, tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from tempfile import mkdtemp
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
@@ -28,7 +27,6 @@ from tests.tracking.state_data import (
     LOG,
     Files,
     content,
-    drive,
     filled,
     held,
     opened,
@@ -39,12 +37,12 @@ from tests.tracking.state_data import (
 )
 
 
-def test_the_folder_does_not_grow_with_the_number_of_snapshots(memory: Path) -> None:
-    with opened(memory) as database:
+def test_the_folder_does_not_grow_with_the_number_of_snapshots(tmp_path: Path) -> None:
+    with opened(tmp_path) as database:
         for _ in range(60):
             database.append(os.urandom(10_000))
             database.snapshot(os.urandom(100_000))
-    assert sum(map(len, content(memory).values())) < 1_000_000
+    assert sum(map(len, content(tmp_path).values())) < 1_000_000
 
 
 def test_other_files_are_left_alone(tmp_path: Path) -> None:
@@ -80,59 +78,6 @@ def test_every_commit_is_synced(tmp_path: Path) -> None:
         ):
             found = database._connection.execute(f"PRAGMA {pragma}").fetchone()
             assert found == (expected,), pragma
-
-
-def test_a_power_cut_during_an_append_keeps_every_acknowledged_input(memory: Path) -> None:
-    """Of the bytes after the last sync, any may have reached the disk."""
-    rng = np.random.default_rng(0)
-    with opened(memory / "state") as database:
-        *_, done = drive(database, 5)
-        before = content(memory / "state")
-        database.append(b"005")
-        after = content(memory / "state")
-    assert before[DATABASE] == after[DATABASE]
-    old, new = (np.frombuffer(files[LOG], np.uint8) for files in (before, after))
-    changed = np.flatnonzero(new[: len(old)] != old)
-    first = changed[0] if len(changed) else len(old)
-    seen = set()
-    for length in [*range(first, len(new), 251), len(new)]:
-        survivors = np.zeros(max(length, len(old)), np.uint8)
-        survivors[: len(old)] = old
-        survivors[first:length] = new[first:length]
-        for spoil in (False, True):
-            if spoil:  # sectors that did not reach the disk, in any order
-                for sector in range(first // 512, length // 512):
-                    if rng.random() < 0.3:
-                        rows = slice(max(first, 512 * sector), min(length, 512 * sector + 512))
-                        survivors[rows] = rng.integers(256)
-            folder = restored(memory / "copy", after | {LOG: survivors.tobytes()})
-            result = recovered(folder)
-            assert result.damages == ()
-            assert held(result) in (done, done + b"005")
-            seen.add(held(result))
-    assert seen == {done, done + b"005"}
-    require_usable(folder, held(result))
-
-
-def test_a_power_cut_during_a_checkpoint_keeps_every_acknowledged_input(memory: Path) -> None:
-    """The log is whole then; of the pages that are copied from it, any may be on the disk."""
-    rng = np.random.default_rng(0)
-    with opened(memory / "state") as database:
-        *_, done = drive(database, 8)
-        before = content(memory / "state")
-        database._connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
-        after = content(memory / "state")
-    assert before[LOG] == after[LOG] and before[DATABASE] != after[DATABASE]
-    size = len(after[DATABASE])
-    old = np.frombuffer(before[DATABASE].ljust(size, b"\0"), np.uint8).reshape(-1, 512)
-    new = np.frombuffer(after[DATABASE], np.uint8).reshape(-1, 512)
-    for _ in range(50):
-        mixed = np.where(rng.random(len(old))[:, None] < 0.5, old, new)
-        folder = restored(memory / "copy", before | {DATABASE: mixed.tobytes()})
-        if mixed[0].tobytes() not in (old[0].tobytes(), new[0].tobytes()):
-            continue
-        assert recovered(folder).damages == ()
-        require_usable(folder, done)
 
 
 def test_what_a_crash_left_of_a_new_database_is_removed(tmp_path: Path) -> None:
@@ -299,9 +244,9 @@ def file_size_limit(limit_bytes: int) -> Iterator[None]:
 class Journal(RuleBasedStateMachine):
     """A database, and beside it all that it has acknowledged."""
 
-    def __init__(self, memory: Path) -> None:
+    def __init__(self, tmp_path: Path) -> None:
         super().__init__()
-        self.folder = Path(mkdtemp(dir=memory)) / "state"
+        self.folder = Path(mkdtemp(dir=tmp_path)) / "state"
         self.count, self.done = 0, b""
         self.database = StateDatabase(self.folder)
 
@@ -407,9 +352,9 @@ def damaged(data: bytes, place: float, is_cut: bool) -> bytes:
     return data[:at] + (b"" if is_cut else bytes([data[at] ^ 0xFF]) + data[at + 1 :])
 
 
-def test_what_was_acknowledged_is_there_after_kills_full_disks_and_damage(memory: Path) -> None:
+def test_what_was_acknowledged_is_there_after_kills_full_disks_and_damage(tmp_path: Path) -> None:
     run_state_machine_as_test(
-        partial(Journal, memory),
+        partial(Journal, tmp_path),
         settings=settings(
             max_examples=80,
             stateful_step_count=20,
@@ -421,9 +366,9 @@ def test_what_was_acknowledged_is_there_after_kills_full_disks_and_damage(memory
     )
 
 
-def test_a_state_that_a_full_disk_hides_is_not_called_damaged(memory: Path) -> None:
-    truth = filled(memory / "state", 5)
+def test_a_state_that_a_full_disk_hides_is_not_called_damaged(tmp_path: Path) -> None:
+    truth = filled(tmp_path / "state", 5)
     full = pytest.raises(FileError, match="cannot be read .*: is the disk full")
     with file_size_limit(1000), full:
-        StateDatabase(memory / "state")
-    require_usable(memory / "state", truth)
+        StateDatabase(tmp_path / "state")
+    require_usable(tmp_path / "state", truth)

@@ -145,24 +145,15 @@ def test_the_times_of_a_rig_stand_where_the_motion_of_a_bag_is_known() -> None:
     assert {check.status for of in checks.values() for check in of} == {"PASS"}
 
 
-def registered(
-    stems: Sequence[str], folder: str, suffix: str, step_m: float, monkeypatch: pytest.MonkeyPatch
-) -> list[Frame]:
-    """Frames that have moved ahead by ``step_m`` from one to the next; their clouds fit exactly."""
-    T = np.eye(4)
-    T[0, 3] = step_m
+def register_clouds(poses: Sequence[np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clouds of frames at these poses fit exactly."""
 
-    def fit(target: np.ndarray, source: np.ndarray, _: Path) -> np.ndarray:
-        steps = round(float(source[0, 0] - target[0, 0]))
-        return np.asarray(np.linalg.matrix_power(T if steps > 0 else np.linalg.inv(T), abs(steps)))
+    def register(target: int, source: int, _: Path) -> np.ndarray:
+        return np.asarray(invert(poses[target]) @ poses[source])
 
-    monkeypatch.setattr("calibgraph.io.frame.register", fit)
-    monkeypatch.setattr("calibgraph.io.frame.prepare_scan", lambda points: points)
-    monkeypatch.setattr(
-        Frame, "load_cloud", lambda self: np.full((1, 4), self.index, dtype=np.float32)
-    )
-    paths = [Path(folder) / f"{stem}{suffix}" for stem in stems]
-    return [Frame(n, stem, paths[n], {}) for n, stem in enumerate(stems)]
+    monkeypatch.setattr("calibgraph.io.frame.register", register)
+    monkeypatch.setattr("calibgraph.io.frame.prepare_scan", lambda points: int(points[0, 0]))
+    monkeypatch.setattr(Frame, "load_cloud", lambda frame: np.full((1, 4), frame.index))
 
 
 @pytest.mark.parametrize(
@@ -181,8 +172,10 @@ def test_clouds_are_as_far_apart_as_their_stamps_or_numbers_say(
 ) -> None:
     rig, table, _ = late_by(0.0)
     suffix = MESSAGE_SUFFIX if suffix == ".message" else suffix
-    frames = registered(stems, "drive", suffix, 2.0, monkeypatch)
-    kept = keep_frames(Dataset(rig=rig, frames=tuple(frames), folders=()))
+    ahead = gtsam.Pose3(gtsam.Rot3(), np.array([2.0, 0.0, 0.0])).matrix()
+    register_clouds([np.linalg.matrix_power(ahead, n) for n in range(len(stems))], monkeypatch)
+    frames = tuple(Frame(n, s, Path("drive") / f"{s}{suffix}", {}) for n, s in enumerate(stems))
+    kept = keep_frames(Dataset(rig=rig, frames=frames, folders=()))
     moved, by_scans = _with_known_motion(kept)
     assert moved is not None and by_scans
     for frame in moved.frames:
@@ -208,13 +201,7 @@ def drive(monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
     poses = [np.eye(4)]
     for twist in twists:
         poses.append(poses[-1] @ gtsam.Pose3.Expmap(0.1 * twist).matrix())
-
-    def register(target: int, source: int, _: Path) -> np.ndarray:
-        return np.asarray(invert(poses[target]) @ poses[source])
-
-    monkeypatch.setattr("calibgraph.io.frame.register", register)
-    monkeypatch.setattr("calibgraph.io.frame.prepare_scan", lambda points: int(points[0, 0]))
-    monkeypatch.setattr(Frame, "load_cloud", lambda frame: np.full((1, 4), frame.index))
+    register_clouds(poses, monkeypatch)
     return (twists[:-1] + twists[1:]) / 2
 
 

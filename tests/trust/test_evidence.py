@@ -17,7 +17,6 @@ from calibgraph import (
     Config,
     Correspondences,
     MatcherErrors,
-    RelativePose,
     Rig,
     concatenate,
     perturb,
@@ -25,12 +24,12 @@ from calibgraph import (
     solve,
 )
 from calibgraph.model.camera_matches import CameraMatches
-from calibgraph.model.geometry import relative_transform
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pair_refinement import fit_pairs
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.pair_agreement import PairAgreement, check_agreement, pair_agreement
 from factors import pose_sigmas
+from tests.conftest import stereo_relative_pose
 from tests.solver.test_camera_pairs import simulated_pairs
 from tests.trust.conftest import named, simulated
 
@@ -39,14 +38,8 @@ Array = NDArray[np.float64]
 
 def tied(rig: Rig, *, rotation_deg: float, translation_m: float) -> Rig:
     """With a measured relative pose of right and left."""
-    T = rig.T_camera_lidar
-    measured = RelativePose(
-        a="right",
-        b="left",
-        T_a_b=relative_transform(T["right"], T["left"]),
-        rotation_sigma_rad=np.radians(rotation_deg),
-        translation_sigma_m=translation_m,
-    )
+    sigmas = np.radians(rotation_deg), translation_m
+    measured = stereo_relative_pose(rig, "right", "left", sigmas=sigmas)
     return rig.model_copy(update={"relative_poses": (measured,)})
 
 
@@ -227,11 +220,7 @@ def test_cameras_that_end_at_one_pose_are_no_pass_unless_the_rig_ties_them(
     rig = pair.moved_to({"right": T})
     table = simulate_correspondences(rig, frames=8, matches=200)
     if tied:
-        tie = RelativePose(
-            a="left", b="right", T_a_b=np.eye(4),
-            rotation_sigma_rad=0.001, translation_sigma_m=0.001,
-        )  # fmt: skip
-        rig = rig.model_copy(update={"relative_poses": (tie,)})
+        rig = rig.model_copy(update={"relative_poses": (stereo_relative_pose(rig),)})
     verdicts = calibgraph.solve(rig, table).camera_verdicts
     asked = not tied and metres == 0
     for verdict in verdicts.values():
