@@ -293,13 +293,10 @@ def fits_of(rig: Rig) -> list[PairFit]:
     return fit_pairs(rig, simulated_pairs(rig), Config(), held)
 
 
-def test_it_is_never_taken_for_less_than_usual(pair: Rig) -> None:
+def test_it_is_never_taken_for_less_than_usual_and_as_usual_without_tied_cameras(pair: Rig) -> None:
     covariance = np.diag(np.tile(EACH, 2))
-    assert shared_variance_ratio(pair.T_camera_lidar, covariance, fits_of(pair)) == 1.0
-
-
-def test_without_tied_cameras_it_is_as_usual(pair: Rig) -> None:
-    assert shared_variance_ratio(pair.T_camera_lidar, np.eye(12), ()) == 1.0
+    for fits in (fits_of(pair), ()):
+        assert shared_variance_ratio(pair.T_camera_lidar, covariance, fits) == 1.0
 
 
 def test_a_displaced_camera_widens_the_error_bars(pair: Rig) -> None:
@@ -362,10 +359,7 @@ def test_the_size_of_places_is_found_from_many_of_them(pair: Rig, size: float) -
     assert np.mean(found) == pytest.approx(expected, rel=0.15, abs=4 * spread)
 
 
-def test_few_places_are_never_taken_for_better_than_usual(pair: Rig) -> None:
-    assert errors_of(pair, table_of(pair, 4, 0.0, 0)).ratios == VarianceRatios()
-
-
-def test_one_place_has_the_usual_size(pair: Rig) -> None:
-    """Nothing is measured twice, so nothing is learnt, whatever the error."""
-    assert errors_of(pair, table_of(pair, 1, 25.0, 0)).ratios == VarianceRatios()
+def test_few_places_are_never_taken_for_better_than_usual_and_one_says_nothing(pair: Rig) -> None:
+    """At one place nothing is measured twice, so nothing is learnt, whatever the error."""
+    for places, size in ((4, 0.0), (1, 25.0)):
+        assert errors_of(pair, table_of(pair, places, size, 0)).ratios == VarianceRatios()

@@ -86,10 +86,9 @@ def test_a_step_of_one_camera_is_found_within_3_frames_and_named(pair: Rig, who:
         assert one.calibration().summary.moves == (str(event),)
     assert abs(event.size.rotation_deg - 0.5) < 4 * event.size.rotation_sigma_deg
     for name, T in updates[-1].T_camera_lidar.items():
-        covariance = updates[-1].covariance[name]
         xi = difference(T, after.T_camera_lidar[name])
         # 6 degrees of freedom, of which few are estimated from 25 frames: 50 is beyond 1e-7.
-        assert xi @ np.linalg.solve(covariance, xi) < 50
+        assert xi @ np.linalg.solve(updates[-1].covariance[name], xi) < 50
 
 
 def test_a_step_of_the_lidar_is_not_blamed_on_a_camera(mixed_rig: Rig) -> None:
@@ -136,20 +135,15 @@ def test_failed_matches_are_left_out_and_counted(pair: Rig) -> None:
     assert 4 <= left_out <= 20  # 30 % of 40 is 12 +- 2.9
     assert tracker.calibration().counts["left"]["left_out"] == left_out
     xi = difference(updates[-1].T_camera_lidar["left"], pair.T_camera_lidar["left"])
-    covariance = updates[-1].covariance["left"]
-    assert xi @ np.linalg.solve(covariance, xi) < 50
+    assert xi @ np.linalg.solve(updates[-1].covariance["left"], xi) < 50
 
 
 def test_a_blind_camera_is_reported_once_and_again_when_it_is_back(pair: Rig) -> None:
     tables = drive_at(lambda frame: pair, 60, blind={"right": range(15, 40)})
     _, updates = tracked(pair, tables)
     blind, back = events_of(updates)
-    assert (blind.kind, blind.camera, blind.frame, blind.detected_frame) == (
-        "blind",
-        "right",
-        15,
-        34,
-    )
+    assert (blind.kind, blind.camera) == ("blind", "right")
+    assert (blind.frame, blind.detected_frame) == (15, 34)
     assert (back.kind, back.camera, back.frame) == ("back", "right", 40)
     assert any("no usable matches" in reason for reason in updates[38].verdicts["right"].reasons)
     assert updates[-1].verdicts["right"].status == "PASS"
