@@ -28,6 +28,7 @@ from calibgraph.model.geometry import invert, twist_between
 from calibgraph.model.places import Places
 from tests.conftest import SAMPLE, Call, stereo_relative_pose
 from tests.matching.structure.data import with_noise_images
+from tests.solver.test_elimination import minimize
 
 pytestmark = pytest.mark.usefixtures("blank_diagrams", "no_image_checks")
 
@@ -216,11 +217,7 @@ def test_the_result_is_the_optimum_of_its_graph(truth: Rig, guess: Rig, config: 
     """GTSAM's Levenberg-Marquardt, from where all poses of a camera are equal."""
     table = table_of(truth).with_places(Places(places=((0, 1, 2), (3, 4, 5))))
     result = calibgraph.solve(guess.moved_to(truth.T_camera_lidar), table, config)
-    values = values_of(result)
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(0.0)
-    parameters.setAbsoluteErrorTol(0.0)
-    values = gtsam.LevenbergMarquardtOptimizer(result.graph, values, parameters).optimize()
+    values = minimize(result.graph, values_of(result))
     covariance = result.joint_covariance
     of = aligned_key if config.preset == "auto" else camera_key
     keys = [of(number) for number in range(len(truth.cameras))]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -48,7 +47,7 @@ def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def piped(monkeypatch: pytest.MonkeyPatch, call: Call) -> Callable[..., tuple[int, str, str]]:
+def piped(monkeypatch: pytest.MonkeyPatch, call: Call) -> Call:
     """Run ``track RIG -`` with bytes, or a file, on standard input."""
 
     def run(rig: Path, given: Any, *options: object) -> tuple[int, str, str]:

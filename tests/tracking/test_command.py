@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +46,7 @@ def test_every_update_is_a_line_of_json(world: World, call: Call, tmp_path: Path
 
 @pytest.mark.parametrize("kind", ["lines", "by camera", "csv", "folder"])
 def test_every_source_gives_the_same_lines(
-    kind: str, world: World, call: Call, piped: Callable[..., Any], tmp_path: Path
+    kind: str, world: World, call: Call, piped: Call, tmp_path: Path
 ) -> None:
     out = ("--out", tmp_path / "out")
     whole = concatenate(world.tables)
@@ -90,7 +89,7 @@ def test_every_nth_frame_is_taken_also_after_a_restart(
 
 @pytest.mark.parametrize("numbers", [(10**18, 10**8), (-(2**63), 1), (-5, 1), (2**63 - 15, 1)])
 def test_frame_numbers_may_be_any_of_64_bits(
-    numbers: tuple[int, int], world: World, piped: Callable[..., Any], tmp_path: Path
+    numbers: tuple[int, int], world: World, piped: Call, tmp_path: Path
 ) -> None:
     first, step = numbers
     contents = [content_of(table) for table in world.tables]
@@ -118,7 +117,7 @@ def test_frame_numbers_may_be_any_of_64_bits(
     ],
 )
 def test_a_number_far_beyond_the_last_one_does_not_make_all_others_late(
-    key: str, number: int, reason: str, world: World, piped: Callable[..., Any], tmp_path: Path
+    key: str, number: int, reason: str, world: World, piped: Call, tmp_path: Path
 ) -> None:
     contents = [content_of(table) for table in world.tables]
     for place, content in enumerate(contents):
@@ -169,7 +168,7 @@ class Feed:
 @pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGINT])
 @pytest.mark.parametrize(("at", "expected"), [(10, 0), (3, 1)])
 def test_a_signal_ends_it_with_the_code_of_the_verdict(
-    kind: int, at: int, expected: int, world: World, piped: Callable[..., Any], tmp_path: Path
+    kind: int, at: int, expected: int, world: World, piped: Call, tmp_path: Path
 ) -> None:
     lines = as_lines(world.tables).splitlines(keepends=True)
     before = signal.getsignal(kind)
@@ -184,7 +183,7 @@ def test_a_signal_ends_it_with_the_code_of_the_verdict(
 
 
 def test_a_second_signal_ends_it_at_once_and_loses_nothing(
-    world: World, monkeypatch: pytest.MonkeyPatch, piped: Callable[..., Any], tmp_path: Path
+    world: World, monkeypatch: pytest.MonkeyPatch, piped: Call, tmp_path: Path
 ) -> None:
     given: list[str] = []
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import resource
-import signal
 import sqlite3
 import struct
 import subprocess
@@ -206,24 +205,10 @@ def test_files_beside_a_database_of_another_program_are_left_alone(
     require_refused(restored(tmp_path, files), "is a database of another program")
 
 
-HOLDING = """
-import sys
-from pathlib import Path
-from calibgraph.tracking.state_database import StateDatabase
-database = StateDatabase(Path(sys.argv[1]))
-print("locked", flush=True)
-sys.stdin.read()
-"""
-
-
-def test_two_processes_cannot_have_one_folder(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", HOLDING, str(tmp_path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
-        assert other.stdout.readline() == b"locked\n"
-        with pytest.raises(FileError, match="is in use by another process; stop that one"):
-            StateDatabase(tmp_path)
-        other.send_signal(signal.SIGKILL)
-        other.wait()
+def test_two_cannot_have_one_folder(tmp_path: Path) -> None:
+    busy = pytest.raises(FileError, match="is in use by another process; stop that one")
+    with opened(tmp_path), busy:
+        StateDatabase(tmp_path)
     filled(tmp_path, 1)
 
 

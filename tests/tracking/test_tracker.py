@@ -24,8 +24,6 @@ from calibgraph import (
 )
 from calibgraph.tracking import tracker as tracker_module
 from calibgraph.tracking.cause import Steps, find_cause
-from calibgraph.tracking.restart import handle_small_step
-from calibgraph.tracking.step_detection import DetectedStep
 from calibgraph.tracking.update import json_line
 from tests.conftest import KANNALA, make_camera, stereo_relative_pose
 from tests.tracking.drives import ERRORS, drive, drive_at, moved, pair_of, step_of
@@ -224,18 +222,6 @@ def test_an_update_that_fails_leaves_nothing_behind(
     for table, expected in zip(tables[19:], whole[19:], strict=True):
         found = tracker.update(table)
         np.testing.assert_array_equal(found.T_camera_lidar["left"], expected.T_camera_lidar["left"])
-
-
-@pytest.mark.parametrize(
-    ("live_epochs", "frames"), [(1, 30), (3, 50), pytest.param(8, 100, marks=pytest.mark.slow)]
-)
-def test_a_change_at_any_live_epoch_can_be_followed(
-    pair: Rig, live_epochs: int, frames: int
-) -> None:
-    tracker, _ = tracked(pair, drive_at(lambda frame: pair, frames), live_epochs=live_epochs)
-    state = tracker._state
-    for epoch in state.epochs[:-1]:  # the last one is open, and empty here
-        handle_small_step(state, DetectedStep(epoch.frames[0].number, frozenset([0])))
 
 
 @pytest.mark.parametrize("noise_px", [0.0, 0.1])

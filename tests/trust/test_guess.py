@@ -191,8 +191,6 @@ def test_guesses_from_another_frame_of_the_vehicle_are_named(pair: Rig) -> None:
 
 
 SLOW = pytest.mark.slow
-
-
 ERRORS = tuple(undo_convention_errors(np.eye(4)))
 
 

@@ -164,6 +164,7 @@ def test_no_real_cloud_is_named(realdata: Path) -> None:
     assert [path for path in clouds[::3] if displacement_of_parts(load_cloud(path))] == []
 
 
+Run = tuple[Calibration, Correspondences]
 CAMERA, OTHER = "left", "right"
 FLAT = 0.01 * np.random.default_rng(1).standard_normal((50, 6))
 """Half a degree, a centimetre."""
@@ -172,7 +173,7 @@ CAUSE = Check("convention of the guess", "FAIL", "T_camera_lidar is inverted")
 
 
 @pytest.fixture(scope="module")
-def left_by_run(pair: Rig) -> tuple[Calibration, Correspondences]:
+def left_by_run(pair: Rig) -> Run:
     """The result of a run that saw flat evidence of one camera, and a fault; and its table."""
     solution = solve_joint(pair, simulated(pair, frames=20))
     posterior = PosePosterior(0.1 * FLAT, FLAT, 0.3)
@@ -189,7 +190,7 @@ def pair() -> Rig:
 
 
 def test_covariance_and_verdict_of_the_saved_table_are_those_of_the_run(
-    left_by_run: tuple[Calibration, Correspondences], tmp_path: Path, pair: Rig
+    left_by_run: Run, tmp_path: Path, pair: Rig
 ) -> None:
     made, table = left_by_run
     table.save(tmp_path / "table.parquet")
@@ -214,7 +215,7 @@ def test_covariance_and_verdict_of_the_saved_table_are_those_of_the_run(
     [(0.5, "FAIL", "its images exclude this pose"), (0.01, "WARN", "from this one")],
 )
 def test_what_images_said_of_another_pose_is_not_of_this_one(
-    left_by_run: tuple[Calibration, Correspondences], moved_m: float, status: str, words: str
+    left_by_run: Run, moved_m: float, status: str, words: str
 ) -> None:
     """The posterior, which covers its surroundings, is, and may exclude it; the checks are not."""
     made, table = left_by_run
@@ -235,9 +236,7 @@ def test_what_images_said_of_another_pose_is_not_of_this_one(
     assert found.covariance[CAMERA][3, 3] > (0.8 * moved_m) ** 2
 
 
-def test_what_images_said_with_another_lens_is_not_of_this_one(
-    left_by_run: tuple[Calibration, Correspondences],
-) -> None:
+def test_what_images_said_with_another_lens_is_not_of_this_one(left_by_run: Run) -> None:
     made, table = left_by_run
     camera = made.rig.cameras[CAMERA]
     lens = camera.intrinsics_px.model_copy(update={"fx": 1.02 * camera.intrinsics_px.fx})
@@ -248,9 +247,7 @@ def test_what_images_said_with_another_lens_is_not_of_this_one(
     assert "flat_evidence" not in [check.kind for check in found.camera_verdicts[CAMERA].checks]
 
 
-def test_a_fault_of_one_camera_stays_where_another_has_moved(
-    left_by_run: tuple[Calibration, Correspondences],
-) -> None:
+def test_a_fault_of_one_camera_stays_where_another_has_moved(left_by_run: Run) -> None:
     made, table = left_by_run
     pixels = table.pixels_px.copy()
     pixels[table.camera_index == table.cameras.index(OTHER)] += 5.0
@@ -263,7 +260,7 @@ def test_a_fault_of_one_camera_stays_where_another_has_moved(
 
 @pytest.mark.parametrize(("tolerance", "kept"), [((0.2, 4.0), True), ((2.0, 60.0), False)])
 def test_checks_of_another_tolerance_are_no_pass(
-    left_by_run: tuple[Calibration, Correspondences], tolerance: tuple[float, float], kept: bool
+    left_by_run: Run, tolerance: tuple[float, float], kept: bool
 ) -> None:
     """What failed at a wider one fails at this; at a wider than that it is not known."""
     made, table = left_by_run
@@ -292,9 +289,7 @@ def images_of(found: Calibration, name: str) -> list[Check]:
         ("share", 50),
     ],
 )
-def test_a_malformed_record_is_one_line(
-    left_by_run: tuple[Calibration, Correspondences], path: str, value: object
-) -> None:
+def test_a_malformed_record_is_one_line(left_by_run: Run, path: str, value: object) -> None:
     made, table = left_by_run
     record = table.metadata[IMAGES]
     cameras = dict(record["cameras"])
