@@ -203,8 +203,14 @@ def angles_deg(*angles: float) -> Array:
             [[1.05, 0.0, 1.0], [1.06, 0.0, 1.0], [1.5, 0.0, 1.0]],
             [1, 0, 0],
         ),
+        # r (1 - 0.3 r^2) / (1 + 0.1 r^2) grows until 0.03 r^4 + r^2 = 1: 0.9857.
+        (
+            Lens.pinhole(**K, distortion=(-0.3, 0, 0, 0, 0, 0.1, 0, 0)),
+            [[0.98, 0.0, 1.0], [0.99, 0.0, 1.0]],
+            [1, 0],
+        ),
     ],
-    ids=["behind", "poles", "mirror", "fold"],
+    ids=["behind", "poles", "mirror", "fold", "rational fold"],
 )
 def test_what_a_lens_does_not_see_is_invalid_and_finite(
     lens: Lens, points: Array, expected: list[int]

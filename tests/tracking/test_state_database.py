@@ -90,7 +90,7 @@ import os, random, signal, sys, time
 from pathlib import Path
 from calibgraph.tracking.state_database import StateDatabase
 
-def work(folder, round):
+def work(folder, round, first):
     database = StateDatabase(folder)
     result = database.recovered
     assert not result.damages, result.damages
@@ -100,16 +100,20 @@ def work(folder, round):
         database.append(line)
         lines.append(line)
         os.write(1, line.rsplit(b" ", 1)[0] + b"\\n")
+        os.write(first, b"x")
         if random.random() < 0.2:
             database.snapshot(b"\\n".join(lines))
 
 random.seed(5)
 StateDatabase(Path(sys.argv[1])).close()
 for round in range(int(sys.argv[2])):
+    ready, first = os.pipe()
     child = os.fork()
     if child == 0:
-        work(Path(sys.argv[1]), round)
-    time.sleep(random.uniform(0.02, 0.25))
+        work(Path(sys.argv[1]), round, first)
+    os.close(first)
+    os.read(ready, 1)  # it has acknowledged one, however busy the machine is
+    time.sleep(random.uniform(0, 0.2))
     os.kill(child, signal.SIGKILL)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL, "it ended on its own"
 """
