@@ -221,36 +221,19 @@ class ImageResult:
         matches: of the last network.
         T_camera_lidar: (4, 4) estimated from them by PnP; None if that failed.
         failed: whether a network gave no pose, or one beyond its range of training.
-        start_dependence: see :mod:`calibgraph.matching.cmrnext.probe`; None if not measured.
-        memorization: see the same module; None if not measured.
     """
 
     job: MatchingJob
     matches: Correspondences
     T_camera_lidar: Array | None
     failed: bool
-    start_dependence: float | None = None
-    memorization: float | None = None
 
 
 def to_findings(results: Mapping[str, Sequence[ImageResult]], last: Checkpoint) -> MatcherFindings:
-    """Failed frames, in the last round the probes, and the shared error of the last network."""
+    """Failed frames, and the shared error of the last network."""
     prior = asdict(error_components().matchers["cmrnext"])
     stated = {key: last.config[key] for key in prior if last.config.get(key) is not None}
     return MatcherFindings(
         failed_share={name: float(np.mean([r.failed for r in e])) for name, e in results.items()},
-        start_dependence=_medians(results, "start_dependence"),
-        memorization=_medians(results, "memorization"),
         **{**prior, **stated},
     )
-
-
-def _medians(results: Mapping[str, Sequence[ImageResult]], attribute: str) -> dict[str, float]:
-    """Median of a probe over the frames of each probed camera; NaN if none could be measured."""
-    medians = {}
-    for name, each in results.items():
-        probed = [value for one in each if (value := getattr(one, attribute)) is not None]
-        if probed:
-            finite = [value for value in probed if np.isfinite(value)]
-            medians[name] = float(np.median(finite)) if finite else float("nan")
-    return medians
