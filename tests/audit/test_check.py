@@ -18,7 +18,7 @@ from calibgraph.audit.check import provenance
 from calibgraph.audit.matching import Matching, match_from_deployed
 from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import KeptFrame, keep_frames
-from calibgraph.matching.protocol import to_full_matcher
+from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.structure.matcher import StructureMatcher
 from calibgraph.model.config import Config
 from calibgraph.model.findings import MatcherFindings
@@ -194,7 +194,7 @@ class MatcherOfTruth:
 def rounds_from(deployed: Rig, matcher: MatcherOfTruth) -> list[int]:
     """The rounds that are run from a deployed rig."""
     data, config = calibgraph.load_dataset(SAMPLE, TRUTH), Config().changed(stage1="rig")
-    matching = Matching(data, deployed, to_full_matcher(matcher), config, no_progress)
+    matching = Matching(data, deployed, FullMatcher(matcher), config, no_progress)
     match_from_deployed(matching, Stopwatch())
     return matcher.asked
 
