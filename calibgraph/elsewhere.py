@@ -54,20 +54,14 @@ def groups_elsewhere(solution: Evidence) -> list[tuple[str, ...]]:
 def _go_on(
     evidence: RunEvidence, groups: Sequence[tuple[str, ...]], T_first: Mapping[str, Array]
 ) -> MatchingRun | None:
-    """The run with the groups that agree better at the end of rounds from there; None if none.
-
-    Only their cameras are matched again.
-    """
+    """The run with the groups that agree better at the end of rounds from there; None if none."""
     run, posteriors = evidence.run, evidence.solution.posteriors
     rig = run.solution.solved_rig
     densest = {name: posteriors[name].elsewhere[0] for group in groups for name in group}
-    cameras = {
-        name: camera.moved_to(gtsam.Pose3.Expmap(densest[name]).matrix() @ camera.T_camera_lidar)
-        for name, camera in rig.cameras.items()
-        if name in densest
-    }
-    between = tuple(p for p in rig.relative_poses if {p.a, p.b} <= cameras.keys())
-    start = rig.model_copy(update={"cameras": cameras, "relative_poses": between})
+    start = rig.moved_to({
+        name: gtsam.Pose3.Expmap(twist).matrix() @ rig.T_camera_lidar[name]
+        for name, twist in densest.items()
+    })  # fmt: skip
     fine = run.matcher.tracking_rounds[-1:]
     try:
         with run.watch("match_again"):

@@ -73,7 +73,7 @@ def rounds_from(
 
     Args:
         run: with the data, the matcher and the settings.
-        start: where the cameras are at the first of the rounds; those that are matched.
+        start: where the cameras are at the first of the rounds.
         rounds: their numbers.
         progress: called as the work goes on.
         solve: how the matches of a round are solved.
@@ -82,8 +82,6 @@ def rounds_from(
         CorrespondenceError: if a camera gets too few correspondences.
     """
     config, terms = run.solution.config, run.solution.terms
-    excluded = tuple(name for name in config.excluded_cameras if name in start.cameras)
-    config = config.changed(excluded_cameras=excluded)
     places, estimate, last = run.correspondences.places, start, None
     for index in dict.fromkeys(rounds):
         if run.is_late():

@@ -16,7 +16,6 @@ from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher, Start
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.progress import Progress, no_progress
-from calibgraph.rematch import rounds_from
 from calibgraph.rounds import match_in_rounds
 from factors import Clock
 from tests.conftest import SAMPLE
@@ -146,19 +145,6 @@ def test_every_member_is_used_in_its_turn(truth: Rig, guess: Rig) -> None:
     assert end[0] == "release"
     assert run.rematch is not None and run.rematch.again is not None
     assert run.matcher.image_checks_can_fail
-
-
-def test_rounds_of_some_cameras_match_these_alone(truth: Rig, guess: Rig) -> None:
-    """Also if a camera is excluded that is none of them."""
-    data = calibgraph.load_dataset(SAMPLE, guess)
-    run = match_in_rounds(data, matcher=Complete(truth), progress=no_progress)
-    config = run.solution.config.changed(excluded_cameras=("left",))
-    solution = replace(run.solution, objective=replace(run.solution.objective, config=config))
-    run = replace(run, solution=solution, matcher=FullMatcher(Minimal()))
-    some = Rig(cameras={"front_left": guess.cameras["front_left"]})
-    last = rounds_from(run, some, (0,), no_progress)
-    assert last is not None and last.correspondences.cameras == ("front_left",)
-    assert last.solution.solved_rig.cameras.keys() == last.summary.keys() == some.cameras.keys()
 
 
 def test_findings_of_the_start_and_of_the_last_round_are_in_the_table(
