@@ -20,7 +20,7 @@ FileVersion = tuple[Path, int, int]
 """Path, time of the last change [ns] and size [bytes]: a file that has changed is decoded again."""
 
 
-MAX_IMAGE_BYTES, MAX_CLOUD_BYTES, MAX_SMALL_BYTES = 1_500_000_000, 500_000_000, 1_000_000_000
+MAX_IMAGE_BYTES, MAX_CLOUD_BYTES, MAX_SMALL_BYTES = 1_500_000_000, 500_000_000, 600_000_000
 
 
 class FrameCache:
