@@ -203,7 +203,7 @@ class Trial:
         tracer = coverage.Coverage(None, config_file=False, include=sources)
         tracer.set_option("run:disable_warnings", ["no-data-collected"])
         tracer.start()
-        for item, after in zip(items, [*items[1:], None], strict=True):
+        for item, after in zip(items, [*items[1:], None], strict=False):
             tracer.switch_context(item.nodeid)
             for each in gc.get_objects():  # what tests share is made by each that uses it
                 if type(each) is _lru_cache_wrapper and each.__module__.startswith("tests"):
@@ -222,7 +222,7 @@ class Trial:
     def attempt(self, place: Place, where: tuple[Path, int], items: list[pytest.Item]) -> str:
         """The test that finds a mutant in this fork, or nothing."""
         mutate(self.tree, place, where)
-        for item, after in zip(items, [*items[1:], None], strict=True):
+        for item, after in zip(items, [*items[1:], None], strict=False):
             item.ihook.pytest_runtest_protocol(item=item, nextitem=after)
             if self.failed:
                 return str(item.nodeid)
