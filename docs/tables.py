@@ -59,13 +59,14 @@ def commands() -> str:
 
 
 def api(*names: str) -> str:
-    """Public names with the first line of their docstrings."""
+    """Public functions with the first lines of their docstrings, then the types by name."""
     import calibgraph
 
-    first_lines = (_cell((getattr(calibgraph, n).__doc__ or "").split("\n\n")[0]) for n in names)
-    return table(
-        ["name", "meaning"], ([f"`{n}`", t] for n, t in zip(names, first_lines, strict=True))
-    )
+    found = {name: getattr(calibgraph, name) for name in names}
+    types = [f"`{name}`" for name, each in found.items() if isinstance(each, type)]
+    functions = {n: each.__doc__ or "" for n, each in found.items() if f"`{n}`" not in types}
+    lines = [f"* `{n}`: {_one_line(text.partition(_BLANK)[0])}" for n, text in functions.items()]
+    return "\n".join([*lines, *([f"* Types: {', '.join(types)}"] if types else [])])
 
 
 def made_wrong(part: str) -> str:
@@ -115,6 +116,7 @@ def with_generated_parts(page: str) -> str:
     return PART.sub(part, page)
 
 
+_BLANK = "\n\n"
 _ROLE = re.compile(r":(?:func|class|meth|mod):")  # docstrings are written for Sphinx
 
 
@@ -154,7 +156,11 @@ def attributes_of(docstring: str) -> dict[str, str]:
 
 def _cell(text: str) -> str:
     """Text on one line, fit for a table."""
-    return " ".join(text.replace("``", "`").split()).replace("|", r"\|")
+    return _one_line(text).replace("|", r"\|")
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.replace("``", "`").split())
 
 
 def _values(schema: Mapping[str, Any]) -> str:
