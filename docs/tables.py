@@ -128,20 +128,25 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def settings_table(model: type[BaseModel], leave_out: Iterable[str] = ()) -> str:
-    """The fields of a model with their meaning: their descriptions, or the docstring's."""
+    """The fields of a model with their meaning: their descriptions, or the docstring's.
+
+    Fields with one meaning share a line. The limits of numbers are in the message that refuses one.
+    """
     schema = model.model_json_schema()["properties"]
     meanings = attributes_of(model.__doc__ or "")
-    rows = [
-        [
-            f"`{name}`",
-            _cell(field.description or meanings[name]),
-            _default(field.default),
-            _values(schema[name]),
-        ]
-        for name, field in model.model_fields.items()
-        if name not in set(leave_out)
-    ]
-    return table(["setting", "meaning", "default", "values"], rows)
+    rows: dict[str, list[tuple[str, str]]] = {}
+    for name, field in model.model_fields.items():
+        if name not in set(leave_out):
+            meaning = _cell(field.description or meanings[name]).replace("None:", "`null`:")
+            meaning += _choices(schema[name], meaning)
+            rows.setdefault(meaning, []).append((f"`{name}`", _default(field.default)))
+    return table(
+        ["setting", "default", "meaning"],
+        (
+            [", ".join(dict.fromkeys(part)) for part in zip(*fields, strict=True)] + [meaning]
+            for meaning, fields in rows.items()
+        ),
+    )
 
 
 def attributes_of(docstring: str) -> dict[str, str]:
@@ -163,26 +168,11 @@ def _one_line(text: str) -> str:
     return " ".join(text.replace("``", "`").split())
 
 
-def _values(schema: Mapping[str, Any]) -> str:
-    """The values that a setting may have, from its JSON schema."""
-    if "anyOf" in schema:
-        return " or ".join(dict.fromkeys(_values(part) for part in schema["anyOf"]))
-    if "enum" in schema:
-        return ", ".join(f"`{value}`" for value in schema["enum"])
-    if schema["type"] == "null":
-        return "`null`"
-    low = schema.get("minimum", schema.get("exclusiveMinimum"))
-    high = schema.get("maximum", schema.get("exclusiveMaximum"))
-    if "exclusiveMaximum" in schema and schema["type"] == "integer":
-        high -= 1
-    if low is not None and high is not None:
-        above = "above " if "exclusiveMinimum" in schema else ""
-        return f"{above}{low:.10g} to {high:.10g}"
-    if low is not None:
-        return f"above {low:.10g}" if "exclusiveMinimum" in schema else f"from {low:.10g}"
-    array = "`[height, width]`" if "prefixItems" in schema else "`[NAME, ...]`"
-    words = {"boolean": "`true`, `false`", "array": array, "integer": "whole number"}
-    return words.get(schema["type"], schema["type"])
+def _choices(schema: Mapping[str, Any], meaning: str) -> str:
+    """The words that a setting may be, from its JSON schema, if its meaning lacks one."""
+    parts = [schema, *schema.get("anyOf", ())]
+    words = [f"`{word}`" for part in parts for word in part.get("enum", ())]
+    return "" if all(word in meaning for word in words) else f" One of {', '.join(words)}."
 
 
 def _default(value: object) -> str:
