@@ -15,7 +15,7 @@ def thresholds_markdown() -> str:
         rows.setdefault(subject, []).append(row)
     return "\n".join(
         [
-            "| `kind` | question | PASS | FAIL (else WARN) |",
+            "| `kind` | question | PASS | FAIL, else WARN |",
             "|---|---|---|---|",
             *(_line(pair) for pair in rows.values()),
             "",
@@ -35,11 +35,12 @@ def _line(rows: list[Threshold]) -> str:
 
 def _passes(rows: list[Threshold]) -> str:
     limits = ", ".join(in_unit(row.warn, row.unit, digits=4) for row in rows)
-    return f"{rows[0].direction} {limits}" + (" \\*" if rows[0].of_tolerance else "")
+    sign = "≤" if rows[0].direction == "at most" else "≥"
+    return f"{sign} {limits}" + (" \\*" if rows[0].of_tolerance else "")
 
 
 def _fails(rows: list[Threshold]) -> str:
     if not all(is_reachable(row.fail, row.unit, row.direction) for row in rows):
         return "never"
-    beyond = "above" if rows[0].direction == "at most" else "below"
-    return f"{beyond} {', '.join(in_unit(row.fail, row.unit, digits=4) for row in rows)}"
+    sign = ">" if rows[0].direction == "at most" else "<"
+    return f"{sign} {', '.join(in_unit(row.fail, row.unit, digits=4) for row in rows)}"
