@@ -7,6 +7,7 @@ writes them anew between the lines ``<!-- generated: NAME -->`` and ``<!-- end g
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -15,6 +16,9 @@ from typing import Any
 import click
 from pydantic import BaseModel
 from typer.main import get_command
+
+MADE_WRONG = Path(__file__).parents[1] / "benchmarks" / "made_wrong.json"
+"""Counts of ``accuracy.verdicts``, ``street_verdicts`` and ``mixtures``, with their commits."""
 
 
 def thresholds() -> str:
@@ -52,10 +56,26 @@ def presets() -> str:
 
 
 def commands() -> str:
-    """Every command with its arguments and options, from the program itself."""
+    """Every command with its arguments and own options; what several share, once."""
     from calibgraph.cli.app import app
+    from calibgraph.cli.options import SHARED
+    from calibgraph.cli.settings import RareSettings
 
-    return "\n\n".join(_command(name, command) for name, command in _walk(get_command(app)))
+    found = [*_walk(get_command(app))]
+    shared: dict[str, list[str]] = {}
+    for parameter in (each for _, command in found for each in command.params):
+        if parameter.name in SHARED and parameter.param_type_name == "option":
+            shared.setdefault(parameter.name, _row(parameter))
+    return "\n\n".join(
+        [
+            "### Options that several commands share",
+            table(_HEADER, shared.values()),
+            "### Keys of `--config` that have no option",
+            "Beside those of the [settings](settings.md):",
+            settings_table(RareSettings),
+            *(_command(name, command, [*shared.values()]) for name, command in found),
+        ]
+    )
 
 
 def api(*names: str) -> str:
@@ -71,17 +91,11 @@ def api(*names: str) -> str:
 
 def made_wrong(part: str) -> str:
     """The ``headline`` or the ``table`` of how results that were made wrong are judged."""
-    from benchmarks.tables import RESULTS, Entry
-
-    lines = (RESULTS / "accuracy.made_wrong.jsonl").read_text("utf-8").splitlines()
-    tables = [each for line in lines for each in Entry.from_json(line).tables]
-    counts = [each for each in tables if "PASS" in each.columns]
-    rows = [row for each in counts for row in each.rows]
+    found = json.loads(MADE_WRONG.read_text("utf-8"))
     if part == "table":
-        return table(counts[0].columns, rows)
-    wrong, passed = (sum(int(row[at]) for row in rows) for at in (1, 2))
-    exceptions = [f"{error} off ({cause})" for each in tables if each not in counts
-                  for error, cause in each.rows]  # fmt: skip
+        return table(found["columns"], found["rows"])
+    wrong, passed = (sum(int(row[at]) for row in found["rows"]) for at in (1, 2))
+    exceptions = [f"{error} off ({cause})" for error, cause in found["passed"]]
     if len(exceptions) != passed:
         raise ValueError(f"{passed} wrong results got PASS, and {len(exceptions)} are described")
     return f"Of {wrong} results made wrong on purpose, {passed} got PASS: {', '.join(exceptions)}."
@@ -98,6 +112,7 @@ GENERATED: Mapping[str, Callable[..., str]] = {
 }
 """By the first word or words after ``generated:``; what follows a colon are arguments."""
 
+_HEADER = ["option", "meaning", "default"]
 PART = re.compile(
     r"<!-- generated: (?P<name>[\w ]+)(?:: (?P<arguments>[\w ]+))? -->\n(?P<text>.*?)"
     r"<!-- end generated -->",
@@ -191,14 +206,21 @@ def _walk(command: click.Command, name: str = "calibgraph") -> Iterable[tuple[st
         yield from _walk(inner, f"{name} {child}")
 
 
-def _command(name: str, command: click.Command) -> str:
+def _command(name: str, command: click.Command, shared: list[list[str]]) -> str:
     arguments = [p for p in command.params if p.param_type_name == "argument"]
     options = [p for p in command.params if p.param_type_name == "option"]
     usage = " ".join([name, *(p.metavar or p.name.upper() for p in arguments), "[options]"])
     rows = [[f"`{p.metavar or p.name.upper()}`", _cell(p.help or ""), ""] for p in arguments]
-    rows += [[_flags(p), _cell(p.help or ""), _shown_default(p)] for p in options]
+    rows += [_row(p) for p in options if _row(p)[:2] not in [row[:2] for row in shared]]
+    also = [f"`{p.opts[0]}`" for p in options if _row(p)[:2] in [row[:2] for row in shared]]
     parts = [f"### {name}", _cell(command.help or ""), f"```text\n{usage}\n```"]
-    return "\n\n".join([*parts, table(["option", "meaning", "default"], rows)])
+    parts += [table(_HEADER, rows)] if rows else []
+    return "\n\n".join([*parts, *([f"Shared: {', '.join(also)}."] if also else [])])
+
+
+def _row(option: click.Parameter) -> list[str]:
+    """An option in a table."""
+    return [_flags(option), _cell(option.help or ""), _shown_default(option)]
 
 
 def _flags(option: click.Parameter) -> str:

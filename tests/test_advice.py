@@ -28,7 +28,7 @@ from tests.conftest import ROOT, SAMPLE, Call
 
 COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
 LIBRARY = ("model", "trust", "matching", "solver", "guessing", "audit", "graph", "io", "tracking")
-ALONE = ("doctor.py", "rounds.py", "overlaps.py", "pipeline.py", "outputs.py")
+ALONE = ("doctor.py", "rounds.py", "overlaps.py", "pipeline.py")
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 COMMAND = re.compile(r"calibgraph ([a-z][a-z-]*)((?: (?:[A-Z.]+|\{\}|--[a-z-]+ \S+))*)")
 

@@ -84,7 +84,7 @@ def main() -> None:
         save(train(samples, options.seed))
         window_network.cache_clear()
     if options.judge:
-        publish("accuracy.window_weights", [judge(options.realdata)], record=options.record)
+        publish([judge(options.realdata)])
 
 
 def rendered(scenes: Path) -> Iterator[tuple[Dataset, Rig]]:

@@ -16,8 +16,6 @@ e_cp  that lens as its matches at place p showed it, where it walks from place t
 
 import gtsam
 
-from calibgraph.outputs import DOT_MARK
-
 CLOUD = int(gtsam.symbol("o", 0))
 DISTORTION = int(gtsam.symbol("d", 0))
 
@@ -75,11 +73,3 @@ def cloud_at_key(place: int) -> int:
 def matched_at_key(place: int, camera: int) -> int:
     """Key of ``a_cp``."""
     return int(gtsam.symbol("a", place * MOST_CAMERAS + camera))
-
-
-def to_dot(graph: gtsam.NonlinearFactorGraph) -> str:
-    """A graph in Graphviz's language."""
-    values = gtsam.Values()
-    for key in graph.keyVector():
-        values.insert(key, gtsam.Pose3())
-    return f"{DOT_MARK}\n{graph.dot(values)}"

@@ -92,10 +92,9 @@ class RigGuess:
         cameras = {name: vars(guess) for name, guess in self.cameras.items()}
         return {"cameras": cameras, "search_deg": self.search_deg, "search_m": self.search_m}
 
-    def save(self, path: Path | str, *, first_line: str = "") -> None:
+    def save(self, path: Path | str) -> None:
         """Write the rig file, with the lines as comments."""
-        comments = "\n".join(f"# {line}" for line in self.lines)
-        self.rig.save(path, first_line=f"{first_line}\n{comments}" if first_line else comments)
+        self.rig.save(path, first_line="\n".join(f"# {line}" for line in self.lines))
 
 
 def guess_rig(

@@ -53,7 +53,7 @@ def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int =
         return to_full_matcher(TableMatcher(load_correspondences(matcher)))
     if str(matcher) == "cmrnext":
         raise ValueError(
-            "the matcher 'cmrnext' needs weights: --weights iter1.tar iter5.tar iter6.tar, or "
+            "the matcher 'cmrnext' needs weights: --weights iter1.tar --weights iter5.tar, or "
             "CmrNextMatcher([...]) of calibgraph.matching.cmrnext"
         )
     raise ValueError(

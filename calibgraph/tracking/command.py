@@ -21,10 +21,8 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.clock import OF_IMAGES, require_motion
 from calibgraph.model.config import Config
 from calibgraph.model.places import as_groups
-from calibgraph.model.result_files import OVERLAYS, REPORT_FILE
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import START, Verdict
-from calibgraph.outputs import PAGE_MARK, is_marked
 from calibgraph.report.as_json import print_line, require_stdout
 from calibgraph.tracking.dataset_frames import DatasetDrive
 from calibgraph.tracking.durable import DurableCalibrator
@@ -129,9 +127,6 @@ def _result(
 
 def _write_results(folder: Path, result: Calibration, history: History | None) -> list[Path]:
     written = [result.save(folder)]
-    if is_marked(folder / REPORT_FILE, PAGE_MARK):  # of a result that this one replaces
-        for stale in (folder / REPORT_FILE, *folder.glob(OVERLAYS)):
-            stale.unlink(missing_ok=True)
     if history is not None:
         history.draw(folder / PICTURE)
         written.append(folder / PICTURE)

@@ -87,10 +87,10 @@ def test_with_a_read_only_folder_kernels_are_compiled_in_memory_and_one_line_rep
     packages = tmp_path / "packages"
     shutil.copytree("factors", packages / "factors", ignore=shutil.ignore_patterns("__pycache__"))
     (packages / "factors").chmod(0o555)
-    two = LOSS + "\nfrom factors.conditioning import root_of_sums as other"
-    two += "; print(other(np.zeros(28), np.empty(7), np.zeros((6, 7))))"
+    two = LOSS + "\nfrom factors.conditioning import fill_root as other"
+    two += "; print(other(np.eye(6), np.ones(6), 9.0, np.empty(7), np.zeros((6, 7))))"
     out, err = run(two, path=packages, **{variable: str(read_only)})
-    assert out.splitlines() == [f"{HUBER} 0", "False"]
+    assert out.splitlines() == [f"{HUBER} 0", "True"]
     assert err.startswith(NOT_KEPT) and err.count("\n") == 1
     assert "Permission denied" in err and "set NUMBA_CACHE_DIR" in err
     assert [*read_only.iterdir()] == []

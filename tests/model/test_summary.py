@@ -83,7 +83,7 @@ WIDE = ErrorSources(
     [
         (ESTIMATED, "Estimate fewer parts of the lens (--estimate)"),
         (LENSES, "State how well lenses and clocks are known"),
-        (UNMODELLED, "Leave --preset out"),
+        (UNMODELLED, "Leave preset out"),
     ],
 )
 def test_a_wide_bar_advises_on_its_largest_source(source: str, expected: str) -> None:

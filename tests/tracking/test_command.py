@@ -84,7 +84,7 @@ def test_every_nth_frame_is_taken_also_after_a_restart(
 ) -> None:
     half = tmp_path / "half.parquet"
     concatenate(world.tables[:8]).save(half)
-    every = ("--every", 3, "--out", tmp_path / "out")
+    every = ("--step", 3, "--out", tmp_path / "out")
     _, first, _ = call("track", world.rig, half, *every)
     _, second, err = call("track", world.rig, world.source, *every)
     assert frames_in(first) == [0, 3, 6] and frames_in(second) == [9, 12]

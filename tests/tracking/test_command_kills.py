@@ -69,7 +69,7 @@ class Killed:
         before = self.lines
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(
-            ["tests.tracking.test_command_kills", "pyarrow.parquet", "calibgraph.cli.tables"]
+            ["tests.tracking.test_command_kills", "pyarrow.parquet", "calibgraph.report.tables"]
         )
         process = context.Process(
             target=_command, args=(self.arguments, self.path, self.snapshot_every)

@@ -54,7 +54,7 @@ def test_a_mistake_is_recognised_by_the_images_at_a_rough_guess(error: str, seed
     T = {name: mistaken(error, T) for name, T in rough.T_camera_lidar.items()}
     wrong = rough.moved_to(T)
     assert likely_intended_guess(one_frame(), wrong) == (
-        f"the images fit clearly better if {in_words(error)}; undo it with calibgraph import RIG "
+        f"the images fit clearly better if {in_words(error)}; undo it with calibgraph rig RIG "
         f"--correct {error} --out FILE.yaml"
     )
     undone = correct_guess(wrong, [error])

@@ -73,7 +73,7 @@ class CmrNextMatcher:
         seed: int = 0,
     ) -> None:
         if not weights:
-            raise ValueError("no weights given: --weights iter1.tar iter5.tar iter6.tar")
+            raise ValueError("no weights given: --weights iter1.tar --weights iter5.tar")
         if start_from not in ("frame", "joint"):
             raise ValueError(f"start_from {start_from!r}: known are frame, joint")
         if iterations < 1 or (batch is not None and batch < 1):

@@ -37,7 +37,7 @@ def torch_device(name: str) -> torch.device:
     if name not in ("auto", "cpu", "cuda"):
         raise ValueError(f"device {name!r}: known are auto, cpu, cuda")
     if name == "cuda" and not torch.cuda.is_available():
-        raise ValueError("device 'cuda': torch finds no GPU; use --device cpu")
+        raise ValueError("device 'cuda': torch finds no GPU; use device: cpu in --config")
     use_gpu = name == "cuda" or (name == "auto" and torch.cuda.is_available())
     return torch.device("cuda" if use_gpu else "cpu")
 

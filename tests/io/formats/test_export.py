@@ -186,7 +186,7 @@ def test_the_verdict_is_that_of_the_cameras_that_are_written(
         export_calibration(mixed, tmp_path / "a.json", "json")
     export_calibration(mixed, tmp_path / "a.json", "json", cameras=["left"])
     assert json.loads((tmp_path / "a.json").read_text())["verdict"] != "FAIL"
-    export_calibration(mixed, tmp_path / "a.json", "json", even_if_failed=True)
+    export_calibration(mixed, tmp_path / "a.json", "json", even_if_failed=True, force=True)
     cameras = json.loads((tmp_path / "a.json").read_text())["cameras"]
     assert cameras["left"]["covariance"] is not None
     assert cameras["right"]["covariance"] is None
@@ -221,18 +221,18 @@ def test_files_hold_the_covariance_in_the_order_of_ros(solved: Calibration, tmp_
             np.testing.assert_allclose(np.reshape(found, (6, 6)), expected, rtol=1e-9)
 
 
-def test_only_files_that_were_exported_before_are_replaced(tmp_path: Path) -> None:
+def test_files_that_are_there_are_replaced_only_with_force(tmp_path: Path) -> None:
     rig, path = make_pair(), tmp_path / "mine.yaml"
     rig.save(path)
     before = path.read_text()
-    with pytest.raises(FileError, match="would be replaced"):
+    with pytest.raises(FileError, match="is there already"):
         export_calibration(path, path, "kalibr")
     assert path.read_text() == before
-    for format in READERS.keys() - {"kitti"}:
-        for _ in range(2):
-            export_calibration(rig, tmp_path / f"again.{format}", format)
+    export_calibration(path, path, "kalibr", force=True)
+    assert path.read_text() != before
     export_calibration(rig, tmp_path / "calib.txt", "kitti")
-    with pytest.raises(FileError, match="would be replaced"):
+    (tmp_path / "calib.txt").unlink()
+    with pytest.raises(FileError, match="calib.direction.txt: is there already"):
         export_calibration(rig, tmp_path / "calib.txt", "kitti")
 
 

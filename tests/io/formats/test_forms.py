@@ -304,7 +304,7 @@ def test_opencv_writes_the_same_in_three_languages(suffix: str, tmp_path: Path) 
 
 def test_a_json_export_is_a_rig(mixed_rig: Rig, tmp_path: Path) -> None:
     for rig in (mixed_rig, rig_for("json")):
-        export_calibration(rig, tmp_path / "rig.json", "json")
+        export_calibration(rig, tmp_path / "rig.json", "json", force=True)
         for read in (load_rig(tmp_path / "rig.json"), import_rig([tmp_path / "rig.json"])):
             assert list(read.cameras) == list(rig.cameras)
             for name, camera in rig.cameras.items():

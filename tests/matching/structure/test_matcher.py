@@ -195,7 +195,7 @@ class TestArguments:
     @pytest.mark.parametrize(
         ("arguments", "line"),
         [
-            (("--search-deg", "far"), "--search-deg far: give a number, or none"),
+            (("--search-deg", "far"), "Input should be a valid number"),
             (("--search-deg", "100"), "the search reaches up to 45 deg and 5 m per axis"),
             (("--matcher", "m.csv", "--search-m", "1"), "--search-m is for --matcher structure"),
             (("--time-limit-s", "-1"), "--time-limit-s"),
