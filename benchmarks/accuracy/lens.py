@@ -127,7 +127,7 @@ def values_of(camera: Camera) -> dict[str, float]:
     k, packed = camera.intrinsics_px, camera.lens.packed
     numbers = COEFFICIENT_NUMBERS[camera.lens.kind]
     return {
-        "focal": float(np.sqrt(k.fx * k.fy)), "aspect": k.fx / k.fy, "centre_x": k.cx,
+        "focal": float(np.sqrt(k.fx * k.fy)), "centre_x": k.cx,
         "centre_y": k.cy,
         "offset": camera.time_offset_s or 0.0, "readout": camera.readout_s or 0.0,
         **{name: float(packed[4 + number]) for name, number in numbers.items()},

@@ -39,7 +39,7 @@ from tools.scenes.rolling_drives import WRONG, draw_wrong, load_drive, truth_of
 
 KITTI = ("05", "06", "07", "08", "06+07+08")
 SPOILT = (
-    ("focal", 0.03), ("focal", 0.05), ("aspect", 0.04), ("centre", 20.0), ("distortion", 0.05)
+    ("focal", 0.03), ("focal", 0.05), ("centre", 20.0), ("distortion", 0.05)
 )  # fmt: skip
 OTHER_RIGS = (
     "surround6", "nuscenes_a", "dgp_scene01", "opencalib_a", "vlp16_distorted",

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.paper.aggregates import aggregate
 from benchmarks.paper.baselines import paper_solve
 from calibgraph.errors import CorrespondenceError
 from calibgraph.io.dataset import load_dataset
@@ -29,7 +30,7 @@ from calibgraph.simulation.scenarios import SCENARIOS, scenario_of
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.objective import Transforms
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.solver.stage1 import Stage1, aggregate, estimate_stage1
+from calibgraph.solver.stage1 import Stage1, estimate_stage1
 
 GUESS_DEG, GUESS_M = 20.0, 1.5
 """Exact displacement of every guess, the paper's T_delta."""

@@ -171,7 +171,9 @@ class Limits:
 
     def are_exceeded(self, deviation: Array, covariance: Array, freedom: Array) -> Mask:
         """(n,) True for results with an axis beyond both limits."""
-        return np.asarray(self.exceeded(deviation, np.sqrt(_variances(covariance)), freedom).any(axis=1))
+        return np.asarray(
+            self.exceeded(deviation, np.sqrt(_variances(covariance)), freedom).any(axis=1)
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -103,8 +103,8 @@ Estimate = Annotated[
     str | None,
     Option(
         metavar="PART,...",
-        help="Estimate each camera's lens and clock too: focal, aspect, centre, distortion, or "
-        "lens for all but aspect; offset, readout, or clock for both.",
+        help="Estimate each camera's lens and clock too: focal, centre, distortion, or lens for "
+        "all; offset, readout, or clock for both.",
     ),
 ]
 Of = Annotated[

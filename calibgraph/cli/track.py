@@ -27,12 +27,6 @@ def track(
     step: int = Option(1, min=1, help="Take every N-th frame only."),
     follow: bool = Option(False, "--follow", help="Wait for new files in the folder."),
     matcher: str | None = Option(None, metavar="NAME", help="Match frames: structure or cmrnext."),
-    estimate: str | None = Option(
-        None,
-        metavar="offset",
-        help="Follow the time offset of each camera: how long after its points an image is "
-        "taken. The motion of the LiDAR must be known.",
-    ),
     interval_s: options.IntervalS = None,
     motion: options.Motion = None,
     weights: options.Weights = None,
@@ -55,12 +49,12 @@ def track(
     from calibgraph.model.result_files import require_result_folder
     from calibgraph.report.tables import print_result
     from calibgraph.tracking.command import Tracking, track
-    from calibgraph.tracking.offsets import require_offset_alone
+    from calibgraph.tracking.state import require_poses_alone
 
     require_result_folder(out, [rig, *source])
     with checked_arguments():
-        settings, rare = read_settings(config, seed=seed, estimate=estimate)
-        require_offset_alone(settings)
+        settings, rare = read_settings(config, seed=seed)
+        require_poses_alone(settings)
         if matcher is None:
             given = {"--interval-s": interval_s, "--motion": motion, "--weights": weights}
             _require_matcher_for(source, given | rare.of_cmrnext)

@@ -11,15 +11,12 @@ o_p   the cloud as it is displaced at place p
 a_cp  camera c as its matches at place p show it
 l_c   the lens of camera c, if it is estimated, in standard deviations of its prior
 s_c   that lens as its matches show it
-e_cp  that lens as its matches at place p showed it, where it walks from place to place
 """
 
 import gtsam
 
 CLOUD = int(gtsam.symbol("o", 0))
 DISTORTION = int(gtsam.symbol("d", 0))
-
-"""First line of a graph in Graphviz's language."""
 
 MOST_CAMERAS = 1000
 """``a3002`` is camera 2 at place 3."""
@@ -58,11 +55,6 @@ def lens_key(camera: int) -> int:
 def seen_lens_key(camera: int) -> int:
     """Key of ``s_c``."""
     return int(gtsam.symbol("s", camera))
-
-
-def seen_lens_at_key(place: int, camera: int) -> int:
-    """Key of ``e_cp``."""
-    return int(gtsam.symbol("e", place * MOST_CAMERAS + camera))
 
 
 def cloud_at_key(place: int) -> int:

@@ -18,7 +18,6 @@ from calibgraph.matching.burnt_in import hide_burnt_in
 from calibgraph.matching.protocol import Matcher, to_full_matcher
 from calibgraph.matching.same_images import require_different_images
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.clock import OF_IMAGES, require_motion
 from calibgraph.model.config import Config
 from calibgraph.model.places import as_groups
 from calibgraph.model.rig import Rig
@@ -165,8 +164,6 @@ def _drive(settings: Tracking, matcher: Matcher, source: Sequence[Path]) -> Data
         data = load_dataset(source, settings.rig, bag=settings.bag, interval_s=settings.interval_s)
     except ValueError as error:  # of an option: a wrong argument of the user
         raise DatasetError(str(error)) from error
-    known = data.frames[0].twist_per_s is not None
-    require_motion(settings.config.estimate, is_known=known, how=OF_IMAGES)
     full = to_full_matcher(matcher)
     require_different_images(data, settings.rig)
     data = hide_burnt_in(replace(data, frames=data.frames[:: settings.every]), settings.rig)

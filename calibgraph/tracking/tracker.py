@@ -27,7 +27,7 @@ from calibgraph.tracking.absorption import (
 )
 from calibgraph.tracking.assessment import Assessment, MeasureOnFrames, assess, to_calibration
 from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
-from calibgraph.tracking.epochs import at_explaining_offsets, close_epoch
+from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_group import Blocks, usual_frames
 from calibgraph.tracking.frame_order import (
@@ -180,11 +180,6 @@ class IncrementalCalibrator:
 
     def _take(self, one: Incoming, table: Correspondences, blocks: Blocks) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
-        sums = self._closed.all_sums(self._state)
-        state, blocks = at_explaining_offsets(self._state, sums, blocks)
-        if state is not self._state:
-            self._state = state
-            self._rebuild()
         self._state, agreeing = select_agreeing(self._state, self._closed, blocks)
         self._state, (used,) = absorb(self._state, self._closed, agreeing)
         self._state, events = start_cameras(self._state, table, blocks)
@@ -286,11 +281,10 @@ class IncrementalCalibrator:
 
     def _close_epoch(self, *, together: bool) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, begin another."""
-        state, offsets = self._state, self._state.offsets
+        state = self._state
         if self._assessed is not None and self._assessed[0].epochs[-1].frames:
             state = changed(state, optimum=self._assessed[1].newest(state.optimum))
-            offsets = self._assessed[1].offsets(state)
-        self._state, events = close_epoch(state, offsets, self._closed.all_sums(state))
+        self._state, events = close_epoch(state)
         detected = detect_small_step(self._state)
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)

@@ -62,8 +62,7 @@ class Window:
     def _update(
         self, model: LatentPoseModel, held: gtsam.NonlinearFactorGraph, start: gtsam.Values
     ) -> None:
-        parts = model.error_graph, model.lens_graph, model.place_graph, data_graph(model)
-        graph = join(held, *parts)
+        graph = join(held, model.error_graph, model.place_graph, data_graph(model))
         result = self._isam.update(graph, start, self._exchanged)
         self._exchanged = [*result.getNewFactorsIndices()][held.size() :]
         for _ in range(_MOST_STEPS):

@@ -23,7 +23,7 @@ def test_command_writes_a_dataset_and_none_over_it(call: Call, tmp_path: Path) -
     assert len(load_dataset(tmp_path / "made").frames) == 1
     code, _, errors = call("simulate", "street", *options, "--out", tmp_path / "made")
     assert code == 2
-    assert "holds files, and none" in errors
+    assert "holds files, but no" in errors
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -41,6 +41,6 @@ def test_the_command_writes_a_table_and_a_guess_that_is_off(
     ).cameras.items():
         assert error.rotation_error_deg == pytest.approx(5, abs=1e-6), name_
     code, _, text = call("simulate", name, "--frames", 3, "--out", folder)
-    assert code == 2 and "holds files, and none" in text
+    assert code == 2 and "holds files, but no" in text
     again = scenario_of(name).draw(3, 0)
     np.testing.assert_array_equal(again.pixels_px, table.pixels_px)

@@ -218,3 +218,21 @@ def test_the_former_key_of_an_error_probability_is_read(
     for name, verdict in load_calibration(path).camera_verdicts.items():
         assert verdict.error_probability is not None
         assert old.camera_verdicts[name].error_probability == verdict.error_probability
+
+
+def test_settings_that_only_earlier_versions_had_are_left_out(
+    calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    settings = content_of(calibrated_sample)["config"]
+    former = {
+        "relative_prior_pairs": "all",
+        "aggregate": "mean",
+        "estimate": ["focal", "aspect"],
+        "tracking": {**settings["tracking"], "walk_time_offset_s": 1e-4},
+    }
+    file = edited({"config": {**settings, **former}}, calibrated_sample, tmp_path)
+    config = load_calibration(calibrated_sample.folder).config
+    assert load_calibration(file).config == config.changed(estimate=("focal",))
+    file = edited({"config": {**settings, "unknown": 1}}, calibrated_sample, tmp_path)
+    with pytest.raises(FileError, match="unknown"):
+        load_calibration(file)

@@ -1,4 +1,4 @@
-"""The matcher `structure` on the sample; from its own guess, as a user calls it: test_readme.py."""
+"""The matcher `structure` on the sample; from its own guess, as a user calls it: test_docs.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Times of images: what they do to points and poses, in rig files, tables and comparisons."""
+"""Lenses and clocks of cameras: how well they are known, and what an offset does."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from calibgraph import (
+    Camera,
     Correspondences,
+    Intrinsics,
     Rig,
     dataset_from_arrays,
     evaluate,
@@ -20,9 +22,13 @@ from calibgraph import (
     load_rig,
 )
 from calibgraph.errors import CalibrationError, MotionError
+from calibgraph.graph.lens import LensVariable
 from calibgraph.matching.run import with_motion
 from calibgraph.model.clock import at_pixels, seen_at_rows, when_taken
+from calibgraph.model.lens_difference import lens_difference
+from calibgraph.model.lens_knowledge import IN_DOUBT, LensSigmas, state_calibrated
 from calibgraph.simulation.rigs import rig_of
+from tests.conftest import make_camera, make_pair
 
 TWISTS = np.array([[0.01, 0.02, 0.3, 8.0, 0.1, 0.0], [0.0, 0.0, -0.2, 12.0, 0.0, 0.1]])
 
@@ -132,3 +138,56 @@ def test_evaluation_compares_times_that_both_rigs_state() -> None:
     found = evaluate(rig_with(time_offset_s=0.021, readout_s=0.03), rig_with(time_offset_s=0.02))
     assert found.time_offset_ms == pytest.approx(dict.fromkeys(found.cameras, 1.0))
     assert found.readout_ms == {}
+
+
+WIDTH, HEIGHT = 1240, 376
+
+
+def camera_of(model: str, distortion: tuple[float, ...] = (), focal: float = 600.0) -> Camera:
+    camera = make_camera()
+    k = Intrinsics(fx=focal, fy=focal, cx=(WIDTH - 1) / 2, cy=(HEIGHT - 1) / 2)
+    changes = {"model": model, "distortion": distortion, "intrinsics_px": k}
+    return camera.model_copy(update={**changes, "width_px": WIDTH, "height_px": HEIGHT})
+
+
+def test_a_longer_focal_length_moves_pixels_away_from_the_centre() -> None:
+    before, after = camera_of("pinhole"), camera_of("pinhole", (), 606.0)
+    pixels = np.array([[619.5, 187.5], [719.5, 137.5], [0.0, 0.0]])
+    centre = np.array([619.5, 187.5])
+    assert lens_difference(before, after, pixels) == pytest.approx(0.01 * (pixels - centre))
+
+
+def test_rigs_are_compared_by_their_lenses_in_the_corners() -> None:
+    before, after = camera_of("pinhole"), camera_of("pinhole", (), 606.0)
+    narrow = camera_of("pinhole", (-0.5, 0.0, 0.0, 0.0), 500.0)  # of the corners it has no ray
+    apart = evaluate(
+        Rig(cameras={"a": after, "same": before, "lost": before}),
+        Rig(cameras={"a": before, "same": before, "lost": narrow}),
+    ).lens_px
+    assert apart.keys() == {"a", "lost"}
+    assert apart["a"] == pytest.approx(0.01 * np.hypot(619.5, 187.5))
+    assert apart["lost"] == np.inf
+
+
+def test_a_calibrated_lens_is_known_to_a_500th_of_its_focal_length() -> None:
+    rig = state_calibrated(make_pair())
+    for camera in rig.cameras.values():
+        sigma, fx = camera.intrinsics_sigma_px, camera.intrinsics_px.fx
+        assert sigma.focal == pytest.approx(0.002 * fx, abs=0.006)  # written to 0.01 px
+        assert sigma.centre == pytest.approx(0.002 * fx, abs=0.006)
+        assert camera.distortion_sigma == 0.002
+    doubted = {n: IN_DOUBT.state_in(c) for n, c in make_pair().cameras.items()}
+    again = state_calibrated(Rig(cameras=doubted))
+    for name, camera in again.cameras.items():
+        assert camera.intrinsics_sigma_px == doubted[name].intrinsics_sigma_px
+
+
+def test_a_lens_without_a_word_has_the_priors_of_a_stated_calibration() -> None:
+    (camera, *_) = make_pair().cameras.values()
+    (stated, *_) = state_calibrated(make_pair()).cameras.values()
+    parts = ("focal", "centre", "distortion")
+    without, with_sigmas = (
+        LensVariable.of(each, parts, LensSigmas.calibrated(camera)).free.sigmas
+        for each in (camera, stated)
+    )
+    assert with_sigmas == pytest.approx(without, rel=0.01)  # written to 0.01 px
