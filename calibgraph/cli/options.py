@@ -5,12 +5,6 @@ from typing import Annotated
 
 from typer import Argument, Option
 
-SHARED = (
-    "rig", "frames", "every_s", "topic", "motion", "interval_s", "matcher", "weights",
-    "time_limit_s", "search_deg", "search_m", "config", "estimate", "seed", "as_json", "force"
-)  # fmt: skip
-"""Names of the options that mean the same in every command, but where a command describes its own:
-``docs/commands.md`` lists them once."""
 _BAGS, _STRUCTURE = "ROS bags", "Matcher structure"
 _MOST_SEED = 2**31 - 1
 
