@@ -140,7 +140,6 @@ def _verdict(
         covariance=None if np.isnan(own).any() else own,
         data_sigmas=sigmas_of_hessian(sums.hessian[camera]),
         conflicts=conflicts,
-        pull=None,
         converged=True,
         terms="full",
         scatter_only=not state.findings.states_common_error,

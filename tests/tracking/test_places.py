@@ -173,7 +173,7 @@ def test_the_covariance_is_that_of_what_places_show() -> None:
     distortion = tuple(replace(none, jacobian=shift, hessian=1e6 * np.eye(6)) for shift in shifts)
     state = replace(tracker._state, distortion=distortion)
     data = PlaceData.of(state, quadratics_of(state, sums), (), {"a": 1})
-    model = place_model(state, sums, seen, data, times={})
+    model = place_model(state, sums, seen, data)
     found = fit_latent_poses(model, start_values(model, rig.T_camera_lidar))
     assert found is not None
     parts, A = model.components, [*map(adjoint_camera_lidar, tracker._state.references)]
@@ -244,7 +244,7 @@ def test_an_update_is_the_optimum_of_the_graph_with_all_places() -> None:
     places = closed.sums.add(sums_by_place(state.epochs[-1].frames))
     rows = {places.names[row]: row for row in (1, 2, 3)}
     data = PlaceData.of(state, quadratics_of(state, state.places), state.live_frames, rows)
-    model = place_model(state, places, FrameSpread.of(state, places), data, times={})
+    model = place_model(state, places, FrameSpread.of(state, places), data)
     model = replace(model, pose_graph=pose_priors(state))
     whole = fit_latent_poses(model, start_values(model, update.T_camera_lidar))
     assert whole is not None
