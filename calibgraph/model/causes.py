@@ -103,7 +103,7 @@ CAUSES: dict[str, Cause] = {
     "priors": Cause(
         "priors and relative poses",
         "Check relative_poses and priors in the rig: p_a = T_a_b * p_b, and their sigmas.",
-        {"relative_pose": "", "pull_rotation": "", "pull_translation": "",
+        {"relative_pose": "",
          "prior_share": "Give this camera matches of its own, or check its priors: they decide."},
     ),
     "agreement": Cause(

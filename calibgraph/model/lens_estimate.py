@@ -86,14 +86,6 @@ class LensEstimate:
         unit = f" {self.printed_unit}" if self.unit else ""
         return f"{self.name} {new} +- {sigma}{unit}, before {old}{unit}"
 
-    @property
-    def trade_off(self) -> str:
-        """Which change of the pose may be a change of it, in words; empty if none."""
-        if self.correlation <= _NONE:
-            return ""
-        pair = f"{self.name} with {self.direction} {self.correlation:.2f}"
-        return f"part of it may be the other, by their correlation: {pair}"
-
     def describe(self) -> str:
         """Whether the data determine it, and what it cannot be told from."""
         pair = f"with {self.direction} {self.correlation:.2f}" if self.correlation > _NONE else ""

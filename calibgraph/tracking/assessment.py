@@ -24,7 +24,7 @@ from calibgraph.tracking.shown_frames import groups_by_frames
 from calibgraph.tracking.sources import error_sources
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
-from calibgraph.tracking.window import AnyWindow
+from calibgraph.tracking.window import Window
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.image_posteriors import ImagePosteriors, measured_pairs
 from calibgraph.trust.pose_posterior import PosePosterior, group_tied
@@ -56,7 +56,7 @@ class Assessment:
     T_lidar_camera: tuple[gtsam.Pose3, ...]
     joint_covariance: Array
     verdicts: dict[str, Verdict]
-    window: AnyWindow
+    window: Window
     pairs: tuple[RelativePose, ...] = ()
 
     def newest(self, optimum: Optimum | None) -> Optimum | None:
@@ -65,7 +65,7 @@ class Assessment:
         return None if optimum is None else optimum.updated(newer)
 
 
-def assess(state: State, closed: ClosedPlaces, window: AnyWindow | None) -> Assessment:
+def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessment:
     """Assess the present estimates.
 
     A relative pose that contradicts the correspondences of both its cameras takes no part, as in a
@@ -77,7 +77,7 @@ def assess(state: State, closed: ClosedPlaces, window: AnyWindow | None) -> Asse
         window: of the frame before, if of the same epoch.
     """
     sums = closed.all_sums(state)
-    window, conflicts = closed.graph(state, window)
+    window, conflicts = closed.with_open_epoch(state, window)
     keys, estimates = window.model.reported_keys, state.T_lidar_camera
     if state.config.preset == "auto":
         estimates = window.T_lidar_camera(keys)
@@ -140,7 +140,6 @@ def _verdict(
         covariance=None if np.isnan(own).any() else own,
         data_sigmas=sigmas_of_hessian(sums.hessian[camera]),
         conflicts=conflicts,
-        pull=None,
         converged=True,
         terms="full",
         scatter_only=not state.findings.states_common_error,

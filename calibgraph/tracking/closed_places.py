@@ -45,10 +45,10 @@ from calibgraph.tracking.quadratics import (
 )
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, equation_5
-from calibgraph.tracking.window import AnyWindow, ClosedWindow, Window
+from calibgraph.tracking.window import Window
 
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
-STEPS = 5  # fits, and estimates of the variance ratios between them
+_ROUNDS = 2  # of estimates of the variance ratios, a fit after each
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,17 +93,6 @@ class ClosedPlaces:
             model = changed(model, pose_graph=pose_priors(state, dropped))
             fit = LatentPoseFit(Linearization.at(model, values), 0, True)
         return ClosedPlaces(state, sums, seen, data, fit, dropped)
-
-    def at_optimum(self, state: State) -> ClosedPlaces:
-        """The same as :meth:`of` a state with the optimum and the variance ratios found here."""
-        data = self.data.with_quadratics(earlier_quadratics(state))
-        blocks = {
-            state.names[camera]: matches.with_variance(self.seen.least(camera))
-            for camera, matches in data.cameras.items()
-        }
-        model, values = self.fit.linear.model.with_blocks(blocks), self.fit.linear.values
-        fit = LatentPoseFit(Linearization.at(model, values), 0, True)
-        return changed(self, state=state, data=data, fit=fit, _pose_graphs={})
 
     def fitted(self, state: State) -> ClosedPlaces:
         """At the optimum for the variance ratios of the state."""
@@ -160,19 +149,11 @@ class ClosedPlaces:
         cameras = zip(self.state.cameras, self.sums.frames.sum(axis=0), strict=True)
         return all(count >= _SETTLED for one, count in cameras if one.started)
 
-    def graph(self, state: State, window: AnyWindow | None) -> tuple[AnyWindow, Conflicts]:
-        """The whole graph, and the conflicts of relative poses with correspondences.
+    def with_open_epoch(self, state: State, window: Window | None) -> tuple[Window, Conflicts]:
+        """The whole graph in iSAM2, and the conflicts of relative poses with correspondences.
 
         The window of the frame before, if it is of the same epoch, goes on if its graph allows.
         """
-        partial = state.drifting or state.config.preset != "auto"
-        begun = state.epochs[-1].frames or not state.is_refined or self.state.sizes != state.sizes
-        if partial or begun or state.rig.relative_poses:  # these may contradict the newest frames
-            return self.with_open_epoch(state, window)
-        return ClosedWindow(self.fit.linear, self.data.names), {}
-
-    def with_open_epoch(self, state: State, window: AnyWindow | None) -> tuple[Window, Conflicts]:
-        """The same in iSAM2."""
         frames = state.epochs[-1].frames
         opened = (*frames, *state.live_frames[-1:])
         touched = {frame.place for frame in opened}
@@ -196,7 +177,7 @@ class ClosedPlaces:
             before = changed(model, pose_graph=self._summary(kept))
             conflicts = find_conflicts(state, every, before, start)
         model = changed(model, pose_graph=self._pose_graph(kept, contradicting(conflicts)))
-        if isinstance(window, Window) and window.has_graph_of(model, data.names):
+        if window is not None and window.has_graph_of(model, data.names):
             window.exchange(model)
         else:
             window = Window(model, data.names, _start(state, model, data.names))
@@ -231,39 +212,16 @@ class ClosedPlaces:
         return kept, sorted(rows)
 
 
-def settle(state: State, *, together: bool) -> tuple[State, ClosedPlaces]:
-    """The state with optimum and variance ratios of its closed epochs.
-
-    When these are many an epoch changes little, and the frames after it do the work step by step;
-    but not if they come together.
-    """
-    at_once = together and state.optimum is not None
-    closed = ClosedPlaces.of(state, fitted=at_once)
-    state = changed(state, is_refined=together)
-    if at_once:  # this is where the first step leads
-        state = changed(state, optimum=closed.optimum)
-    elif closed.is_settled and not together:
-        return state, closed
-    for step in range(2 if at_once else 1, STEPS + 1):
-        state, closed = refine(state, closed, step)
-    return state, closed.at_optimum(state)
-
-
-def refine(state: State, closed: ClosedPlaces, step: int) -> tuple[State, ClosedPlaces]:
-    """One step towards optimum and variance ratios of the closed epochs.
-
-    The first is a fit, the second an estimate of the ratios; and so again while these change. The
-    next epoch goes on from there.
-    """
-    if step % 2:
-        if step == 1 or closed.state.sizes != state.sizes:
-            closed = closed.fitted(state)
-            state = changed(state, optimum=closed.optimum)
-    elif closed.state.sizes == state.sizes and closed.shows_ratios:
+def settle(state: State) -> State:
+    """The state with optimum and variance ratios of its closed epochs."""
+    closed = ClosedPlaces.of(state, fitted=True)
+    for _ in range(_ROUNDS if closed.shows_ratios else 0):
         found = estimate_variance_ratios(closed.fit, state.sizes)
-        if not found.is_near(state.sizes):
-            state = changed(state, sizes=found)
-    return state, closed
+        if found.is_near(state.sizes):
+            break
+        state = changed(state, sizes=found)
+        closed = closed.fitted(state)
+    return changed(state, optimum=closed.optimum)
 
 
 def _start(state: State, model: LatentPoseModel, names: Sequence[str]) -> gtsam.Values:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
-    BlockByPlace,
     SummarizedByPlace,
 )
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
@@ -36,7 +35,6 @@ from calibgraph.solver.within_place import (
     relative_covariance,
     split_excess,
 )
-from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.quadratics import Data, Quadratics, by_place
@@ -143,16 +141,6 @@ class PlaceData:
             elif len(quadratic.places):
                 cameras[camera] = quadratic
         return PlaceData([*places], np.array([*places.values()], dtype=np.int64), cameras)
-
-    def with_quadratics(self, earlier: Quadratics) -> PlaceData:
-        """The same matches with other quadratics of earlier ones."""
-        cameras = dict(self.cameras)
-        for camera, own in self.cameras.items():
-            if not isinstance(own, BlockByPlace):
-                quadratic = by_place(earlier[camera], self.names)
-                several = isinstance(own, SummarizedByPlace)
-                cameras[camera] = changed(own, earlier=quadratic) if several else quadratic
-        return replace(self, cameras=cameras)
 
 
 def place_model(

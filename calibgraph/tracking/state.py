@@ -72,7 +72,6 @@ class State:
         findings: of the errors that frames share, by their matcher.
         sizes: of these, as the data show them, over what the matcher states.
         optimum: of the graph of the closed epochs; None where it is not known.
-        is_refined: whether it is exact, so that nothing is left to the frames of the open epoch.
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
         updates: number of updates.
@@ -94,7 +93,6 @@ class State:
     findings: MatcherFindings = MatcherFindings()
     sizes: VarianceRatios = VarianceRatios()
     optimum: Optimum | None = None
-    is_refined: bool = False
     frame: int | None = None
     stamp_ns: int | None = None
     updates: int = 0

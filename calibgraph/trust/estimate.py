@@ -27,8 +27,6 @@ class Estimate:
         data_sigmas: (6,) standard deviations if every correspondence were independent: rotation
             [rad], translation [m]; or None.
         conflicts: of the relative poses that name this camera.
-        pull: how far priors and relative poses pull it from its own solution [deg, cm]; None if
-            nothing pulls, or by less than ``pull_sigmas`` of that solution.
         converged: whether the last pass stopped by its tolerance.
         terms: of the objective.
         held: whether nothing determines it.
@@ -45,7 +43,6 @@ class Estimate:
     covariance: Array | None
     data_sigmas: Array | None
     conflicts: tuple[Conflict, ...]
-    pull: tuple[float, float] | None
     converged: bool
     terms: Terms
     held: bool = False

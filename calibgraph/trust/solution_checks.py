@@ -112,15 +112,6 @@ def _check_relative_pose(conflict: Conflict) -> Check:
     return row.describe(sigmas, status, text, name=name)
 
 
-def pull_checks(estimate: Estimate) -> list[Check]:
-    """How far priors and relative poses pull the camera from its own solution."""
-    degrees, centimetres = estimate.pull or (0.0, 0.0)
-    return [
-        threshold("pull_rotation", estimate.tolerance).check(degrees),
-        threshold("pull_translation", estimate.tolerance).check(centimetres),
-    ]
-
-
 def terms_checks(estimate: Estimate) -> list[Check]:
     """Whether the terms use the correspondences."""
     if estimate.terms not in ("stage1", "priors"):
@@ -160,7 +151,6 @@ ESTIMATE_CHECKS: tuple[Callable[[Estimate], list[Check]], ...] = (
     sigma_checks,
     common_error_checks,
     relative_pose_checks,
-    pull_checks,
     terms_checks,
     count_checks,
     lens_prior_checks,

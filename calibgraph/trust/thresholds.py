@@ -63,16 +63,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "0.5 deg 2.0 to 3.4; a focal length 3 % off 2.8 to 3.8. Four is 0.5 deg or 11 cm.",
               "one of the two is wrong: check their intrinsics and the guesses, and that their "
               "images are of one instant and not swapped"),
-    Threshold("pull_rotation", "difference of the joint solution from the camera's own", "at most",
-              0.15, 1.0, "deg",
-              "How far do priors and relative poses pull a camera from its own solution?",
-              "As for sigma; FAIL only where the pull is gross. Counted beyond `pull_sigmas`.",
-              "priors or relative poses pull it; are they right?",
-              of_tolerance=True),
-    Threshold("pull_translation", "difference of the joint solution from the camera's own",
-              "at most", 5.0, 30.0, "cm", "The same.", "As for its rotation.",
-              "priors or relative poses pull it; are they right?",
-              of_tolerance=True),
     Threshold("flat_evidence", "sigma by the images over that by the matches", "at most", 3.0,
               math.inf, "times", "Do the images leave the pose more open than the matches do?",
               "Poses near a result are within 3 sigma of the matches; a larger ratio is of poses "
@@ -213,8 +203,6 @@ class Limit:
 
 # fmt: off
 LIMITS: tuple[Limit, ...] = (
-    Limit("pull_sigmas", 4.0, "sigma",
-          "A pull within this of what a camera's own solution leaves open is zero."),
     Limit("lens_wrong", _WRONG_SIGMAS, "sigma", "The error of a wrong lens parameter, in standard "
           "deviations of a calibrated one: 0.2 % of the focal length and of fx / fy, "
           "0.002 focal lengths of the principal point, 0.002 of k1, 2 ms of the time of "

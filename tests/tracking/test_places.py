@@ -212,7 +212,7 @@ def test_an_update_is_the_optimum_of_the_graph_with_all_places() -> None:
     places = closed.sums.add(sums_by_place(state.epochs[-1].frames))
     rows = {places.names[row]: row for row in (1, 2, 3)}
     data = PlaceData.of(state, quadratics_of(state, state.places), state.live_frames, rows)
-    model = place_model(state, places, FrameSpread.of(state, places), data, times={})
+    model = place_model(state, places, FrameSpread.of(state, places), data)
     model = replace(model, pose_graph=pose_priors(state))
     whole = fit_latent_poses(model, start_values(model, update.T_camera_lidar))
     sigmas = np.sqrt(np.diag(whole.covariance)).reshape(2, 6)
