@@ -67,12 +67,8 @@ $(VENV)/docs: pyproject.toml constraints.txt
 docs: $(VENV)/docs ## Build the documentation into build/docs, without a network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-bench: $(VENV)/test ## Compare ratios of processor times with the last release's; measure parts by themselves
+bench: $(VENV)/test ## Compare ratios of processor times with the last release's; time updates while driving
 	$(BIN)/python -m benchmarks.speed.gate --against benchmarks/ratios.json
-	$(BIN)/python -m benchmarks.speed.stages data/sample
-	$(BIN)/python -m benchmarks.speed.solve --frames 10 100 --cameras 2
-	$(BIN)/python -m benchmarks.speed.solve --frames 20 --cameras 12 --matches 500
-	$(BIN)/python -m benchmarks.speed.scaling --rows 1e3 1e5 1e7
 	$(BIN)/python -m benchmarks.speed.incremental
 
 clean: ## Remove everything that was made

@@ -1,1 +1,1 @@
-"""Benchmarks: run from the checkout, as `python -m benchmarks.speed.solve`."""
+"""Benchmarks: run from the checkout, as `python -m benchmarks.speed.gate`."""

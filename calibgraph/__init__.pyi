@@ -2,7 +2,6 @@
 
 from .audit import Audit as Audit
 from .audit import CameraAudit as CameraAudit
-from .audit import CameraDrift as CameraDrift
 from .audit import Drift as Drift
 from .audit import LidarAudit as LidarAudit
 from .audit import Trend as Trend

@@ -5,14 +5,41 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from calibgraph.errors import FileError
 from calibgraph.files import cannot_write, require_place_for_folder, sync_folder
 
+INDEX_FILES = (
+    "calibration.yaml", "doctor.json", "fleet_model.json", "session.json", "state/state.sqlite"
+)  # fmt: skip
+"""A folder that holds one of these is a command's own, and may be written again."""
 _PREFIX = ".writing-"
 _NEW_S = 60.0
+
+
+def require_own_folder(folder: Path, read: Iterable[Path] = ()) -> None:
+    """Check, before hours of work, that a command may write its files into a folder.
+
+    Raises:
+        FileError: if there is no place for it, if it holds files and none of ``INDEX_FILES``, or if
+            it is read itself.
+    """
+    require_place_for_folder(folder)
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not any((folder / name).is_file() for name in INDEX_FILES):
+        raise FileError(
+            folder,
+            f"holds files, but no {INDEX_FILES[0]} or other index file of calibgraph; choose "
+            "another folder, or empty this one",
+        )
+    if any(path.is_dir() and path.samefile(folder) for path in read):
+        raise FileError(
+            folder, "is read by this command, which would write into it; choose another --out"
+        )
 
 
 @contextmanager

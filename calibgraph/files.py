@@ -79,6 +79,17 @@ def require_place_for_file(path: Path, *suffixes: str) -> None:
     require_place_for_folder(path.parent)
 
 
+def require_new_file(path: Path, *suffixes: str, force: bool = False) -> None:
+    """Check, before hours of work, that a file can be written and, without force, is not there.
+
+    Raises:
+        FileError: as of :func:`require_place_for_file`, or if it is there.
+    """
+    require_place_for_file(path, *suffixes)
+    if os.path.lexists(path) and not force:
+        raise FileError(path, "is there already; choose another name, or replace it with --force")
+
+
 def require_place_for_folder(folder: Path) -> None:
     """Check, before hours of work, that a folder exists or can be created."""
     for part in (folder, *folder.parents):

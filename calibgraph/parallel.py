@@ -1,5 +1,6 @@
 """Threads: as many as there are cores, and values that they make once."""
 
+import math
 import os
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
@@ -135,10 +136,15 @@ def _controller() -> ThreadpoolController:
 
 
 class KeyedCache(Generic[Key, Value]):
-    """Values by key, each made by the first thread that needs it; the one used last comes last."""
+    """Values by key, each made by the first thread that needs it; the one used last comes last.
 
-    def __init__(self) -> None:
-        self._lock = Lock()
+    Args:
+        most_bytes: when another value is made, those that were used longest ago are dropped until
+            the sizes of the others, their ``nbytes``, sum to this.
+    """
+
+    def __init__(self, most_bytes: float = math.inf) -> None:
+        self._lock, self._most_bytes = Lock(), most_bytes
         self._being_made: dict[Key, Lock] = {}
         self._values: OrderedDict[Key, Value] = OrderedDict()
 
@@ -147,10 +153,15 @@ class KeyedCache(Generic[Key, Value]):
         with self._lock:
             being_made = self._being_made.setdefault(key, Lock())
         with being_made:
-            value = self._values[key] if key in self._values else make()
+            try:
+                value, is_new = self._values[key], False
+            except KeyError:
+                value, is_new = make(), True
             with self._lock:
                 self._values[key] = value
                 self._values.move_to_end(key)
+                if is_new and self._most_bytes < math.inf:
+                    self._keep_last()
         return value
 
     def values(self) -> list[Value]:
@@ -164,12 +175,10 @@ class KeyedCache(Generic[Key, Value]):
             for key in [key for key in self._values if not wanted(key)]:
                 del self._values[key], self._being_made[key]
 
-    def keep_last(self, most: float, size: Callable[[Value], float]) -> None:
-        """Drop the values that were used longest ago, until the others' sizes sum to the most."""
-        with self._lock:
-            total = sum(size(value) for value in self._values.values())
-            for key in list(self._values)[:-1]:
-                if total <= most:
-                    break
-                total -= size(self._values.pop(key))
-                del self._being_made[key]
+    def _keep_last(self) -> None:
+        total = sum(value.nbytes for value in self._values.values())  # type: ignore[attr-defined]
+        for key in list(self._values)[:-1]:
+            if total <= self._most_bytes:
+                break
+            total -= self._values.pop(key).nbytes  # type: ignore[attr-defined]
+            del self._being_made[key]

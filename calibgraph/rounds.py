@@ -16,7 +16,7 @@ from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.matching.burnt_in import hide_burnt_in
-from calibgraph.matching.camera_pairs import match_some_frames, with_surfaces
+from calibgraph.matching.camera_pairs import PAIR_FRAMES, match_cameras, with_surfaces
 from calibgraph.matching.cloud_similarity import find_up
 from calibgraph.matching.frame_choice import FrameChoice, choose_frames, without_copies
 from calibgraph.matching.named import find_matcher
@@ -200,7 +200,7 @@ def _solve(
         return solve_joint(*matched, config, terms)
     except CorrespondenceError as error:
         with suppress(CalibrationError, OSError):
-            matches = match_some_frames(dataset, guess, seed=config.seed)
+            matches = match_cameras(dataset, guess, most_frames=PAIR_FRAMES, seed=config.seed)
             matches = with_surfaces(matches, dataset, matched[0])
             return solve_joint(*matched, config, terms, camera_matches=matches)
         with suppress(CorrespondenceError):

@@ -10,7 +10,9 @@ from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
-from tables import PART
+from tables import API, PART
+
+import calibgraph
 
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = ("data/overlay.webp", "data/track.png")
@@ -32,7 +34,13 @@ def _described(part: re.Match[str]) -> str:
     """A generated part; of the API, what mkdocstrings makes of every name."""
     if part["name"] != "api":
         return part["text"]
-    return "\n\n".join(f"::: calibgraph.{name}" for name in part["arguments"].split())
+    return "\n\n".join(f"::: {_path(name)}" for name in API[part["arguments"]].split())
+
+
+def _path(name: str) -> str:
+    """Of a public name; where its module has the same name, mkdocstrings would take the module."""
+    module = getattr(calibgraph, name).__module__
+    return f"{module}.{name}" if module.endswith(f".{name}") else f"calibgraph.{name}"
 
 
 def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:

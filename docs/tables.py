@@ -7,14 +7,19 @@ writes them anew between the lines ``<!-- generated: NAME -->`` and ``<!-- end g
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 from pydantic import BaseModel
 from typer.main import get_command
+
+MADE_WRONG = Path(__file__).parents[1] / "benchmarks" / "made_wrong.json"
+"""Counts of ``accuracy.verdicts``, ``street_verdicts`` and ``mixtures``, with their commits."""
 
 
 def thresholds() -> str:
@@ -28,59 +33,62 @@ def settings() -> str:
     """The settings of the solve: name, values, default, meaning."""
     from calibgraph.model.config import Config
 
-    return settings_table(Config, leave_out={"preset", "tracking"})
+    return settings_list(Config, leave_out={"preset", "tracking"})
 
 
 def tracking_settings() -> str:
     """The settings under ``tracking``."""
     from calibgraph.model.config import Tracking
 
-    return settings_table(Tracking)
+    return settings_list(Tracking)
 
 
 def presets() -> str:
-    """The settings in which the presets differ."""
-    from calibgraph.model.config import PRESETS, preset
+    """The settings of the paper's presets, as far as they differ from the default."""
+    from calibgraph.model.config import PRESETS, Config, preset
 
-    values = {name: preset(name).model_dump(exclude={"preset"}) for name in PRESETS}
-    rows = [
-        [f"`{key}`", *(_default(of_preset[key]) for of_preset in values.values())]
-        for key in next(iter(values.values()))
-        if len({str(of_preset[key]) for of_preset in values.values()}) > 1
-    ]
-    return table(["setting", *(f"`{name}`" for name in PRESETS)], rows)
+    default = Config().model_dump()
+    lines = []
+    for name in PRESETS:
+        values = preset(name).model_dump(exclude={"preset"}).items()
+        other = [f"`{key}: {_plain(each)}`" for key, each in values if each != default[key]]
+        lines += [f"* `{name}`: {', '.join(other)}"] if other else []
+    return "\n".join(lines)
 
 
 def commands() -> str:
-    """Every command with its arguments and options, from the program itself."""
+    """Every command with its arguments and options; those that several have alike, once."""
     from calibgraph.cli.app import app
+    from calibgraph.cli.settings import RareSettings
 
-    return "\n\n".join(_command(name, command) for name, command in _walk(get_command(app)))
-
-
-def api(*names: str) -> str:
-    """Public names with the first line of their docstrings."""
-    import calibgraph
-
-    first_lines = (_cell((getattr(calibgraph, n).__doc__ or "").split("\n\n")[0]) for n in names)
-    return table(
-        ["name", "meaning"], ([f"`{n}`", t] for n, t in zip(names, first_lines, strict=True))
+    found = [*_walk(get_command(app))]
+    lines = Counter((_name(p), _line(p)) for _, command in found for p in command.params)
+    commonest = dict(sorted(lines, key=lines.__getitem__))  # of a name's lines the last counts
+    shared = [line for (name, line), n in lines.items() if n > 1 and commonest[name] == line]
+    return "\n\n".join(
+        [
+            "### Shared by several commands",
+            "\n".join(shared),
+            "### Keys of a config file",
+            "Those of the [settings](settings.md), and rare ones that have no option:",
+            settings_list(RareSettings),
+            *(_command(name, command, shared) for name, command in found),
+        ]
     )
+
+
+def api(subject: str) -> str:
+    """The public names of a subject; the site has their descriptions in its place."""
+    return ", ".join(f"`{name}`" for name in API[subject].split())
 
 
 def made_wrong(part: str) -> str:
     """The ``headline`` or the ``table`` of how results that were made wrong are judged."""
-    from benchmarks.tables import RESULTS, Entry
-
-    lines = (RESULTS / "accuracy.made_wrong.jsonl").read_text("utf-8").splitlines()
-    tables = [each for line in lines for each in Entry.from_json(line).tables]
-    counts = [each for each in tables if "PASS" in each.columns]
-    rows = [row for each in counts for row in each.rows]
+    found = json.loads(MADE_WRONG.read_text("utf-8"))
     if part == "table":
-        return table(counts[0].columns, rows)
-    wrong, passed = (sum(int(row[at]) for row in rows) for at in (1, 2))
-    exceptions = [f"{error} off ({cause})" for each in tables if each not in counts
-                  for error, cause in each.rows]  # fmt: skip
+        return table(found["columns"], found["rows"])
+    wrong, passed = (sum(int(row[at]) for row in found["rows"]) for at in (1, 2))
+    exceptions = [f"{error} off ({cause})" for error, cause in found["passed"]]
     if len(exceptions) != passed:
         raise ValueError(f"{passed} wrong results got PASS, and {len(exceptions)} are described")
     return f"Of {wrong} results made wrong on purpose, {passed} got PASS: {', '.join(exceptions)}."
@@ -96,6 +104,34 @@ GENERATED: Mapping[str, Callable[..., str]] = {
     "api": api,
 }
 """By the first word or words after ``generated:``; what follows a colon are arguments."""
+
+_SHARED = "shared-by-several-commands"
+API = {
+    "judge": """
+        calibrate solve load_config preset evaluate perturb check write_audit_report drift
+        Calibration Residuals Verdict Check Config Evaluation PoseError Audit CameraAudit
+        LidarAudit Drift Trend
+    """,
+    "data": """
+        load_dataset dataset_from_arrays cloud_from_message image_from_message
+        camera_from_message load_rig rig_of_bag load_correspondences concatenate
+        load_camera_matches load_calibration diagnose import_rig export_calibration
+        describe_rig write_rig_template guess_rig write_rerun write_mcap Rig Camera
+        Intrinsics RelativePose Dataset Frame BagOptions Diagnosis Finding Correspondences
+        CameraMatches RigGuess CameraGuess
+    """,
+    "matchers": """
+        match_cameras with_surfaces warm_up_tracker run_fleet read_rows observe fit_fleet
+        write_fleet_report Matcher StructureMatcher IncrementalCalibrator DurableCalibrator
+        Update Event FleetModel
+    """,
+    "simulation": """
+        simulate_street simulate_correspondences block_factor projection_factor
+        camera_prior_factor relative_prior_factor relative_pose_factor MatcherErrors
+        CalibrationError FileError RigError CorrespondenceError DatasetError
+    """,
+}
+"""Public names by subject, in the order of ``docs/library.md``."""
 
 PART = re.compile(
     r"<!-- generated: (?P<name>[\w ]+)(?:: (?P<arguments>[\w ]+))? -->\n(?P<text>.*?)"
@@ -125,21 +161,20 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def settings_table(model: type[BaseModel], leave_out: Iterable[str] = ()) -> str:
-    """The fields of a model with their meaning: their descriptions, or the docstring's."""
+def settings_list(model: type[BaseModel], leave_out: Iterable[str] = ()) -> str:
+    """The fields of a model, their defaults, and their meaning: descriptions, or the docstring's.
+
+    Fields with one meaning share a line. The limits of numbers are in the message that refuses one.
+    """
     schema = model.model_json_schema()["properties"]
     meanings = attributes_of(model.__doc__ or "")
-    rows = [
-        [
-            f"`{name}`",
-            _cell(field.description or meanings[name]),
-            _default(field.default),
-            _values(schema[name]),
-        ]
-        for name, field in model.model_fields.items()
-        if name not in set(leave_out)
-    ]
-    return table(["setting", "meaning", "default", "values"], rows)
+    lines: dict[str, list[str]] = {}
+    for name, field in model.model_fields.items():
+        if name not in set(leave_out):
+            meaning = _one_line(field.description or meanings[name]).replace("None:", "`null`:")
+            meaning += _choices(schema[name], meaning)
+            lines.setdefault(meaning, []).append(f"`{name}: {_plain(field.default)}`")
+    return "\n".join(f"* {', '.join(fields)}: {meaning}" for meaning, fields in lines.items())
 
 
 def attributes_of(docstring: str) -> dict[str, str]:
@@ -148,41 +183,27 @@ def attributes_of(docstring: str) -> dict[str, str]:
     found: dict[str, str] = {}
     for names, text in re.findall(r"^ {8}([\w, ]+): (.*?)(?=^ {8}\S|\Z)", section, re.M | re.S):
         for name in names.split(", "):
-            found[name] = _cell(text)
+            found[name] = _one_line(text)
     return found
 
 
-def _cell(text: str) -> str:
-    """Text on one line, fit for a table."""
-    return " ".join(text.replace("``", "`").split()).replace("|", r"\|")
+def _one_line(text: str) -> str:
+    """Docstrings and help as Markdown."""
+    return " ".join(text.replace("``", "`").split())
 
 
-def _values(schema: Mapping[str, Any]) -> str:
-    """The values that a setting may have, from its JSON schema."""
-    if "anyOf" in schema:
-        return " or ".join(dict.fromkeys(_values(part) for part in schema["anyOf"]))
-    if "enum" in schema:
-        return ", ".join(f"`{value}`" for value in schema["enum"])
-    if schema["type"] == "null":
-        return "`null`"
-    low = schema.get("minimum", schema.get("exclusiveMinimum"))
-    high = schema.get("maximum", schema.get("exclusiveMaximum"))
-    if "exclusiveMaximum" in schema and schema["type"] == "integer":
-        high -= 1
-    if low is not None and high is not None:
-        above = "above " if "exclusiveMinimum" in schema else ""
-        return f"{above}{low:.10g} to {high:.10g}"
-    if low is not None:
-        return f"above {low:.10g}" if "exclusiveMinimum" in schema else f"from {low:.10g}"
-    array = "`[height, width]`" if "prefixItems" in schema else "`[NAME, ...]`"
-    words = {"boolean": "`true`, `false`", "array": array, "integer": "whole number"}
-    return words.get(schema["type"], schema["type"])
+def _choices(schema: Mapping[str, Any], meaning: str) -> str:
+    """The words that a setting may be, from its JSON schema, if its meaning lacks one."""
+    parts = [schema, *schema.get("anyOf", ())]
+    words = [f"`{word}`" for part in parts for word in part.get("enum", ())]
+    return "" if all(word in meaning for word in words) else f" One of {', '.join(words)}."
 
 
-def _default(value: object) -> str:
+def _plain(value: object) -> object:
+    """A value as YAML has it."""
     if value is None or isinstance(value, bool):
-        return {None: "`null`", True: "`true`", False: "`false`"}[value]
-    return f"`{list(value) if isinstance(value, tuple) else value}`"
+        return {None: "null", True: "true", False: "false"}[value]
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _walk(command: click.Command, name: str = "calibgraph") -> Iterable[tuple[str, click.Command]]:
@@ -195,25 +216,29 @@ def _walk(command: click.Command, name: str = "calibgraph") -> Iterable[tuple[st
         yield from _walk(inner, f"{name} {child}")
 
 
-def _command(name: str, command: click.Command) -> str:
-    arguments = [p for p in command.params if p.param_type_name == "argument"]
-    options = [p for p in command.params if p.param_type_name == "option"]
-    usage = " ".join([name, *(p.metavar or p.name.upper() for p in arguments), "[options]"])
-    rows = [[f"`{p.metavar or p.name.upper()}`", _cell(p.help or ""), ""] for p in arguments]
-    rows += [[_flags(p), _cell(p.help or ""), _shown_default(p)] for p in options]
-    parts = [f"### {name}", _cell(command.help or ""), f"```text\n{usage}\n```"]
-    return "\n\n".join([*parts, table(["option", "meaning", "default"], rows)])
+def _command(name: str, command: click.Command, shared: Sequence[str]) -> str:
+    usage = [name, *(_name(p) for p in command.params if p.param_type_name == "argument")]
+    own = [_line(each) for each in command.params if _line(each) not in shared]
+    also = [f"`{_name(each)}`" for each in command.params if _line(each) in shared]
+    parts = [f"### {name}", f"`{' '.join(usage)} [options]`", _one_line(command.help or "")]
+    parts += ["\n".join(own)] if own else []
+    return "\n\n".join([*parts, *([f"[Shared](#{_SHARED}): {', '.join(also)}"] if also else [])])
 
 
-def _flags(option: click.Parameter) -> str:
-    names = "`, `".join([*option.opts, *option.secondary_opts])
-    flags = f"`{names} {option.metavar}`" if option.metavar else f"`{names}`"
-    return flags.replace("|", r"\|")
+def _line(parameter: click.Parameter) -> str:
+    """An argument or an option in a list."""
+    names = [_name(parameter), *parameter.opts[1:], *parameter.secondary_opts]
+    option = parameter.param_type_name == "option"
+    value = f" {parameter.metavar}" if option and parameter.metavar else ""
+    shown = getattr(parameter, "show_default", False) and parameter.default not in (None, False)
+    default = f" (default: `{parameter.default}`)" if option and shown else ""
+    return f"* `{'`, `'.join(names)}{value}`: {_one_line(parameter.help or '')}{default}"
 
 
-def _shown_default(option: click.Parameter) -> str:
-    shown = getattr(option, "show_default", False)
-    return f"`{option.default}`" if shown and option.default not in (None, False) else ""
+def _name(parameter: click.Parameter) -> str:
+    if parameter.param_type_name == "option":
+        return parameter.opts[0]
+    return parameter.metavar or parameter.name.upper()
 
 
 if __name__ == "__main__":

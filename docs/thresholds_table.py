@@ -4,38 +4,43 @@ from __future__ import annotations
 
 from calibgraph.model.threshold import Threshold, in_unit, is_reachable
 from calibgraph.model.verdict import TOLERANCE
-from calibgraph.trust.thresholds import LIMITS, THRESHOLDS, Limit
+from calibgraph.trust.thresholds import THRESHOLDS
 
 
 def thresholds_markdown() -> str:
-    """Both tables in Markdown, a line per row."""
-    lines = [
-        "| key | question | PASS | FAIL (else WARN) | reason, or the data it is from |",
-        "|---|---|---|---|---|",
-        *(_line(row) for row in THRESHOLDS),
-        "",
-        "\\* At the default tolerance of "
-        f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. A limit of "
-        "FAIL, or in the table below, grows with the tolerance, and never falls below this value.",
-        "",
-        "| key | limit | meaning |",
-        "|---|---|---|",
-        *(_limit_line(row) for row in LIMITS),
-    ]
-    return "\n".join(lines) + "\n"
+    """The table in Markdown; a check of a rotation and that of the translation share a line."""
+    rows: dict[str, list[Threshold]] = {}
+    for row in THRESHOLDS:
+        subject = row.key.removesuffix("_rotation").removesuffix("_translation")
+        rows.setdefault(subject, []).append(row)
+    return "\n".join(
+        [
+            "| `kind` | question | PASS | FAIL, else WARN |",
+            "|---|---|---|---|",
+            *(_line(pair) for pair in rows.values()),
+            "",
+            "\\* At the default tolerance of "
+            f"{TOLERANCE[0]:g} deg and {TOLERANCE[1]:g} cm; another one scales the limit. A limit "
+            "of FAIL grows with the tolerance, and never falls below this value.",
+        ]
+    )
 
 
-def _limit_line(row: Limit) -> str:
-    scaled = " \\*" if row.of_tolerance else ""
-    return f"| `{row.key}` | {in_unit(row.value, row.unit)}{scaled} | {row.meaning} |"
+def _line(rows: list[Threshold]) -> str:
+    keys = [row.key for row in rows]
+    keys[1:] = [key.removeprefix(keys[0].rpartition("_")[0]) for key in keys[1:]]
+    cells = ("`, `".join(keys), rows[0].question, _passes(rows), _fails(rows))
+    return "| `{}` | {} | {} | {} |".format(*cells)
 
 
-def _line(row: Threshold) -> str:
-    beyond = "above" if row.direction == "at most" else "below"
-    passes = f"{row.direction} {in_unit(row.warn, row.unit, digits=4)}"
-    passes += " \\*" if row.of_tolerance else ""
-    fails = "never"
-    if is_reachable(row.fail, row.unit, row.direction):
-        fails = f"{beyond} {in_unit(row.fail, row.unit, digits=4)}"
-    cells = (f"`{row.key}`", row.question, passes, fails, row.reason)
-    return f"| {' | '.join(cells)} |"
+def _passes(rows: list[Threshold]) -> str:
+    limits = ", ".join(in_unit(row.warn, row.unit, digits=4) for row in rows)
+    sign = "≤" if rows[0].direction == "at most" else "≥"
+    return f"{sign} {limits}" + (" \\*" if rows[0].of_tolerance else "")
+
+
+def _fails(rows: list[Threshold]) -> str:
+    if not all(is_reachable(row.fail, row.unit, row.direction) for row in rows):
+        return "never"
+    sign = ">" if rows[0].direction == "at most" else "<"
+    return f"{sign} {', '.join(in_unit(row.fail, row.unit, digits=4) for row in rows)}"

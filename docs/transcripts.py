@@ -42,9 +42,17 @@ def main() -> None:
     PAGE.write_text(new, "utf-8")
 
 
+def shown(output: str, before: str) -> str:
+    """The output as a block shows it: its first lines, if the block ends with ``...``."""
+    lines = before.splitlines()
+    if lines[-1:] == ["..."]:
+        return "\n".join([*output.splitlines()[: len(lines) - 1], "..."])
+    return output
+
+
 def _with_output(block: re.Match[str]) -> str:
     command = block["command"]
-    return f"```text\n$ calibgraph {command}\n{run(command, Path())}\n```"
+    return f"```text\n$ calibgraph {command}\n{shown(run(command, Path()), block['output'])}\n```"
 
 
 if __name__ == "__main__":

@@ -19,7 +19,6 @@ from factors.free_lens import (
     FreeLens,
     FreeLensBlock,
     free_lens_factor,
-    free_lens_sums_factor,
 )
 from factors.lens import Lens, LensModel
 from factors.loss import LOSSES, LossName, robust_noise
@@ -60,7 +59,6 @@ __all__ = [
     "displaced_between_factor",
     "displace",
     "free_lens_factor",
-    "free_lens_sums_factor",
     "linear_factor",
     "pair_block_factor",
     "pair_chain",

@@ -31,7 +31,6 @@ from factors.block_arrays import (
     to_runs,
 )
 from factors.block_sums import BlockSums, square_root, unpack_sums
-from factors.conditioning import root_of_sums
 from factors.kernel import COST, GRADIENT, HESSIAN, accumulate, evaluate
 from factors.kernel_projection import MATRICES, RAYS
 from factors.lens import Lens
@@ -262,10 +261,7 @@ class ProjectionBlock(RobustBlock):
 
     def error_and_jacobian(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, Array]:
         """The (7,) error and (7, 6) Jacobian of the block factor."""
-        runs = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
-        sums, error, jacobian = runs.sum(axis=0), np.empty(7), np.zeros((6, 7))
-        regular = root_of_sums(sums, error, jacobian)
-        return (error, jacobian.T) if regular else square_root(unpack_sums(sums))
+        return square_root(self.sums(T_lidar_camera))
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:

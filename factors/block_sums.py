@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.conditioning import REGULAR, unit_diagonal
+from factors.block_arrays import contiguous
+from factors.conditioning import fill_root, unit_diagonal
 
 Array = NDArray[np.float64]
 
@@ -35,29 +36,20 @@ def square_root(sums: BlockSums) -> tuple[Array, Array]:
     digits to each other. The root is triangular; where H is nearly rank deficient, it is by the
     eigenvectors, and directions without information get a zero row.
     """
-    scaled, units = unit_diagonal(sums.hessian)
-    along = sums.gradient / units
-    root = _triangular_root(scaled)
-    if root is not None:
-        error = np.linalg.solve(root, along)
-    else:
-        values, vectors = np.linalg.eigh(scaled)
-        known = values > _LEAST * max(values[-1], 0.0)
-        roots = np.sqrt(np.where(known, values, 1.0))
-        root = np.asarray(vectors * np.where(known, roots, 0.0), dtype=np.float64)
-        error = np.where(known, vectors.T @ along / roots, 0.0)
-    rest = math.sqrt(max(float(sums.cost) - float(error @ error), 0.0))
-    jacobian: Array = np.vstack([root.T * units, np.zeros(len(units))])
-    return np.append(error, rest), jacobian
-
-
-def _triangular_root(scaled: Array) -> Array | None:
-    """Cholesky's root of a matrix of unit diagonal; None where it is nearly singular."""
-    try:
-        root = np.asarray(np.linalg.cholesky(scaled), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return None
-    return root if (np.diag(root) ** 2 > REGULAR).all() else None
+    size = len(sums.gradient)
+    error, jacobian = np.empty(size + 1), np.zeros((size, size + 1))
+    hessian, gradient = contiguous(sums.hessian), contiguous(sums.gradient)
+    if fill_root(hessian, gradient, float(sums.cost), error, jacobian):
+        return error, jacobian.T
+    scaled, units = unit_diagonal(hessian)
+    values, vectors = np.linalg.eigh(scaled)
+    known = values > _LEAST * max(values[-1], 0.0)
+    roots = np.sqrt(np.where(known, values, 1.0))
+    error[:size] = np.where(known, vectors.T @ (gradient / units) / roots, 0.0)
+    error[size] = math.sqrt(max(float(sums.cost) - float(error[:size] @ error[:size]), 0.0))
+    jacobian[:, :size] = (vectors * np.where(known, roots, 0.0)) * units[:, None]
+    jacobian[:, size] = 0.0
+    return error, jacobian.T
 
 
 def sums_of_runs(rows: Array, losses: Array, edges: NDArray[np.int64]) -> BlockSums:

@@ -88,24 +88,26 @@ def sigmas_of_hessian(hessian: Array) -> Array:
 
 
 @compiled()
-def root_of_sums(sums, error, jacobian):  # type: ignore[no-untyped-def]
-    """Fill the (7,) error and transposed Jacobian of ``block_sums.square_root``, by Cholesky.
+def fill_root(hessian, gradient, cost, error, jacobian):  # type: ignore[no-untyped-def]
+    """Fill the (n + 1,) error and transposed Jacobian of ``block_sums.square_root``, by Cholesky.
 
     Args:
-        sums: (28,) 21 of the upper triangle of H, 6 of b, 1 of c.
-        error: (7,).
-        jacobian: (6, 7), of zeros.
+        hessian: (n, n) H.
+        gradient: (n,) b.
+        cost: c.
+        error: (n + 1,).
+        jacobian: (n, n + 1), of zeros.
 
     Returns:
         Whether H is regular; if it is not, both mean nothing.
     """
-    rest_of_cost = sums[27]
-    for i in range(6):
-        square = sums[i * (13 - i) // 2]
+    n = len(hessian)
+    for i in range(n):
+        square = hessian[i, i]
         unit = math.sqrt(square) if square > 0.0 else 1.0
-        along, jacobian[i, 6] = sums[21 + i] / unit, unit  # for a while
+        along, jacobian[i, n] = gradient[i] / unit, unit  # for a while
         for j in range(i + 1):
-            rest = sums[j * (11 - j) // 2 + i] / (unit * jacobian[j, 6])
+            rest = hessian[j, i] / (unit * jacobian[j, n])
             for m in range(j):
                 rest -= jacobian[i, m] * jacobian[j, m]
             if j < i:
@@ -118,10 +120,10 @@ def root_of_sums(sums, error, jacobian):  # type: ignore[no-untyped-def]
                 return False
             jacobian[i, j] = rest
         error[i] = along
-        rest_of_cost -= along * along
-    for i in range(6):
+        cost -= along * along
+    for i in range(n):
         for j in range(i + 1):
-            jacobian[i, j] *= jacobian[i, 6]
-        jacobian[i, 6] = 0.0
-    error[6] = math.sqrt(rest_of_cost) if rest_of_cost > 0.0 else 0.0
+            jacobian[i, j] *= jacobian[i, n]
+        jacobian[i, n] = 0.0
+    error[n] = math.sqrt(cost) if cost > 0.0 else 0.0
     return True

@@ -268,26 +268,14 @@ def free_lens_factor(keys: Sequence[int], block: FreeLensBlock) -> gtsam.CustomF
             these displaces the points.
         block: of the camera.
     """
-    return free_lens_sums_factor(keys, block.sums, len(block.lens))
-
-
-def free_lens_sums_factor(
-    keys: Sequence[int], sums: Callable[[Array, Array], BlockSums], parameters: int
-) -> gtsam.CustomFactor:
-    """The same of any quadratic.
-
-    Args:
-        keys: as there.
-        sums: of H, b and c at a (4, 4) T_camera_lidar and the (k,) values of the lens.
-        parameters: k.
-    """
 
     def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
         *clouds, pose = (values.atPose3(key) for key in keys[:-1])
         seen = clouds[0].between(pose) if clouds else pose
-        found, jacobian = square_root(sums(seen.inverse().matrix(), values.atVector(keys[-1])))
+        sums = block.sums(seen.inverse().matrix(), values.atVector(keys[-1]))
+        found, jacobian = square_root(sums)
         by_pose = jacobian[:, :6]
         by_cloud = [-by_pose @ seen.inverse().AdjointMap()] if clouds else []
         return found, [*by_cloud, by_pose, jacobian[:, 6:]]
 
-    return custom_factor(gtsam.noiseModel.Unit.Create(7 + parameters), keys, linearize)
+    return custom_factor(gtsam.noiseModel.Unit.Create(7 + len(block.lens)), keys, linearize)

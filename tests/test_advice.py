@@ -28,7 +28,7 @@ from tests.conftest import ROOT, SAMPLE, Call
 
 COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
 LIBRARY = ("model", "trust", "matching", "solver", "guessing", "audit", "graph", "io", "tracking")
-ALONE = ("doctor.py", "rounds.py", "overlaps.py", "pipeline.py", "outputs.py")
+ALONE = ("doctor.py", "rounds.py", "overlaps.py", "pipeline.py")
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 COMMAND = re.compile(r"calibgraph ([a-z][a-z-]*)((?: (?:[A-Z.]+|\{\}|--[a-z-]+ \S+))*)")
 
@@ -57,15 +57,8 @@ def texts_of(path: Path) -> Iterator[str]:
 
 
 def test_every_option_and_command_that_a_message_names_exists() -> None:
-    others = {"--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw", "--frame-id"}  # of ROS
-    others |= {
-        "--child-frame-id",
-        "--once",
-        "--ros-args",
-        "--qos-durability",
-        "--index-url",
-        "--debug",
-    }
+    of_ros = "x y z qx qy qz qw frame-id child-frame-id once ros-args qos-durability"
+    others = {f"--{name}" for name in (*of_ros.split(), "index-url", "debug")}
     known = {flag for name in COMMANDS for flag in options_of(name)} | others
     wrong = []
     for path in sources():

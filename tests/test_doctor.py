@@ -86,7 +86,7 @@ def test_a_guess_in_millimetres_is_named_by_what_the_images_show_first() -> None
     assert found.points_in_image["left"] == 0
     assert texts(found, "error") == [
         "the images of left fit clearly better if the guess has a translation in millimetres; undo "
-        "it with calibgraph import RIG --correct left=millimetres --out FILE.yaml",
+        "it with calibgraph rig RIG --correct left=millimetres --out FILE.yaml",
         "left: by the guess, no point of the cloud lies in the image",
     ]
     assert texts(found, "warning") == [

@@ -1,87 +1,57 @@
-"""YAML files: what is no plain mapping is refused in one line."""
+"""Files: YAML that is no plain mapping, sets that are written together, errors in words."""
 
 from __future__ import annotations
 
 import errno
 import re
+import subprocess
+import sys
 import time
+import tokenize
 import tracemalloc
+import zipfile
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
-from calibgraph import (
-    FileError,
-    Rig,
-    load_rig,
-)
-from calibgraph.files import (
-    read_yaml,
-    write_atomically,
-    write_yaml,
-)
+from calibgraph import FileError, Rig, load_rig
+from calibgraph.errors import in_words, printable
+from calibgraph.file_sets import written_together
+from calibgraph.files import read_yaml, write_atomically, write_text, write_yaml
 from calibgraph.yaml_text import parse_yaml
 from tests.conftest import SAMPLE
-from tests.model.rig_files import written
+from tests.model.test_rig import written
+
+ALIASES = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+ALIASES += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]
+MERGES = ["a0: &a0 {x: 1}"]
+MERGES += [f"a{i}: &a{i} {{<<: [*a{i - 1}, *a{i - 1}]}}" for i in range(1, 26)]
+LARGE = "a0: &a0 {" + ", ".join(f"k{k}: {k}" for k in range(3000)) + "}"
+REFUSED = {
+    **dict.fromkeys(("", "- a\n- b\n", "{unclosed", "\x00\x01", "just words", "&a [*a]"), "."),
+    **dict.fromkeys(("a: 2020-13-45", "a: !!int abc", "a: !!int ''"), "not valid YAML"),
+    "a: " + "9" * 5000: "not valid YAML",
+    "[" * 20_000: "not valid YAML|too deeply",
+    "{a: " * 1000: "not valid YAML|too deeply",
+    "a: " + "[" * 40_000 + "]" * 40_000: "too deeply",  # the parser would end the process
+    "\n".join([*ALIASES, "cameras: {a: {T_camera_lidar: *a11}}"]): "aliases stand for over",
+    "\n".join(MERGES): "merge keys .* stand for over",
+    "\n".join([LARGE, "all:", *["- {<<: *a0}"] * 1000]): "merge keys .* stand for over",
+}
 
 
-@pytest.mark.parametrize("text", ["", "- a\n- b\n", "{unclosed", "\x00\x01", "just words"])
-def test_what_is_not_a_mapping_is_refused(text: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("text", "message"), REFUSED.items(), ids=range(len(REFUSED)))
+def test_what_is_no_mapping_or_a_bomb_is_refused_at_once(
+    text: str, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text(text)
-    with pytest.raises(FileError, match=str(path)):
-        load_rig(path)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("a: 2020-13-45", "not valid YAML"),
-        ("a: !!int abc", "not valid YAML"),
-        ("a: !!int ''", "not valid YAML"),
-        ("a: " + "9" * 5000, "not valid YAML"),
-        ("[" * 20_000, "not valid YAML|too deeply"),
-        ("{a: " * 1000, "not valid YAML|too deeply"),
-        ("a: " + "[" * 40_000 + "]" * 40_000, "too deeply"),  # the parser would end the process
-        ("&a [*a]", "."),
-    ],
-)
-def test_what_the_yaml_parser_chokes_on_is_refused(text: str, message: str, tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    path.write_text(text)
+    begin = time.process_time()
     with pytest.raises(FileError, match=message) as caught:
         load_rig(path)
-    assert "\n" not in str(caught.value)
-
-
-def test_an_alias_bomb_is_refused_at_once(tmp_path: Path) -> None:
-    lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
-    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]
-    path = tmp_path / "rig.yaml"
-    path.write_text("\n".join([*lines, "cameras: {a: {T_camera_lidar: *a11}}"]))
-    with pytest.raises(FileError, match="aliases stand for over"):
-        load_rig(path)
-
-
-def merge_bombs() -> dict[str, str]:
-    """YAML files whose merge keys multiply: by aliases of aliases, or of one large mapping."""
-    doubled = [f"a{i}: &a{i} {{<<: [*a{i - 1}, *a{i - 1}]}}" for i in range(1, 26)]
-    large = "a0: &a0 {" + ", ".join(f"k{k}: {k}" for k in range(3000)) + "}"
-    return {
-        "of aliases": "\n".join(["a0: &a0 {x: 1}", *doubled]),
-        "of a large mapping": "\n".join([large, "all:", *["- {<<: *a0}"] * 1000]),
-    }
-
-
-@pytest.mark.parametrize("kind", merge_bombs())
-def test_a_merge_key_bomb_is_refused_at_once(kind: str, tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    path.write_text(merge_bombs()[kind])
-    begin = time.process_time()
-    with pytest.raises(FileError, match="merge keys .* stand for over") as caught:
-        load_rig(path)
-    assert time.process_time() - begin < 10  # written out it takes over a minute
-    assert "\n" not in str(caught.value)
+    assert time.process_time() - begin < 10  # written out, merge keys take over a minute
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("wrong", [{"fx": True}, {"cx": False}])
@@ -159,3 +129,140 @@ def test_texts_as_other_programs_save_them_are_named(
     with pytest.raises(FileError, match=words) as caught:
         read_yaml(path)
     assert "\n" not in str(caught.value)
+
+
+NAMES = ("a.txt", "calibration.yaml", "z.txt")
+LAST = "calibration.yaml"
+
+
+def write_all(folder: Path, text: str) -> None:
+    with written_together(folder, last=LAST) as new:
+        for name in reversed(NAMES):
+            write_text(new / name, text)
+
+
+def texts(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
+
+
+def test_files_that_are_written_together_appear_together_or_not_at_all(tmp_path: Path) -> None:
+    old = tmp_path / "a.txt"
+    old.write_text("old")
+    full = OSError(errno.ENOSPC, "No space left on device")
+    with (
+        pytest.raises(OSError, match="No space") as caught,
+        written_together(tmp_path, last=LAST) as new,
+    ):
+        write_text(new / "a.txt", "new")
+        full.filename = str(new / "lidar" / "b.npy")
+        raise full
+    assert caught.value.filename == str(tmp_path / "lidar" / "b.npy")
+    assert ([*tmp_path.iterdir()], old.read_text()) == ([old], "old")
+    write_all(tmp_path, "new")
+    assert texts(tmp_path) == dict.fromkeys(NAMES, "new")
+    assert len([*tmp_path.iterdir()]) == len(NAMES)
+
+
+def test_two_sets_are_not_mixed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second one waits while the files of the first are moved."""
+    replace, moved = Path.replace, list[Path]()
+    second = Thread(target=write_all, args=(tmp_path, "second"))
+
+    def move(path: Path, target: Path) -> Path:
+        if target.parent == tmp_path:
+            moved.append(target)
+            if len(moved) == 2:
+                second.start()
+                second.join(0.3)
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", move)
+    write_all(tmp_path, "first")
+    second.join()
+    assert texts(tmp_path) == dict.fromkeys(NAMES, "second")
+
+
+@pytest.mark.parametrize("fails", [1, 2, 3])
+@pytest.mark.parametrize("has_links", [True, False])
+def test_an_error_between_the_moves_leaves_what_was_there(
+    fails: int, has_links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, moved, replace = {"a.txt": "old", LAST: "old"}, list[Path](), Path.replace
+    for name, text in before.items():
+        (tmp_path / name).write_text(text)
+
+    def move(path: Path, target: Path) -> Path:
+        if target.parent == tmp_path and target not in moved:
+            moved.append(target)
+            if len(moved) == fails:
+                raise OSError(errno.EPERM, "not permitted", str(path))
+        return replace(path, target)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EPERM, "no hard links")
+
+    if not has_links:
+        monkeypatch.setattr("os.link", refuse)
+    monkeypatch.setattr(Path, "replace", move)
+    with pytest.raises(OSError, match="cannot be written .*; choose another folder") as caught:
+        write_all(tmp_path, "new")
+    assert caught.value.filename == str(moved[fails - 1])
+    assert texts(tmp_path) == before
+    assert len([*tmp_path.iterdir()]) == len(before)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from calibgraph.file_sets import written_together
+with written_together(Path(sys.argv[1]), last="a.txt") as new:
+    (new / "a.txt").write_text("half")
+    (new / "lidar").mkdir()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_process_left_is_removed_but_nothing_of_a_living_one(tmp_path: Path) -> None:
+    (tmp_path / ".writing-notes").write_text("mine")
+    subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
+    assert len([*tmp_path.glob(".writing-*/lidar")]) == 1
+    with written_together(tmp_path, last=LAST) as living:
+        assert [path.parent for path in tmp_path.glob(".writing-*")] == [tmp_path] * 2
+        assert not [*tmp_path.glob(".writing-*/lidar")]
+        write_text(living / "b.txt", "living")
+        write_all(tmp_path, "other")
+        assert (living / "b.txt").read_text() == "living"
+    assert texts(tmp_path) == dict.fromkeys(NAMES, "other") | {
+        "b.txt": "living", ".writing-notes": "mine"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("\x1b[2J", "\\x1b[2J"),
+        ("a\x7fb\x9b2J", "a\\x7fb\\x9b2J"),
+        ("rig\u202elmay.gir", "rig\\u202elmay.gir"),
+        ("a\rb\u2028c\ud800", "a\\rb\\u2028c\\ud800"),
+        ("Kamera größer\n\tü 前 שלום", "Kamera größer\n\tü 前 שלום"),
+    ],
+)
+def test_characters_that_are_not_seen_are_escaped(text: str, shown: str) -> None:
+    assert printable(text) == shown
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(), MemoryError((2, 3)), tokenize.TokenError("EOF in multi-line", (1, 0)),
+        SyntaxError("x", ("<unknown>", 1, 1, "", 1, 1)), KeyError("descr"), RecursionError(),
+        AttributeError("'NoneType' object has no attribute 'x'"), AssertionError(), EOFError(),
+        ValueError(), ValueError("no header"), OSError(5, "Input/output error"),
+        zipfile.BadZipFile("no zip"),
+    ],
+)  # fmt: skip
+def test_errors_of_libraries_are_put_in_words(error: Exception) -> None:
+    words = in_words(error)
+    assert words
+    assert type(error).__name__ not in words
+    assert not set("()'<>") & set(words)

@@ -82,9 +82,11 @@ def test_untrained_networks_fail_on_real_frames(realdata: Path, tmp_path: Path, 
     weights = saved(tmp_path / "random.tar", good_content(Architecture(width=16)))
     (folder,) = sequences(realdata, "07")
     for start_from in ("frame", "joint"):
+        config = tmp_path / "config.yaml"
+        config.write_text(f"start_from: {start_from}\nhalf_resolution: true\n")
         code, _, text = call(
             "calibrate", folder, "--frames", "0,1", "--matcher", "cmrnext",
-            "--weights", weights, weights, "--start-from", start_from, "--half-resolution",
+            "--weights", weights, "--weights", weights, "--config", config,
             "--out", tmp_path / start_from,
         )  # fmt: skip
         assert code == 1

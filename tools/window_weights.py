@@ -30,7 +30,7 @@ from calibgraph import Dataset, Rig, load_dataset, simulate_street
 from calibgraph.files import write_text
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
 from calibgraph.matching.structure.schedule import LEVELS
-from calibgraph.matching.structure.score_kernel import score_windows
+from calibgraph.matching.structure.score_kernel import pad, score_windows
 from calibgraph.matching.structure.shift_scores import select_windows
 from calibgraph.matching.structure.visibility import find_places
 from calibgraph.matching.structure.window_kernels import FEATURES
@@ -84,7 +84,7 @@ def main() -> None:
         save(train(samples, options.seed))
         window_network.cache_clear()
     if options.judge:
-        publish("accuracy.window_weights", [judge(options.realdata)], record=options.record)
+        publish([judge(options.realdata)])
 
 
 def rendered(scenes: Path) -> Iterator[tuple[Dataset, Rig]]:
@@ -210,7 +210,7 @@ def score_each(image: np.ndarray, places: np.ndarray, windows: Windows, reach: i
     count, side = len(windows.counts), 2 * reach + 1
     grids = np.zeros((count, side, side), np.float32)
     group, first = np.arange(count, dtype=np.int32), np.array([-reach, -reach])
-    score_windows(image, places, windows.counts, windows.basis, group, first, True, grids)
+    score_windows(pad(image), places, windows.counts, windows.basis, group, first, True, grids)
     return grids
 
 

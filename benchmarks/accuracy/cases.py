@@ -24,12 +24,12 @@ from benchmarks.accuracy.scenes import (
     Case,
     Folders,
     Scene,
+    paint_images,
     with_clouds,
     with_images,
 )
 from calibgraph import (
     Camera,
-    Correspondences,
     Frame,
     Intrinsics,
     RelativePose,
@@ -57,8 +57,6 @@ from tools.scenes.worlds import RIGS, Problem, World
 Array = np.ndarray
 Rng = np.random.Generator
 Drawn = dict[str, Any]
-TableCase = tuple[Rig, Correspondences, Drawn]
-"""The rig with its guess, the table, and what was drawn for this kind of case."""
 RigChange = Callable[[Rig, Rng], tuple[Rig, Drawn]]
 
 STEREO_SIGMA_DEG, STEREO_SIGMA_M = 0.1, 0.01
@@ -161,37 +159,37 @@ OF_RIGS: dict[str, RigChange] = {
 """Rigs that are wrong, of tables and of scenes."""
 
 
-def table_of(world: World, rng: Rng, change: RigChange | None = None) -> TableCase:
-    """Good matches; the rig may be wrong."""
-    guess, drawn = change(world.guess(), rng) if change else (world.guess(), {})
-    return guess, world.table(), drawn
+def good(of: World | Scene, rng: Rng, change: RigChange | None = None) -> Case:
+    """Good data; the rig may be wrong."""
+    guess, drawn = change(of.guess(), rng) if change else (of.guess(), {})
+    return of.data, guess, drawn
 
 
-def random(world: World, rng: Rng) -> TableCase:
+def random(world: World, rng: Rng) -> Case:
     """Every pixel is random."""
     errors = replace(world.errors, outlier_share=1.0, informative_confidence=False)
-    return world.guess(), replace(world, errors=errors).table(), {}
+    return replace(world, errors=errors).table(), world.guess(), {}
 
 
-def swapped_names(world: World, rng: Rng) -> TableCase:
+def swapped_names(world: World, rng: Rng) -> Case:
     """Two neighbouring cameras' matches have each other's names; their relative pose is known."""
     names = list(world.truth.cameras)
     first = int(rng.integers(len(names) - 1))
     a, b = names[first], names[first + 1]
     table, swap = world.table(), {a: b, b: a}
     renamed = replace(table, cameras=tuple(swap.get(name, name) for name in table.cameras))
-    return with_stereo(world.guess(), world.truth, a, b), renamed, {"swapped": [a, b]}
+    return renamed, with_stereo(world.guess(), world.truth, a, b), {"swapped": [a, b]}
 
 
-def tied(world: World, rng: Rng) -> TableCase:
+def tied(world: World, rng: Rng) -> Case:
     """One camera has no matches: a right relative pose ties it to another."""
     names = list(world.truth.cameras)
     without, other = (names[k] for k in rng.permutation(len(names))[:2])
     table = concatenate([world.table().of_camera(name) for name in names if name != without])
-    return with_stereo(world.guess(), world.truth, without, other), table, {"without": without}
+    return table, with_stereo(world.guess(), world.truth, without, other), {"without": without}
 
 
-def shuffled_table(world: World, rng: Rng) -> TableCase:
+def shuffled_table(world: World, rng: Rng) -> Case:
     """Clouds are paired with images of other frames; the vehicle moves 1 to 2 m per frame."""
     how = str(rng.choice(["neighbours", "next", "any"]))
     order = np.arange(world.frames)
@@ -208,24 +206,24 @@ def shuffled_table(world: World, rng: Rng) -> TableCase:
         T_image_cloud = invert(T_start_lidar[order[frame]]) @ T_start_lidar[frame]
         return compose_extrinsics(world.truth, T_image_cloud)
 
-    return world.guess(), world.table(rig_at), {"shuffle": how}
+    return world.table(rig_at), world.guess(), {"shuffle": how}
 
 
-def distorted(world: World, rng: Rng) -> TableCase:
+def distorted(world: World, rng: Rng) -> Case:
     """The lenses distort, and the rig file has no distortion."""
     k1 = rng.uniform(-0.35, -0.25)
     lenses = with_lenses(world.truth, lambda camera: {"distortion": (k1, 0.1, 0.0, 0.0, 0.0)})
     guess = with_lenses(world.guess(), lambda camera: {"distortion": ()})
-    return guess, replace(world, truth=lenses).table(), {"k1": k1}
+    return replace(world, truth=lenses).table(), guess, {"k1": k1}
 
 
-def with_points(world: World, rng: Rng, scale: Any) -> TableCase:
+def with_points(world: World, rng: Rng, scale: Any) -> Case:
     """The points are mirrored (y is -y), or in millimetres."""
     table = world.table()
-    return world.guess(), replace(table, points_lidar_m=table.points_lidar_m * scale), {}
+    return replace(table, points_lidar_m=table.points_lidar_m * scale), world.guess(), {}
 
 
-def wall(world: World, rng: Rng) -> TableCase:
+def wall(world: World, rng: Rng) -> Case:
     """Each camera sees one wall and nothing else, opposite or oblique."""
     distance, tilt = rng.uniform(5, 30), rng.choice([0.0, rng.uniform(10, 70)])
     angle = rng.uniform(0, 2 * np.pi)
@@ -240,10 +238,10 @@ def wall(world: World, rng: Rng) -> TableCase:
         on_wall = points[met] * (distance / along[met])[:, None]  # pixels are unchanged
         rows = rows.select(met)
         tables.append(replace(rows, points_lidar_m=(on_wall - T[:3, 3]) @ T[:3, :3]))
-    return world.guess(), concatenate(tables), {"distance_m": distance, "tilt_deg": tilt}
+    return concatenate(tables), world.guess(), {"distance_m": distance, "tilt_deg": tilt}
 
 
-def narrow_cone(world: World, rng: Rng) -> TableCase:
+def narrow_cone(world: World, rng: Rng) -> Case:
     """All matches lie in a small part of the image."""
     share, middle = rng.uniform(0.05, 0.15), rng.uniform(-0.3, 0.3, 2)
     tables, table = [], world.table()
@@ -258,24 +256,22 @@ def narrow_cone(world: World, rng: Rng) -> TableCase:
         seen = camera.in_image(pixels)  # outliers may not be
         moved = replace(rows, pixels_px=pixels, points_lidar_m=(bundled - T[:3, 3]) @ T[:3, :3])
         tables.append(moved.select(seen))
-    return world.guess(), concatenate(tables), {"share": share}
+    return concatenate(tables), world.guess(), {"share": share}
 
 
-def far_away(world: World, rng: Rng) -> TableCase:
+def far_away(world: World, rng: Rng) -> Case:
     """All matches are beyond 40 m."""
-    return world.guess(), replace(world, depth_m=(40.0, 120.0)).table(), {}
+    return replace(world, depth_m=(40.0, 120.0)).table(), world.guess(), {}
 
 
-def slightly_wrong_focal(
-    world: World, rng: Rng, of: Callable[[World, Rng], TableCase]
-) -> TableCase:
+def slightly_wrong_focal(world: World, rng: Rng, of: Callable[[World, Rng], Case]) -> Case:
     """Another kind, with focal lengths wrong by 0.5 to 1 %, which weak geometry amplifies."""
-    guess, table, drawn = of(world, rng)
+    table, guess, drawn = of(world, rng)
     factor = 1 + random_sign(rng) * rng.uniform(0.005, 0.01)
-    return scaled_lens(guess, factor), table, {**drawn, "factor": factor}
+    return table, scaled_lens(guess, factor), {**drawn, "factor": factor}
 
 
-def two_poses(world: World, rng: Rng, share: float) -> TableCase:
+def two_poses(world: World, rng: Rng, share: float) -> Case:
     """A share of the matches agrees on another pose, of each camera or of the whole rig."""
     deg, m = rng.uniform(1, 10), rng.uniform(0.1, 1.0)
     whole, seed = bool(rng.random() < 0.5), int(rng.integers(2**31))
@@ -290,24 +286,24 @@ def two_poses(world: World, rng: Rng, share: float) -> TableCase:
         replace(world, matches=max(1, world.matches - wrong)).table(),
         replace(world, truth=other, matches=wrong, seed=seed).table(),
     ]
-    return world.guess(), concatenate(tables), {"deg": deg, "m": m, "whole_rig": whole}
+    return concatenate(tables), world.guess(), {"deg": deg, "m": m, "whole_rig": whole}
 
 
-def few_frames_of_table(world: World, rng: Rng) -> TableCase:
+def few_frames_of_table(world: World, rng: Rng) -> Case:
     """Two to five frames."""
     frames = int(rng.integers(2, 6))
-    return world.guess(), replace(world, frames=frames).table(), {"few": frames}
+    return replace(world, frames=frames).table(), world.guess(), {"few": frames}
 
 
-def bias(world: World, rng: Rng) -> TableCase:
+def bias(world: World, rng: Rng) -> Case:
     """All frames share an error of the matcher, which no table can distinguish from a pose."""
     size, angle = rng.uniform(5, 15), rng.uniform(0, 2 * np.pi)
     table = world.table()
     pixels = table.pixels_px + size * np.array([np.cos(angle), np.sin(angle)])
-    return world.guess(), replace(table, pixels_px=pixels), {"offset_px": size}
+    return replace(table, pixels_px=pixels), world.guess(), {"offset_px": size}
 
 
-def time_offset(world: World, rng: Rng) -> TableCase:
+def time_offset(world: World, rng: Rng) -> Case:
     """Clouds and images are 20 to 100 ms apart, on a drive of varying speed and yaw rate."""
     seconds = random_sign(rng) * rng.uniform(0.02, 0.1)
     speed, yaw = rng.uniform(0, 15, world.frames), rng.uniform(-20, 20, world.frames)
@@ -316,7 +312,7 @@ def time_offset(world: World, rng: Rng) -> TableCase:
         turn, shift = np.array([0, 0, yaw[frame]]), np.array([speed[frame], 0, 0])
         return compose_extrinsics(world.truth, to_transform(seconds * turn, seconds * shift))
 
-    return world.guess(), world.table(rig_at), {"seconds": seconds}
+    return world.table(rig_at), world.guess(), {"seconds": seconds}
 
 
 def lidar_axes(rig: Rig, rng: Rng) -> tuple[Rig, Drawn]:
@@ -328,14 +324,14 @@ def lidar_axes(rig: Rig, rng: Rng) -> tuple[Rig, Drawn]:
     return rig.moved_to(transforms), {}
 
 
-TABLES: dict[str, Callable[[World, Rng], TableCase]] = {
-    "good": table_of,
+TABLES: dict[str, Callable[[World, Rng], Case]] = {
+    "good": good,
     "tied": tied,
     "random": random,
     "swapped": swapped_names,
     "shuffled": shuffled_table,
-    **{kind: partial(table_of, change=change) for kind, change in OF_RIGS.items()},
-    "focal_1": partial(slightly_wrong_focal, of=table_of),
+    **{kind: partial(good, change=change) for kind, change in OF_RIGS.items()},
+    "focal_1": partial(slightly_wrong_focal, of=good),
     "distorted": distorted,
     "mirrored": partial(with_points, scale=[1, -1, 1]),
     "wall": wall,
@@ -349,14 +345,8 @@ TABLES: dict[str, Callable[[World, Rng], TableCase]] = {
     "bias": bias,
     "time_offset": time_offset,
     "units": partial(with_points, scale=1000),
-    "axes": partial(table_of, change=lidar_axes),
+    "axes": partial(good, change=lidar_axes),
 }
-
-
-def scene_of(scene: Scene, rng: Rng, change: RigChange | None = None) -> Case:
-    """Good data; the rig may be wrong."""
-    guess, drawn = change(scene.guess(), rng) if change else (scene.guess(), {})
-    return scene.data, guess, drawn
 
 
 def few_frames(scene: Scene, rng: Rng) -> Case:
@@ -443,25 +433,14 @@ def copies(scene: Scene, rng: Rng) -> Case:
     return replace(scene.data, frames=frames), scene.guess(), {}
 
 
-Painter = Callable[[Array, int, Camera, Rng], Array]
-"""An image, the number of its frame, its camera and a generator, to the changed image."""
-
-
-def painted(scene: Scene, rng: Rng, paint: Painter, one: bool = True) -> Case:
+def painted(
+    scene: Scene, rng: Rng, paint: Callable[[Array, int, Camera, Rng], Array], one: bool = True
+) -> Case:
     """The images of one camera drawn at random, or of all, are changed."""
     names = list(scene.truth.cameras)
     chosen = [str(rng.choice(names))] if one else names
-
-    def paths(index: int, frame: Frame) -> dict[str, Path]:
-        changed = dict(frame.image_paths)
-        for name in filter(chosen.__contains__, frame.image_paths):
-            camera = scene.truth.cameras[name]
-            image = paint(frame.load_image(name, camera), index, camera, rng)
-            changed[name] = scene.scratch / f"{name}_{index:06d}.png"
-            cv2.imwrite(str(changed[name]), image)
-        return changed
-
-    return with_images(scene.data, paths), scene.guess(), {"changed": chosen}
+    data = paint_images(scene, chosen, lambda *image: paint(*image, rng))
+    return data, scene.guess(), {"changed": chosen}
 
 
 def moved_halfway(scene: Scene, rng: Rng) -> Case:
@@ -518,8 +497,8 @@ def covered(scene: Scene, rng: Rng, change: Callable[[Array], Array]) -> Case:
 
 
 DATA: dict[str, Callable[[Scene, Rng], Case]] = {
-    "good": scene_of,
-    "motorway": scene_of,
+    "good": good,
+    "motorway": good,
     "few_frames": few_frames,
     "far": partial(far, turned=False),
     "far_turned": partial(far, turned=True),
@@ -527,8 +506,8 @@ DATA: dict[str, Callable[[Scene, Rng], Case]] = {
     "swapped_unknown": swapped,
     "shuffled": shuffled,
     "shifted": shifted,
-    **{kind: partial(scene_of, change=change) for kind, change in OF_RIGS.items()},
-    "focal_y": partial(scene_of, change=wrong_focal_y),
+    **{kind: partial(good, change=change) for kind, change in OF_RIGS.items()},
+    "focal_y": partial(good, change=wrong_focal_y),
     "mirrored": partial(of_clouds, change=lambda cloud: cloud * [1, -1, 1, 1]),
     "other": other,
     "covered": partial(covered, change=np.zeros_like),
@@ -552,7 +531,7 @@ DATA: dict[str, Callable[[Scene, Rng], Case]] = {
     "blank_wall": blank_wall,
     "exchanged_axes": partial(of_clouds, change=lambda cloud: cloud[:, [1, 0, 2, 3]]),
     "scaled": scaled,
-    "half_resolution": partial(scene_of, change=half_resolution),
+    "half_resolution": partial(good, change=half_resolution),
     "distant_swap": partial(swapped, distant=True),
 }  # fmt: skip
 
@@ -585,7 +564,7 @@ def table_problem(kind: str, rig: str, seed: int) -> Problem:
     """One case of TABLES, of one of RIGS; all that is drawn is of the seed."""
     rng = np.random.default_rng([seed, zlib.crc32(kind.encode())])
     world = World.draw(RIGS[rig], rng)
-    guess, table, drawn = TABLES[kind](world, rng)
+    table, guess, drawn = TABLES[kind](world, rng)
     return Problem(world.truth, lambda: solve(guess, table), {**world.drawn(), **drawn})
 
 

@@ -14,7 +14,7 @@ covariances is of how results repeat, and its squared error should be 1.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
@@ -42,21 +42,9 @@ WITHIN_95 = float(chi2.ppf(0.95, 6)) / 6
 ALL = "all"
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """One camera's result.
-
-    Attributes:
-        T_camera_lidar: (4, 4).
-        covariance: (6, 6) rotation [rad] and translation [m] in the camera's axes.
-        status: its verdict.
-        repeats: (6, 6) covariance without what all places share.
-    """
-
-    T_camera_lidar: Array
-    covariance: Array
-    status: str
-    repeats: Array
+Estimate = tuple[Array, Array, str, Array]
+"""Of a camera: (4, 4) T_camera_lidar; (6, 6) its covariance, rotation [rad] and translation [m] in
+the camera's axes; its verdict; and the covariance without what all places share."""
 
 
 def main() -> None:
@@ -76,7 +64,7 @@ def main() -> None:
     pairs = [Key(PAIRS, "each", pair, options.first) for pair in options.pairs]
     work = partial(run_case, folders=Folders(options.realdata, None))
     records = ledger.records_of(options, [*halves, *pairs], work)
-    ledger.publish_cases("accuracy.disjoint", [report(records)], records, record=options.record)
+    ledger.publish_cases([report(records)], records)
 
 
 def run_case(case: Key, folders: Folders) -> Record:
@@ -106,7 +94,7 @@ def estimates(result: Calibration) -> dict[str, Estimate]:
     """The cameras that have an error bar."""
     repeats = repeat_covariances(result)
     return {
-        name: Estimate(T, covariance, result.camera_verdicts[name].status, repeats[name])
+        name: (T, covariance, result.camera_verdicts[name].status, repeats[name])
         for name, T in result.T_camera_lidar.items()
         if (covariance := result.covariance.get(name)) is not None
     }
@@ -133,17 +121,16 @@ def split(count: int, seed: int) -> tuple[list[int], list[int]]:
 
 def difference(first: Estimate, second: Estimate) -> Record:
     """The difference of two results: its size, and its square in the sum of their covariances."""
-    xi = twist_between(first.T_camera_lidar, second.T_camera_lidar)
+    xi = twist_between(first[0], second[0])
     squared, repeated = (
-        float(xi @ np.linalg.solve(both, xi)) / 6
-        for both in (first.covariance + second.covariance, first.repeats + second.repeats)
+        float(xi @ np.linalg.solve(first[which] + second[which], xi)) / 6 for which in (1, 3)
     )
     return {
         "difference_deg": float(np.degrees(np.linalg.norm(xi[:3]))),
         "difference_cm": float(100 * np.linalg.norm(xi[3:])),
         "normalised_squared": squared,
         "repeated_squared": repeated,
-        "statuses": [first.status, second.status],
+        "statuses": [first[2], second[2]],
     }
 
 

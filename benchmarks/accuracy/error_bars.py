@@ -17,17 +17,18 @@ NEES is the squared error in the metric of its covariance; its mean over 6 shoul
 from __future__ import annotations
 
 from argparse import ArgumentParser
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.uncertainty import calibration
+from benchmarks.accuracy.verdicts import STATUSES, class_of
 from benchmarks.tables import ROOT, Table
 from calibgraph import (
     Config,
@@ -75,7 +76,7 @@ def main() -> None:
     work = partial(run_case, scenes=arguments.scenes)
     records = ledger.records_of(arguments, cases, work)
     tables = [report(records), *report_together(records, arguments.scenes)]
-    ledger.publish_cases("accuracy.error_bars", tables, records, record=arguments.record)
+    ledger.publish_cases(tables, records)
 
 
 def group_parser(description: str | None, name: str, groups: list[int]) -> ArgumentParser:
@@ -145,17 +146,6 @@ def run_case(case: Key, scenes: Path) -> Record:
 
 
 @dataclass(frozen=True)
-class Found:
-    """The error of one camera, with its verdict, or of one next to the one before it."""
-
-    of: str
-    nees_over_6: float
-    degrees: float
-    centimetres: float
-    status: str = ""
-
-
-@dataclass(frozen=True)
 class Streets:
     """What is solved together.
 
@@ -192,8 +182,8 @@ def load_streets(folders: Sequence[Path]) -> Streets:
     return Streets(truth, aligned, load_rig(folders[0] / "result.yaml"), joined, matches)
 
 
-def solve_streets(streets: Streets) -> Iterator[Found]:
-    """Of each camera, and of each next to the one before it."""
+def solve_streets(streets: Streets) -> Iterator[tuple[str, Record]]:
+    """Errors of each camera, with its verdict, and of each next to the one before it."""
     truth = streets.truth
     solved = solve_joint(
         streets.start, streets.table, Config(stage1="rig", learnt_weights=False),
@@ -202,7 +192,6 @@ def solve_streets(streets: Streets) -> Iterator[Found]:
     evidence = Evidence(solved, guess=streets.start)
     checks = RunChecks(assess(evidence), unseen=evidence.cameras)
     verdicts = to_calibration(evidence, checks).camera_verdicts
-    statuses = {name: verdict.status for name, verdict in verdicts.items()}
     joint, mount = solved.covariance, solved.marginals.mount
     assert joint is not None and mount.covariance is not None
     errors, T = [], mount.T_camera_lidar
@@ -210,18 +199,22 @@ def solve_streets(streets: Streets) -> Iterator[Found]:
         errors.append(twist_between(T[name], truth.cameras[name].T_camera_lidar))
         rows = slice(6 * place, 6 * place + 6)
         error = twist_between(solved.T_camera_lidar[name], streets.aligned[name])
-        yield replace(_found("camera", error, joint[rows, rows]), status=statuses[name])
+        yield "camera", _found(error, joint[rows, rows], verdicts[name].status)
         if place:
             T_b_a = relative_transform(T[name], T[list(T)[place - 1]])
             between = errors[place] - gtsam.Pose3(T_b_a).AdjointMap() @ errors[place - 1]
             of_pair = relative_covariance(mount.covariance, place - 1, place, T_b_a)
-            yield _found("pair", between, of_pair)
+            yield "pair", _found(between, of_pair)
 
 
-def _found(of: str, error: np.ndarray, covariance: np.ndarray) -> Found:
-    nees = float(error @ np.linalg.solve(covariance, error))
-    degrees, metres = (float(np.linalg.norm(part)) for part in (error[:3], error[3:]))
-    return Found(of, nees / 6, float(np.degrees(degrees)), 100 * metres)
+def _found(error: np.ndarray, covariance: np.ndarray, status: str = "") -> Record:
+    """As a camera's part of a record."""
+    return {
+        "normalised_squared": float(error @ np.linalg.solve(covariance, error)) / 6,
+        "error_deg": float(np.degrees(np.linalg.norm(error[:3]))),
+        "error_cm": 100 * float(np.linalg.norm(error[3:])),
+        "status": status,
+    }
 
 
 def without_pairs(streets: Streets, rng: np.random.Generator) -> Streets:
@@ -270,10 +263,24 @@ CHANGES: dict[str, Callable[[Streets, np.random.Generator], Streets]] = {
 }
 
 
-COLUMNS = (
-    "size of errors", "cameras", "rotation, median [deg]", "largest", "position, median [cm]",
-    "largest", "mean NEES / 6", "in the 95 % region", "off", "PASS, WARN, FAIL",
+_CELLS = (
+    "results", "mean NEES / 6", "in the 95 % region", "error, median [deg]", "largest", "[cm]",
+    "largest", "PASS, WARN, FAIL", "of these off",
 )  # fmt: skip
+
+
+def _cells(found: Sequence[Record]) -> tuple[str, ...]:
+    """Errors of cameras or pairs in their error bars, their sizes, and verdicts."""
+    deg, cm = (np.array([one[f"error_{unit}"] for one in found]) for unit in ("deg", "cm"))
+    nees = [6 * one["normalised_squared"] for one in found if one["normalised_squared"]]
+    sizes = f"{np.median(deg):.3f}", f"{deg.max():.2f}", f"{np.median(cm):.2f}", f"{cm.max():.1f}"
+    judged = [one for one in found if one["status"]]
+    off = [one for one in judged if class_of(one) == "off"]
+    counts = (
+        ", ".join(str(sum(one["status"] == status for one in of)) for status in STATUSES)
+        for of in (judged, off)
+    )
+    return str(len(found)), *calibration(nees), *sizes, *counts
 
 
 def report(records: Sequence[Record]) -> Table:
@@ -282,39 +289,23 @@ def report(records: Sequence[Record]) -> Table:
     rows = []
     for size in (*sorted({record["data"] for record in done}), "all"):
         cameras = [c for r in done if size in (r["data"], "all") for c in r["cameras"].values()]
-        deg, cm = (np.array([c[f"error_{unit}"] for c in cameras]) for unit in ("deg", "cm"))
-        nees = np.array([c["normalised_squared"] for c in cameras if c["normalised_squared"]])
-        counts = [sum(c["status"] == s for c in cameras) for s in STATUSES]
-        rows.append(
-            (size, str(len(cameras)), f"{np.median(deg):.3f}", f"{deg.max():.2f}",
-             f"{np.median(cm):.2f}", f"{cm.max():.1f}", *_calibration(nees),
-             str(np.sum((deg > OFF[0]) | (cm > OFF[1]))), ", ".join(map(str, counts)))
-        )  # fmt: skip
-    return Table("One place of three frames each", COLUMNS, tuple(rows))
-
-
-OFF = (0.5, 10.0)  # deg, cm
-STATUSES = ("PASS", "WARN", "FAIL")
-
-
-def _calibration(nees_over_6: Iterable[float]) -> tuple[str, str]:
-    values = np.array(list(nees_over_6))
-    return f"{values.mean():.2f}", f"{np.mean(6 * values < chi2.ppf(0.95, 6)):.1%}"
+        rows.append((size, *_cells(cameras)))
+    return Table("One place of three frames each", ("size of errors", *_CELLS), tuple(rows))
 
 
 def report_together(records: Sequence[Record], scenes: Path) -> list[Table]:
     """A row per number of places and size of the errors, and per change of five places."""
-    places: dict[tuple[int, str, str], list[Found]] = {}
-    changes: dict[tuple[str, str, str], list[Found]] = {}
+    places: dict[tuple[int, str, str], list[Record]] = {}
+    changes: dict[tuple[str, str, str], list[Record]] = {}
     for size, folders in streets_of_groups(records, scenes):
         for count in (1, 2, STREETS, 10, 20):
             for start in range(0, len(folders) - count + 1, count):
-                for what in solve_streets(load_streets(folders[start : start + count])):
-                    places.setdefault((count, size, what.of), []).append(what)
+                for of, what in solve_streets(load_streets(folders[start : start + count])):
+                    places.setdefault((count, size, of), []).append(what)
         for name, change in CHANGES.items() if len(folders) >= STREETS else ():
             rng = np.random.default_rng([11, int(folders[0].name.split("_")[1])])
-            for what in solve_streets(change(load_streets(folders[:STREETS]), rng)):
-                changes.setdefault((name, size, what.of), []).append(what)
+            for of, what in solve_streets(change(load_streets(folders[:STREETS]), rng)):
+                changes.setdefault((name, size, of), []).append(what)
     title = "Streets of one sensor solved together"
     return [
         Table(title, ("places", "size", "of", *_CELLS),
@@ -322,25 +313,6 @@ def report_together(records: Sequence[Record], scenes: Path) -> list[Table]:
         Table(f"{title}, changed", ("five places", "size", "of", *_CELLS),
               tuple((*key, *_cells(found)) for key, found in changes.items())),
     ]  # fmt: skip
-
-
-_CELLS = (
-    "results", "mean NEES / 6", "in the 95 % region", "error, median [deg]", "[cm]",
-    "PASS, WARN, FAIL", "of these off",
-)  # fmt: skip
-
-
-def _cells(values: Sequence[Found]) -> tuple[str, ...]:
-    deg, cm = (np.median([getattr(one, unit) for one in values])
-               for unit in ("degrees", "centimetres"))  # fmt: skip
-    nees = _calibration(one.nees_over_6 for one in values)
-    judged = [one for one in values if one.status]
-    off = [one for one in judged if one.degrees > OFF[0] or one.centimetres > OFF[1]]
-    counts = (
-        ", ".join(str(sum(one.status == status for one in of)) for status in STATUSES)
-        for of in (judged, off)
-    )
-    return str(len(values)), *nees, f"{deg:.3f}", f"{cm:.2f}", *counts
 
 
 def streets_of_groups(records: Sequence[Record], scenes: Path) -> Iterator[tuple[str, list[Path]]]:

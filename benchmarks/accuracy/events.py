@@ -46,7 +46,6 @@ class Outcome:
         frames: of the run.
         error_deg, error_cm: largest over the cameras, at the end.
         error_sigmas: largest component of the errors at the end, in sigmas.
-        reports: all events that were reported, in words.
     """
 
     detected: bool
@@ -57,7 +56,6 @@ class Outcome:
     error_deg: float
     error_cm: float
     error_sigmas: float
-    reports: tuple[str, ...]
 
 
 def drive(
@@ -94,7 +92,6 @@ def drive(
         bool(after) if kind else not events, named if kind else not events,
         right[0].detected_frame - at if right else np.nan, len(events) - min(len(right), 1), frames,
         *(float(value) for value in np.max(sizes, axis=0)),
-        reports=tuple(f"{e.kind} {e.camera} {e.frame}->{e.detected_frame}" for e in events),
     )  # fmt: skip
 
 
@@ -156,8 +153,8 @@ def cells(name: str, outcomes: list[Outcome]) -> tuple[str, ...]:
     """The row of a scenario."""
     values = {
         column: np.array([getattr(outcome, column) for outcome in outcomes], dtype=float)
-        for column in Outcome.__dataclass_fields__ if column != "reports"
-    }  # fmt: skip
+        for column in Outcome.__dataclass_fields__
+    }
     delays = values["delay"][~np.isnan(values["delay"])]
     deg, cm = values["error_deg"], values["error_cm"]
     return (
@@ -175,26 +172,21 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("scenario", nargs="*", default=list(SCENARIOS), help=", ".join(SCENARIOS))
     parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first run")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--verbose", action="store_true", help="print the reports of wrong runs")
     parser.add_argument("--picture", type=Path, help="draw data/track.png instead")
     options = parser.parse_args()
     if options.picture is not None:
         draw_picture(options.picture)
         return
-    seeds, rows = range(options.first, options.first + options.runs), []
+    seeds, rows = range(options.runs), []
     for name in options.scenario:
         start = time.perf_counter()
         with ProcessPoolExecutor(options.jobs) as pool:
             outcomes = list(pool.map(SCENARIOS[name], seeds))
         rows.append(cells(name, outcomes))
         print(f"{', '.join(rows[-1])}; {time.perf_counter() - start:.0f} s", flush=True)
-        for seed, outcome in zip(seeds, outcomes, strict=True) if options.verbose else ():
-            if not outcome.attributed or outcome.false_alarms:
-                print("   ", seed, outcome.reports, outcome.delay)
     table = Table("Simulated drives", COLUMNS, tuple(rows))
-    publish("accuracy.events", [table], record=options.record)
+    publish([table])
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ def main() -> None:
     records = [record for path in options.records for record in ledger.read(path)]
     found = errors_of(records)
     tables = [left_out(found), reliability(found)]
-    ledger.publish_cases("accuracy.left_out_rigs", tables, records, record=options.record)
+    ledger.publish_cases(tables, records)
 
 
 def errors_of(records: Iterable[Record]) -> dict[str, Array]:

@@ -1,83 +1,97 @@
-"""Lenses that are wrong, before and after they are estimated with the extrinsics.
+"""Lenses and clocks that are wrong, before and after they are estimated with the extrinsics.
 
-    python -m benchmarks.accuracy.lens [--draws 30]
+    python -m benchmarks.accuracy.lens [--draws 30] [--parts focal lens offset ...]
 
 Simulated tables of two cameras like KITTI's, 30 frames of 100 matches, with errors that the matches
-of a frame share. NEES is the squared error of a camera's pose in the metric of its covariance; its
-mean over 6 should be 1. ``z^2`` is the mean square of the lens' errors in their sigmas. Recordings:
-``benchmarks.accuracy.lens_cases``.
+of a frame share. Clocks: images that are later than their clouds, of a LiDAR on a car in town, 2 to
+15 m/s with turns of 0.2 rad/s. NEES is the squared error of a camera's pose in the metric of its
+covariance; its mean over 6 should be 1. ``z^2`` is the mean square of the errors of lens or clock
+in their sigmas. Recordings: ``benchmarks.accuracy.lens_cases``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.accuracy.uncertainty import ERRORS
 from benchmarks.tables import Table, parser_of, publish
-from calibgraph import Camera, Config, Correspondences, MatcherErrors, Rig, simulate_correspondences
+from calibgraph import Camera, Config, Correspondences, Rig, simulate_correspondences
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import twist_between
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.solution import Solution
+from factors import Clock
 from factors.free_lens import COEFFICIENT_NUMBERS
+from tests.draws.clocks import draw_twists, put_clock_error
 from tests.draws.lenses import put_lens_error
 
 Array = NDArray[np.float64]
+Drawn = tuple[list[Array], list[Array], list[float], list[tuple[float, float]]]
+"""Per camera (6,) error of the pose before, and after, and its NEES; of what was spoilt the error
+of the estimate, with its sigma."""
 
-ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
-CASES = (
+FRAMES, MATCHES = 30, 100
+CASES: tuple[tuple[str, float | Clock], ...] = (
     ("focal", 0.0), ("focal", 0.003), ("focal", 0.017), ("focal", 0.05),
     ("centre", 3.0), ("centre", 10.0), ("centre", 30.0),
     ("distortion", 0.01), ("distortion", 0.03), ("distortion", 0.1),
     ("lens", 0.0),
+    *(("offset", Clock(offset_s, 0.0)) for offset_s in (0.0, 0.005, 0.02, 0.1)),
+    ("readout", Clock(0.0, 0.03)), ("clock", Clock(0.02, 0.03)), ("lens,clock", Clock(0.02, 0.03)),
 )  # fmt: skip
-"""Part that is estimated; its error: of the focal length (share), of cx [px], of k1."""
+"""Part that is estimated; its error: of the focal length (share), of cx [px], of k1, or the clock
+of the images; the whole lens is drawn from its prior."""
 
 COLUMNS = (
-    "part", "error", "before [deg]", "[cm]", "after [deg]", "[cm]", "NEES / 6", "lens off",
-    "sigma", "z^2",
+    "part", "error", "before [deg]", "[cm]", "after [deg]", "[cm]", "NEES / 6", "off", "sigma",
+    "z^2",
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """One solve with a wrong lens.
+def main() -> None:
+    """Draw, solve, and print the table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--draws", type=int, default=30)
+    parts = sorted({part for part, _ in CASES})
+    parser.add_argument("--parts", nargs="+", default=parts, choices=parts)
+    options = parser.parse_args()
+    rows = []
+    for part, error in CASES:
+        if part in options.parts:
+            drawn = [draw(part, error, seed) for seed in range(options.draws)]
+            rows.append((part, _text(error), *cells_of(drawn)))
+    title = f"{options.draws} draws, medians of 2 cameras; times in seconds"
+    publish([Table(title, COLUMNS, tuple(rows))])
 
-    Attributes:
-        before: per camera (6,) error of the pose with the wrong lens.
-        after: the same with the estimated lens.
-        nees: per camera, of ``after``.
-        off: per camera and parameter that was spoilt, error of the estimate.
-        sigmas: of these.
-    """
 
-    before: list[Array]
-    after: list[Array]
-    nees: list[float]
-    off: list[float]
-    sigmas: list[float]
+def _text(error: float | Clock) -> str:
+    if isinstance(error, Clock):
+        return f"{1e3 * error.offset_s:g}, {1e3 * error.readout_s:g} ms"
+    return f"{error:g}"
 
 
 @cache
-def simulated(seed: int, frames: int = 30, matches: int = 100) -> tuple[Rig, Correspondences]:
+def simulated(seed: int) -> tuple[Rig, Correspondences]:
     """The true rig, and its matches."""
     rig = rig_of("kitti")
     return rig, simulate_correspondences(
-        rig, frames=frames, matches=matches, errors=ERRORS, seed=seed
+        rig, frames=FRAMES, matches=MATCHES, errors=ERRORS, seed=seed
     )
 
 
-def draw(part: str, error: float, seed: int) -> Drawn:
-    """Solve a table with a wrong lens; of ``lens``, all of it is drawn from its prior."""
-    truth, table = simulated(seed)
-    config = Config(estimate=part)
-    wrong = put_lens_error(truth, part, error)
-    if part == "lens":
+def draw(part: str, error: float | Clock, seed: int) -> Drawn:
+    """Solve a table with a wrong lens, or of late images, without and with the estimate."""
+    (truth, table), config = simulated(seed), Config(estimate=part)
+    wrong, times = truth, dict[str, float]()
+    if isinstance(error, Clock):
+        twists = draw_twists(int(table.frame.max()) + 1, np.random.default_rng([seed, 1]))
+        table = put_clock_error(table, truth, twists, error)
+        times = {"offset": error.offset_s, "readout": error.readout_s}
+    elif part == "lens":
         rng = np.random.default_rng(seed)
         free = {n: LensVariable.of(c, config.estimate) for n, c in truth.cameras.items()}
         cameras = {
@@ -85,23 +99,27 @@ def draw(part: str, error: float, seed: int) -> Drawn:
             for name, lens in free.items()
         }
         wrong = truth.model_copy(update={"cameras": cameras})
+    else:
+        wrong = put_lens_error(truth, part, error)  # type: ignore[arg-type]
     before, after = (solve_joint(wrong, table, one) for one in (Config(), config))
-    errors = errors_of(after, truth)
-    off, sigmas = zip(*_lens_errors(after, truth, part), strict=True)
-    return Drawn(errors_of(before, truth), errors, nees_of(after, errors), [*off], [*sigmas])
+    errors = [_errors(each.T_camera_lidar, truth) for each in (before, after)]
+    covariance = after.covariance
+    assert covariance is not None
+    nees = [
+        float(xi @ np.linalg.solve(covariance[6 * n : 6 * n + 6, 6 * n : 6 * n + 6], xi))
+        for n, xi in enumerate(errors[1])
+    ]
+    off = [
+        (one.value - right[one.name], one.sigma)
+        for name, found in after.lens.items()
+        for right in [times or values_of(truth.cameras[name])]
+        for one in (found if times or part == "lens" else found[:1]) if one.name in right
+    ]  # fmt: skip
+    return errors[0], errors[1], nees, off
 
 
-def errors_of(found: Solution, truth: Rig) -> list[Array]:
-    """(6,) per camera, of its pose."""
-    reference = truth.T_camera_lidar
-    return [twist_between(T, reference[name]) for name, T in found.T_camera_lidar.items()]
-
-
-def nees_of(found: Solution, errors: list[Array]) -> list[float]:
-    """Per camera, the squared error in the metric of its covariance."""
-    assert found.covariance is not None
-    blocks = (found.covariance[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] for n in range(len(errors)))
-    return [float(e @ np.linalg.solve(own, e)) for e, own in zip(errors, blocks, strict=True)]
+def _errors(T: dict[str, Array], truth: Rig) -> list[Array]:
+    return [twist_between(T[name], truth.T_camera_lidar[name]) for name in T]
 
 
 def values_of(camera: Camera) -> dict[str, float]:
@@ -109,51 +127,24 @@ def values_of(camera: Camera) -> dict[str, float]:
     k, packed = camera.intrinsics_px, camera.lens.packed
     numbers = COEFFICIENT_NUMBERS[camera.lens.kind]
     return {
-        "focal": float(np.sqrt(k.fx * k.fy)), "aspect": k.fx / k.fy, "centre_x": k.cx,
+        "focal": float(np.sqrt(k.fx * k.fy)), "centre_x": k.cx,
         "centre_y": k.cy,
         "offset": camera.time_offset_s or 0.0, "readout": camera.readout_s or 0.0,
         **{name: float(packed[4 + number]) for name, number in numbers.items()},
     }  # fmt: skip
 
 
-def _lens_errors(found: Solution, truth: Rig, part: str) -> Iterator[tuple[float, float]]:
-    """Error and sigma of the parameter that was spoilt, of all with ``lens``."""
-    for name, parameters in found.lens.items():
-        right = values_of(truth.cameras[name])
-        for one in parameters[: None if part == "lens" else 1]:
-            yield one.value - right[one.name], one.sigma
-
-
-def main() -> None:
-    """Draw, solve, and print the tables."""
-    parser = parser_of(__doc__)
-    parser.add_argument("--draws", type=int, default=30)
-    options = parser.parse_args()
-    seeds = range(options.draws)
-    rows = tuple((part, f"{error:g}", *cells_of([draw(part, error, seed) for seed in seeds]))
-                 for part, error in CASES)  # fmt: skip
-    table = Table(f"{options.draws} draws, medians of 2 cameras", COLUMNS, rows)
-    publish("accuracy.lens", [table], record=options.record)
-
-
-def cells_of(found: list[Drawn]) -> tuple[str, ...]:
+def cells_of(found: Sequence[Drawn]) -> tuple[str, ...]:
     """Of all draws: errors before and after, NEES, and how far the estimates are off."""
-    cells = [cell for when in ("before", "after") for cell in sizes_of(found, when)]
-    nees = np.mean([value for one in found for value in one.nees]) / 6
-    off, sigmas = (
-        np.concatenate([getattr(one, key) for one in found]) for key in ("off", "sigmas")
-    )
-    lens = (np.median(np.abs(off)), np.median(sigmas), np.mean((off / sigmas) ** 2))
-    return (*cells, f"{nees:.2f}", *(f"{value:.2g}" for value in lens))
-
-
-def sizes_of(found: list[Drawn], when: str) -> tuple[str, str]:
-    """Medians over draws and cameras: degrees, centimetres."""
-    errors = np.array([error for one in found for error in getattr(one, when)])
-    turned, moved = (
-        np.median(np.linalg.norm(part, axis=1)) for part in np.split(errors, 2, axis=1)
-    )
-    return f"{np.degrees(turned):.3f}", f"{100 * moved:.2f}"
+    cells = []
+    for when in (0, 1):
+        errors = np.array([xi for one in found for xi in one[when]])
+        turned, moved = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2).T
+        cells += [f"{np.degrees(np.median(turned)):.3f}", f"{100 * np.median(moved):.2f}"]
+    nees = np.mean([value for one in found for value in one[2]]) / 6
+    off, sigmas = np.array([pair for one in found for pair in one[3]]).T
+    of_part = (np.median(np.abs(off)), np.median(sigmas), np.mean((off / sigmas) ** 2))
+    return (*cells, f"{nees:.2f}", *(f"{value:.2g}" for value in of_part))
 
 
 if __name__ == "__main__":

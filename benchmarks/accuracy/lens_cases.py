@@ -1,13 +1,17 @@
 """Recordings with lenses and clocks that are wrong, right or unknown, and ``--estimate``.
 
     python -m benchmarks.accuracy.lens_cases [--sets spoilt right unknown] [--data 05,06] [--jobs 2]
+    python -m benchmarks.accuracy.lens_cases --sets rendered --rigs 0:64 --scenes out/mixtures
 
 ``spoilt``: KITTI's lenses are wrong by what the docs of the verdict list, fixed and estimated, and
 the distortion is estimated where nothing was spoilt. ``right``: the whole lens, or the offset, is
 estimated where nothing is wrong, beside the same without: which parameters leave their prior, how
 far cameras move in standard deviations, how much longer it takes. ``unknown``: recordings with
-distortion that the rig states as zero. All start 1 degree and 10 cm off; errors are against the
-reference. Cases are kept in ``--out``, a line each; a stopped run continues.
+distortion that the rig states as zero. ``late``: each cloud with the image of the next frame, which
+is 100 ms late. ``rendered``: drives of a camera like KITTI's whose lens and clock are both wrong,
+by the number of the rig, in town at 2 to 15 m/s or on a road at an even speed; calibrated with the
+right values, with the wrong ones, and with the wrong ones estimated.
+All start 1 degree and 10 cm off. Cases are kept in ``--out``, a line each; a stopped run continues.
 """
 
 from __future__ import annotations
@@ -15,7 +19,9 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -24,15 +30,16 @@ from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.lens import values_of
 from benchmarks.accuracy.scenes import Folders
 from benchmarks.accuracy.verdicts import STATUSES, class_of
-from benchmarks.tables import Table
+from benchmarks.tables import ROOT, Table
 from calibgraph import Calibration, Config, Dataset, Rig, calibrate, evaluate, load_dataset, perturb
 from calibgraph.model.geometry import twist_between
 from calibgraph.model.rig import Camera
 from tests.draws.lenses import put_lens_error
+from tools.scenes.rolling_drives import WRONG, draw_wrong, load_drive, truth_of
 
 KITTI = ("05", "06", "07", "08", "06+07+08")
 SPOILT = (
-    ("focal", 0.03), ("focal", 0.05), ("aspect", 0.04), ("centre", 20.0), ("distortion", 0.05)
+    ("focal", 0.03), ("focal", 0.05), ("centre", 20.0), ("distortion", 0.05)
 )  # fmt: skip
 OTHER_RIGS = (
     "surround6", "nuscenes_a", "dgp_scene01", "opencalib_a", "vlp16_distorted",
@@ -44,49 +51,43 @@ INTERVAL_S, START_DEG, START_M, SEED = 0.1, 1.0, 0.1, 1
 FAR_SIGMAS = 3.0
 WIDE_SIGMA = 0.3  # of radial coefficients, where nothing is known of them
 FIXED = "fixed"
+SETS = ("spoilt", "right", "unknown", "late", "rendered")
 
 
-def cases(chosen: Sequence[str], data: Sequence[str]) -> Iterator[Key]:
-    """The cases of some sets, by their kind: part, error and what is estimated."""
-    every = {
-        "spoilt": [
-            *((f"{part} {error:g} {how}", name) for name in KITTI for part, error in SPOILT
-              for how in (FIXED, part)),
-            *(("distortion 0 distortion", name) for name in ("07", "08")),
-        ],
-        "right": [
-            *(("lens", name) for name in OTHER_RIGS), *(("offset", name) for name in DRIVES)
-        ],
-        "unknown": [
-            (kind, name) for name in DISTORTED for kind in ("right", "zero", "default", "wide")
-        ],
-    }  # fmt: skip
-    for level in chosen:
-        for kind, name in every[level]:
-            if not data or name in data:
-                yield Key(level, kind, name, SEED)
+def cases(rigs: Sequence[int]) -> Iterator[Key]:
+    """All cases, by their kind: what is wrong, and what is estimated."""
+    for name in KITTI:
+        for part, error in SPOILT:
+            for how in (FIXED, part):
+                yield Key("spoilt", f"{part} {error:g} {how}", name, SEED)
+    for name in ("07", "08"):
+        yield Key("spoilt", "distortion 0 distortion", name, SEED)
+    yield from (Key("right", "lens", name, SEED) for name in OTHER_RIGS)
+    yield from (Key("right", "offset", name, SEED) for name in DRIVES)
+    for name in DISTORTED:
+        for kind in ("right", "zero", "default", "wide"):
+            yield Key("unknown", kind, name, SEED)
+    for name in DRIVES:
+        for later in (0, 1):
+            for how in (FIXED, "offset"):
+                yield Key("late", f"{later} {how}", name, SEED)
+    for seed in rigs:
+        for kind in ("right", "wrong", "estimated"):
+            yield Key("rendered", kind, "+".join(WRONG[seed % len(WRONG)]), seed)
 
 
-def run_case(case: Key, folders: Folders) -> Record:
-    """One case by its set."""
-    return {"spoilt": _spoilt, "right": _right, "unknown": _unknown}[case.level](case, folders)
-
-
-def _spoilt(case: Key, folders: Folders) -> Record:
-    part, error, how = case.kind.split()
-    data, truth = folders.load(case.data)
-    wrong = put_lens_error(truth, part, float(error)) if float(error) else truth  # type: ignore[arg-type]
-    result, _ = _calibrate(data, wrong, "" if how == FIXED else how)
-    return _to_record(result, truth)
-
-
-def _right(case: Key, folders: Folders) -> Record:
-    """Without and with the estimate, each from the files."""
-    found = []
-    for estimate in ("", case.kind):
-        data, truth = _with_motion(case, folders)
-        found.append(_calibrate(data, truth, estimate))
-    (before, before_s), (after, after_s) = found
+def run_case(case: Key, folders: Folders, scenes: Path) -> Record:
+    """Calibrate one case, and compare; of ``right``, without the estimate before."""
+    estimate = case.kind.split()[-1]
+    data, truth, rig = _load(case, folders, scenes)
+    if case.level == "unknown":
+        estimate = "distortion" if case.kind in ("default", "wide") else FIXED
+    if case.level == "rendered":
+        estimate = case.data.replace("+", ",") if case.kind == "estimated" else FIXED
+    if case.level != "right":
+        return _to_record(_calibrate(data, rig, estimate, case.seed)[0], truth)
+    before, before_s = _calibrate(data, rig, FIXED, case.seed)
+    after, after_s = _calibrate(_load(case, folders, scenes)[0], rig, estimate, case.seed)
     record = _to_record(after, truth)
     for name, camera in record["cameras"].items():
         camera["before"] = before.camera_verdicts[name].status
@@ -94,19 +95,50 @@ def _right(case: Key, folders: Folders) -> Record:
     return {**record, "cpu_ratio": after_s / before_s, "cpu_s": before_s}
 
 
-def _unknown(case: Key, folders: Folders) -> Record:
-    """The right lens and one without distortion fixed; then this estimated, with two priors."""
+def _load(case: Key, folders: Folders, scenes: Path) -> tuple[Dataset, Rig, Rig]:
+    """The data, the right rig, and the one that is stated."""
+    if case.level == "rendered":
+        truth = truth_of(case.seed)
+        data = load_drive(scenes, case.seed)
+        return data, truth, truth if case.kind == "right" else _wrong_rig(truth, case.seed)
     data, truth = folders.load(case.data)
-    sigma = WIDE_SIGMA if case.kind == "wide" else None
-    cameras = {
-        name: c.model_copy(
-            update={"distortion": _without(c), "distortion_sigma": sigma or c.distortion_sigma}
-        )
-        for name, c in truth.cameras.items()
-    }
-    rig = truth if case.kind == "right" else truth.model_copy(update={"cameras": cameras})
-    result, _ = _calibrate(data, rig, "distortion" if case.kind in ("default", "wide") else "")
-    return _to_record(result, truth)
+    if case.level == "spoilt":
+        part, error, _ = case.kind.split()
+        spoilt = put_lens_error(truth, part, float(error)) if float(error) else truth  # type: ignore[arg-type]
+        return data, truth, spoilt
+    if case.level == "unknown" and case.kind != "right":
+        sigma = WIDE_SIGMA if case.kind == "wide" else None
+        cameras = {
+            name: camera.model_copy(update={
+                "distortion": _without(camera),
+                "distortion_sigma": sigma or camera.distortion_sigma,
+            })
+            for name, camera in truth.cameras.items()
+        }  # fmt: skip
+        return data, truth, truth.model_copy(update={"cameras": cameras})
+    if "offset" in case.kind or case.level == "late":  # with the motion of the LiDAR
+        assert folders.realdata is not None
+        own, kitti = folders.realdata / case.data, folders.realdata / "kitti_odometry" / "sequences"
+        data = load_dataset(own if own.is_dir() else kitti / case.data, interval_s=INTERVAL_S)
+    if case.level == "late":
+        later = int(case.kind.split()[0])
+        pairs = zip(data.frames[: len(data.frames) - later], data.frames[later:], strict=True)
+        frames = tuple(replace(one, image_paths=other.image_paths) for one, other in pairs)
+        data, late = replace(data, frames=frames), {"time_offset_s": later * INTERVAL_S}
+        cameras = {name: camera.model_copy(update=late) for name, camera in truth.cameras.items()}
+        return data, truth.model_copy(update={"cameras": cameras}), truth
+    return data, truth, truth
+
+
+def _wrong_rig(truth: Rig, seed: int) -> Rig:
+    """The rig as it is stated: at the right pose, without times."""
+    rig, wrong = truth, draw_wrong(seed)
+    for part in ("focal", "centre", "distortion"):
+        if part in wrong:
+            rig = put_lens_error(rig, part, wrong[part])  # type: ignore[arg-type]
+    times = {"time_offset_s": None, "readout_s": None}
+    cameras = {name: camera.model_copy(update=times) for name, camera in rig.cameras.items()}
+    return rig.model_copy(update={"cameras": cameras})
 
 
 def _without(camera: Camera) -> tuple[float, ...]:
@@ -115,22 +147,12 @@ def _without(camera: Camera) -> tuple[float, ...]:
     return (*kept, *[0.0] * (len(camera.distortion) - len(kept)))
 
 
-def _with_motion(case: Key, folders: Folders) -> tuple[Dataset, Rig]:
-    """Recordings of drives with the motion of their LiDAR, for an offset."""
-    data, truth = folders.load(case.data)
-    if case.kind != "offset" or folders.realdata is None:
-        return data, truth
-    own = folders.realdata / case.data
-    drive = own if own.is_dir() else folders.realdata / "kitti_odometry" / "sequences" / case.data
-    return load_dataset(drive, interval_s=INTERVAL_S), truth
-
-
-def _calibrate(data: Dataset, rig: Rig, estimate: str) -> tuple[Calibration, float]:
+def _calibrate(data: Dataset, rig: Rig, estimate: str, seed: int) -> tuple[Calibration, float]:
     """The result, and the processor time [s]."""
-    guess = perturb(rig, rotation_deg=START_DEG, translation_m=START_M, seed=SEED)
+    guess = perturb(rig, rotation_deg=START_DEG, translation_m=START_M, seed=seed)
     before = time.process_time()
-    result = calibrate(data, guess, config=Config(estimate=estimate or ()))
-    return result, time.process_time() - before
+    config = Config() if estimate == FIXED else Config(estimate=estimate)
+    return calibrate(data, guess, config=config), time.process_time() - before
 
 
 def _to_record(result: Calibration, truth: Rig) -> Record:
@@ -140,12 +162,7 @@ def _to_record(result: Calibration, truth: Rig) -> Record:
         right = values_of(truth.cameras[name])
         camera["corners_px"] = corners_px.get(name, 0.0)
         camera["lens"] = [
-            {
-                **vars(one),
-                "is_determined": one.is_determined,
-                "right": right[one.name],
-                "z": (one.value - right[one.name]) / one.sigma,
-            }
+            {**vars(one), "right": right[one.name], "z": (one.value - right[one.name]) / one.sigma}
             for one in result.lens.get(name, ())
         ]
     return record
@@ -160,8 +177,8 @@ def _moved(before: Calibration, after: Calibration, name: str) -> float | None:
     return float(np.sqrt(step @ np.linalg.solve(covariance, step) / len(step)))
 
 
-def report_spoilt(records: Sequence[Record]) -> list[Table]:
-    """Verdicts by what was wrong, and a row per case."""
+def report_verdicts(level: str, records: Sequence[Record]) -> Table:
+    """Verdicts by what was wrong."""
     heads = [(off, status) for off in (True, False) for status in STATUSES]
     rows = []
     for kind in dict.fromkeys(record["kind"] for record in records):
@@ -177,10 +194,10 @@ def report_spoilt(records: Sequence[Record]) -> list[Table]:
     columns = ("wrong, estimated", "cases",
                *(f"{'off' if off else 'right'}: {status}" for off, status in heads),
                "median [deg]", "[cm]", "z^2 of the lens")  # fmt: skip
-    return [Table("Spoilt lenses: cameras", columns, tuple(rows)), _details(records)]
+    return Table(f"{level}: cameras", columns, tuple(rows))
 
 
-def report_right(records: Sequence[Record]) -> list[Table]:
+def report_right(records: Sequence[Record]) -> Table:
     """A row per case, and all of them."""
     columns = (
         "estimated", "recording", "parameters", f"beyond {FAR_SIGMAS:g} prior sigmas", "largest",
@@ -201,24 +218,25 @@ def report_right(records: Sequence[Record]) -> list[Table]:
         ))  # fmt: skip
         every += left
     rows.append(("all", "", str(len(every)), str(sum(z > FAR_SIGMAS for z in every)), *[""] * 5))
-    return [Table("Nothing wrong", columns, tuple(rows))]
+    return Table("Nothing wrong", columns, tuple(rows))
 
 
-def _details(records: Sequence[Record]) -> Table:
+def report_cameras(level: str, records: Sequence[Record]) -> Table:
     """A row per camera."""
     columns = (
-        "recording", "case", "camera", "verdict", "[deg]", "[cm]", "corners [px]",
+        "recording", "case", "camera", "verdict", "[deg]", "[cm]", "NEES / 6", "corners [px]",
         "the parameter farthest off, in sigmas", "sigma",
     )  # fmt: skip
     rows = [
         (record["data"], record["kind"], name, camera["status"], f"{camera['error_deg']:.3f}",
-         f"{camera['error_cm']:.1f}", f"{camera['corners_px']:.1f}", *_farthest(camera))
+         f"{camera['error_cm']:.1f}", f"{camera['normalised_squared'] or np.nan:.2f}",
+         f"{camera['corners_px']:.1f}", *_farthest(camera))
         for record in records
         for name, camera in record.get("cameras", {}).items()
     ]  # fmt: skip
-    rows += [(r["data"], r["kind"], "refused or crashed", *[""] * 6)
+    rows += [(r["data"], r["kind"], "refused or crashed", *[""] * 7)
              for r in records if "cameras" not in r]  # fmt: skip
-    return Table("Cameras", columns, tuple(rows))
+    return Table(f"{level}: each camera", columns, tuple(rows))
 
 
 def _farthest(camera: Record) -> tuple[str, str]:
@@ -229,32 +247,30 @@ def _farthest(camera: Record) -> tuple[str, str]:
     return f"{one['name']} {error:+.3g}: {one['z']:+.1f}", f"{one['sigma']:.2g}"
 
 
-REPORTS = {
-    "spoilt": report_spoilt,
-    "right": report_right,
-    "unknown": lambda records: [_details(records)],
-}
-
-
 def main() -> None:
     """Run the cases that are left, and print the tables."""
     parser = ledger.case_parser(__doc__, "lens_cases")
-    parser.add_argument("--sets", nargs="+", choices=[*REPORTS], default=[*REPORTS])
+    parser.add_argument("--sets", nargs="+", choices=SETS, default=[*SETS])
     parser.add_argument("--data", type=lambda text: text.split(","), default=[], help="only these")
     parser.add_argument("--kind", help="only cases of this kind, as 'focal 0.03 fixed'")
+    parser.add_argument("--scenes", type=Path, default=ROOT / "out" / "mixtures")
+    parser.add_argument("--rigs", default="0:64", help="rendered ones")
     options = parser.parse_args()
     chosen = [
-        case for case in cases(options.sets, options.data) if options.kind in (None, case.kind)
-    ]
-    work = partial(run_case, folders=Folders(options.realdata, None))
-    records = ledger.records_of(options, chosen, work)
-    tables = [
-        table
-        for level, report in REPORTS.items()
-        if (own := [record for record in records if record["level"] == level])
-        for table in report(own)
-    ]
-    ledger.publish_cases("accuracy.lens_cases", tables, records, record=options.record)
+        case for case in cases(range(*map(int, options.rigs.split(":"))))
+        if case.level in options.sets and options.kind in (None, case.kind)
+        and (not options.data or case.data in options.data)
+    ]  # fmt: skip
+    options.scenes.mkdir(parents=True, exist_ok=True)
+    work = partial(run_case, folders=Folders(options.realdata, None), scenes=options.scenes)
+    records, tables = ledger.records_of(options, chosen, work), []
+    for level in options.sets:
+        own = [record for record in records if record["level"] == level]
+        if own and level == "right":
+            tables.append(report_right(own))
+        elif own:
+            tables += [report_verdicts(level, own), report_cameras(level, own)]
+    ledger.publish_cases(tables, records)
 
 
 if __name__ == "__main__":

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
-from calibgraph import Dataset, Frame, Rig, load_dataset, load_rig, perturb
+from calibgraph import Camera, Dataset, Frame, Rig, load_dataset, load_rig, perturb
 
 Array = np.ndarray
 
@@ -104,8 +105,8 @@ class Scene:
         return first, second
 
 
-Case = tuple[Dataset, Rig, dict[str, Any]]
-"""The data, the rig with its guess, and what was drawn for this kind of case."""
+Case = tuple[Any, Rig, dict[str, Any]]
+"""Data or a table, the rig with its guess, and what was drawn for this kind of case."""
 
 
 def with_images(data: Dataset, paths: Callable[[int, Frame], dict[str, Path]]) -> Dataset:
@@ -122,3 +123,21 @@ def with_clouds(scene: Scene, change: Callable[[Array], Array]) -> Dataset:
         np.save(path, change(frame.load_cloud()).astype(np.float32))
         frames.append(replace(frame, cloud_path=path))
     return replace(scene.data, frames=tuple(frames))
+
+
+Painter = Callable[[Array, int, Camera], Array]
+"""An image, the number of its frame and its camera, to the changed image."""
+
+
+def paint_images(scene: Scene, names: Collection[str], paint: Painter) -> Dataset:
+    """The data with the images of some cameras changed, in the scratch folder."""
+
+    def paths(index: int, frame: Frame) -> dict[str, Path]:
+        changed = dict(frame.image_paths)
+        for name in filter(names.__contains__, frame.image_paths):
+            camera = scene.truth.cameras[name]
+            changed[name] = scene.scratch / f"{name}_{index:06d}.png"
+            cv2.imwrite(str(changed[name]), paint(frame.load_image(name, camera), index, camera))
+        return changed
+
+    return with_images(scene.data, paths)

@@ -22,8 +22,6 @@ import numpy as np
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.cases import DATA
 from benchmarks.accuracy.error_bars import (
-    OFF,
-    STATUSES,
     STREETS,
     group_parser,
     render_street,
@@ -31,6 +29,7 @@ from benchmarks.accuracy.error_bars import (
 )
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import Folders, Scene
+from benchmarks.accuracy.verdicts import CLASSES, STATUSES, class_of
 from benchmarks.tables import Table
 from calibgraph import calibrate, load_dataset
 from tools.scenes.sensor_streets import RIGS, mean_poses
@@ -38,7 +37,6 @@ from tools.scenes.sensor_streets import RIGS, mean_poses
 LONGER, CLOSER_M = 6, 1.5  # frames of the street that is alone, and their distance
 _ALONE = 300_000  # seeds of such streets
 RIGHT = (0.3, 7.0)  # deg, cm
-CLASSES = ("right", "between", "off")
 GOOD, ONE = "good", "good, one place"
 WRONG = (
     "focal_5", "shuffled", "principal", "mirrored", "focal_3", "moved_halfway", "sheared",
@@ -56,8 +54,7 @@ def main() -> None:
         for kind in (GOOD, ONE, WRONG[group % len(WRONG)])
     ]
     records = ledger.records_of(options, cases, partial(run_case, scenes=options.scenes))
-    tables = [report(records), report_checks(records)]
-    ledger.publish_cases("accuracy.street_verdicts", tables, records, record=options.record)
+    ledger.publish_cases([report(records)], records)
 
 
 def run_case(case: Key, scenes: Path) -> Record:
@@ -82,14 +79,6 @@ def run_case(case: Key, scenes: Path) -> Record:
     return {"drawn": drawn, "places": len(result.places), **found}
 
 
-def class_of(camera: Record) -> str:
-    """How wrong one camera's result is."""
-    deg, cm = camera["error_deg"], camera["error_cm"]
-    if not (deg <= OFF[0] and cm <= OFF[1]):
-        return "off"  # also NaN
-    return "right" if deg <= RIGHT[0] and cm <= RIGHT[1] else "between"
-
-
 def report(records: Sequence[Record]) -> Table:
     """A row per kind, and one of all that were made wrong."""
     groups: dict[str, list[Record]] = {}
@@ -108,7 +97,7 @@ def report(records: Sequence[Record]) -> Table:
 def _cells(name: str, records: Sequence[Record]) -> tuple[str, ...]:
     done = [record for record in records if "cameras" in record]
     cameras = [camera for record in done for camera in record["cameras"].values()]
-    found = Counter((class_of(camera), camera["status"]) for camera in cameras)
+    found = Counter((class_of(camera, RIGHT), camera["status"]) for camera in cameras)
     sizes = [_median(camera[f"error_{unit}"] for camera in cameras) for unit in ("deg", "cm")]
     refused = sum("refusal" in record for record in records)
     counts = [str(found[which, status]) for which in CLASSES for status in STATUSES]
@@ -119,20 +108,6 @@ def _cells(name: str, records: Sequence[Record]) -> tuple[str, ...]:
 
 def _median(values: Iterable[float]) -> float:
     return float(np.median([*values] or [np.nan]))
-
-
-def report_checks(records: Sequence[Record]) -> Table:
-    """What keeps right results of good drives from a PASS: checks beyond their limits."""
-    found: Counter[tuple[str, str]] = Counter()
-    for record in records:
-        for camera in record.get("cameras", {}).values():
-            if record["kind"] in WRONG or camera["status"] == "PASS" or class_of(camera) != "right":
-                continue
-            beyond = {kind for kind, status, *_ in camera["checks"] if status != "PASS"}
-            found.update((record["kind"], kind) for kind in beyond or {"(none: by the error bar)"})
-    rows = [(*key, str(count)) for key, count in found.most_common()]
-    return Table("Checks beyond a limit, of right results that are not PASS",
-                 ("drives", "check", "cameras"), tuple(rows))  # fmt: skip
 
 
 if __name__ == "__main__":

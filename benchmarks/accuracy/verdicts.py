@@ -58,10 +58,10 @@ def main() -> None:
     folders = Folders(*there)
     cases = [case for case in cases_of(options, folders) if case.kind in options.kinds]
     records = ledger.records_of(options, cases, partial(run_case, folders=folders))
-    counted = [record for record in records if record["kind"] not in options.uncounted]
+    counted = [record for record in records if record["kind"] not in UNDETECTABLE]
     tables = [summary(records, counted), figures(counted)]
-    ledger.publish_cases("accuracy.verdicts", tables, records, record=options.record)
-    print("\n".join(remarks(records, counted)))
+    ledger.publish_cases(tables, records)
+    print("\n".join(remarks(counted)))
 
 
 def parse_options() -> argparse.Namespace:
@@ -74,7 +74,6 @@ def parse_options() -> argparse.Namespace:
     add("--data", type=int, default=0, help="cases per kind of images and clouds")
     add("--first", type=int, default=0, help="number of the first case of a kind")
     add("--kinds", type=names, default=known, help=", ".join(known))
-    add("--uncounted", type=names, default=UNDETECTABLE, help="left out of the sums")
     add("--scenes", type=Path, default=SCENES, help="folder of scene_0, ...")
     arguments = parser.parse_args()
     unknown = {*arguments.kinds} - {*known}
@@ -109,13 +108,12 @@ def run_case(case: Key, folders: Folders) -> Record:
         return {"drawn": problem.drawn, **ledger.to_record(problem.calibrate(), problem.truth)}
 
 
-def class_of(camera: Record) -> str:
-    """How wrong one camera's result is."""
-    if not (camera["error_deg"] <= OFF_DEG and camera["error_cm"] <= OFF_CM):
+def class_of(camera: Record, right: tuple[float, float] = (RIGHT_DEG, RIGHT_CM)) -> str:
+    """How wrong one camera's result is, if it is right within these [deg, cm]."""
+    deg, cm = camera["error_deg"], camera["error_cm"]
+    if not (deg <= OFF_DEG and cm <= OFF_CM):
         return "off"  # also NaN
-    if camera["error_deg"] <= RIGHT_DEG and camera["error_cm"] <= RIGHT_CM:
-        return "right"
-    return "between"
+    return "right" if deg <= right[0] and cm <= right[1] else "between"
 
 
 def cameras_of(records: Iterable[Record]) -> Iterator[tuple[str, str]]:
@@ -178,8 +176,8 @@ def figures(counted: list[Record]) -> Table:
     return Table("Wrong verdicts", ("", "share"), tuple(rows))
 
 
-def remarks(records: list[Record], counted: list[Record]) -> Iterator[str]:
-    """Cases that PASS although off, reasons of refusals, and crashes."""
+def remarks(counted: list[Record]) -> Iterator[str]:
+    """Cases that PASS although off, and reasons of refusals."""
     for record in _passed(counted):
         wrong = {
             name: f"{camera['error_deg']:.2f} deg {camera['error_cm']:.1f} cm"
@@ -188,12 +186,10 @@ def remarks(records: list[Record], counted: list[Record]) -> Iterator[str]:
         }
         yield f"PASS but off: {' '.join(map(str, astuple(ledger.key_of(record))))}: {wrong}"
     refusals = Counter(
-        (r["level"], r["kind"], re.sub(r"[0-9.]+", "#", r["refusal"])[:120])
-        for r in records if "refusal" in r
+        f"{r['level']} {r['kind']} {re.sub(r'[0-9.]+', '#', r['refusal'])[:120]}"
+        for r in counted if "refusal" in r
     )  # fmt: skip
-    crashes = Counter(r["crash"].strip().splitlines()[-1] for r in records if "crash" in r)
-    yield from (f"refused, {n}: {' '.join(what)}" for what, n in refusals.items())
-    yield from (f"CRASHED, {n}: {what}" for what, n in crashes.items())
+    yield from (f"refused, {count}: {what}" for what, count in refusals.items())
 
 
 def _passed(counted: list[Record]) -> list[Record]:

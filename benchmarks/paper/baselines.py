@@ -34,12 +34,8 @@ def paper_solve(
         rig: lenses, and the order of the cameras.
         table: preprocessed correspondences.
         T_hat: (4, 4) Stage-1 estimate of T_camera_lidar per camera; also the start.
-        config: with ``loss_scale_px`` and ``gate_px``: the preset kitti or walkley, say. Its loss
-            must be Cauchy's.
+        config: with a Cauchy loss, ``loss_scale_px`` and ``gate_px``.
         terms: terms of the objective.
-
-    Returns:
-        (4, 4) T_camera_lidar per camera.
 
     Raises:
         ValueError: if the settings leave scales to the data, or have another loss.

@@ -1,33 +1,21 @@
-"""The experiment's report as Markdown and JSON, beside the numbers that the paper publishes."""
+"""The experiment's report in Markdown, beside the numbers that the paper publishes."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
 from benchmarks.paper.draws import HEADLINE, STAGE1, TRF_TERMS
-from benchmarks.paper.experiment import (
-    IMPROVEMENT,
-    REPROJECTION,
-    ROTATION,
-    TRANSLATION,
-    Block,
-    Report,
-    Row,
-)
-from benchmarks.tables import Table
-from calibgraph.report.as_json import finite
+from benchmarks.paper.experiment import REPROJECTION, Report, Row
 
+ROTATION, TRANSLATION = "rotation_error_deg", "translation_error_cm"
 AXES = (TRANSLATION, ROTATION, "x_cm", "y_cm", "z_cm", "roll_deg", "pitch_deg", "yaw_deg")
 _HEADS = {
     TRANSLATION: "E_t [cm]", ROTATION: "E_R [deg]", "x_cm": "x [cm]", "y_cm": "y [cm]",
     "z_cm": "z [cm]", "roll_deg": "roll [deg]", "pitch_deg": "pitch [deg]",
-    "yaw_deg": "yaw [deg]", REPROJECTION: "reproj. [px]", IMPROVEMENT: "better than Stage 1 [px]",
+    "yaw_deg": "yaw [deg]", REPROJECTION: "reproj. [px]",
 }  # fmt: skip
 _NOTES = """\
 Medians over the draws in which the method found extrinsics, in brackets the 5 % and 95 % quantiles.
@@ -74,78 +62,43 @@ def published(data: str, row: str, frames: int, which: int) -> dict[str, float]:
     return found | ({REPROJECTION: known[3][which]} if which < PAIR and known[3] else {})
 
 
-def write_report(report: Report, folder: Path) -> list[Path]:
-    """Write ``paper.md`` and ``paper.json``; returns their paths."""
-    written = [folder / f"paper.{kind}" for kind in ("md", "json")]
-    folder.mkdir(parents=True, exist_ok=True)
-    written[0].write_text(markdown(report), "utf-8")
-    content = finite(json.loads(json.dumps(to_mapping(report))))
-    written[1].write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", "utf-8")
-    return written
+def markdown(published_as: str, draws: int, report: Report) -> Iterator[str]:
+    """The paper's two tables: errors per camera; between cameras and of reprojection.
 
-
-def worst_cameras(block: Block) -> Table:
-    """The errors of the worst camera of every row: the median and the 95 % quantile."""
-    heads = ("worst camera", "E_R [deg]", "95 %", "E_t [cm]", "95 %", "failed")
-    rows = (
-        (name, *_worst(row, ROTATION, 3), *_worst(row, TRANSLATION, 2), str(row.failed or ""))
-        for name, row in block.rows.items()
-    )
-    return Table(f"{block.frames} frames, {block.draws} draws", heads, tuple(rows))
-
-
-def _worst(row: Row, metric: str, digits: int) -> list[str]:
-    """Median and 95 % quantile of the camera with the largest median error."""
-    found = [metrics[metric] for name, metrics in row.numbers.items() if "->" not in name]
-    if not found:
-        return ["-", "-"]
-    _, median, high = max(found, key=lambda interval: interval[1])
-    return [f"{median:.{digits}f}", f"{high:.{digits}f}"]
-
-
-def to_mapping(report: Report) -> dict[str, Any]:
-    """As plain values; times in their own key, so that the rest only depends on the seed."""
-    content = asdict(report)
-    content["seconds"] = [
-        {"frames": block["frames"], **{n: row.pop("seconds") for n, row in block["rows"].items()}}
-        for block in content["blocks"]
-    ]
-    return content
-
-
-def markdown(report: Report) -> str:
-    """The paper's two tables: errors per camera; between cameras and of reprojection."""
-    settings = f"Settings of the paper's rows: preset {report.preset}. Seed {report.seed}."
-    parts = [f"# {report.data}", settings, _NOTES]
-    for block in report.blocks:
-        parts.append(f"## N = {block.frames} ({block.draws} draws)")
-        names = next((list(row.numbers) for row in block.rows.values() if row.numbers), [])
+    Args:
+        published_as: the paper's data set to compare with, or nothing.
+        draws: of each number of frames.
+        report: its rows.
+    """
+    yield _NOTES
+    for frames, rows in report.items():
+        yield f"## N = {frames} ({draws} draws)"
+        names = next((list(row.numbers) for row in rows.values() if row.numbers), [])
         cameras, pairs = ([n for n in names if ("->" in n) == pair] for pair in (False, True))
+        table = partial(_table, rows, draws, partial(published, published_as, frames=frames))
         for index, camera in enumerate(cameras):
-            columns = [(camera, m) for m in AXES]
             theirs = [(index, m) for m in (TRANSLATION, ROTATION)]
-            parts += [f"### {camera}", "\n".join(_table(report, block, columns, theirs))]
+            yield f"### {camera}\n\n" + "\n".join(table([(camera, m) for m in AXES], theirs))
         columns = [(pair, m) for pair in pairs for m in (ROTATION, TRANSLATION)]
-        columns += [(camera, m) for camera in cameras for m in (REPROJECTION, IMPROVEMENT)]
+        columns += [(camera, REPROJECTION) for camera in cameras]
         theirs = [(PAIR, ROTATION), (PAIR, TRANSLATION), (0, REPROJECTION), (1, REPROJECTION)]
-        parts += ["### Between cameras, and reprojection",
-                  "\n".join(_table(report, block, columns, theirs))]  # fmt: skip
-    return "\n\n".join(parts) + "\n"
+        yield "### Between cameras, and reprojection\n\n" + "\n".join(table(columns, theirs))
 
 
 def _table(
-    report: Report, block: Block, ours: Sequence[tuple[str, str]], theirs: Sequence[tuple[int, str]]
-) -> Iterator[str]:
+    rows: Mapping[str, Row], draws: int, paper: Callable[..., dict[str, float]],
+    ours: Sequence[tuple[str, str]], theirs: Sequence[tuple[int, str]],
+) -> Iterator[str]:  # fmt: skip
     where = ("first", "second", "between")
     heads = ["method", *(f"{name}: {_HEADS[m]}" for name, m in ours),
              *(f"paper {where[c] if c < len(where) else ''} {_HEADS[m]}" for c, m in theirs),
              "failed", "s"]  # fmt: skip
     yield f"| {' | '.join(heads)} |\n|" + "---|" * len(heads)
-    for name, row in block.rows.items():
-        paper = (published(report.published_as, name, block.frames, c).get(m) for c, m in theirs)
-        failed = f"{row.failed} of {block.draws}" if row.failed else ""
+    for name, row in rows.items():
+        known = (paper(row=name, which=c).get(m) for c, m in theirs)
+        failed = f"{row.failed} of {draws}" if row.failed else ""
         cells = [f"**{name}**" if name == HEADLINE else name, *(_cell(row, *at) for at in ours),
-                 *("" if v is None else _number(v) for v in paper), failed,
+                 *("" if v is None else _number(v) for v in known), failed,
                  f"{row.seconds:.2f}"]  # fmt: skip
         yield f"| {' | '.join(cells)} |"
 

@@ -1,6 +1,5 @@
 """Processor time as ratios against well-known baselines, all of one run; fails if one has grown.
 
-    python -m benchmarks.speed.gate                   print, and write out/ratios.json
     python -m benchmarks.speed.gate --against FILE    fail where one is over 1.25 times that of FILE
     python -m benchmarks.speed.gate --write           keep them as those of this release
 
@@ -12,7 +11,6 @@ GTSAM factor per correspondence, a copy of memory as large as the table.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import inspect
 import json
@@ -28,26 +26,39 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
+from benchmarks.paper.baselines import minimize_trf, prior_rows
 from benchmarks.speed.incremental import GUESS, frames
-from benchmarks.speed.solvers import Problem, solve_gtsam_python, solve_ours_once, solve_trf_once
-from benchmarks.tables import ROOT, Table
+from benchmarks.tables import ROOT, Table, parser_of
 from calibgraph import (
+    Correspondences,
     Dataset,
     IncrementalCalibrator,
+    MatcherErrors,
     Rig,
     StructureMatcher,
     calibrate,
     load_correspondences,
     load_dataset,
     perturb,
+    preset,
+    simulate_correspondences,
     solve,
 )
+from calibgraph.graph.objective import objective_graph, pose_key
 from calibgraph.matching.structure import correlation_maps, shift_scores
+from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.parallel import THREADS_VARIABLE
 from calibgraph.progress import no_progress
+from calibgraph.simulation.rigs import rig_of
+from calibgraph.solver.camera_block import camera_blocks
+from calibgraph.solver.objective import Objective
+from calibgraph.solver.optimizer import to_values
 from calibgraph.tracking import warm_up_tracker
+from factors import projection_factor
 
 RELEASE = ROOT / "benchmarks" / "ratios.json"
 SAMPLE = ROOT / "data" / "sample"
@@ -60,8 +71,16 @@ _ENVIRONMENT = {**ONE_THREAD, "NUMBA_NUM_THREADS": "1", THREADS_VARIABLE: "1"}
 _FRAMES, _CAMERAS = 2, 2  # of the sample, that are calibrated
 _UPDATES = 40  # of a tracker
 
+Array = NDArray[np.float64]
+Transforms = dict[str, Array]
+"""Per camera, (4, 4) T_camera_lidar."""
 Ratios = dict[str, float]
 Run = Callable[[], object]
+
+CONFIG = preset("kitti").changed(stage1="rig")
+ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.15)
+SCALE_PX = 4.0  # the preset's
+MATCHES = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +108,9 @@ class Pair:
 
 def main() -> int:
     """Measure, print, write, compare."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--against", type=Path, help="ratios of a release")
     parser.add_argument("--write", action="store_true", help=f"to {RELEASE.relative_to(ROOT)}")
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "ratios.json")
     options = parser.parse_args()
     if not _ENVIRONMENT.items() <= os.environ.items():
         command = [sys.executable, "-m", __spec__.name, *sys.argv[1:]]
@@ -102,9 +118,8 @@ def main() -> int:
     former = json.loads(options.against.read_text("utf-8")) if options.against else {}
     with tempfile.TemporaryDirectory() as folder:
         found = {pair.name: measure(pair, former) for pair in all_pairs(Path(folder))}
-    for path in (options.out, *([RELEASE] if options.write else [])):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    if options.write:
+        RELEASE.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
     print(compare(found, former).text())
     worse = slower(found, former)
     for name in worse:
@@ -128,10 +143,10 @@ def all_pairs(folder: Path) -> Iterator[Pair]:
         folder: for a table.
     """
     yield kernel()
-    small, large = Problem.draw(10, 2), Problem.draw(100, 2)
+    small, large = Problem.draw(10), Problem.draw(100)
     yield solve_of(small, "2 x 10 x 1000", times=2, pairs=9)
     yield solve_of(large, "2 x 100 x 1000", times=3, pairs=3)
-    yield one_pass(Problem.draw(3, 2))
+    yield one_pass(Problem.draw(3))
     yield update(small)
     yield reading(large, folder / "correspondences.parquet")
     yield whole()
@@ -140,11 +155,11 @@ def all_pairs(folder: Path) -> Iterator[Pair]:
 def kernel() -> Pair:
     """Window scores, per multiply-add of their definition, over those of sgemm."""
     calls, times = matcher_calls(load_dataset(SAMPLE)), 4
-    work = sum(call.multiply_adds() for call in calls)
+    work = sum(map(multiply_adds, calls))
 
-    def run() -> None:
+    def run() -> None:  # each call adds to the same grids again
         for call in calls:
-            call.run()
+            shift_scores.score_windows(*call.values())
 
     unit = work / (times * MATRIX**3)
     return Pair("window scores / sgemm, per multiply-add", run, _sgemm(times), 5, unit)
@@ -154,37 +169,29 @@ class _EnoughError(Exception):
     """The search has made its call."""
 
 
-@dataclass(frozen=True, eq=False)
-class Call:
-    """One call of the matcher's kernel, with its arguments by the names of its parameters."""
+def multiply_adds(call: dict[str, Any]) -> int:
+    """Multiply-adds by the definition of the score, however it is computed.
 
-    arguments: dict[str, Any]
+    For each point and shift inside the image a product with depth, intensity, one, itself, and
+    with both trends where these are not zero.
 
-    def run(self) -> None:
-        """Call the kernel again; it adds to the same grids."""
-        shift_scores.score_windows(*self.arguments.values())
-
-    def multiply_adds(self) -> int:
-        """Multiply-adds by the definition of the score, however it is computed.
-
-        For each point and shift inside the image a product with depth, intensity, one, itself, and
-        with both trends where these are not zero.
-        """
-        a = self.arguments
-        size = np.array(a["grids"].shape[:0:-1])  # columns, rows
-        image = np.array(a["image"].shape[::-1])
-        low, high = a["places"].min(axis=1), a["places"].max(axis=1)
-        first = np.maximum(a["origin"], -low)
-        shifts = np.maximum(0, np.minimum(a["origin"] + size, image - high) - first).prod(axis=1)
-        products = 4 + 2 * np.any(a["basis"][:, :, 2:], axis=(1, 2))
-        return int(np.sum(a["counts"] * shifts * products))
+    Args:
+        call: arguments of the kernel by the names of its parameters.
+    """
+    size = np.array(call["grids"].shape[:0:-1])  # columns, rows
+    image = np.array(call["image"].shape[::-1])
+    low, high = call["places"].min(axis=1), call["places"].max(axis=1)
+    first = np.maximum(call["origin"], -low)
+    last = np.minimum(call["origin"] + size, image - high)
+    products = 4 + 2 * np.any(call["basis"][:, :, 2:], axis=(1, 2))
+    return int(np.sum(call["counts"] * np.maximum(0, last - first).prod(axis=1) * products))
 
 
-def matcher_calls(dataset: Dataset) -> list[Call]:
+def matcher_calls(dataset: Dataset) -> list[dict[str, Any]]:
     """The kernel's calls for one camera and frame: by the search, and in each round."""
     name = next(iter(dataset.rig.cameras))
     rig, one = Rig(cameras={name: dataset.rig.cameras[name]}), dataset.select("0")
-    matcher, calls = StructureMatcher(), list[Call]()
+    matcher, calls = StructureMatcher(), list[dict[str, Any]]()
     far = perturb(rig, rotation_deg=FAR_DEG, translation_m=FAR_M)
     with recorded(correlation_maps, calls, stop=True), contextlib.suppress(_EnoughError):
         matcher.locate(one, far, out_of_time=lambda: False, progress=no_progress)
@@ -195,13 +202,13 @@ def matcher_calls(dataset: Dataset) -> list[Call]:
 
 
 @contextmanager
-def recorded(module: Any, calls: list[Call], *, stop: bool = False) -> Iterator[None]:
+def recorded(module: Any, calls: list[dict[str, Any]], *, stop: bool = False) -> Iterator[None]:
     """Record the calls of the kernel that a module makes; with ``stop``, none goes on."""
     kernel = module.score_windows
     signature = inspect.signature(getattr(kernel, "py_func", kernel))
 
     def record(*arguments: Any) -> None:
-        calls.append(Call(dict(signature.bind(*arguments).arguments)))
+        calls.append(dict(signature.bind(*arguments).arguments))
         if stop:
             raise _EnoughError
         kernel(*arguments)
@@ -211,6 +218,72 @@ def recorded(module: Any, calls: list[Call], *, stop: bool = False) -> Iterator[
         yield
     finally:
         module.score_windows = kernel
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A table and the start.
+
+    Attributes:
+        rig: lenses and the start, which is also T_hat.
+        table: all correspondences.
+        rows: per camera, those that the cost sums over.
+    """
+
+    rig: Rig
+    table: Correspondences
+    rows: dict[str, Correspondences]
+
+    @staticmethod
+    def draw(frames: int) -> Problem:
+        """A stereo pair; the start is 0.5 deg and 5 cm off."""
+        rig = rig_of("kitti")
+        table = simulate_correspondences(rig, frames=frames, matches=MATCHES, errors=ERRORS)
+        guess = perturb(rig, rotation_deg=0.5, translation_m=0.05)
+        return Problem(guess, table, {name: table.of_camera(name) for name in rig.cameras})
+
+    @property
+    def T_hat(self) -> Transforms:
+        """The start, to which the priors pull."""
+        return self.rig.T_camera_lidar
+
+    def residuals(self, name: str, T: Array) -> Array:
+        """(n, 2) residuals of a camera, as the paper's Python would compute them."""
+        lens, rows = self.rig.cameras[name].intrinsics_px, self.rows[name]
+        p = rows.points_lidar_m @ T[:3, :3].T + T[:3, 3]
+        u, v = lens.fx * p[:, 0] / p[:, 2] + lens.cx, lens.fy * p[:, 1] / p[:, 2] + lens.cy
+        return np.stack([u, v], 1) - rows.pixels_px
+
+
+def solve_ours_once(problem: Problem) -> Transforms:
+    """The first pass of calibgraph; the time includes building the graph."""
+    blocks = camera_blocks(problem.rig, problem.table, CONFIG)
+    objective = Objective(problem.rig, blocks, problem.T_hat, CONFIG, "full")
+    return objective.minimize_with_scale(problem.T_hat)[0]
+
+
+def solve_trf_once(problem: Problem) -> Transforms:
+    """The first pass of the paper's solver, as its comparison runs it."""
+
+    def residuals(T: Transforms) -> Array:
+        return np.concatenate([problem.residuals(name, T[name]) for name in problem.rows])
+
+    def priors(T: Transforms) -> Array:
+        return prior_rows(T, problem.T_hat, CONFIG)
+
+    return minimize_trf(residuals, priors, problem.T_hat, scale_px=SCALE_PX)
+
+
+def solve_gtsam_python(problem: Problem) -> Transforms:
+    """The first pass with one Python factor per correspondence."""
+    names, T_hat = list(problem.rows), problem.T_hat
+    graph = objective_graph(problem.rig, {}, T_hat, CONFIG, terms="full")
+    for name, rows in problem.rows.items():
+        key, lens = pose_key(names, name), problem.rig.cameras[name].lens
+        for point, pixel in zip(rows.points_lidar_m, rows.pixels_px, strict=True):
+            graph.add(projection_factor(key, lens, point, pixel, scale=SCALE_PX))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, to_values(names, T_hat)).optimize()
+    return {name: to_T_camera_lidar(found.atPose3(pose_key(names, name))) for name in names}
 
 
 def solve_of(problem: Problem, size: str, *, times: int, pairs: int) -> Pair:

@@ -1,9 +1,8 @@
-"""Time and memory of an update, against plain iSAM2 and against solving the batch again.
+"""Time and memory of an update while driving.
 
     python -m benchmarks.speed.incremental [--frames 20000]
 
-2 cameras, 500 correspondences each, 10 % outliers, all in one run. Plain iSAM2 has a block factor
-per camera and frame and keeps them all; it does one pass per frame, ours does two.
+2 cameras, 500 correspondences each, 10 % outliers, all in one run.
 """
 
 from __future__ import annotations
@@ -15,20 +14,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import gtsam
 import numpy as np
 
 from benchmarks.tables import Table, parser_of, publish
-from calibgraph import IncrementalCalibrator, MatcherErrors, Rig, perturb, solve
-from calibgraph.graph.objective import pose_key, prior_graph
-from calibgraph.model.config import Config
-from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph import Correspondences, IncrementalCalibrator, MatcherErrors, Rig, perturb
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.solver.camera_block import camera_blocks
-from calibgraph.solver.optimizer import to_values
-from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from calibgraph.tracking import warm_up_tracker
-from factors import block_factor
 from tests.draws.drives import simulate_drive
 from tools.scenes.drives import camera
 
@@ -47,7 +38,6 @@ STATED = MatcherFindings(
     place_variance=0.5,
 )
 EARLY, SAMPLE = 100, 100  # medians are of so many updates, around this frame and at the end
-PLAIN_AT = (100, 500, 2000)
 
 
 def frames(count: int) -> Iterator[Correspondences]:
@@ -65,8 +55,8 @@ def resident_mb() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def measure_ours(count: int) -> tuple[dict[int, float], Table]:
-    """Median seconds of the updates around some frames, by their number; and over the run."""
+def measure(count: int) -> Table:
+    """Seconds of the updates over the run, and memory."""
     warm_up_tracker()
     tracker = IncrementalCalibrator(GUESS)
     seconds, memory = [], {}
@@ -91,8 +81,7 @@ def measure_ours(count: int) -> tuple[dict[int, float], Table]:
         ("longest of the others [ms]", f"{1e3 * max(seconds[EARLY:]):.0f}"),
         *((f"resident memory at frame {at} [MB]", f"{mb:.1f}") for at, mb in memory.items()),
     ]
-    at = {n: float(np.median(seconds[n - 50 : n + 50])) for n in PLAIN_AT if n + 50 <= count}
-    return at, Table("Updates", ("", "value"), tuple(rows))
+    return Table("Updates", ("", "value"), tuple(rows))
 
 
 def measure_load(count: int, places: int) -> tuple[str, ...]:
@@ -109,59 +98,14 @@ def measure_load(count: int, places: int) -> tuple[str, ...]:
     return str(places), *(f"{number:.1f}" for number in numbers)
 
 
-def measure_plain_isam2(count: int) -> dict[int, float]:
-    """Median seconds of an update before some frames, with every frame kept."""
-    parameters = gtsam.ISAM2Params()
-    parameters.setRelinearizeThreshold(1e-7)
-    parameters.relinearizeSkip = 1
-    isam = gtsam.ISAM2(parameters)
-    names = list(RIG.cameras)
-    isam.update(
-        prior_graph(names, RIG.T_camera_lidar, weight=1.0), to_values(names, RIG.T_camera_lidar)
-    )
-    seconds = []
-    for table in frames(count):
-        matches = camera_blocks(RIG, table, Config())
-        start = time.perf_counter()
-        graph = gtsam.NonlinearFactorGraph()
-        for name, m in matches.items():
-            graph.add(
-                block_factor(pose_key(names, name), replace(m.block, scale=CAUCHY_SCALE_SIGMAS))
-            )
-        isam.update(graph, gtsam.Values())
-        isam.calculateBestEstimate()
-        seconds.append(time.perf_counter() - start)
-    return {n: float(np.median(seconds[n - 10 : n])) for n in PLAIN_AT if n <= count}
-
-
-def measure_batch(count: int) -> float:
-    """Seconds of a batch solve over so many frames."""
-    table = concatenate(list(frames(count)))
-    solve(GUESS, table)
-    start = time.perf_counter()
-    solve(GUESS, table)
-    return time.perf_counter() - start
-
-
 def main() -> None:
     """Measure and print."""
     parser = parser_of(__doc__)
     parser.add_argument("--frames", type=int, default=20_000, help="at least 150")
     options = parser.parse_args()
-    ours, updates = measure_ours(options.frames)
-    plain = measure_plain_isam2(min(options.frames, PLAIN_AT[-1]))
-    rows = []
-    for number, seconds in ours.items():
-        again = measure_batch(number) if number < PLAIN_AT[-1] else np.nan
-        numbers = [1e3 * seconds, 1e3 * plain[number], plain[number] / seconds]
-        batch = ["", ""] if np.isnan(again) else [f"{1e3 * again:.0f}", f"{again / seconds:.0f}"]
-        rows.append((str(number), *(f"{value:.2f}" for value in numbers), *batch))
-    columns = ("frame", "ours [ms]", "plain iSAM2 [ms]", "ratio", "batch again [ms]", "ratio")
-    comparison = Table("An update, beside other ways", columns, tuple(rows))
     of_load = ("places", "median [ms]", "95 % [ms]", "longest [ms]", "longest / median")
     load = tuple(measure_load(min(options.frames, 600), places) for places in (1, PLACES))
-    tables = [updates, Table("Processor time of updates", of_load, load), comparison]
-    publish("speed.incremental", tables, record=options.record)
+    publish([measure(options.frames), Table("Processor time of updates", of_load, load)])
 
 
 if __name__ == "__main__":

@@ -2,13 +2,12 @@
 
 from calibgraph.audit.check import check
 from calibgraph.audit.drift import drift
-from calibgraph.audit.drift_result import CameraDrift, Drift, Trend, drift_summary
+from calibgraph.audit.drift_result import Drift, Trend, drift_summary
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit, audit_summary
 
 __all__ = [
     "Audit",
     "CameraAudit",
-    "CameraDrift",
     "Drift",
     "LidarAudit",
     "Trend",

@@ -2,8 +2,8 @@
 
 import logging
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from pydantic import BaseModel
 
@@ -203,11 +203,8 @@ def _doubt_by_z_score(z_score: float | None) -> str:
     )
 
 
-class _Verdict(BaseModel):
-    status: Status
-
-
-class _Config(BaseModel):
+class _Part(BaseModel):
+    status: Status | None = None
     of: Reported = "alignment"
 
 
@@ -215,18 +212,12 @@ class _Result(BaseModel):
     """What is used here of the file of a result."""
 
     inputs: dict[str, str] = {}
-    verdict: _Verdict | None = None
-    config: _Config = _Config()
+    verdict: _Part = _Part()
+    config: _Part = _Part()
 
 
-@dataclass(frozen=True)
-class Provenance:
-    """What the file of a deployed calibration states.
-
-    Attributes:
-        same_recording: whether a cloud of the recording is one that it was made from.
-        verdict: of the result when it was made; None for a rig that is no result.
-    """
+class Provenance(NamedTuple):
+    """Whether the recording is the deployed result's own; its verdict, None of other rigs."""
 
     same_recording: bool = False
     verdict: Status | None = None
@@ -252,4 +243,4 @@ def provenance(rig: Path, data: Dataset) -> Provenance:
     names = {Path(source).name for source in result.inputs}
     clouds = (frame.cloud_path for frame in data.frames if frame.cloud_path.name in names)
     same = any(hash_source(cloud) in result.inputs.values() for cloud in clouds)
-    return Provenance(same, None if result.verdict is None else result.verdict.status)
+    return Provenance(same, result.verdict.status)

@@ -1,21 +1,13 @@
 """``drift``: which of several results of one rig deviates, of which camera, in which axis?"""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
-from calibgraph.audit.drift_result import (
-    CameraDrift,
-    Drift,
-    DriftStatus,
-    Results,
-    Trend,
-    open_results,
-    pairs_of_one_recording,
-)
+from calibgraph.audit.drift_result import Drift, Results, Trend, open_results
 from calibgraph.audit.judgement import (
     CAMERA_AXES,
     SINGLE_CAMERA,
@@ -24,7 +16,7 @@ from calibgraph.audit.judgement import (
     judge_deviation,
 )
 from calibgraph.audit.model import Deviations, Limits, compare, fit_slope, poses_of
-from calibgraph.audit.result import LidarAudit
+from calibgraph.audit.result import CameraAudit, LidarAudit
 from calibgraph.audit.significance import Quantiles, Tolerance, detectable
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import pose_rows
@@ -75,36 +67,33 @@ def drift(
     """
     tolerance = Tolerance(tolerance_deg, tolerance_cm)
     opened = open_results(results, own_lenses=own_lenses)
-    at, first = _times(days, len(opened)), next(iter(opened.values()))
-    tests = 6 * len(first.rig.cameras) * (len(opened) + 1)
-    limits = Limits(FALSE_ALARM_RATE / (2 * tests), tolerance.twist)
-    asked = _Comparison((*opened,), (*opened.values(),), limits, tolerance)
-    found = {name: asked.deviations(name) for name in first.rig.cameras}
-    judged = {name: asked.judge(name, each) for name, each in found.items()}
-    compared = {name: each for name, each in found.items() if each is not None}
-    unit = "result" if days is None else "day"
-    trends = {name: _trend(each, at, unit, limits) for name, each in compared.items()}
-    return Drift(
-        results=asked.names,
-        at=at,
-        cameras=judged,
-        trends={name: trend for name, trend in trends.items() if trend is not None},
-        lidar=tuple(asked.lidar(place, compared, judged) for place in range(len(opened))),
-        tolerance_deg=tolerance_deg,
-        tolerance_cm=tolerance_cm,
-        false_alarm_rate=FALSE_ALARM_RATE,
-        same_recording=pairs_of_one_recording(opened),
-    )
-
-
-def _times(days: Sequence[float] | None, count: int) -> Array:
-    """(n,) days, or places."""
+    names, loaded, count = (*opened,), (*opened.values(),), len(opened)
     at = np.arange(count, dtype=np.float64) if days is None else np.array(days, np.float64)
     if at.shape != (count,) or not (np.abs(at) <= _LATEST_DAY).all():
         raise ValueError(
             f"days: expected {count} numbers up to {_LATEST_DAY:g}, one per result, found {days}"
         )
-    return at
+    cameras = [*loaded[0].rig.cameras]
+    limits = Limits(FALSE_ALARM_RATE / (2 * 6 * len(cameras) * (count + 1)), tolerance.twist)
+    found = {name: _deviations(loaded, name, limits) for name in cameras}
+    judged = {name: _judge(opened, name, each, limits) for name, each in found.items()}
+    compared = {name: each for name, each in found.items() if each is not None}
+    unit = "result" if days is None else "day"
+    trends = {name: _trend(each, at, unit, limits) for name, each in compared.items()}
+    hashes = {name: {*result.inputs.values()} for name, result in opened.items()}
+    return Drift(
+        results=names,
+        at=at,
+        cameras=judged,
+        trends={name: trend for name, trend in trends.items() if trend is not None},
+        lidar=tuple(
+            _lidar(loaded, place, compared, judged, limits=limits) for place in range(count)
+        ),
+        tolerance_deg=tolerance_deg,
+        tolerance_cm=tolerance_cm,
+        false_alarm_rate=FALSE_ALARM_RATE,
+        same_recording=tuple((a, b) for a, b in combinations(names, 2) if hashes[a] & hashes[b]),
+    )
 
 
 def _why_unusable(result: Calibration, name: str) -> str:
@@ -119,104 +108,103 @@ def _why_unusable(result: Calibration, name: str) -> str:
     return ""
 
 
-@dataclass(frozen=True)
-class _Comparison:
-    """Results by name, and what counts as a change."""
+def _deviations(results: Sequence[Calibration], name: str, limits: Limits) -> Deviations | None:
+    """The deviations of one camera; None with fewer than two usable results."""
+    usable = [k for k, each in enumerate(results) if not _why_unusable(each, name)]
+    if len(usable) < 2:  # noqa: PLR2004 - a comparison
+        return None
+    seen = [results[place] for place in usable]
+    T_camera_lidar = np.array([each.T_camera_lidar[name] for each in seen])
+    covariance = np.array([each.covariance[name] for each in seen])
+    frames = np.array([each.counts[name].get("frames_used", 1) for each in seen])
+    freedom = np.maximum(frames, 1.0) - 1.0 + PSEUDO_FRAMES
+    return compare(poses_of(usable, T_camera_lidar, covariance, freedom), limits)
 
-    names: tuple[str, ...]
-    results: tuple[Calibration, ...]
-    limits: Limits
-    tolerance: Tolerance
 
-    def deviations(self, name: str) -> Deviations | None:
-        """The deviations of one camera; None with fewer than two usable results."""
-        usable = [k for k, each in enumerate(self.results) if not _why_unusable(each, name)]
-        if len(usable) < 2:  # noqa: PLR2004 - a comparison
-            return None
-        seen = [self.results[place] for place in usable]
-        T_camera_lidar = np.array([each.T_camera_lidar[name] for each in seen])
-        covariance = np.array([each.covariance[name] for each in seen])
-        frames = np.array([each.counts[name].get("frames_used", 1) for each in seen])
-        freedom = np.maximum(frames, 1.0) - 1.0 + PSEUDO_FRAMES
-        return compare(poses_of(usable, T_camera_lidar, covariance, freedom), self.limits)
-
-    def judge(self, camera: str, found: Deviations | None) -> tuple[CameraDrift, ...]:
-        """The status of one camera in every result."""
-        judged = [CameraDrift("CANNOT TELL", _why_unusable(each, camera) or _ALONE)
-                  for each in self.results]  # fmt: skip
-        for row, place in enumerate([] if found is None else found.poses.results):
-            assert found is not None
-            deviation, sigma = found.deviation[row], found.sigma[row]
-            quantiles = Quantiles.from_freedom(found.freedom[row], self.limits.tail)
-            audit, reason = judge_deviation(
-                deviation, found.covariance[row], quantiles, self.tolerance
-            )
-            status: DriftStatus = "CHANGED" if audit == "WRONG" else audit
-            axes: tuple[int, ...] = ()
-            if status == "CHANGED":
-                beyond = self.limits.exceeded(deviation, sigma, found.freedom[row])
-                axes = tuple(np.flatnonzero(beyond).tolist())
-                reason += self._whose_change(found, row)
-                reason += SINGLE_CAMERA if len(self.results[0].rig.cameras) == 1 else ""
-            smallest = detectable(sigma, quantiles.significant)
-            judged[place] = CameraDrift(status, reason, deviation, sigma, smallest, axes)
+def _judge(
+    results: Mapping[str, Calibration], camera: str, found: Deviations | None, limits: Limits
+) -> tuple[CameraAudit, ...]:
+    """The status of one camera in every result."""
+    names = [*results]
+    judged = [CameraAudit("CANNOT TELL", _why_unusable(each, camera) or _ALONE)
+              for each in results.values()]  # fmt: skip
+    if found is None:
         return tuple(judged)
-
-    def _whose_change(self, found: Deviations, row: int) -> str:
-        """The other results that may have changed instead, as the end of a sentence."""
-        count, agreeing = len(found.poses), np.count_nonzero(found.agreeing)
-        others = [self.names[k] for k in found.poses.results[found.ambiguous[row]]]
-        if not others:
-            return ""
-        if count == 2:  # noqa: PLR2004 - no majority
-            return f" from {others[0]}; of two results it is not known which changed: give a third"
-        if 2 * agreeing <= count:
-            return "; no more than half of the results agree, so that it is not known which changed"
-        return f"; it may be {' or '.join(others)} that changed, not this result: give more results"
-
-    def lidar(
-        self,
-        place: int,
-        compared: dict[str, Deviations],
-        judged: dict[str, tuple[CameraDrift, ...]],
-    ) -> LidarAudit | None:
-        """The motion of the LiDAR that explains how all cameras of one result deviate."""
-        seen = {name: each for name, each in compared.items() if place in each.poses.results}
-        moved = [k for k, name in enumerate(seen) if judged[name][place].status == "CHANGED"]
-        if len(seen) < 2:  # noqa: PLR2004 - one camera cannot be told from the LiDAR
-            return None
-        covariance = self._joint_covariance(place, seen)
-        if covariance is None:
-            return None
-        rows = [int(np.flatnonzero(each.poses.results == place)[0]) for each in seen.values()]
-        pairs = [*zip(seen.values(), rows, strict=True)]
-        freedom = np.min([each.freedom[row] for each, row in pairs])
-        return find_lidar_motion(
-            np.concatenate([each.deviation[row] for each, row in pairs]),
-            covariance,
-            [each.poses.base for each in seen.values()],
-            moved=moved,
-            quantile=float(self.limits.sigmas(freedom)),
+    alone = SINGLE_CAMERA if len(results[names[0]].rig.cameras) == 1 else ""
+    for row, place in enumerate(found.poses.results):
+        deviation, sigma, freedom = found.deviation[row], found.sigma[row], found.freedom[row]
+        quantiles = Quantiles.from_freedom(freedom, limits.tail)
+        status, reason = judge_deviation(
+            deviation, found.covariance[row], quantiles, limits.tolerance
         )
+        axes: tuple[int, ...] = ()
+        if status == "WRONG":
+            status = "CHANGED"
+            axes = tuple(np.flatnonzero(limits.exceeded(deviation, sigma, freedom)).tolist())
+            reason += _whose_change(names, found, row) + alone
+        smallest = detectable(sigma, quantiles.significant)
+        judged[place] = CameraAudit(status, reason, deviation, sigma, smallest, axes=axes)
+    return tuple(judged)
 
-    def _joint_covariance(self, place: int, seen: dict[str, Deviations]) -> Array | None:
-        """(6 N, 6 N) of one result's deviations of these cameras; None if it is not known."""
-        gains = {name: each.coefficients(int(np.flatnonzero(each.poses.results == place)[0]))
-                 for name, each in seen.items()}  # fmt: skip
-        whole = np.zeros((6 * len(seen), 6 * len(seen)))
-        for other, result in enumerate(self.results):
-            at = {name: np.flatnonzero(each.poses.results == other) for name, each in seen.items()}
-            parts = [gains[name][rows[0]] if len(rows) else np.zeros((6, 6))
-                     for name, rows in at.items()]  # fmt: skip
-            if not np.any(parts):
-                continue
-            if result.joint_covariance is None:
-                return None
-            order = [*result.rig.cameras]
-            columns = np.concatenate([np.r_[pose_rows(order.index(name))] for name in seen])
-            gain = block_diag(*parts)
-            whole += gain @ result.joint_covariance[np.ix_(columns, columns)] @ gain.T
-        return whole if np.linalg.eigvalsh(whole)[0] > 0 else None
+
+def _whose_change(names: Sequence[str], found: Deviations, row: int) -> str:
+    """The other results that may have changed instead, as the end of a sentence."""
+    count, agreeing = len(found.poses), np.count_nonzero(found.agreeing)
+    others = [names[k] for k in found.poses.results[found.ambiguous[row]]]
+    if not others:
+        return ""
+    if count == 2:  # noqa: PLR2004 - no majority
+        return f" from {others[0]}; of two results it is not known which changed: give a third"
+    if 2 * agreeing <= count:
+        return "; no more than half of the results agree, so that it is not known which changed"
+    return f"; it may be {' or '.join(others)} that changed, not this result: give more results"
+
+
+def _lidar(
+    results: Sequence[Calibration],
+    place: int,
+    compared: Mapping[str, Deviations],
+    judged: Mapping[str, tuple[CameraAudit, ...]],
+    *,
+    limits: Limits,
+) -> LidarAudit | None:
+    """The motion of the LiDAR that explains how all cameras of one result deviate."""
+    rows = {name: int(np.flatnonzero(each.poses.results == place)[0])
+            for name, each in compared.items() if place in each.poses.results}  # fmt: skip
+    moved = [k for k, name in enumerate(rows) if judged[name][place].status == "CHANGED"]
+    if len(rows) < 2:  # noqa: PLR2004 - one camera cannot be told from the LiDAR
+        return None
+    covariance = _joint_covariance(results, rows, compared)
+    if covariance is None:
+        return None
+    freedom = np.min([compared[name].freedom[row] for name, row in rows.items()])
+    return find_lidar_motion(
+        np.concatenate([compared[name].deviation[row] for name, row in rows.items()]),
+        covariance,
+        [compared[name].poses.base for name in rows],
+        moved=moved,
+        quantile=float(limits.sigmas(freedom)),
+    )
+
+
+def _joint_covariance(
+    results: Sequence[Calibration], rows: Mapping[str, int], compared: Mapping[str, Deviations]
+) -> Array | None:
+    """(6 N, 6 N) of one result's deviations of these cameras; None if it is not known."""
+    gains = {name: compared[name].coefficients(row) for name, row in rows.items()}
+    whole = np.zeros((6 * len(rows), 6 * len(rows)))
+    for other, result in enumerate(results):
+        at = {name: np.flatnonzero(compared[name].poses.results == other) for name in rows}
+        parts = [gains[name][k[0]] if len(k) else np.zeros((6, 6)) for name, k in at.items()]
+        if not np.any(parts):
+            continue
+        if result.joint_covariance is None:
+            return None
+        order = [*result.rig.cameras]
+        columns = np.concatenate([np.r_[pose_rows(order.index(name))] for name in rows])
+        gain = block_diag(*parts)
+        whole += gain @ result.joint_covariance[np.ix_(columns, columns)] @ gain.T
+    return whole if np.linalg.eigvalsh(whole)[0] > 0 else None
 
 
 def _trend(found: Deviations, at: Array, unit: str, limits: Limits) -> Trend | None:
@@ -239,12 +227,8 @@ def _trend(found: Deviations, at: Array, unit: str, limits: Limits) -> Trend | N
     beyond = bool(limits.exceeded(whole, sigma, freedom).any())
     changed = beyond and bool(by_slope < by_changes)
     clear = np.abs(whole) > limits.sigmas(freedom) * sigma
-    reason = "no significant trend"
-    if clear.any():
-        motion = describe_motion(whole, sigma, clear, CAMERA_AXES)
-        reason = f"{motion} from the first to the last result"
-        if not beyond:
-            reason += ", within the tolerance"
-        elif not changed:
-            reason += "; changes of single results explain it better"
+    why = "; changes of single results explain it better" if beyond else ", within the tolerance"
+    reason = describe_motion(whole, sigma, clear, CAMERA_AXES)
+    reason += f" from the first to the last result{'' if changed else why}"
+    reason = reason if clear.any() else "no significant trend"
     return Trend(changed, reason, change, sigma / span, unit, span)

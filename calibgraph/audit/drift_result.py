@@ -3,37 +3,17 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 from calibgraph.arrays import Array
 from calibgraph.audit.judgement import CAMERA_AXES
-from calibgraph.audit.result import Compared, LidarAudit, by_unit, freeze, lidar_summary
+from calibgraph.audit.result import ORDER, CameraAudit, LidarAudit, by_unit, lidar_summary
 from calibgraph.errors import CalibrationError
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.image_times import IMAGE_TIMES
 from calibgraph.model.result_files import CALIBRATION_FILE
-
-DriftStatus = Literal["OK", "CANNOT TELL", "CHANGED"]
-
-_ORDER: tuple[DriftStatus, ...] = ("OK", "CANNOT TELL", "CHANGED")
-
-
-@dataclass(frozen=True, eq=False)
-class CameraDrift(Compared):
-    """One camera in one result.
-
-    ``deviation`` is xi in T_others_here = exp(xi), the pose of the camera by this result in its
-    frame by the other results.
-
-    Attributes:
-        axes: which of the six CHANGED, in this order.
-    """
-
-    status: DriftStatus
-    axes: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +37,6 @@ class Trend:
     unit: str
     span: float
 
-    def __post_init__(self) -> None:
-        freeze(self.slope, self.sigma)
-
 
 @dataclass(frozen=True, eq=False)
 class Drift:
@@ -79,7 +56,7 @@ class Drift:
 
     results: tuple[str, ...]
     at: Array
-    cameras: Mapping[str, tuple[CameraDrift, ...]]
+    cameras: Mapping[str, tuple[CameraAudit, ...]]
     trends: Mapping[str, Trend]
     lidar: tuple[LidarAudit | None, ...]
     tolerance_deg: float
@@ -99,26 +76,40 @@ class Drift:
         )
 
     @property
-    def status(self) -> DriftStatus:
+    def status(self) -> str:
         """The worst of all cameras, results and trends."""
         if any(trend.changed for trend in self.trends.values()):
             return "CHANGED"
-        return max((each.status for entries in self.cameras.values() for each in entries),
-                   key=_ORDER.index)  # fmt: skip
+        every = (each.status for entries in self.cameras.values() for each in entries)
+        return max(every, key=ORDER.index)
 
     @property
     def changed(self) -> tuple[tuple[str, str], ...]:
         """Pairs of a result and what CHANGED there: "LiDAR", or a camera. Without the trends."""
-        found = []
-        for place, (result, lidar) in enumerate(zip(self.results, self.lidar, strict=True)):
-            moved = [name for name, each in self.cameras.items()
-                     if each[place].status == "CHANGED"]  # fmt: skip
-            found += [(result, name) for name in (moved if lidar is None else ["LiDAR"])]
-        return tuple(found)
+        return tuple(
+            (result, name)
+            for place, (result, lidar) in enumerate(zip(self.results, self.lidar, strict=True))
+            for name in (self.cameras if lidar is None else ["LiDAR"])
+            if lidar is not None or self.cameras[name][place].status == "CHANGED"
+        )
 
 
 def drift_summary(drift: Drift) -> dict[str, Any]:
     """A comparison as plain values; every key names its unit, every list is x, y, z."""
+    cameras = {}
+    for name, entries in drift.cameras.items():
+        trend = drift.trends.get(name)
+        cameras[name] = {
+            "results": {
+                result: each.summary(axes=[CAMERA_AXES[axis] for axis in each.axes])
+                for result, each in zip(drift.results, entries, strict=True)
+            },
+            "trend": None if trend is None else {
+                "changed": trend.changed, "reason": trend.reason, "per": trend.unit,
+                **by_unit("slope", trend.slope), **by_unit("sigma", trend.sigma),
+            },
+        }  # fmt: skip
+    lidars = zip(drift.results, drift.lidar, strict=True)
     return {
         "status": drift.status,
         "changed": [{"result": result, "what": what} for result, what in drift.changed],
@@ -127,33 +118,8 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
         "false_alarm_rate": drift.false_alarm_rate,
         "results": list(drift.results),
         "same_recording": [list(pair) for pair in drift.same_recording],
-        "cameras": {
-            name: {
-                "results": {
-                    result: each.summary(axes=[CAMERA_AXES[axis] for axis in each.axes])
-                    for result, each in zip(drift.results, entries, strict=True)
-                },
-                "trend": _trend_summary(drift.trends.get(name)),
-            }
-            for name, entries in drift.cameras.items()
-        },
-        "lidar": {
-            result: lidar_summary(lidar)
-            for result, lidar in zip(drift.results, drift.lidar, strict=True)
-            if lidar is not None
-        },
-    }
-
-
-def _trend_summary(trend: Trend | None) -> dict[str, Any] | None:
-    if trend is None:
-        return None
-    return {
-        "changed": trend.changed,
-        "reason": trend.reason,
-        "per": trend.unit,
-        **by_unit("slope", trend.slope),
-        **by_unit("sigma", trend.sigma),
+        "cameras": cameras,
+        "lidar": {result: lidar_summary(lidar) for result, lidar in lidars if lidar is not None},
     }
 
 
@@ -185,12 +151,6 @@ def open_results(given: Results, *, own_lenses: bool) -> dict[str, Calibration]:
     return dict(zip(names, loaded, strict=True))
 
 
-def pairs_of_one_recording(results: Mapping[str, Calibration]) -> tuple[tuple[str, str], ...]:
-    """Pairs of results that were made from some of the same files."""
-    hashes = {name: {*result.inputs.values()} for name, result in results.items()}
-    return tuple((a, b) for a, b in combinations(hashes, 2) if hashes[a] & hashes[b])
-
-
 def _names(given: Sequence[Result]) -> list[str]:
     """Paths below the common folder; of results in memory their places, from 1."""
     paths = [Path(item).resolve() for item in given if not isinstance(item, Calibration)]
@@ -208,6 +168,8 @@ def _require_same_rig(
 ) -> None:
     """Check that two results have the same cameras."""
     a, b = one.rig.cameras, two.rig.cameras
+    parts = {"T_camera_lidar", *IMAGE_TIMES}
+    parts |= {"intrinsics_px", "distortion"} if own_lenses else set()
     if a.keys() != b.keys():
         raise CalibrationError(
             f"{name}: has the cameras {', '.join(b)}, {first} has {', '.join(a)}; give results of "
@@ -219,8 +181,6 @@ def _require_same_rig(
             "different quantities; solve one of them again with the other's --of"
         )
     for camera, other in b.items():
-        parts = {"T_camera_lidar", *IMAGE_TIMES}
-        parts |= {"intrinsics_px", "distortion"} if own_lenses else set()
         if other.model_dump(exclude=parts) != a[camera].model_dump(exclude=parts):
             raise CalibrationError(
                 f"{name}: camera {camera} has another image size or lens than in {first}, which "

@@ -6,7 +6,7 @@ so of many reports one in a hundred is expected to be wrong, however many tests 
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,10 +16,9 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2, false_discovery_control, fisher_exact
 
 from calibgraph.arrays import Array
-from calibgraph.audit.fleet_model import FALSE_DISCOVERIES, FleetModel, ModelFit
+from calibgraph.audit.fleet_model import FALSE_DISCOVERIES, FleetModel, Mount
 from calibgraph.audit.judgement import find_lidar_motion
 from calibgraph.audit.model import fit_slope
-from calibgraph.audit.mounts import Mount, Pooled
 from calibgraph.model.geometry import twists_between
 
 Kind = Literal["mount", "batch", "date", "drift"]
@@ -75,7 +74,11 @@ def _size(change: Array) -> str:
 
 def find_changes(fleet: FleetModel) -> list[Finding]:
     """Everything that stands out among mounts, batches, dates and drifts, the surest first."""
-    tests = [test for name, model in fleet.models.items() for test in _tests(fleet, name, model)]
+    tests: list[Finding] = []
+    for mounts in fleet.mounts.values():
+        tests += _moved_mounts(fleet, mounts)
+        for mount in mounts.values():
+            tests += [*_changed_batches(mount), *_changes_at_dates(mount), *_drifts(mount)]
     if not tests:
         return []
     adjusted = false_discovery_control([test.p_value for test in tests])
@@ -83,88 +86,73 @@ def find_changes(fleet: FleetModel) -> list[Finding]:
     return sorted(found, key=lambda finding: finding.p_value)
 
 
-def _tests(fleet: FleetModel, name: str, model: ModelFit) -> Iterator[Finding]:
-    """Every test of one model."""
-    yield from _moved_mounts(fleet, name, model)
-    for mount in model.mounts.values():
-        yield from _changed_batches(mount, model.pooled)
-        information, y = mount.weigh(model.pooled).information, mount.deviations()
-        for batch, label in enumerate(mount.batches):
-            rows = mount.batch == batch
-            found = _change_at_a_date(mount.seen.day[rows], information[rows], y[rows])
-            if found is not None:
-                yield Finding("date", mount.model, mount.camera, label, *found)
-        columns = {**mount.seen.covariates, "date": mount.seen.day}
-        for column, x in columns.items():
-            slope = fit_slope(x, mount.batch, information, y)
-            if slope is not None:
-                reach = float(np.nanmax(x) - np.nanmin(x))
-                yield Finding("drift", mount.model, mount.camera, "", _p_value(*slope), slope[0],
-                              np.sqrt(np.diag(slope[1])), column, reach)  # fmt: skip
-
-
-def _moved_mounts(fleet: FleetModel, name: str, model: ModelFit) -> Iterator[Finding]:
-    """Fisher's exact test: of a camera against the model's others, more were moved."""
+def _moved_mounts(fleet: FleetModel, mounts: Mapping[str, Mount]) -> Iterator[Finding]:
+    """Fisher's exact test: of a camera against its model's others, more were moved."""
     of, nothing = fleet.observations, np.full(6, np.nan)
-    rows = (of.model == name) & of.measured
-    counts = np.array([[np.count_nonzero(fleet.apart & rows & (of.camera == camera)),
-                        np.count_nonzero(rows & (of.camera == camera))]
-                       for camera in model.mounts])  # fmt: skip
-    if len(counts) == 1:
-        return
-    for camera, (moved, all_of_it) in zip(model.mounts, counts, strict=True):
-        others = counts.sum(axis=0) - [moved, all_of_it]
-        table = [[moved, all_of_it - moved], [others[0], others[1] - others[0]]]
+    rows = [of.measured & (of.model == mount.model) & (of.camera == mount.camera)
+            for mount in mounts.values()]  # fmt: skip
+    counts = np.array([[np.count_nonzero(some & fleet.apart), some.sum()] for some in rows])
+    for mount, own in zip(mounts.values() if len(counts) > 1 else (), counts, strict=False):
+        sides = np.array([own, counts.sum(axis=0) - own])
+        table = np.column_stack([sides[:, 0], sides[:, 1] - sides[:, 0]])
         p = float(fisher_exact(table, alternative="greater").pvalue)
-        yield Finding("mount", name, camera, "", p, nothing, nothing, f"{moved} of {all_of_it}")
+        at = f"{own[0]} of {own[1]}"
+        yield Finding("mount", mount.model, mount.camera, "", p, nothing, nothing, at)
 
 
-def _changed_batches(mount: Mount, pooled: Pooled) -> Iterator[Finding]:
+def _changed_batches(mount: Mount) -> Iterator[Finding]:
     """Batches whose centre is further from the model's than batches scatter."""
     if len(mount.batches) == 1:
         return
-    some, T, noise = mount.measured_batches(mount.weigh(pooled))
-    y = twists_between(T, mount.centers.nominal)
-    total = noise + pooled.batch * mount.spread + mount.centers.nominal_covariance
+    some, T, noise = mount.measured_batches(mount.weigh().information)
+    y = twists_between(T, mount.nominal)
+    total = noise + mount.pooled.batch * mount.spread + mount.nominal_covariance
     for batch, deviation, covariance in zip(some, y, total, strict=True):
-        sigma = np.sqrt(np.diag(covariance))
         yield Finding("batch", mount.model, mount.camera, mount.batches[batch],
-                      _p_value(deviation, covariance), deviation, sigma)  # fmt: skip
+                      _p_value(deviation, covariance), deviation, _sigma(covariance))  # fmt: skip
 
 
-def _change_at_a_date(
-    day: Array, information: Array, y: Array
-) -> tuple[float, Array, Array, str] | None:
-    """The split in time with the largest change; its p-value counts all splits (Bonferroni).
+def _drifts(mount: Mount) -> Iterator[Finding]:
+    """Slopes over the date and over each column of numbers."""
+    information, y = mount.weigh().information, mount.deviations()
+    for column, x in {**mount.seen.covariates, "date": mount.seen.day}.items():
+        slope = fit_slope(x, mount.batch, information, y)
+        if slope is not None:
+            reach = float(np.nanmax(x) - np.nanmin(x))
+            yield Finding("drift", mount.model, mount.camera, "", _p_value(*slope), slope[0],
+                          _sigma(slope[1]), column, reach)  # fmt: skip
 
-    Args:
-        day: (n,) of one batch; NaN where unknown.
-        information: (n, 6, 6) of each vehicle about the batch's centre.
-        y: (n, 6) deviations.
 
-    Returns:
-        p-value, (6,) change, (6,) sigma, the first day after it. None with too few vehicles.
-    """
-    order = np.argsort(day)[: np.count_nonzero(np.isfinite(day))]
-    if len(order) < 2 * _MIN_ON_A_SIDE:
-        return None
-    H = information[order].cumsum(axis=0)
-    g = np.einsum("nij,nj->ni", information[order], y[order]).cumsum(axis=0)
-    splits = np.arange(_MIN_ON_A_SIDE - 1, len(order) - _MIN_ON_A_SIDE)
-    before, after = np.linalg.inv(H[splits]), np.linalg.inv(H[-1] - H[splits])
-    change = np.einsum("kij,kj->ki", after, g[-1] - g[splits])
-    change -= np.einsum("kij,kj->ki", before, g[splits])
-    covariance = before + after
-    squared = np.einsum("ki,kij,kj->k", change, np.linalg.inv(covariance), change)
-    best = int(np.argmax(squared))
-    first = np.datetime64(int(day[order][splits[best] + 1]), "D")
-    p = min(1.0, len(splits) * float(chi2.sf(squared[best], 6)))
-    return p, change[best], np.sqrt(np.diag(covariance[best])), str(first)
+def _changes_at_dates(mount: Mount) -> Iterator[Finding]:
+    """Per batch, the split in time with the largest change; p counts all splits (Bonferroni)."""
+    information, y, day = mount.weigh().information, mount.deviations(), mount.seen.day
+    for batch, label in enumerate(mount.batches):
+        rows = np.flatnonzero((mount.batch == batch) & np.isfinite(day))
+        rows = rows[np.argsort(day[rows])]
+        splits = np.arange(_MIN_ON_A_SIDE - 1, len(rows) - _MIN_ON_A_SIDE)
+        if not len(splits):
+            continue
+        H = information[rows].cumsum(axis=0)
+        g = np.einsum("nij,nj->ni", information[rows], y[rows]).cumsum(axis=0)
+        before, after = np.linalg.inv(H[splits]), np.linalg.inv(H[-1] - H[splits])
+        change = np.einsum("kij,kj->ki", after, g[-1] - g[splits])
+        change -= np.einsum("kij,kj->ki", before, g[splits])
+        covariance = before + after
+        squared = np.einsum("ki,kij,kj->k", change, np.linalg.inv(covariance), change)
+        best = int(np.argmax(squared))
+        first = np.datetime64(int(day[rows][splits[best] + 1]), "D")
+        p = min(1.0, len(splits) * float(chi2.sf(squared[best], 6)))
+        yield Finding("date", mount.model, mount.camera, label, p, change[best],
+                      _sigma(covariance[best]), str(first))  # fmt: skip
 
 
 def _p_value(change: Array, covariance: Array) -> float:
     """Of a change of six axes, if there is none."""
     return float(chi2.sf(change @ np.linalg.solve(covariance, change), 6))
+
+
+def _sigma(covariance: Array) -> Array:
+    return np.asarray(np.sqrt(np.diag(covariance)))
 
 
 def moved_lidars(fleet: FleetModel) -> list[str]:
@@ -178,13 +166,9 @@ def moved_lidars(fleet: FleetModel) -> list[str]:
 
 def _explains(fleet: FleetModel, rows: NDArray[np.intp]) -> bool:
     """Whether a motion of the LiDAR explains how the cameras of one vehicle deviate."""
-    of, model = fleet.observations, fleet.models[str(fleet.observations.model[rows[0]])]
-    spreads = [model.mounts[str(of.camera[row])].spread for row in rows]
-    found = find_lidar_motion(
-        fleet.deviation[rows].ravel(),
-        block_diag(*(of.covariance[rows] + spreads)),
-        [*of.T_camera_lidar[rows]],
-        moved=range(len(rows)),
-        quantile=0.0,
-    )
+    of, mounts = fleet.observations, fleet.mounts[str(fleet.observations.model[rows[0]])]
+    spreads = [mounts[str(of.camera[row])].spread for row in rows]
+    deviation, covariance = fleet.deviation[rows].ravel(), of.covariance[rows] + spreads
+    poses, every = [*of.T_camera_lidar[rows]], range(len(rows))
+    found = find_lidar_motion(deviation, block_diag(*covariance), poses, moved=every, quantile=0.0)
     return found is not None

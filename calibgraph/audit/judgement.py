@@ -1,21 +1,13 @@
 """From a measured rig and its covariance to OK, WRONG or CANNOT TELL, per camera.
 
-Statements about the turn and the shift of a camera, and about their axes with deviation d and
-standard deviation sigma:
+An axis with deviation d and standard deviation sigma is significant if |d| > q sigma; of 1000 rigs
+without any deviation one has such an axis. Quantiles are of Student's t: sigma is itself estimated,
+from the scatter of few frames; its stated part, of the error that all frames share, is known.
 
-* an axis is significant: |d| > q sigma, with q such that one of 1000 rigs without any deviation has
-  a significant axis;
-* a turn or a shift is beyond the tolerance: the length of its significant axes exceeds it;
-* it is certainly within: its length exceeds the tolerance with a probability of at most 5 %, given
-  d and the covariance.
-* these data would show a change as large as the tolerance: the smallest detectable one is below it
-  on every axis.
-
-Quantiles are of Student's t: sigma is itself estimated, from the scatter of few frames. The stated
-part of it, for the error that all frames share, is taken as known.
-
-WRONG: a turn or shift is beyond the tolerance. OK: both are certainly within, and the smallest
-detectable changes are below the tolerance. Else the data cannot tell.
+* WRONG: the length of the significant axes of a turn or a shift exceeds the tolerance.
+* OK: each exceeds it with a probability of at most 5 %, given d and the covariance, and a change as
+  large as the tolerance would be detected on every axis.
+* CANNOT TELL: neither.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -24,7 +16,7 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.audit.result import AuditStatus, CameraAudit, LidarAudit
+from calibgraph.audit.result import CameraAudit, LidarAudit
 from calibgraph.audit.significance import (
     CONFIDENCE,
     DISPLAY,
@@ -36,7 +28,7 @@ from calibgraph.audit.significance import (
     tail_of_axis,
 )
 from calibgraph.model.error_components import UNKNOWN, error_components
-from calibgraph.model.error_sources import MOST_TIMES, ErrorSources
+from calibgraph.model.error_sources import MOST_TIMES
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
 from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
 from calibgraph.tracking.cause import Steps, find_cause
@@ -75,17 +67,22 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
         return CameraAudit("CANNOT TELL", doubt or _NO_ERROR_BAR, deviation, z_score=z_score)
     if has_too_few_frames(evidence, name):
         return CameraAudit("CANNOT TELL", _TOO_FEW_FRAMES, deviation, z_score=z_score)
-    if not evidence.findings.states_common_error:
-        covariance = covariance + _unstated_error()
+    if not evidence.findings.states_common_error:  # the prior, for a matcher that states none
+        prior = error_components().matchers[UNKNOWN]
+        rad, metres = prior.systematic_rotation_rad, prior.systematic_translation_m
+        covariance = covariance + np.diag(pose_sigmas(rotation_rad=rad, translation_m=metres) ** 2)
     sigma = np.sqrt(np.diag(covariance))
     quantiles = _quantiles(evidence, name, covariance)
-    least = _least_share(evidence.error_sources.get(name))
-    status, reason = judge_deviation(deviation, covariance, quantiles, tolerance, least=least)
+    most, least, sources = tolerance.twist, np.zeros(6), evidence.error_sources.get(name)
+    if sources is not None:
+        now = np.array([sources.rotation_deg, sources.translation_cm])
+        least = np.repeat(sources.forecast[MOST_TIMES] / now, 3)
+    status, reason = judge_deviation(deviation, covariance, quantiles, most, least=least)
     if status == "WRONG" and name in evidence.posteriors:
         posterior = evidence.posteriors[name]
         widest = posterior.widest(covariance)
         allowed = posterior.log_ratio < quantiles.significant.max() ** 2
-        if allowed or judge_deviation(deviation, widest, quantiles, tolerance)[0] != "WRONG":
+        if allowed or judge_deviation(deviation, widest, quantiles, most)[0] != "WRONG":
             status, reason = "CANNOT TELL", f"{_IMAGES_ALLOW}; {reason}"
     if doubt:
         status, reason = "CANNOT TELL", doubt
@@ -93,23 +90,6 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
         reason += SINGLE_CAMERA
     smallest = detectable(sigma, quantiles.confident)
     return CameraAudit(status, reason, deviation, sigma, smallest, z_score)
-
-
-def _least_share(sources: ErrorSources | None) -> Array | float:
-    """(6,) share of an error bar that remains with any number of frames; 0 if unknown."""
-    if sources is None:
-        return 0.0
-    now = np.array([sources.rotation_deg, sources.translation_cm])
-    return np.repeat(sources.forecast[MOST_TIMES] / now, 3)
-
-
-def _unstated_error() -> Array:
-    """(6, 6) prior of the error that all frames share, for a matcher that states none."""
-    prior = error_components().matchers[UNKNOWN]
-    sigmas = pose_sigmas(
-        rotation_rad=prior.systematic_rotation_rad, translation_m=prior.systematic_translation_m
-    )
-    return np.asarray(np.diag(sigmas**2))
 
 
 def has_too_few_frames(evidence: Evidence, name: str) -> bool:
@@ -120,7 +100,6 @@ def has_too_few_frames(evidence: Evidence, name: str) -> bool:
 
 
 def _quantiles(evidence: Evidence, name: str, covariance: Array) -> Quantiles:
-    """Quantiles of a camera's error bar: Student's t for the scatter, normal for stated errors."""
     tail = tail_of_axis(len(evidence.cameras))
     known = Quantiles.from_freedom(np.inf, tail)
     block, scatter = evidence.solution.inliers.blocks.get(name), evidence.scatter_of(name)
@@ -140,25 +119,25 @@ def judge_deviation(
     deviation: Array,
     covariance: Array,
     quantiles: Quantiles,
-    tolerance: Tolerance,
+    tolerance: Array,
     *,
     least: Array | float = 0.0,
-) -> tuple[AuditStatus, str]:
+) -> tuple[str, str]:
     """The status of a trusted measurement, and its reason.
 
     Args:
         deviation: (6,) of all axes.
         covariance: (6, 6) of it.
         quantiles: of its standard deviations.
-        tolerance: of the turn and of the shift.
+        tolerance: (2,) of the turn [rad] and of the shift [m].
         least: (6,) share of sigma that remains however many frames are recorded.
     """
     sigma, size = np.sqrt(np.diag(covariance)), np.abs(deviation)
     significant = size > quantiles.significant * sigma
-    wrong = axes_beyond(deviation, significant, tolerance.twist)
+    wrong = axes_beyond(deviation, significant, tolerance)
     if wrong.any():
         return "WRONG", describe_motion(deviation, sigma, wrong, CAMERA_AXES)
-    needed, most = detectable(sigma, quantiles.confident), np.repeat(tolerance.twist, 3)
+    needed, most = detectable(sigma, quantiles.confident), np.repeat(tolerance, 3)
     blind = needed > most
     unsure = blind | _may_be_beyond(deviation, covariance, quantiles, tolerance)
     if unsure.any():
@@ -173,14 +152,14 @@ def judge_deviation(
 
 
 def _may_be_beyond(
-    deviation: Array, covariance: Array, quantiles: Quantiles, tolerance: Tolerance
+    deviation: Array, covariance: Array, quantiles: Quantiles, tolerance: Array
 ) -> Mask:
     """(6,) the largest axes of a turn or shift that is not certainly within the tolerance."""
     wider = quantiles.confident / ndtri(CONFIDENCE)  # as few frames have it
     covariance = covariance * np.outer(wider, wider)
     reach = np.abs(deviation) + quantiles.confident * np.sqrt(np.diag(covariance))
     unsure = np.zeros(6, np.bool_)
-    for part, most in zip((slice(0, 3), slice(3, 6)), tolerance.twist, strict=True):
+    for part, most in zip((slice(0, 3), slice(3, 6)), tolerance, strict=True):
         beyond = probability_outside(deviation[part], covariance[part, part], most)
         if beyond > 1 - CONFIDENCE:
             unsure[part] = reach[part] > 0.5 * reach[part].max()
@@ -204,14 +183,14 @@ def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> Lidar
 
     None where no camera is WRONG, or with a single camera, which cannot be told from the LiDAR.
     """
-    wrong = [place for place, each in enumerate(cameras.values()) if each.status == "WRONG"]
     if evidence.joint_covariance is None:
         return None
-    deviation = np.concatenate([_deviation(evidence, name) for name in cameras])
-    T_camera_lidar = [evidence.guess.T_camera_lidar[name] for name in cameras]
-    quantile = float(ndtri(1 - tail_of_axis(len(cameras))))
     return find_lidar_motion(
-        deviation, evidence.joint_covariance, T_camera_lidar, moved=wrong, quantile=quantile
+        np.concatenate([_deviation(evidence, name) for name in cameras]),
+        evidence.joint_covariance,
+        [evidence.guess.T_camera_lidar[name] for name in cameras],
+        moved=[k for k, each in enumerate(cameras.values()) if each.status == "WRONG"],
+        quantile=float(ndtri(1 - tail_of_axis(len(cameras)))),
     )
 
 
@@ -260,8 +239,7 @@ def describe_motion(motion: Array, sigma: Array, which: Mask, axes: tuple[str, .
         axes: (6) their names.
     """
     values, errors = motion * DISPLAY, sigma * DISPLAY
-    verbs = ["turned about"] * 3 + ["moved along"] * 3
-    units = ["deg"] * 3 + ["cm"] * 3
+    verbs, units = np.repeat([["turned about", "moved along"], ["deg", "cm"]], 3, axis=1)
     return ", ".join(
         f"{verbs[k]} {axes[k]} by {values[k]:+.2f} {units[k]} (sigma {errors[k]:.2f})"
         for k in np.flatnonzero(which)

@@ -1,6 +1,7 @@
 """Rounds of matching that begin at a deployed rig, without a search."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -47,22 +48,13 @@ def match_from_deployed(matching: Matching, watch: Stopwatch) -> MatchingRun:
     tracking = matching.matcher.tracking_rounds
     if not tracking:
         return _run_rounds(matching, range(matching.matcher.rounds), watch)
-    if len(tracking) > 1 and (found := _confirm(matching, tracking[-1], watch)) is not None:
-        return found
+    if len(tracking) > 1:  # the last alone, if it ends where it begins, as a converged run
+        with suppress(CorrespondenceError):
+            run = _run_rounds(matching, tracking[-1:], watch)
+            if not run.solution.held and _has_settled(run, still="PASS"):
+                return run
     run = _run_rounds(matching, tracking, watch)
     return run if _has_settled(run) else _run_rounds(matching, (0, *tracking), watch)
-
-
-def _confirm(matching: Matching, last: int, watch: Stopwatch) -> MatchingRun | None:
-    """The last round alone, if it ends where it begins: at the deployed rig, as a converged run.
-
-    None if a camera moves by more than a last round may, or has a low z-score or too few matches.
-    """
-    try:
-        run = _run_rounds(matching, (last,), watch)
-    except CorrespondenceError:
-        return None
-    return run if not run.solution.held and _has_settled(run, still="PASS") else None
 
 
 def _run_rounds(matching: Matching, rounds: Sequence[int], watch: Stopwatch) -> MatchingRun:
@@ -85,12 +77,12 @@ def _has_settled(run: MatchingRun, still: Status = "WARN") -> bool:
     deployed, ended = run.guess.T_camera_lidar, run.solution.solved_rig.T_camera_lidar
     for name, T in deployed.items():
         degrees, centimetres = pose_difference(ended[name], T)
-        steps = {
+        grades = [
             threshold("last_round_rotation").grade(last[name]["moved_deg"]),
             threshold("last_round_translation").grade(last[name]["moved_cm"]),
-        }
-        good = threshold("z_score").grade(z_scores.get(name, 0.0)) == "PASS"
-        far = degrees > _REACH_DEG or centimetres > _REACH_CM
-        if not good or far or not steps <= {"PASS", still}:
+        ]
+        is_good = threshold("z_score").grade(z_scores.get(name, 0.0)) == "PASS"
+        is_near = degrees <= _REACH_DEG and centimetres <= _REACH_CM
+        if not (is_good and is_near and {*grades} <= {"PASS", still}):
             return False
     return True

@@ -169,6 +169,11 @@ class Limits:
         significant = np.abs(deviation) > self.sigmas(freedom) * sigma
         return axes_beyond(deviation, significant, self.tolerance)
 
+    def are_exceeded(self, deviation: Array, covariance: Array, freedom: Array) -> Mask:
+        """(n,) True for results with an axis beyond both limits."""
+        exceeded = self.exceeded(deviation, np.sqrt(_variances(covariance)), freedom)
+        return np.asarray(exceeded.any(axis=1))
+
 
 @dataclass(frozen=True, eq=False)
 class Deviations:
@@ -243,8 +248,7 @@ def _agreeing(poses: Poses, limits: Limits) -> Mask:
     kept = np.ones(len(poses), np.bool_)
     while np.count_nonzero(kept) > 1:
         deviation, covariance, freedom = _leave_one_out(poses, kept)
-        sigma = np.sqrt(_variances(covariance))
-        beyond = kept & limits.exceeded(deviation, sigma, freedom).any(axis=1)
+        beyond = kept & limits.are_exceeded(deviation, covariance, freedom)
         if not beyond.any():
             break
         # Decrease of the chi-squared of the rest when each result is removed.
@@ -261,10 +265,8 @@ def _ambiguous_pairs(poses: Poses, agreeing: Mask, limits: Limits) -> Mask:
         for left in np.flatnonzero(agreeing):
             swapped = agreeing.copy()
             swapped[[removed, left]] = True, False
-            deviation, covariance, freedom = _leave_one_out(poses, swapped)
-            sigma = np.sqrt(_variances(covariance))
-            beyond = limits.exceeded(deviation, sigma, freedom).any(axis=1)
-            ambiguous[removed, left] = ambiguous[left, removed] = not (swapped & beyond).any()
+            beyond = swapped & limits.are_exceeded(*_leave_one_out(poses, swapped))
+            ambiguous[removed, left] = ambiguous[left, removed] = not beyond.any()
     return ambiguous
 
 

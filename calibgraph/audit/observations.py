@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import pyarrow as pa
@@ -16,6 +16,7 @@ Words = NDArray[np.str_]
 
 NAMES = ("vehicle", "camera", "model", "batch")
 _NO_COVARIATES = (*NAMES, "seconds", "probability_off", "date")
+_NUMBERS = pa.types.is_floating, pa.types.is_integer
 _UNKNOWN = 1e6
 """Variance [rad^2, m^2] of a camera without a usable result: it leaves the prior as it is."""
 
@@ -46,12 +47,9 @@ class Observations:
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
         """Some rows: a mask or an index array."""
-        chosen = {
-            name: getattr(self, name)[rows]
-            for name in (*NAMES, "T_camera_lidar", "covariance", "measured", "day")
-        }
-        covariates = {name: values[rows] for name, values in self.covariates.items()}
-        return Observations(**chosen, covariates=covariates)
+        own = {each.name: getattr(self, each.name) for each in fields(self)}
+        covariates = {name: values[rows] for name, values in own.pop("covariates").items()}
+        return Observations(**{k: v[rows] for k, v in own.items()}, covariates=covariates)
 
 
 def observe(rows: pa.Table) -> Observations:
@@ -70,32 +68,32 @@ def observe(rows: pa.Table) -> Observations:
             f"the fleet's table has no column {missing[0]!r}, found "
             f"{', '.join(rows.column_names)}; give the folder that calibgraph fleet wrote"
         )
-    _require_one_quantity(rows)
+    done, vehicle = words(rows, "status") == "done", words(rows, "vehicle")
+    of, first = np.unique(words(rows, "of")[done] == "mount", return_index=True)
+    if len(of) > 1:
+        alignment, mount = vehicle[done][first].tolist()
+        raise CalibrationError(
+            f"the rows of vehicle {mount!r} are of mounts, those of {alignment!r} of alignments, "
+            "which are different quantities; calibrate all with one `of` in their settings"
+        )
     T, placed = _fixed_size(rows, "T_camera_lidar", 16)
     covariance, bounded = _fixed_size(rows, "covariance", 36)
-    done = (words(rows, "status") == "done") & (words(rows, "verdict") != "FAIL")
-    measured = done & placed & bounded & (words(rows, "camera") != "")
+    measured = done & (words(rows, "verdict") != "FAIL") & placed & bounded
+    measured &= words(rows, "camera") != ""
     unknown = np.eye(6) * _UNKNOWN
+    numbers = [field.name for field in rows.schema if field.name not in _NO_COVARIATES
+               and any(is_kind(field.type) for is_kind in _NUMBERS)]  # fmt: skip
     return Observations(
         **{name: words(rows, name) for name in NAMES},
         T_camera_lidar=np.where(measured[:, None, None], T.reshape(-1, 4, 4), np.eye(4)),
         covariance=np.where(measured[:, None, None], covariance.reshape(-1, 6, 6), unknown),
         measured=measured,
         day=days(rows),
-        covariates=_covariates(rows),
+        covariates={
+            name: rows.column(name).cast(pa.float64()).fill_null(np.nan).to_numpy()
+            for name in numbers
+        },
     )
-
-
-def _require_one_quantity(rows: pa.Table) -> None:
-    """Check that the poses of all rows are alignments, or all mounts."""
-    done = words(rows, "status") == "done"
-    of, first = np.unique(words(rows, "of")[done] == "mount", return_index=True)
-    if len(of) > 1:
-        alignment, mount = words(rows, "vehicle")[done][first].tolist()
-        raise CalibrationError(
-            f"the rows of vehicle {mount!r} are of mounts, those of {alignment!r} of alignments, "
-            "which are different quantities; calibrate all with one `of` in their settings"
-        )
 
 
 def newest_rows(rows: pa.Table) -> pa.Table:
@@ -136,13 +134,3 @@ def _fixed_size(rows: pa.Table, name: str, size: int) -> tuple[Array, NDArray[np
     values = np.zeros((len(rows), size))
     values[present] = np.asarray(column.flatten(), dtype=np.float64).reshape(-1, size)
     return values, present & np.isfinite(values).all(axis=1)
-
-
-def _covariates(rows: pa.Table) -> dict[str, Array]:
-    """The columns of numbers that are not the fleet's own."""
-    plain = (pa.types.is_floating, pa.types.is_integer)
-    others = [field for field in rows.schema if field.name not in _NO_COVARIATES]
-    numbers = [field.name for field in others if any(test(field.type) for test in plain)]
-    return {
-        name: rows.column(name).cast(pa.float64()).fill_null(np.nan).to_numpy() for name in numbers
-    }

@@ -3,7 +3,6 @@
 Per camera: numbers, the cloud on an image.
 """
 
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -26,6 +25,9 @@ from calibgraph.report.page_overlays import (
     width_on_page,
 )
 
+Pictures = dict[str, tuple[str, str | None]]
+"""The cloud on an image of each camera, as data URIs: as deployed, and as measured, if it was."""
+
 
 def write_audit_report(audit: Audit, path: Path | str) -> Path:
     """Write an audit as one HTML page that needs nothing else: no network, no files beside it.
@@ -43,26 +45,25 @@ def write_audit_report(audit: Audit, path: Path | str) -> Path:
     Raises:
         FileError: if the page cannot be written.
     """
-    path = Path(path)
-    write_text(path, audit_html(audit))
-    return path
-
-
-def audit_html(audit: Audit) -> str:
-    """The page as text; see :func:`write_audit_report`."""
-    cameras, left_out = camera_sections(audit)
-    return load_template("page.html.j2", "calibgraph.audit").render(
+    measured = {name: measured_camera(audit.deployed.cameras[name], camera)
+                for name, camera in audit.cameras.items()}  # fmt: skip
+    pictures, left_out = _draw(audit, measured)
+    page = load_template("page.html.j2", "calibgraph.audit").render(
         audit=audit,
         date=datetime.now(UTC).date().isoformat(),
-        cameras=cameras,
+        measured=measured,
+        overlays=pictures,
         pictures_left_out=left_out,
         reasons=_reasons(audit),
         detectable=_detectable(audit),
         twist_cells=twist_cells,
         matrix_text=matrix_text,
+        width_on_page=width_on_page,
         depth_scale=depth_scale(),
         frames_sentence=FRAMES_SENTENCE,
     )
+    write_text(Path(path), page)
+    return Path(path)
 
 
 def _reasons(audit: Audit) -> list[Reason]:
@@ -94,57 +95,6 @@ def _detectable(audit: Audit) -> str:
     return " ".join(sentences)
 
 
-@dataclass(frozen=True)
-class Pictures:
-    """A cloud on an image of one camera, as data URIs.
-
-    Attributes:
-        deployed: by the deployed extrinsic.
-        measured: by the measured one; None if nothing was measured.
-        width_px: at most so wide they are shown.
-    """
-
-    deployed: str
-    measured: str | None
-    width_px: int
-
-
-@dataclass(frozen=True)
-class Section:
-    """One camera's values for the template.
-
-    Attributes:
-        pictures: None if they cannot be drawn.
-        deployed, measured: the camera; None if nothing was measured.
-    """
-
-    name: str
-    anchor: str
-    audit: CameraAudit
-    pictures: Pictures | None
-    deployed: Camera
-    measured: Camera | None
-
-
-def camera_sections(audit: Audit) -> tuple[list[Section], str | None]:
-    """The sections of all cameras; the reason why pictures are missing, None if none are."""
-    pictures, left_out = _draw(audit)
-    sections = []
-    for number, (name, camera) in enumerate(audit.cameras.items()):
-        deployed = audit.deployed.cameras[name]
-        sections.append(
-            Section(
-                name=name,
-                anchor=f"camera-{number}",
-                audit=camera,
-                pictures=pictures.get(name),
-                deployed=deployed,
-                measured=measured_camera(deployed, camera),
-            )
-        )
-    return sections, left_out
-
-
 def measured_camera(deployed: Camera, audit: CameraAudit) -> Camera | None:
     """The camera where it was measured; None if nothing was measured."""
     if audit.deviation is None:
@@ -153,23 +103,18 @@ def measured_camera(deployed: Camera, audit: CameraAudit) -> Camera | None:
     return deployed.moved_to(np.asarray(T_now_deployed @ deployed.T_camera_lidar))
 
 
-def _draw(audit: Audit) -> tuple[dict[str, Pictures], str | None]:
-    """Per camera its pictures; the reason why the others are missing, None if none are."""
-    drawn: dict[str, Pictures] = {}
-    budget = PICTURES_BYTES // (2 * len(audit.cameras))
+def _draw(audit: Audit, measured: dict[str, Camera | None]) -> tuple[Pictures, str | None]:
+    """The pictures; the reason why some are missing, None if none are."""
+    drawn: Pictures = {}
+    budget, frame = PICTURES_BYTES // (2 * len(audit.cameras)), audit.shown
     try:
-        cloud = audit.shown.load_cloud()[:, :3].astype(np.float64)
+        cloud = frame.load_cloud()[:, :3].astype(np.float64)
         for name, camera in audit.deployed.cameras.items():
-            if name in audit.shown.image_paths:
-                image = audit.shown.load_image(name, camera)
-                measured = measured_camera(camera, audit.cameras[name])
-                twist = audit.shown.twist_per_s
-                seen = None if measured is None else when_taken(measured, twist)
-                drawn[name] = Pictures(
-                    draw_by_depth(image, cloud, when_taken(camera, twist), budget),
-                    None if seen is None else draw_by_depth(image, cloud, seen, budget),
-                    width_on_page(camera),
-                )
+            if name in frame.image_paths:
+                image, cameras = frame.load_image(name, camera), (camera, measured[name])
+                seen = [when_taken(each, frame.twist_per_s) for each in cameras if each is not None]
+                before, *now = (draw_by_depth(image, cloud, each, budget) for each in seen)
+                drawn[name] = before, now[0] if now else None
     except (CalibrationError, OSError) as error:
         return drawn, str(error)
     return drawn, None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -14,23 +14,24 @@ from calibgraph.model.rig import Rig
 from calibgraph.model.threshold import fixed
 from calibgraph.model.verdict import Status
 
-AuditStatus = Literal["OK", "CANNOT TELL", "WRONG"]
-
-_ORDER: tuple[AuditStatus, ...] = ("OK", "CANNOT TELL", "WRONG")
+ORDER = ("OK", "CANNOT TELL", "CHANGED", "WRONG")
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
+class CameraAudit:
     """A camera's pose, compared with another one of it.
 
     Attributes:
-        status: OK, CANNOT TELL, or WRONG or CHANGED.
+        status: OK, CANNOT TELL, or what deviates: WRONG of ``check``, CHANGED of ``drift``.
         reason: one sentence: what was found and, where nothing can be told, what to record.
-        deviation: (6,) xi of its pose in its frame by the other one: rotation [rad], translation
-            [m]; None if nothing was measured.
+        deviation: (6,) xi in T_other_here = exp(xi), the pose of the camera now in its frame as
+            deployed, or by one result in its frame by the others: rotation [rad], translation [m];
+            None if nothing was measured.
         sigma: (6,) standard deviations of ``deviation``; None without an error bar.
         detectable: (6,) smallest change per axis that these data tell from none, with 90 %
             probability; None without an error bar.
+        z_score: agreement of image and cloud at the measured extrinsic; None if unknown.
+        axes: of ``drift``, which of the six CHANGED, in this order.
     """
 
     status: str
@@ -38,9 +39,8 @@ class Compared:
     deviation: Array | None = None
     sigma: Array | None = None
     detectable: Array | None = None
-
-    def __post_init__(self) -> None:
-        freeze(self.deviation, self.sigma, self.detectable)
+    z_score: float | None = None
+    axes: tuple[int, ...] = ()
 
     def summary(self, **own: object) -> dict[str, Any]:
         """As plain values, with those of a kind of comparison."""
@@ -52,21 +52,6 @@ class Compared:
             **by_unit("sigma", self.sigma),
             **by_unit("detectable", self.detectable),
         }
-
-
-@dataclass(frozen=True, eq=False)
-class CameraAudit(Compared):
-    """The audit of one camera's extrinsic.
-
-    ``deviation`` is xi in T_deployed_now = exp(xi), the pose of the camera now in its frame as
-    deployed.
-
-    Attributes:
-        z_score: agreement of image and cloud at the measured extrinsic; None if unknown.
-    """
-
-    status: AuditStatus
-    z_score: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +68,6 @@ class LidarAudit:
     reason: str
     motion: Array
     sigma: Array
-
-    def __post_init__(self) -> None:
-        freeze(self.motion, self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,16 +103,20 @@ class Audit:
     deployed_verdict: Status | None = None
 
     @property
-    def status(self) -> AuditStatus:
+    def status(self) -> str:
         """The worst of the cameras."""
-        return max((camera.status for camera in self.cameras.values()), key=_ORDER.index)
+        return max((camera.status for camera in self.cameras.values()), key=ORDER.index)
 
     @property
     def wrong(self) -> tuple[str, ...]:
         """The names that are WRONG: the LiDAR alone, or cameras."""
         if self.lidar is not None:
             return ("LiDAR",)
-        return tuple(name for name, camera in self.cameras.items() if camera.status == "WRONG")
+        return self.with_status("WRONG")
+
+    def with_status(self, status: str) -> tuple[str, ...]:
+        """The names of cameras."""
+        return tuple(name for name, camera in self.cameras.items() if camera.status == status)
 
     @property
     def same_recording_note(self) -> str:
@@ -153,13 +139,6 @@ class Audit:
         )
 
 
-def freeze(*arrays: Array | None) -> None:
-    """Make arrays read-only."""
-    for array in arrays:
-        if array is not None:
-            array.setflags(write=False)
-
-
 def audit_summary(audit: Audit) -> dict[str, Any]:
     """An audit as plain values; every key names its unit, every list is x, y, z."""
     return {
@@ -180,11 +159,8 @@ def audit_summary(audit: Audit) -> dict[str, Any]:
 
 def lidar_summary(lidar: LidarAudit) -> dict[str, Any]:
     """A motion of the LiDAR as plain values."""
-    return {
-        "reason": lidar.reason,
-        **by_unit("motion", lidar.motion),
-        **by_unit("sigma", lidar.sigma),
-    }
+    twists = {**by_unit("motion", lidar.motion), **by_unit("sigma", lidar.sigma)}
+    return {"reason": lidar.reason, **twists}
 
 
 def by_unit(name: str, twist: Array | None) -> dict[str, list[float] | None]:

@@ -42,8 +42,7 @@ class Tolerance:
     @property
     def twist(self) -> Array:
         """(2,) rotation [rad], translation [m]."""
-        twist: Array = np.array([self.degrees, self.centimetres]) / DISPLAY[::3]
-        return twist
+        return np.asarray(np.array([self.degrees, self.centimetres]) / DISPLAY[::3])
 
 
 def axes_beyond(deviation: Array, significant: Mask, tolerance: Array) -> Mask:
@@ -55,8 +54,8 @@ def axes_beyond(deviation: Array, significant: Mask, tolerance: Array) -> Mask:
         tolerance: (2,) largest turn and shift.
     """
     parts = np.where(significant, deviation, 0.0).reshape(*deviation.shape[:-1], 2, 3)
-    beyond: Mask = significant & np.repeat(np.linalg.norm(parts, axis=-1) > tolerance, 3, axis=-1)
-    return beyond
+    is_large = np.linalg.norm(parts, axis=-1) > tolerance
+    return np.asarray(significant & np.repeat(is_large, 3, axis=-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +90,8 @@ class Quantiles:
             share: (6,) of the variances that is estimated.
             known: quantiles of the rest.
         """
-
-        def blend(ours: Array, theirs: Array) -> Array:
-            blended: Array = np.sqrt(share * ours**2 + (1 - share) * theirs**2)
-            return blended
-
-        return Quantiles(
-            blend(self.significant, known.significant), blend(self.confident, known.confident)
-        )
+        pairs = (self.significant, known.significant), (self.confident, known.confident)
+        return Quantiles(*(np.sqrt(share * a**2 + (1 - share) * b**2) for a, b in pairs))
 
 
 def tail_of_axis(cameras: int) -> float:
@@ -113,5 +106,4 @@ def detectable(sigma: Array, quantile: float | Array) -> Array:
         sigma: (6,) standard deviations.
         quantile: how many of them count, per axis or of all.
     """
-    smallest: Array = (quantile + float(ndtri(POWER))) * sigma
-    return smallest
+    return np.asarray((quantile + float(ndtri(POWER))) * sigma)

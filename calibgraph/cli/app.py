@@ -11,24 +11,20 @@ import atexit
 import gc
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
-from typing import Annotated, Any, TextIO
+from typing import Any, TextIO
 
 import typer
 
 from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve
-from calibgraph.cli.declaration import declare, help_of
-from calibgraph.cli.exchange import export, import_
+from calibgraph.cli.export import export
 from calibgraph.cli.fleet import fleet
-from calibgraph.cli.guess import bag, guess, init
-from calibgraph.cli.inspect import doctor, evaluate, perturb, report, view
-from calibgraph.cli.learned import weights
-from calibgraph.cli.outputs import keep_files
-from calibgraph.cli.pick import pick
-from calibgraph.cli.serve import serve
+from calibgraph.cli.inspect import doctor, evaluate, perturb, report, weights
+from calibgraph.cli.rig import rig
+from calibgraph.cli.serve import pick, serve
 from calibgraph.cli.simulate import simulate
 from calibgraph.cli.track import track
 
@@ -39,9 +35,7 @@ kernels are compiled goes into searches of objects that all live."""
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
 """BLAS and OpenCV get one thread each: calibgraph's own threads use all cores, and idle threads of
 these libraries spin (0.3 s of processor time while BLAS starts)."""
-_WEIGHTS_SUFFIXES = (".tar", ".pt", ".pth", ".safetensors")
 _UsageError: type[Exception] = typer.BadParameter.__base__ or Exception
-_PLAIN: Any = {"add_completion": False, "pretty_exceptions_enable": False}
 
 app = typer.Typer(
     help="Calibrate all cameras around a LiDAR at once, from ordinary driving data.\n\n"
@@ -49,7 +43,8 @@ app = typer.Typer(
     "A RIG, ESTIMATE or REFERENCE is a rig file, a result (file or folder), a dataset folder "
     "(its rig.yaml), a KITTI odometry sequence folder, a nuScenes folder or a ROS bag.",
     no_args_is_help=True,
-    **_PLAIN,
+    add_completion=False,
+    pretty_exceptions_enable=False,
 )
 
 
@@ -63,27 +58,22 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Print the version."
-        ),
-    ] = False,
+    debug: bool = typer.Option(False, "--debug", help="Show tracebacks."),
+    version: bool = typer.Option(
+        False, "--version", callback=_print_version, is_eager=True, help="Print the version."
+    ),
 ) -> None:
     """Options before the command; ``--debug`` is read by :func:`main`."""
 
 
 COMMANDS: tuple[Callable[..., None], ...] = (
-    calibrate, check, drift, match, solve, report, view, evaluate, perturb, bag, doctor, init,
-    guess, export, import_, simulate, weights, track, pick, fleet,
-    serve,
+    calibrate, check, drift, rig, doctor, match, solve, report, evaluate, export, track, pick,
+    simulate, perturb, weights, fleet, serve,
 )  # fmt: skip
 """In the order of the help."""
 for _command in COMMANDS:
-    app.command(_command.__name__.rstrip("_").replace("_", "-"), help=help_of(_command))(
-        keep_files(declare(_command))
-    )
+    _help = "\n\n".join(" ".join(text.split()) for text in (_command.__doc__ or "").split("\n\n"))
+    app.command(help=_help)(_command)
 
 
 def main() -> None:
@@ -93,7 +83,6 @@ def main() -> None:
     os.environ.update(_ONE_THREAD | os.environ)
     gc.set_threshold(*_COLLECT_AFTER)
     atexit.register(gc.freeze)  # at its end Python would look for garbage in all objects: 0.3 s
-    sys.argv[1:] = _repeat_weights_option(sys.argv[1:])
     try:
         _require_utf8(sys.argv[1:])
         code = _run_app()
@@ -158,20 +147,6 @@ def _flush(stream: TextIO | None) -> None:
         stream.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def _repeat_weights_option(arguments: Iterable[str]) -> Iterator[str]:
-    """Expand ``--weights a.tar b.tar`` to ``--weights a.tar --weights b.tar``."""
-    in_list, previous = False, ""
-    for argument in arguments:
-        if previous == "--weights" or argument.startswith("--weights="):
-            in_list = True
-        elif in_list and argument.lower().endswith(_WEIGHTS_SUFFIXES):
-            yield "--weights"
-        else:
-            in_list = False
-        yield argument
-        previous = argument
 
 
 def _one_line(error: Exception) -> str:

@@ -1,93 +1,89 @@
 """The commands that compare calibrations with a recording, and with each other: check, drift."""
 
+from contextlib import suppress
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
-from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
-from calibgraph.cli import outputs
+from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
-from calibgraph.cli.options import JsonOption, SeedOption
-from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import elapsed_s, print_json, print_line, progress_bar, terminal
 
 _EXIT_CODES = {"OK": 0, "WRONG": 1, "CHANGED": 1, "CANNOT TELL": 3}
 
 
 def check(
-    rig: Path,
-    dataset: list[Path],
-    tolerance_deg: float = 0.5,
-    tolerance_cm: float = 10.0,
-    frames: str | None = None,
-    seed: SeedOption = 0,
-    page: Annotated[Path | None, outputs.PAGE_OF_AUDIT] = None,
-    as_json: JsonOption = False,
+    *,
+    rig: Path = Argument(..., metavar="RIG", help="The deployed calibration: a result or a rig."),
+    dataset: options.Datasets,
+    tolerance_deg: options.ToleranceDeg = 0.5,
+    tolerance_cm: options.ToleranceCm = 10.0,
+    frames: options.Frames = None,
+    seed: options.Seed = 0,
+    out: Path | None = Option(None, metavar="FILE.html", help="The answer as a page."),
+    as_json: options.JsonOption = False,
+    force: options.Force = False,
 ) -> None:
     """Is a deployed calibration still right? Exit 0: all OK, 1: WRONG, 3: the data cannot tell.
 
     Compares it with images and clouds of a recent recording, per camera and axis. Writes no file
     but the page, if one is wanted.
-
-    Args:
-        rig (RIG): The deployed calibration: a result or a rig.
-        page (FILE.html): Show the answer on a page, with pictures.
     """
     from calibgraph.audit import check
     from calibgraph.audit.check import provenance
     from calibgraph.audit.significance import Tolerance
+    from calibgraph.files import require_new_file
     from calibgraph.io.rigs import load_rig
 
+    if out is not None:
+        require_new_file(out, ".html", ".htm", force=force)
     with checked_arguments():
         Tolerance(tolerance_deg, tolerance_cm)
-        matcher = matcher_from("structure", None, seed=seed, all_frames=frames is not None)
+        matcher = matcher_from("structure", seed=seed, all_frames=frames is not None)
     data, deployed = dataset_from(dataset, rig, frames), load_rig(rig)
     origin = provenance(rig, data)
     with progress_bar() as progress:
         audit = check(
-            deployed,
-            data,
-            tolerance_deg=tolerance_deg,
-            tolerance_cm=tolerance_cm,
-            matcher=matcher,
-            seed=seed,
-            progress=progress,
-        )
+            deployed, data, tolerance_deg=tolerance_deg, tolerance_cm=tolerance_cm,
+            matcher=matcher, seed=seed, progress=progress,
+        )  # fmt: skip
     audit = replace(audit, same_recording=origin.same_recording, deployed_verdict=origin.verdict)
-    if page is not None:
+    if out is not None:
         from calibgraph.audit.page import write_audit_report
 
-        write_audit_report(audit, page)
+        write_audit_report(audit, out)
     if as_json:
         from calibgraph.audit import audit_summary
 
         print_json(audit_summary(audit))
     else:
-        from calibgraph.cli.audit_tables import print_audit
+        from calibgraph.audit.tables import print_audit
 
-        print_audit(terminal(), audit, page)
+        print_audit(terminal(), audit, out, elapsed_s())
     raise typer.Exit(_EXIT_CODES[audit.status])
 
 
 def drift(
-    results: list[Path],
-    days: str | None = None,
-    tolerance_deg: float = 0.5,
-    tolerance_cm: float = 10.0,
-    own_lenses: bool = False,
-    as_json: JsonOption = False,
+    results: list[Path] = Argument(
+        ..., metavar="RESULT...", help="Of one rig: their folders, or calibration.yaml files."
+    ),
+    days: str | None = Option(
+        None, metavar="DAY,DAY,...", help="When each was recorded: dates, or numbers of days."
+    ),
+    tolerance_deg: options.ToleranceDeg = 0.5,
+    tolerance_cm: options.ToleranceCm = 10.0,
+    own_lenses: bool = Option(
+        False, "--own-lenses", help="Lenses may differ: several vehicles, each with its own."
+    ),
+    as_json: options.JsonOption = False,
 ) -> None:
     """Which of several results of one rig deviates? Exit 0: none, 1: one CHANGED, 3: cannot tell.
 
     Compares each result with the others that agree, per camera and axis, without a reference: of
     several days, or of several vehicles. One false alarm in 100 calls.
-
-    Args:
-        results (RESULT...): Results of one rig: their folders, or calibration.yaml files.
-        days (DAY,DAY,...): When each was recorded, for the trend: dates like 2026-03-01, or numbers
-            of days. (default: the order given)
-        own_lenses: Lenses may differ: several vehicles, each with its own.
     """
     from calibgraph.audit import drift
 
@@ -104,25 +100,23 @@ def drift(
 
         print_json(drift_summary(found))
     else:
-        from calibgraph.cli.audit_tables import print_drift
+        from calibgraph.audit.tables import print_drift
 
         print_drift(terminal(), found)
-        print_plain(terminal(), "nothing was written")
+        print_line("nothing was written")
     raise typer.Exit(_EXIT_CODES[found.status])
 
 
 def _parse_days(text: str) -> list[float]:
     """Days of dates or numbers, separated by commas."""
-    return [_parse_day(part.strip()) for part in text.split(",")]
 
+    def parse(part: str) -> float:
+        with suppress(ValueError):
+            return float(part)
+        return float(date.fromisoformat(part).toordinal())
 
-def _parse_day(text: str) -> float:
     try:
-        return float(text)
-    except ValueError:
-        pass
-    try:
-        return float(date.fromisoformat(text).toordinal())
+        return [parse(part.strip()) for part in text.split(",")]
     except ValueError as error:
         raise ValueError(
             f"--days {text!r}: expected a date like 2026-03-01 or a number, for each result, "

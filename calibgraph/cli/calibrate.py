@@ -5,146 +5,192 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
+from typer import Argument, Option
 
-from calibgraph.cli import options, outputs
-from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.option_groups import MatchingOptions, SolveOptions
-from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
+from calibgraph.cli import options
+from calibgraph.cli.arguments import (
+    bag_options_from,
+    checked_arguments,
+    dataset_from,
+    matcher_from,
+    time_limit_of,
+)  # fmt: skip
+from calibgraph.cli.terminal import elapsed_s, print_json, print_line, progress_bar, terminal
 
 if TYPE_CHECKING:
     from calibgraph.io.dataset import Dataset
     from calibgraph.model.calibration import Calibration
-    from calibgraph.model.correspondences import Correspondences
+
+TABLE_SUFFIXES = (".parquet", ".csv")
 
 
 def calibrate(
-    dataset: list[Path],
-    matching: MatchingOptions,
-    out: Annotated[Path, outputs.RESULT] = Path("calibration"),
-    *,
-    solving: SolveOptions,
+    dataset: options.Datasets,
+    out: options.ResultFolder = Path("calibration"),
+    rig: options.RigFile = None,
+    frames: options.Frames = None,
+    every_s: options.EveryS = None,
+    topic: options.Topic = None,
+    motion: options.Motion = None,
+    interval_s: options.IntervalS = None,
+    matcher: options.MatcherName = "structure",
+    weights: options.Weights = None,
+    time_limit_s: options.TimeLimitS = None,
+    search_deg: options.SearchDeg = None,
+    search_m: options.SearchM = None,
+    estimate: options.Estimate = None,
+    of: options.Of = None,
+    config: options.ConfigFile = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
-    result, data, written = _calibrate(dataset, matching, out, solving)
+    from calibgraph.cli.settings import read_settings
+    from calibgraph.compile_ahead import compile_ahead
+    from calibgraph.memory import keep_freed_memory
+    from calibgraph.model.result_files import require_result_folder
+
+    keep_freed_memory()
+    require_result_folder(out, [*dataset, *_rig_files(rig)])
+    from calibgraph.pipeline import calibrate
+    from calibgraph.report.html import write_result
+
+    with checked_arguments():
+        settings, rare = read_settings(config, estimate=estimate, of=of)
+        chosen = matcher_from(
+            matcher, weights, seed=settings.seed, all_frames=bool(frames or every_s),
+            of_cmrnext=rare.of_cmrnext, search_deg=search_deg, search_m=search_m
+        )  # fmt: skip
+    bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
+    data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
+    with compile_ahead(data.rig), progress_bar() as progress:
+        result = calibrate(
+            data, matcher=chosen, config=settings, terms=rare.terms,
+            time_limit_s=time_limit_of(matcher, time_limit_s), progress=progress
+        )  # fmt: skip
+        result = _warned_of_same_data(result, rig)
+        written = write_result(result, out, data)
     checks = next(iter(result.camera_verdicts.values())).checks
     copies = next((check.value for check in checks if check.name == "copies"), None)
     _print_frames_used(len(result.frames), data, int(copies or 0))
     _print_and_exit(result, written, as_json=as_json)
 
 
-def _calibrate(
-    dataset: list[Path], matching: MatchingOptions, out: Path, solving: SolveOptions
-) -> tuple[Calibration, Dataset, list[Path]]:
-    """The result, the data, and the files that were written."""
-    from calibgraph.cli.compile_ahead import compile_ahead
-    from calibgraph.memory import keep_freed_memory
-
-    keep_freed_memory()
-    from calibgraph.pipeline import calibrate
-    from calibgraph.report.html import write_result
-
-    with checked_arguments():
-        settings, terms = solving.checked()
-        chosen = matching.find_matcher(seed=settings.seed)
-    data = matching.load_dataset(dataset)
-    with compile_ahead(data.rig), progress_bar() as progress:
-        result = calibrate(
-            data,
-            matcher=chosen,
-            config=settings,
-            terms=terms,
-            time_limit_s=matching.limit_s,
-            progress=progress,
-        )
-        result = _warned_of_same_data(result, matching.rig)
-        return result, data, write_result(result, out, data)
-
-
 def match(
-    dataset: list[Path],
-    matching: MatchingOptions,
-    out: Annotated[Path, outputs.TABLE] = Path("correspondences.parquet"),
-    seed: options.SeedOption = 0,
+    dataset: options.Datasets,
+    out: Path = Option(
+        Path("correspondences.parquet"), metavar="FILE", help="Table to write, .parquet or .csv."
+    ),
+    rig: options.RigFile = None,
+    frames: options.Frames = None,
+    every_s: options.EveryS = None,
+    topic: options.Topic = None,
+    motion: options.Motion = None,
+    interval_s: options.IntervalS = None,
+    matcher: options.MatcherName = "structure",
+    weights: options.Weights = None,
+    time_limit_s: options.TimeLimitS = None,
+    search_deg: options.SearchDeg = None,
+    search_m: options.SearchM = None,
+    seed: options.SeedOrConfig = None,
+    config: options.ConfigFile = None,
     as_json: options.JsonOption = False,
+    force: options.Force = False,
 ) -> None:
-    """Find correspondences and write them as a table; exit 1 if a camera was not found.
-
-    Args:
-        out (FILE): Table to write, .parquet or .csv.
-    """
-    from calibgraph.model.result_files import MATCH, WRITTEN_KEY
+    """Find correspondences and write them as a table; exit 1 if a camera was not found."""
+    from calibgraph.cli.settings import read_settings
+    from calibgraph.files import require_new_file
     from calibgraph.rounds import match_in_rounds
 
+    require_new_file(out, *TABLE_SUFFIXES, force=force)
     with checked_arguments():
-        chosen = matching.find_matcher(seed=seed)
-    data = matching.load_dataset(dataset)
+        settings, rare = read_settings(config, seed=seed)
+        chosen = matcher_from(
+            matcher, weights, seed=settings.seed, all_frames=bool(frames or every_s),
+            of_cmrnext=rare.of_cmrnext, search_deg=search_deg, search_m=search_m
+        )  # fmt: skip
+    bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
+    data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
+    limit_s = time_limit_of(matcher, time_limit_s)
     with progress_bar() as progress:
-        run = match_in_rounds(
-            data, matcher=chosen, time_limit_s=matching.limit_s, progress=progress
-        )
-        found = run.correspondences
-        replace(found, metadata={**found.metadata, WRITTEN_KEY: MATCH}).save(out)
+        run = match_in_rounds(data, matcher=chosen, time_limit_s=limit_s, progress=progress)
+        run.correspondences.save(out)
     _print_frames_used(len(run.dataset.frames), data, len(run.copies))
-    _print_table_and_exit(run.correspondences, out, as_json=as_json)
+    counts, missed = run.correspondences.counts(), list(run.correspondences.findings.missed)
+    if as_json:
+        print_json({"out": str(out), "matches": counts, "missed": missed})
+    else:
+        of_each = ", ".join(f"{name} {count}" for name, count in counts.items())
+        print_line(f"{out}: {len(run.correspondences)} correspondences ({of_each})")
+    if missed:
+        lost = f"not found: {', '.join(missed)}"
+        print_line(f"{lost}: a solve of their matches from the guess will FAIL")
+        raise typer.Exit(1)
 
 
 def solve(
-    rig: Path,
-    correspondences: Path,
-    out: Annotated[Path, outputs.RESULT] = Path("calibration"),
-    *,
-    solving: SolveOptions,
-    camera_matches: Path | None = None,
-    common_deg: Annotated[float | None, typer.Option(min=0)] = None,
-    common_cm: Annotated[float | None, typer.Option(min=0)] = None,
-    print_graph: Annotated[bool, typer.Option(callback=options.require_stdout)] = False,
-    graph: Annotated[Path | None, outputs.GRAPH] = None,
+    rig: Path = Argument(..., metavar="RIG", help="Rig with the initial guess."),
+    correspondences: Path = Argument(
+        ..., metavar="CORRESPONDENCES", help="Table, .parquet or .csv, or a folder of .parquet."
+    ),
+    out: options.ResultFolder = Path("calibration"),
+    terms: str | None = Option(
+        None, metavar="full|reprojection|priors|stage1", help="Of the objective. (default: full)"
+    ),
+    estimate: options.Estimate = None,
+    of: options.Of = None,
+    camera_matches: Path | None = Option(
+        None, metavar="FILE", help="What cameras have in common: the table of a result."
+    ),
+    common_deg: float | None = Option(
+        None, metavar="DEG", min=0, help="Error that all frames share. (default: the table's)"
+    ),
+    common_cm: float | None = Option(None, metavar="CM", min=0, help="Likewise, of the position."),
+    print_graph: bool = Option(
+        False, "--print-graph", callback=options.require_stdout, help="Print every factor."
+    ),
+    config: options.ConfigFile = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Calibrate all cameras jointly from a table of correspondences, with a report.
-
-    Args:
-        rig (RIG): Rig with the initial guess.
-        correspondences (CORRESPONDENCES): Table, .parquet or .csv, or a folder of .parquet files;
-            larger than memory too.
-        camera_matches (FILE): Features that cameras have in common: camera_matches.parquet of a
-            result.
-        common_deg (DEG): Error per axis that all frames share, 1 sigma; 0 if none. (default: as
-            the table states)
-        common_cm (CM): Likewise, of the position.
-        print_graph: Print every factor of the graph whose optimum is the result, in place of
-            tables.
-        graph (FILE.dot): Write the graph in Graphviz's language to FILE.dot.
-    """
-    from calibgraph.files import sha256, write_text
-    from calibgraph.graph.variables import to_dot
+    """Calibrate all cameras jointly from a table of correspondences, with a report."""
+    from calibgraph.cli.settings import read_settings
+    from calibgraph.files import sha256
     from calibgraph.io.camera_match_tables import load_camera_matches
     from calibgraph.io.correspondence_tables import table_files
     from calibgraph.io.rigs import load_rig
+    from calibgraph.model.result_files import require_result_folder
     from calibgraph.pipeline import solve
     from calibgraph.report.html import write_result
 
+    matches = [] if camera_matches is None else [camera_matches]
+    require_result_folder(out, [*_rig_files(rig), correspondences, *matches])
     with checked_arguments():
-        settings, terms = solving.checked(common_deg=common_deg, common_cm=common_cm)
+        settings, rare = read_settings(
+            config, terms=terms, estimate=estimate, of=of, common_deg=common_deg,
+            common_cm=common_cm
+        )  # fmt: skip
         if print_graph and as_json:
             raise ValueError("--print-graph and --json both print; choose one")
     with progress_bar("solving"), checked_arguments():
         seen = None if camera_matches is None else load_camera_matches(camera_matches)
-        result = solve(load_rig(rig), correspondences, settings, terms, camera_matches=seen)
+        result = solve(load_rig(rig), correspondences, settings, rare.terms, camera_matches=seen)
         result = result.with_inputs({str(path): sha256(path)
                                      for path in table_files(correspondences)})  # fmt: skip
         result = _warned_of_same_data(result, rig)
         written = write_result(result, out)
-        if graph is not None:
-            write_text(graph, to_dot(result.graph))
     if print_graph:
         print(result.graph)
         raise typer.Exit(1 if result.verdict.status == "FAIL" else 0)
     _print_and_exit(result, written, as_json=as_json)
+
+
+def _rig_files(rig: Path | None) -> list[Path]:
+    """The file of a rig, if one is given."""
+    from calibgraph.io.rigs import find_rig_file
+
+    return [] if rig is None else [find_rig_file(rig) or rig]
 
 
 def _warned_of_same_data(result: Calibration, rig: Path | None) -> Calibration:
@@ -171,23 +217,7 @@ def _print_frames_used(used: int, data: Dataset, copies: int) -> None:
     if copies:
         text += f"; {copies} {'copies' if copies > 1 else 'copy'} left out"
     if used < len(data.frames):
-        print_plain(terminal(), text)
-
-
-def _print_table_and_exit(table: Correspondences, out: Path, *, as_json: bool) -> None:
-    """Print the counts of a table of correspondences; exit 1 if a camera was not found."""
-    missed = list(table.findings.missed)
-    if as_json:
-        print_json({"out": str(out), "matches": table.counts(), "missed": missed})
-    else:
-        counts = ", ".join(f"{name} {count}" for name, count in table.counts().items())
-        print_plain(terminal(), f"{out}: {len(table)} correspondences ({counts})")
-    if missed:
-        names = ", ".join(missed)
-        print_plain(
-            terminal(), f"not found: {names}: a solve of their matches from the guess will FAIL"
-        )
-        raise typer.Exit(1)
+        print_line(text)
 
 
 def _print_and_exit(result: Calibration, written: list[Path], *, as_json: bool) -> None:
@@ -197,8 +227,8 @@ def _print_and_exit(result: Calibration, written: list[Path], *, as_json: bool) 
 
         print_json(result_summary(result, written))
     else:
-        from calibgraph.cli.tables import print_result
+        from calibgraph.report.tables import print_result
 
-        print_result(terminal(), result, written)
+        print_result(terminal(), result, written, elapsed_s())
     if result.verdict.status == "FAIL":
         raise typer.Exit(1)

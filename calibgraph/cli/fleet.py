@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING
 
 import typer
+from typer import Argument, Option
 
 from calibgraph.cli.options import JsonOption
-from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
+from calibgraph.cli.terminal import print_json, print_line, progress_bar
 
 if TYPE_CHECKING:
     from calibgraph.fleet.page import FleetReport
@@ -18,30 +20,36 @@ if TYPE_CHECKING:
 
 
 def fleet(
-    manifest: str,
-    out: str = "fleet",
-    dask: str | None = None,
-    jobs: Annotated[int | None, typer.Option(min=1)] = None,
-    timeout_s: Annotated[float, typer.Option(min=0.001)] = 3600.0,
-    memory_gb: Annotated[float | None, typer.Option(min=0.1)] = None,
-    fetch_gb: Annotated[float, typer.Option(min=0.0)] = 50.0,
+    manifest: str = Argument(
+        ...,
+        metavar="MANIFEST",
+        help="Table of the vehicles, .parquet or .csv, a path or URI. Columns: vehicle, "
+        "recording (folders, or a table of correspondences), rig, settings.",
+    ),
+    out: str = Option(
+        "fleet",
+        metavar="URI",
+        help="Folder or URI for the rows, fleet.html, fleet_model.json and estimates.parquet.",
+    ),
+    dask: str | None = Option(
+        None,
+        metavar="ADDRESS",
+        help="Run the jobs on this Dask cluster, as tcp://host:8786. (default: on this machine)",
+    ),
+    jobs: int | None = Option(
+        None, min=1, help="Jobs at once on this machine. (default: one per core)"
+    ),
+    timeout_s: float = Option(3600.0, min=0.001, metavar="SECONDS", help="Longest time of a job."),
+    memory_gb: float | None = Option(
+        None, min=0.1, metavar="GB", help="Most memory of a job. (default: no limit)"
+    ),
+    fetch_gb: float = Option(50.0, min=0.0, metavar="GB", help="Most bytes of a remote recording."),
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate many vehicles, each alone, and show on one page which of them stand apart.
 
     What is finished is not done again: after Ctrl-C, a crash or a lost machine the same command
     goes on. Exit 1 if a job failed or a camera's verdict is FAIL.
-
-    Args:
-        manifest (MANIFEST): Table of the vehicles, .parquet or .csv, a path or URI. Columns:
-            vehicle, recording (folders, or a table of correspondences), rig, settings.
-        out (URI): Folder or URI for the rows, fleet.html, fleet_model.json and estimates.parquet.
-        dask (ADDRESS): Run the jobs on the workers of this Dask scheduler: tcp://host:8786.
-            (default: on this machine)
-        jobs: Jobs at once on this machine. (default: one per core)
-        timeout_s (SECONDS): Longest time of a job.
-        memory_gb (GB): Most memory of a job. (default: no limit)
-        fetch_gb (GB): Most bytes of a remote recording.
     """
     from calibgraph.errors import CalibrationError
     from calibgraph.fleet.page import write_fleet_report
@@ -67,12 +75,7 @@ def fleet(
 @contextmanager
 def _interrupt_on_sigterm() -> Iterator[None]:
     """End as on Ctrl-C when a scheduler stops this process: what is done is published."""
-    import signal
-
-    def interrupt(*_: Any) -> NoReturn:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:
@@ -94,4 +97,4 @@ def _print(summary: Summary, report: FleetReport, out: str) -> None:
     lines += [f"{vehicle}: all cameras moved alike: the LiDAR was moved"
               for vehicle in report.moved_lidars]  # fmt: skip
     for line in [*lines, f"wrote {out}/fleet.html"]:
-        print_plain(terminal(), line)
+        print_line(line)

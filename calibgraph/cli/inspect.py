@@ -1,74 +1,74 @@
-"""The commands about a result, a rig or a dataset: report, view, evaluate, perturb, doctor."""
+"""The commands about what is there: report, evaluate, perturb, doctor, weights."""
 
-from __future__ import annotations
-
+import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
-from calibgraph.cli import options, outputs
-from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.option_groups import DatasetOptions
-from calibgraph.cli.options import JsonOption, SeedOption
-from calibgraph.cli.terminal import print_json, print_plain, progress_bar, terminal
+from calibgraph.cli import options
+from calibgraph.cli.arguments import bag_options_from, checked_arguments
+from calibgraph.cli.terminal import print_json, print_line, progress_bar, terminal
 
-if TYPE_CHECKING:
-    from calibgraph.model.calibration import Calibration
-
-
-_MOVED = typer.Option(
-    metavar="DATASET",
-    help="Where the images and clouds are now, if they have moved; repeat it for several folders, "
-    "in the order in which they were calibrated.",
-)
-
-
-def _load_result(result: Path, dataset: list[Path] | None) -> Calibration:
-    """A result, with its frames where they are now."""
-    from calibgraph.io.calibrations import load_calibration
-    from calibgraph.io.dataset import load_dataset
-    from calibgraph.report.frames import relocate_frames
-
-    loaded = load_calibration(result)
-    if not dataset:
-        return loaded
-    with checked_arguments():
-        return relocate_frames(loaded, load_dataset(dataset, loaded.rig))
+_PAGES = (".html", ".htm")
 
 
 def report(
-    result: Path,
-    out: Annotated[Path | None, outputs.PAGE] = None,
-    dataset: Annotated[list[Path] | None, _MOVED] = None,
+    result: Path = Argument(..., metavar="RESULT", help="Its folder, or its calibration.yaml."),
+    out: Path | None = Option(
+        None, metavar="FILE.html", help="Page. (default: report.html beside, or none for viewers)"
+    ),
+    rerun: Path | None = Option(None, metavar="FILE.rrd", help="Recording for Rerun."),
+    mcap: Path | None = Option(None, metavar="FILE.mcap", help="Recording for Foxglove."),
+    dataset: list[Path] | None = Option(
+        None, metavar="DATASET", help="Where images and clouds are now; repeat it in their order."
+    ),
+    force: options.Force = False,
 ) -> None:
-    """Write a result as one HTML page that opens without a network.
+    """Show a result: as one HTML page that opens without a network, or for viewers.
 
-    Args:
-        out (FILE): Page to write. (default: DIR/report.html)
+    Viewers show clouds, images and projected points, before and after.
     """
+    from calibgraph.files import require_new_file
+    from calibgraph.io.calibrations import load_calibration
+    from calibgraph.io.dataset import load_dataset
     from calibgraph.model.result_files import REPORT_FILE
+    from calibgraph.report.frames import relocate_frames
     from calibgraph.report.html import write_report
 
-    loaded = _load_result(result, dataset)
-    folder = result if result.is_dir() else result.parent
-    path = write_report(loaded, out or folder / REPORT_FILE)
-    print_plain(terminal(), f"{path}: written; the verdict is {loaded.verdict.status}")
+    for path, suffixes in ((out, _PAGES), (rerun, (".rrd",)), (mcap, (".mcap",))):
+        if path is not None:
+            require_new_file(path, *suffixes, force=force)
+    loaded, written = load_calibration(result), []
+    if dataset:
+        with checked_arguments():
+            loaded = relocate_frames(loaded, load_dataset(dataset, loaded.rig))
+    if out is not None or (rerun is None and mcap is None):
+        folder = result if result.is_dir() else result.parent
+        written.append(write_report(loaded, out or folder / REPORT_FILE))
+    os.environ.setdefault("RUST_LOG", "off")  # Rerun logs what our line states
+    with progress_bar("reading") as progress:
+        if rerun is not None:
+            from calibgraph.view.rerun_file import write_rerun
+
+            written.append(write_rerun(loaded, rerun, progress=progress))
+        if mcap is not None:
+            from calibgraph.view.mcap_file import write_mcap
+
+            written.append(write_mcap(loaded, mcap, progress=progress))
+    for path in written:
+        print_line(f"{path}: written; the verdict is {loaded.verdict.status}")
 
 
 def evaluate(
-    estimate: Path,
-    reference: Path,
-    as_json: JsonOption = False,
+    estimate: Path = Argument(..., metavar="ESTIMATE", help="Rig to evaluate."),
+    reference: Path = Argument(..., metavar="REFERENCE", help="Rig to compare with."),
+    as_json: options.JsonOption = False,
 ) -> None:
     """Compare an estimate with a reference: the paper's metrics, per camera and per pair.
 
     Of a reference with error bars, as `calibgraph pick` writes it, in standard deviations as well.
-
-    Args:
-        estimate (ESTIMATE): Rig to evaluate.
-        reference (REFERENCE): Rig to compare with.
     """
     from calibgraph.io.calibrations import error_bars
     from calibgraph.io.rigs import load_rig, rig_file
@@ -79,104 +79,95 @@ def evaluate(
     if as_json:
         print_json(errors.to_mapping())
     else:
-        from calibgraph.cli.tables import print_evaluation
+        from calibgraph.report.tables import print_evaluation
 
         print_evaluation(terminal(), errors, path, rig_file(reference))
 
 
 def perturb(
-    rig: Path,
-    out: Annotated[Path, typer.Option(), outputs.rig_of("perturb")],
-    rotation_deg: Annotated[float, typer.Option(min=0)] = 20.0,
-    translation_m: Annotated[float, typer.Option(min=0)] = 1.5,
-    seed: SeedOption = 0,
-    uniform: bool = False,
+    rig: Path = Argument(..., metavar="RIG", help="Rig to displace, usually a reference."),
+    out: Path = Option(..., metavar="FILE.yaml", help="Rig file to write: the displaced guess."),
+    rotation_deg: float = Option(20.0, min=0, help="Angle, about a random axis."),
+    translation_m: float = Option(1.5, min=0, help="Length, in a random direction."),
+    seed: options.Seed = 0,
+    uniform: bool = Option(False, "--uniform", help="Per axis, uniform within +- the values."),
+    force: options.Force = False,
 ) -> None:
-    """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses.
-
-    Args:
-        rig (RIG): Rig to displace, usually a reference.
-        out (FILE.yaml): Rig file to write: the displaced guess.
-        rotation_deg: Angle, about a random axis.
-        translation_m: Length, in a random direction.
-        uniform: Per axis, uniform within +- the values.
-    """
+    """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses."""
+    from calibgraph.files import require_new_file
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.perturbation import perturb
-    from calibgraph.outputs import yaml_mark
 
+    require_new_file(out, ".yaml", ".yml", force=force)
     given = load_rig(rig)
     with checked_arguments():
-        displaced = perturb(
-            given,
-            rotation_deg=rotation_deg,
-            translation_m=translation_m,
-            seed=seed,
-            uniform=uniform,
-        )
-    displaced.save(out, first_line=yaml_mark("perturb"))
-    print_plain(terminal(), f"{out}: {len(displaced.cameras)} cameras displaced (seed {seed})")
-
-
-def view(
-    result: Path,
-    rerun: Annotated[Path | None, outputs.RERUN] = None,
-    mcap: Annotated[Path | None, outputs.MCAP] = None,
-    dataset: Annotated[list[Path] | None, _MOVED] = None,
-) -> None:
-    """Write a result for viewers: clouds, images and projected points, before and after.
-
-    Args:
-        rerun (FILE.rrd): Recording for Rerun: `rerun FILE.rrd` shows it.
-        mcap (FILE.mcap): Recording for Foxglove.
-    """
-    from calibgraph.errors import CalibrationError
-    from calibgraph.view.mcap_file import write_mcap
-    from calibgraph.view.rerun_file import write_rerun
-
-    if rerun is None and mcap is None:
-        raise CalibrationError("nothing to write; give --rerun FILE.rrd, --mcap FILE.mcap or both")
-    loaded = _load_result(result, dataset)
-    os.environ.setdefault("RUST_LOG", "off")  # Rerun logs what our line states
-    written = []
-    with progress_bar("reading") as progress:
-        if rerun is not None:
-            written.append(write_rerun(loaded, rerun, progress=progress))
-        if mcap is not None:
-            written.append(write_mcap(loaded, mcap, progress=progress))
-    for path in written:
-        print_plain(terminal(), f"{path}: written; the verdict is {loaded.verdict.status}")
+        size = {"rotation_deg": rotation_deg, "translation_m": translation_m}
+        displaced = perturb(given, **size, seed=seed, uniform=uniform)
+    displaced.save(out)
+    print_line(f"{out}: {len(displaced.cameras)} cameras displaced (seed {seed})")
 
 
 def doctor(
-    dataset: list[Path],
-    chosen: DatasetOptions,
-    out: Annotated[Path | None, outputs.PICTURES] = None,
+    dataset: options.Datasets,
+    rig: options.RigFile = None,
+    frames: options.Frames = None,
+    every_s: options.EveryS = None,
+    topic: options.Topic = None,
+    motion: options.Motion = None,
+    config: options.ConfigFile = None,
+    out: Path | None = Option(
+        None, metavar="DIR", help="For guess_CAMERA.png, images with the guess, and doctor.json."
+    ),
     as_json: options.JsonOption = False,
 ) -> None:
-    """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything.
-
-    Args:
-        out (DIR): Folder for guess_CAMERA.png: the guess on an image of each camera.
-    """
+    """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""
+    from calibgraph.cli.settings import read_settings
     from calibgraph.doctor import diagnose
-    from calibgraph.files import require_place_for_folder
+    from calibgraph.file_sets import require_own_folder
+    from calibgraph.files import write_text
     from calibgraph.io.rigs import load_rig
 
     if out is not None:
-        require_place_for_folder(out)
-    bag = chosen.bag
+        require_own_folder(out, dataset)
     with checked_arguments(), progress_bar("reading"):
-        guess = load_rig(chosen.rig) if chosen.rig else None
-        found = diagnose(dataset, guess, frames=chosen.frames, bag=bag, pictures=out)
+        _, rare = read_settings(config)
+        bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
+        guess = load_rig(rig) if rig else None
+        found = diagnose(dataset, guess, frames=frames, bag=bag, pictures=out)
+    if out is not None:
+        write_text(out / "doctor.json", json.dumps(found.to_mapping(), indent=1))
     if as_json:
         print_json(found.to_mapping())
     else:
-        for finding in found.findings:
-            print_plain(terminal(), f"{finding.level:8} {finding.text}")
-        for path in found.pictures:
-            print_plain(terminal(), f"{path}: written")
+        lines = [f"{finding.level:8} {finding.text}" for finding in found.findings]
+        lines += [f"{path}: written" for path in found.pictures]
         if all(finding.level == "note" for finding in found.findings):
-            print_plain(terminal(), "no faults; next: calibgraph calibrate")
+            lines.append("no faults; next: calibgraph calibrate")
+        for line in lines:
+            print_line(line)
     if not found.healthy:
         raise typer.Exit(1)
+
+
+def weights(
+    file: Path = Argument(..., metavar="FILE", help="Weights, .tar or .safetensors."),
+    out: Path | None = Option(None, metavar="FILE", help="Convert to this .safetensors file."),
+    as_json: options.JsonOption = False,
+    force: options.Force = False,
+) -> None:
+    """Check a file of CMRNext weights, print what is in it, and convert it to safetensors."""
+    from calibgraph.files import require_new_file
+
+    if out is not None:
+        require_new_file(out, ".safetensors", force=force)
+    from calibgraph.matching.cmrnext import load_checkpoint
+
+    checkpoint = load_checkpoint(file)
+    if out is not None:
+        checkpoint.save_safetensors(out)
+    if as_json:
+        print_json(checkpoint.summary())
+    else:
+        from calibgraph.report.tables import print_weights
+
+        print_weights(terminal(), checkpoint.summary(), out)

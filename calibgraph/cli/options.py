@@ -1,55 +1,12 @@
-"""Options that several commands share.
-
-Args:
-    as_json: Print JSON on stdout.
-    config (FILE): Settings of the solve, YAML.
-    correct ([CAMERA=]MISTAKE): Undo a mistake of the guess, by the name that doctor gives it, as
-        inverse or camera-flu; of all cameras or of one. May be repeated.
-    dataset (DATASET...): Dataset folder (rig.yaml, lidar/, cameras/NAME/), KITTI odometry sequence
-        or raw drive, nuScenes folder or scene, or ROS bag; several of one rig are calibrated
-        together.
-    device (auto|cpu|cuda): Torch device. (default: auto)
-    forward (+x|-x|+y|-y): Axis of the LiDAR frame that points ahead; z is up.
-    frames (A:B:STEP): Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7.
-        (default: all; of more than 30 the matcher structure takes 30: spread, clear ones)
-    motion (none|odometry|tf|scans): Correct clouds for the motion of the vehicle, to the stamps of
-        the images: by Odometry, /tf, or registration of neighbouring scans. (default: none)
-    mount (NAME=WORDS): How a camera is mounted: front, front-left, left, rear-left, rear, ...; then
-        NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, NUMBER
-        m|cm ahead|behind|left|right|above|below of the LiDAR. May be repeated.
-    out (DIR): Folder for the result.
-    preset (auto|kitti|walkley): Settings of the solve by name.
-    result (DIR): Result: its folder, or its calibration.yaml.
-    rig (RIG): Initial guess, instead of the dataset's own.
-    seed: Seed of everything random.
-    tolerance_cm (CM): Largest deviation along an axis that is OK.
-    tolerance_deg (DEG): Largest deviation about an axis that is OK.
-    topic (NAME=/TOPIC[,/INFO]): Topic of a camera's images, of the clouds as lidar=/TOPIC, or of
-        odometry=/TOPIC; INFO: of the camera_info. May be repeated. (default: found by types)
-    weights (FILE...): Weights of the networks, .tar or .safetensors, in the order in which they
-        run; a file may be repeated: --weights iter1.tar iter5.tar iter5.tar iter6.tar.
-"""
+"""Options and arguments that several commands share."""
 
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
-CMRNEXT, BAGS = "Matcher cmrnext", "ROS bags"
-_MAX_SEED = 2**31 - 1
-WeightsOption = Annotated[list[Path] | None, typer.Option(rich_help_panel=CMRNEXT)]
-DeviceOption = Annotated[str | None, typer.Option(rich_help_panel=CMRNEXT)]
-TopicOption = Annotated[list[str] | None, typer.Option(rich_help_panel=BAGS)]
-MotionOption = Annotated[str | None, typer.Option(rich_help_panel=BAGS)]
-SeedOption = Annotated[int, typer.Option(min=0, max=_MAX_SEED)]
-ConfigSeedOption = Annotated[
-    int | None,
-    typer.Option(
-        min=0,
-        max=_MAX_SEED,
-        help="Seed of everything random. (default: that of --config, else 0)",
-    ),
-]
+_BAGS, _STRUCTURE = "ROS bags", "Matcher structure"
+_MOST_SEED = 2**31 - 1
 
 
 def require_stdout(as_json: bool) -> bool:
@@ -61,4 +18,117 @@ def require_stdout(as_json: bool) -> bool:
     return as_json
 
 
-JsonOption = Annotated[bool, typer.Option("--json", callback=require_stdout)]
+Datasets = Annotated[
+    list[Path],
+    Argument(
+        metavar="DATASET...",
+        help="Dataset folder (rig.yaml, lidar/, cameras/NAME/), KITTI odometry sequence or raw "
+        "drive, nuScenes folder or scene, or ROS bag; several of one rig are calibrated together.",
+    ),
+]
+RigFile = Annotated[
+    Path | None, Option(metavar="RIG", help="Initial guess, instead of the dataset's own.")
+]
+Frames = Annotated[
+    str | None,
+    Option(
+        metavar="A:B:STEP",
+        help="Which frames, by position from 0 among the sorted names: 0:90:10 or 0,5,7. (default: "
+        "all; of more than 30 the matcher structure takes 30: spread, clear ones)",
+    ),
+]
+_EVERY = "One frame in this time; only its surroundings are read. (default: all frames)"
+EveryS = Annotated[
+    float | None, Option(metavar="SECONDS", min=0.001, rich_help_panel=_BAGS, help=_EVERY)
+]
+Topic = Annotated[
+    list[str] | None,
+    Option(
+        metavar="NAME=/TOPIC[,/INFO]",
+        rich_help_panel=_BAGS,
+        help="Topic of a camera's images, of the clouds as lidar=/TOPIC, or of odometry=/TOPIC; "
+        "INFO: of the camera_info. May be repeated. (default: found by types)",
+    ),
+]
+Motion = Annotated[
+    str | None,
+    Option(
+        metavar="none|odometry|tf|scans",
+        rich_help_panel=_BAGS,
+        help="Correct clouds for the motion of the vehicle, to the stamps of the images: by "
+        "Odometry, /tf, or registration of neighbouring scans. (default: none)",
+    ),
+]
+IntervalS = Annotated[
+    float | None,
+    Option(
+        metavar="SECONDS",
+        help="Time between neighbouring clouds of a folder: the motion of the LiDAR is found by "
+        "their registration. For --estimate offset or readout. (default: unknown)",
+    ),
+]
+MatcherName = Annotated[
+    str, Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences.")
+]
+_WEIGHTS = "Networks of cmrnext, .tar or .safetensors; repeat it in the order in which they run."
+Weights = Annotated[list[Path] | None, Option(metavar="FILE", help=_WEIGHTS)]
+TimeLimitS = Annotated[
+    float | None,
+    Option(
+        metavar="SECONDS",
+        min=0.001,
+        help="Stop matching after this time; a result of fewer rounds is marked as partial. "
+        "(default: 1800 with structure, else none; inf for none)",
+    ),
+]
+SearchDeg = Annotated[
+    float | None,
+    Option(
+        metavar="DEG",
+        min=0,
+        rich_help_panel=_STRUCTURE,
+        help="Largest rotation error of the guess, per axis; 0: no search, for a guess within "
+        "about 2.5 deg and 25 cm. The guess itself is tried first. (default: 20)",
+    ),
+]
+_SEARCH_M = "Largest translation error of the guess, per axis. (default: 1.5)"
+SearchM = Annotated[
+    float | None, Option(metavar="M", min=0, rich_help_panel=_STRUCTURE, help=_SEARCH_M)
+]
+ConfigFile = Annotated[
+    Path | None,
+    Option(metavar="FILE", help="Settings of the solve, and rare ones of the rest, YAML."),
+]
+Estimate = Annotated[
+    str | None,
+    Option(
+        metavar="PART,...",
+        help="Estimate each camera's lens and clock too: focal, centre, distortion, or lens for "
+        "all; offset, readout, or clock for both.",
+    ),
+]
+Of = Annotated[
+    str | None,
+    Option(
+        metavar="alignment|mount",
+        help="Poses to report. alignment: for projecting points. mount: the physical pose, with a "
+        "wider error bar. (default: alignment)",
+    ),
+]
+ResultFolder = Annotated[
+    Path,
+    Option(metavar="DIR", help="Folder for the result; that of an older result is written again."),
+]
+Seed = Annotated[int, Option(min=0, max=_MOST_SEED, help="Seed of everything random.")]
+_SEED = "Seed of everything random. (default: that of --config, else 0)"
+SeedOrConfig = Annotated[int | None, Option(min=0, max=_MOST_SEED, help=_SEED)]
+ToleranceDeg = Annotated[
+    float, Option(metavar="DEG", help="Largest deviation about an axis that is OK.")
+]
+ToleranceCm = Annotated[
+    float, Option(metavar="CM", help="Largest deviation along an axis that is OK.")
+]
+JsonOption = Annotated[
+    bool, Option("--json", callback=require_stdout, help="Print JSON on stdout.")
+]
+Force = Annotated[bool, Option("--force", help="Replace a file that is there.")]

@@ -1,56 +1,61 @@
-"""The command of the service."""
+"""The commands that serve pages: serve, pick."""
 
+import webbrowser
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated
 
-import typer
+from typer import Option
 
-from calibgraph.cli.arguments import require_service
-from calibgraph.cli.terminal import print_plain, terminal
-from calibgraph.errors import CalibrationError
+from calibgraph.cli import options
+from calibgraph.cli.arguments import dataset_from
+from calibgraph.cli.terminal import print_line
+from calibgraph.errors import CalibrationError, FileError, needs_extra
 
 _GB = 10**9
 
 
 def serve(
-    data: Path = Path("calibgraph-service"),
-    host: str = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535)] = 8080,
-    tokens: Path | None = None,
-    new_token: str | None = None,
-    host_name: list[str] | None = None,
-    root: list[str] | None = None,
-    database: str | None = None,
-    jobs: Annotated[int | None, typer.Option(min=0)] = None,
-    timeout_s: Annotated[float, typer.Option(min=0.001)] = 3600.0,
-    memory_gb: Annotated[float, typer.Option(min=0.1)] = 8.0,
-    recording_gb: Annotated[float, typer.Option(min=0.001)] = 20.0,
-    free_gb: Annotated[float, typer.Option(min=0.0)] = 1.0,
-    keep_days: Annotated[float, typer.Option(min=0.001)] = 30.0,
-    tracker_processes: Annotated[int, typer.Option(min=1)] = 2,
+    data: Path = Option(
+        Path("calibgraph-service"), metavar="DIR", help="Folder for jobs, results and trackers."
+    ),
+    host: str = Option("127.0.0.1", help="Address to listen on."),
+    port: int = Option(8080, min=0, max=65535, help="Port to listen on."),
+    tokens: Path | None = Option(
+        None, metavar="FILE", help="Who may call. (default: anyone on this machine)"
+    ),
+    new_token: str | None = Option(
+        None,
+        metavar="read|submit",
+        help="Add a token to the file of --tokens, print it, and end.",
+    ),
+    host_name: list[str] | None = Option(
+        None, metavar="NAME", help="Name the server is called by; may be repeated."
+    ),
+    root: list[str] | None = Option(
+        None, metavar="URI", help="Folder that jobs may read from; may be repeated."
+    ),
+    database: str | None = Option(
+        None, metavar="URL", help="postgresql+psycopg://... (default: SQLite in DIR)"
+    ),
+    jobs: int | None = Option(None, min=0, help="Jobs at once. (default: one per core)"),
+    timeout_s: float = Option(3600.0, min=0.001, metavar="SECONDS", help="Longest time of a job."),
+    memory_gb: float = Option(
+        8.0, min=0.1, metavar="GB", help="Most memory of a job, and of a process with trackers."
+    ),
+    recording_gb: float = Option(
+        20.0, min=0.001, metavar="GB", help="Largest upload, unpacked too, and remote recording."
+    ),
+    free_gb: float = Option(1.0, min=0.0, metavar="GB", help="With less on the disk, refuse jobs."),
+    keep_days: float = Option(30.0, min=0.001, metavar="DAYS", help="How long results are kept."),
+    tracker_processes: int = Option(2, min=1, help="Processes that hold the trackers."),
 ) -> None:
     """Calibrate, check and track for others, over HTTP, until stopped.
 
     Ctrl-C and SIGTERM lose nothing: jobs that run wait for the next start, as after a crash.
-
-    Args:
-        data (DIR): Folder for jobs, results and trackers.
-        host: Address to listen on.
-        port: Port to listen on.
-        tokens (FILE): Who may call. (default: anyone on this machine)
-        new_token (read|submit): Add a token to the file of --tokens, print it, and end.
-        host_name (NAME): Name the server is called by; may be repeated.
-        root (URI): Folder that jobs may read from; may be repeated.
-        database (URL): postgresql+psycopg://... (default: SQLite in DIR)
-        jobs: Jobs at once. (default: one per core)
-        timeout_s (SECONDS): Longest time of a job.
-        memory_gb (GB): Most memory of a job, and of a process with trackers.
-        recording_gb (GB): Largest upload, unpacked too, and remote recording.
-        free_gb (GB): With less on the disk, refuse jobs.
-        keep_days (DAYS): How long results are kept.
-        tracker_processes: Processes that hold the trackers.
     """
-    require_service()
+    with needs_extra("service", "the server needs fastapi, hypercorn and others"):
+        for package in ("fastapi", "hypercorn", "python_multipart", "sqlalchemy"):
+            import_module(package)
     from calibgraph.service.app import create_app
     from calibgraph.service.serve import require_safe
     from calibgraph.service.serve import serve as serve_app
@@ -83,7 +88,7 @@ def _announce(url: str, tokens: Path | None) -> None:
     needed = "no token is needed, and no other machine can reach it"
     if tokens is not None:
         needed = f"it asks for a token of {tokens} as the password; --new-token makes one"
-    print_plain(terminal(), f"open {url} in a browser: {needed}")
+    print_line(f"open {url} in a browser: {needed}")
 
 
 def _add_token(path: Path | None, scope: str) -> None:
@@ -95,6 +100,47 @@ def _add_token(path: Path | None, scope: str) -> None:
     for each in SCOPES:
         if scope == each:
             print(add_token(path, each))
-            print_plain(terminal(), f"{path}: a token with scope {scope} was added")
+            print_line(f"{path}: a token with scope {scope} was added")
             return
     raise CalibrationError(f"--new-token {scope}: known are {', '.join(SCOPES)}")
+
+
+def pick(
+    dataset: options.Datasets,
+    out: Path = Option(
+        ...,
+        metavar="DIR",
+        help="Folder of the session, which is continued if it is there, and of what it gives: "
+        "reference.yaml and picked.parquet.",
+    ),
+    rig: options.RigFile = None,
+    frames: options.Frames = None,
+    port: int = Option(0, min=0, max=65535, help="Of this machine. (default: any that is free)"),
+    show: bool = Option(True, "--show/--no-show", help="Open the page in the browser."),
+) -> None:
+    """Pick a reference by hand: a page on which pixels and LiDAR points are paired.
+
+    The server answers this machine only. Ends with Ctrl-C; every change is saved at once.
+    """
+    from calibgraph.file_sets import require_own_folder
+    from calibgraph.io.rigs import REFERENCE_FILE
+    from calibgraph.pick.server import PickServer
+    from calibgraph.pick.session import SESSION_FILE
+    from calibgraph.pick.workspace import TABLE_FILE, Workspace
+
+    require_own_folder(out, dataset)
+    for path in (out / REFERENCE_FILE, out / TABLE_FILE):
+        if path.exists() and not (out / SESSION_FILE).exists():
+            raise FileError(path, "is of no session of pick, and would be replaced; move it")
+    workspace = Workspace(dataset_from(dataset, rig, frames), out)
+    try:
+        server = PickServer(workspace, port)
+    except OSError as error:
+        raise CalibrationError(
+            f"--port {port}: cannot be used ({error.strerror}); leave it out for a free one"
+        ) from error
+    with server:
+        print_line(f"{server.url}: pick there; end with Ctrl-C")
+        if show:
+            webbrowser.open(server.url)
+        server.serve_forever()

@@ -1,125 +1,85 @@
 """The command that makes data with a known truth."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
-import typer
+from typer import Argument, Option
 
+from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments
-from calibgraph.cli.options import SeedOption
-from calibgraph.cli.terminal import progress_bar, terminal
-
-if TYPE_CHECKING:
-    from calibgraph.model.rig import Rig
+from calibgraph.cli.terminal import print_line, progress_bar
 
 STREET = "street"
 RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # defaults of simulate_street, but for the rig
-_street_option = partial(typer.Option, rich_help_panel="Scenario street")
-
-
-@dataclass(frozen=True, kw_only=True)
-class StreetOptions:
-    """What only the scenario street has.
-
-    Attributes:
-        sensor_errors: Of the LiDAR: 0 for an ideal one, 1 for errors as real ones have them: beam
-            angles and widths, motion during a turn, ranges on dark surfaces. (default: 0)
-        vary_layout: Draw also the street's width, curves, gardens and heights by the seed;
-            otherwise all streets are laid out alike.
-    """
-
-    rig: Annotated[
-        str | None,
-        _street_option(
-            metavar="NAME|RIG",
-            help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
-            "(two that see more than a half-space), panorama (one that sees all round), sample "
-            f"(three small ones), or a rig file; its extrinsics are the truth. (default: {RIG})",
-        ),
-    ] = None
-    beams: Annotated[
-        int | None,
-        _street_option(
-            metavar="16|32|64|128",
-            help=f"Of the LiDAR; 32: ahead and to the left only. (default: {BEAMS})",
-        ),
-    ] = None
-    step_m: Annotated[
-        float | None,
-        _street_option(
-            help=f"Mean distance between frames. (default: {STEP_M:g})",
-        ),
-    ] = None
-    sensor_errors: Annotated[float | None, _street_option()] = None
-    vary_layout: Annotated[bool, _street_option()] = False
-
-    @property
-    def given(self) -> dict[str, Any]:
-        """The values of the options that are given, by name."""
-        values = vars(self).items()
-        return {name: value for name, value in values if value is not None and value is not False}
+_PANEL = "Scenario street"
 
 
 def simulate(
-    scenario: str,
-    out: Annotated[Path, typer.Option()],
-    *,
-    frames: int = 10,
-    rotation_deg: Annotated[float, typer.Option(min=0)] = 5.0,
-    translation_m: Annotated[float, typer.Option(min=0)] = 0.3,
-    seed: SeedOption = 0,
-    street: StreetOptions,
+    scenario: str = Argument(
+        ...,
+        metavar="SCENARIO",
+        help="street: a dataset of scans and images of a drive along a procedural street. "
+        "kitti, walkley, surround, fisheye: a table of correspondences, with the errors of the "
+        "paper's matcher (kitti, walkley) or in between.",
+    ),
+    out: Path = Option(..., metavar="DIR", help="Folder to write."),
+    frames: int = Option(10, help="Number of frames."),
+    rotation_deg: float = Option(5.0, min=0, help="Rotation error of the guess, rig.yaml."),
+    translation_m: float = Option(0.3, min=0, help="Translation error of the guess."),
+    seed: options.Seed = 0,
+    rig: str | None = Option(
+        None,
+        metavar="NAME|RIG",
+        rich_help_panel=_PANEL,
+        help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
+        "(two that see more than a half-space), panorama (one that sees all round), sample "
+        f"(three small ones), or a rig file; its extrinsics are the truth. (default: {RIG})",
+    ),
+    beams: int | None = Option(
+        None,
+        metavar="16|32|64|128",
+        rich_help_panel=_PANEL,
+        help=f"Of the LiDAR. (default: {BEAMS})",
+    ),
+    step_m: float | None = Option(
+        None, rich_help_panel=_PANEL, help=f"Mean distance between frames. (default: {STEP_M:g})"
+    ),
+    sensor_errors: float | None = Option(
+        None, rich_help_panel=_PANEL, help="Of the LiDAR: 1 for those of real ones. (default: 0)"
+    ),
+    vary_layout: bool = Option(
+        False, "--vary-layout", rich_help_panel=_PANEL, help="Draw the street's layout by the seed."
+    ),
 ) -> None:
-    """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml.
-
-    Args:
-        scenario (SCENARIO): street: a dataset of scans and images of a drive along a procedural
-            street. kitti, walkley, surround, fisheye: a table of correspondences, with the errors
-            of the paper's matcher (kitti, walkley) or in between.
-        out (DIR): Folder to write.
-        frames: Number of frames.
-        rotation_deg: Rotation error of the guess, rig.yaml.
-        translation_m: Translation error of the guess.
-    """
+    """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
+    from calibgraph.file_sets import require_own_folder
+    from calibgraph.io.rigs import load_rig
     from calibgraph.simulation.recording import simulate_street
-    from calibgraph.simulation.scenarios import simulate_table
+    from calibgraph.simulation.rigs import RIG_NAMES, rig_of
+    from calibgraph.simulation.scenarios import scenario_of, simulate_table
 
     common: dict[str, Any] = {
         "frames": frames, "rotation_deg": rotation_deg, "translation_m": translation_m, "seed": seed
     }  # fmt: skip
+    of_street: dict[str, Any] = {
+        "rig": rig, "beams": beams, "step_m": step_m, "sensor_errors": sensor_errors,
+        "vary_layout": vary_layout or None,
+    }  # fmt: skip
+    street = {name: value for name, value in of_street.items() if value is not None}
+    require_own_folder(out)
     with progress_bar() as progress, checked_arguments():
         if scenario == STREET:
-            given = {"rig": RIG, **street.given}
-            rig = _rig(given.pop("rig"))
-            written = simulate_street(out, rig, **given, **common, progress=progress)
+            name = street.pop("rig", RIG)
+            is_file = name not in RIG_NAMES and name and Path(name).exists()
+            truth = load_rig(name) if is_file else rig_of(name)
+            written = simulate_street(out, truth, **street, **common, progress=progress)
+        elif street and scenario_of(scenario):
+            named = " and ".join(f"--{name.replace('_', '-')}" for name in street)
+            raise ValueError(
+                f"scenario {scenario!r} has its own rig and matcher, {named} would change nothing; "
+                f"leave it out, or simulate {STREET!r}"
+            )
         else:
-            _refuse_options_of_street(scenario, [*street.given])
             written = simulate_table(out, scenario, **common)
     for path in written:
-        terminal().print(f"{path}: written", soft_wrap=True, markup=False, highlight=False)
-
-
-def _refuse_options_of_street(scenario: str, given: Sequence[str]) -> None:
-    from calibgraph.simulation.scenarios import scenario_of
-
-    named = [f"--{name.replace('_', '-')}" for name in given]
-    if named and scenario_of(scenario):
-        raise ValueError(
-            f"scenario {scenario!r} has its own rig and matcher, {' and '.join(named)} "
-            f"would change nothing; leave it out, or simulate {STREET!r}"
-        )
-
-
-def _rig(name: str) -> Rig:
-    """A rig by its name, or from a file."""
-    from calibgraph.io.rigs import load_rig
-    from calibgraph.simulation.rigs import RIG_NAMES, rig_of
-
-    if name and name not in RIG_NAMES and Path(name).exists():
-        return load_rig(name)
-    return rig_of(name)
+        print_line(f"{path}: written")

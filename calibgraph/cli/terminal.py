@@ -43,9 +43,9 @@ def terminal() -> Console:
     return Stderr(stderr=True)
 
 
-def print_plain(console: Console, text: str) -> None:
-    """Print a line as it is: no markup, no colours, no line breaks of rich's own."""
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
+def print_line(text: str) -> None:
+    """Print a line on stderr as it is: no markup, no colours, no line breaks of rich's own."""
+    terminal().out(text, highlight=False)
 
 
 def elapsed_s() -> float:
@@ -69,19 +69,13 @@ def progress_bar(first: str = "starting") -> Iterator[Progress]:
     console = terminal()
     if not console.is_terminal:
         with _printed_warnings(console):
-            yield progress_lines(lambda line: print_plain(console, line))
+            yield progress_lines(print_line)
         return
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    left = (TextColumn("left"), TimeRemainingColumn())
-    with Progress(*columns, *left, console=console, transient=True) as bar:
+    shown = ("{task.description}", progress.BarColumn(), progress.TimeElapsedColumn(), "left")
+    left = progress.TimeRemainingColumn()
+    with progress.Progress(*shown, left, console=console, transient=True) as bar:
         task = bar.add_task(first, total=None)
         with _printed_warnings(bar.console):
             yield lambda what, done, total: bar.update(
@@ -108,21 +102,14 @@ def progress_lines(
 @contextmanager
 def _printed_warnings(console: Console) -> Iterator[None]:
     """Warnings that are logged meanwhile are printed."""
-    logger, lines = logging.getLogger("calibgraph"), _WarningLines(console)
+
+    class Lines(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            console.out(f"{record.levelname.lower()}: {record.getMessage()}", highlight=False)
+
+    logger, lines = logging.getLogger("calibgraph"), Lines(logging.WARNING)
     logger.addHandler(lines)
     try:
         yield
     finally:
         logger.removeHandler(lines)
-
-
-class _WarningLines(logging.Handler):
-    """Prints warnings as lines above a progress bar."""
-
-    def __init__(self, console: Console) -> None:
-        super().__init__(logging.WARNING)
-        self._console = console
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Print one."""
-        print_plain(self._console, f"{record.levelname.lower()}: {record.getMessage()}")

@@ -1,35 +1,37 @@
 """The command that keeps a rig calibrated while driving: track."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
-from calibgraph.cli import options, outputs
-from calibgraph.cli.arguments import bag_options_from, checked_arguments, config_from, matcher_from
-from calibgraph.cli.terminal import print_plain, terminal
-
-if TYPE_CHECKING:
-    from calibgraph.matching.protocol import Matcher
+from calibgraph.cli import options
+from calibgraph.cli.arguments import bag_options_from, checked_arguments, matcher_from
+from calibgraph.cli.terminal import elapsed_s, print_line, terminal
 
 
 def track(
-    rig: Path,
-    source: list[Path],
-    out: Annotated[Path, outputs.RESULT] = Path("tracking"),
-    every: Annotated[int, typer.Option(min=1)] = 1,
-    follow: bool = False,
-    matcher: str | None = None,
-    estimate: str | None = None,
-    interval_s: float | None = None,
-    motion: options.MotionOption = None,
-    config: Path | None = None,
-    preset: str | None = None,
-    seed: options.ConfigSeedOption = None,
-    weights: options.WeightsOption = None,
-    device: options.DeviceOption = None,
+    rig: Path = Argument(..., metavar="RIG", help="Rig with the initial guess."),
+    source: list[Path] = Argument(
+        ...,
+        metavar="SOURCE...",
+        help="Table of correspondences (.parquet, .csv), a growing folder of them, or - for "
+        "standard input (a JSON line per frame). With --matcher: dataset folders, KITTI "
+        "sequences or ROS bags of one rig, as one drive.",
+    ),
+    out: Path = Option(
+        Path("tracking"),
+        metavar="DIR",
+        help="Folder for the state, the result and a picture. A state in it is resumed.",
+    ),
+    step: int = Option(1, min=1, help="Take every N-th frame only."),
+    follow: bool = Option(False, "--follow", help="Wait for new files in the folder."),
+    matcher: str | None = Option(None, metavar="NAME", help="Match frames: structure or cmrnext."),
+    interval_s: options.IntervalS = None,
+    motion: options.Motion = None,
+    weights: options.Weights = None,
+    config: options.ConfigFile = None,
+    seed: options.SeedOrConfig = None,
 ) -> None:
     """Keep all cameras calibrated while driving: one frame in, one line of JSON out.
 
@@ -41,75 +43,48 @@ def track(
     Frames of one place (within some 20 m) share errors: name it in each line ("place") or list the
     frames of each in the table ("places"). Otherwise all are of one place, and the error bar stays
     as wide. With --matcher structure places are found from the images.
-
-    Args:
-        rig (RIG): Rig with the initial guess.
-        source (SOURCE...): Table of correspondences (.parquet, .csv), a growing folder of them, or
-            - for standard input (a JSON line per frame). With --matcher:
-            dataset folders, KITTI sequences or ROS bags of one rig, as one drive.
-        out (DIR): Folder for the state, the result and a picture. A state in it is resumed.
-        every: Take every N-th frame only.
-        follow: Wait for new files in the folder, until stopped.
-        matcher (NAME): Match the frames of a dataset: structure or cmrnext.
-        estimate (offset): Follow the time offset of each camera: how long after its points an image
-            is taken. The motion of the LiDAR must be known.
-        interval_s (SECONDS): Time between neighbouring clouds of a folder, with --matcher: the
-            motion of the LiDAR is found by their registration. For --estimate offset. (default:
-            unknown)
     """
-    from calibgraph.cli.tables import print_result
+    from calibgraph.cli.settings import read_settings
     from calibgraph.io.rigs import load_rig
+    from calibgraph.model.result_files import require_result_folder
+    from calibgraph.report.tables import print_result
     from calibgraph.tracking.command import Tracking, track
-    from calibgraph.tracking.offsets import require_offset_alone
+    from calibgraph.tracking.state import require_poses_alone
 
+    require_result_folder(out, [rig, *source])
     with checked_arguments():
-        settings = config_from(config, preset, seed=seed, estimate=estimate)
-        require_offset_alone(settings)
-        if not matcher:
-            _require_matcher_for(interval_s=interval_s, motion=motion)
-        chosen = _tracking_matcher(matcher, weights, source, seed=settings.seed, device=device)
-    console = terminal()
+        settings, rare = read_settings(config, seed=seed)
+        require_poses_alone(settings)
+        if matcher is None:
+            given = {"--interval-s": interval_s, "--motion": motion, "--weights": weights}
+            _require_matcher_for(source, given | rare.of_cmrnext)
+            chosen = None
+        else:
+            rare_ones = rare.of_cmrnext
+            chosen = matcher_from(matcher, weights, seed=settings.seed, of_cmrnext=rare_ones)
     wanted = Tracking(
         rig=load_rig(rig),
         config=settings,
         out=out,
-        every=every,
+        every=step,
         follow=follow,
         matcher=chosen,
         interval_s=interval_s,
-        bag=bag_options_from(None, motion=motion),
+        bag=bag_options_from(None, motion=motion, **rare.of_bags),
     )
-    result, written = track(wanted, source, notify=lambda text: print_plain(console, text))
-    print_result(console, result, written)
+    result, written = track(wanted, source, notify=print_line)
+    print_result(terminal(), result, written, elapsed_s())
     if result.verdict.status == "FAIL":
         raise typer.Exit(1)
 
 
-def _require_matcher_for(**given: float | str | None) -> None:
-    """Refuse options for clouds without a matcher: correspondences bring their motion."""
+def _require_matcher_for(source: list[Path], given: dict[str, object]) -> None:
+    """Refuse what is for clouds and images without a matcher: tables bring their motion."""
     for name, value in given.items():
         if value is not None:
-            option = f"--{name.replace('_', '-')}"
-            columns = "columns wx_rad_s to vz_m_s, lines have twist_per_s"
             raise ValueError(
-                f"{option} goes with --matcher only: for the motion, tables have {columns}"
+                f"{name} goes with --matcher only: for the motion, tables have columns wx_rad_s to "
+                "vz_m_s, lines have twist_per_s"
             )
-
-
-def _tracking_matcher(
-    name: str | None,
-    weights: list[Path] | None,
-    source: list[Path],
-    *,
-    seed: int,
-    device: str | None,
-) -> Matcher | None:
-    """The matcher for the frames of datasets; None for a source of correspondences."""
-    if name:
-        return matcher_from(name, weights, seed=seed, device=device)
-    for option, value in (("--weights", weights), ("--device", device)):
-        if value:
-            raise ValueError(f"{option} is for --matcher cmrnext only")
     if len(source) > 1:
         raise ValueError(f"{len(source)} sources given; several go with --matcher only")
-    return None

@@ -19,17 +19,12 @@ from calibgraph.fleet.uris import fingerprint, in_arrow, join, read_bytes
 from calibgraph.model.config import Config, Terms, config_from
 from calibgraph.yaml_text import parse_yaml
 
-TABLE_SUFFIXES = (".parquet", ".csv")
-SEPARATOR = ";"
-"""Between several recordings in one cell."""
+Key = tuple[str, str]
+"""What a job is known by in the rows: vehicle, recordings."""
+_SEPARATOR = ";"  # between several recordings in one cell
 _OWN = ("vehicle", "recording", "rig", "settings")
 _MOST_BYTES, _MOST_SETTINGS_BYTES = 2**31, 2**20
 _MATCHING = ("frames", "search_deg", "search_m", "terms")
-
-
-def is_table(uri: str) -> bool:
-    """Whether a URI is of a table of correspondences, by its suffix; it may be in an archive."""
-    return uri.partition("::")[0].endswith(TABLE_SUFFIXES)
 
 
 class Settings(BaseModel):
@@ -69,17 +64,17 @@ class Job:
     @property
     def recording(self) -> str:
         """The recordings in one text, as in the rows."""
-        return SEPARATOR.join(self.recordings)
+        return _SEPARATOR.join(self.recordings)
 
     @property
-    def key(self) -> tuple[str, str]:
-        """What the job is known by in the rows."""
+    def key(self) -> Key:
+        """What the job is known by."""
         return self.vehicle, self.recording
 
     @property
     def is_table(self) -> bool:
-        """Whether the input is a table of correspondences."""
-        return is_table(self.recordings[0])
+        """Whether the input is a table of correspondences, by its suffix, also in an archive."""
+        return self.recordings[0].partition("::")[0].endswith((".parquet", ".csv"))
 
     def input_hash(self) -> str:
         """SHA-256 of the rig, the settings and the recordings."""
@@ -103,31 +98,27 @@ def load_manifest(uri: str) -> Manifest:
     for name, count in Counter(table.column_names).items():
         if count > 1:
             raise FileError(uri, f"column {name!r} is there {count} times; rename or remove one")
+        if name in SCHEMA.names and name not in _OWN:
+            raise FileError(uri, f"column {name!r} is one of the results' own; rename it")
     for name in ("vehicle", "recording"):
         if name not in table.column_names:
-            raise FileError(
-                uri, f"column {name!r} is missing, found {', '.join(table.column_names)}"
-            )
-    taken = {*SCHEMA.names, "bucket"} - {*_OWN}
-    for name in table.column_names:
-        if name in taken:
-            raise FileError(uri, f"column {name!r} is one of the results' own; rename it")
+            found = ", ".join(table.column_names)
+            raise FileError(uri, f"column {name!r} is missing, found {found}")
     if not len(table):
         raise FileError(uri, "holds no rows; write a vehicle and its recording into each")
-    folder, seen, jobs = uri.rpartition("/")[0], dict[tuple[str, str], int](), []
+    folder, jobs = uri.rpartition("/")[0], dict[Key, Job]()
     cells = table.select([name for name in _OWN if name in table.column_names])
     for row, given in enumerate(cells.to_pylist()):
         try:
             job = _job(row, folder, **{**dict.fromkeys(_OWN), **given})
         except (ValueError, CalibrationError) as error:
             raise FileError(uri, f"row {row}: {error}") from error
-        if (first := seen.setdefault(job.key, row)) != row:
+        if (first := jobs.setdefault(job.key, job)) is not job:
             raise FileError(
-                uri, f"row {row}: vehicle {job.vehicle!r} with this recording is in row {first} "
-                "too; remove one"
+                uri, f"row {row}: vehicle {job.vehicle!r} with this recording is in row "
+                f"{first.row} too; remove one"
             )  # fmt: skip
-        jobs.append(job)
-    return Manifest(uri, tuple(jobs), table.drop_columns(cells.column_names))
+    return Manifest(uri, (*jobs.values(),), table.drop_columns(cells.column_names))
 
 
 def _read(uri: str) -> pa.Table:
@@ -159,38 +150,36 @@ def _job(row: int, folder: str, *, vehicle: Any, recording: Any, rig: Any, setti
         raise ValueError(f"vehicle {vehicle!r}: expected a name; give the column as text")
     if not vehicle.isprintable():
         raise ValueError(f"vehicle {vehicle!r}: has control characters; rename it")
-    found = recording.split(SEPARATOR) if isinstance(recording, str) else recording
+    found = recording.split(_SEPARATOR) if isinstance(recording, str) else recording
     if not isinstance(found, list) or not found or not all(u and isinstance(u, str) for u in found):
         raise ValueError(f"recording {recording!r}: expected a path or URI, or several between ;")
-    recordings = tuple(join(folder, uri.strip()) for uri in found)
-    if is_table(recordings[0]) and len(recordings) > 1:
-        raise ValueError(f"vehicle {vehicle!r}: several tables; write them into one file")
-    if is_table(recordings[0]) and not rig:
-        raise ValueError(f"vehicle {vehicle!r}: a table of correspondences needs a 'rig'")
     if rig is not None and not isinstance(rig, str):
         raise ValueError(f"rig {rig!r}: expected a path or URI")
+    recordings = tuple(join(folder, uri.strip()) for uri in found)
     place = join(folder, rig) if rig else None
-    return Job(vehicle, recordings, place, _settings(folder, settings), row)
+    job = Job(vehicle, recordings, place, _settings(folder, settings), row)
+    if job.is_table and len(recordings) > 1:
+        raise ValueError(f"vehicle {vehicle!r}: several tables; write them into one file")
+    if job.is_table and not rig:
+        raise ValueError(f"vehicle {vehicle!r}: a table of correspondences needs a 'rig'")
+    return job
 
 
 def _settings(folder: str, cell: Any) -> Settings:
     """Settings from a mapping, its text, or the URI of a YAML file."""
+    where = "settings"
     if isinstance(cell, Mapping):  # a struct of Arrow has null for what a row leaves out
-        given = {name: value for name, value in cell.items() if value is not None}
-        return _checked(given, "settings")
-    if cell and not isinstance(cell, str):
+        content = {name: value for name, value in cell.items() if value is not None}
+    elif cell and not isinstance(cell, str):
         raise ValueError(f"settings {cell!r}: expected a mapping, or the URI of a YAML file")
-    if not cell or cell.lstrip().startswith("{"):
-        return _checked(parse_yaml(cell or "{}", "settings"), "settings")
-    uri = join(folder, cell)
-    try:
-        text = read_bytes(uri, _MOST_SETTINGS_BYTES).decode()
-    except UnicodeDecodeError as error:
-        raise FileError(uri, f"is not a text file ({error.reason})") from error
-    return _checked(parse_yaml(text, uri), uri)
-
-
-def _checked(content: Mapping[str, Any], where: str) -> Settings:
-    matching = {name: value for name, value in content.items() if name in _MATCHING}
-    config = {name: value for name, value in content.items() if name not in _MATCHING}
-    return checked_model(Settings, {**matching, "config": config_from(config, where)}, where)
+    else:
+        text = cell or "{}"
+        if not text.lstrip().startswith("{"):
+            where = join(folder, text)
+            try:
+                text = read_bytes(where, _MOST_SETTINGS_BYTES).decode()
+            except UnicodeDecodeError as error:
+                raise FileError(where, f"is not a text file ({error.reason})") from error
+        content = parse_yaml(text, where)
+    matching = {name: content.pop(name) for name in _MATCHING if name in content}
+    return checked_model(Settings, {**matching, "config": config_from(content, where)}, where)

@@ -11,14 +11,11 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.audit.findings import Finding, find_changes, moved_lidars
-from calibgraph.audit.fleet_model import FleetModel, expected_pose, fit_fleet
-from calibgraph.audit.mounts import Mount, Pooled
+from calibgraph.audit.fleet_model import FleetModel, Mount, fit_fleet
 from calibgraph.audit.observations import NAMES, newest_rows, observe, words
-from calibgraph.fleet.rows import RowStore, encode, read_rows
+from calibgraph.fleet.rows import Store, read_rows
 from calibgraph.report.kit import load_template
 
-PAGE_FILE, MODEL_FILE, ESTIMATES_FILE = "fleet.html", "fleet_model.json", "estimates.parquet"
-FORMAT = "calibgraph-fleet-model/2"
 STATES = ("PASS", "WARN", "FAIL", "NO RESULT")
 _PASS, _WARN, _FAIL, _NO_RESULT = range(4)
 _UNITS = np.repeat([np.radians(1e-3), 1e-4], 3)  # thousandths of a degree, tenths of a millimetre
@@ -27,11 +24,22 @@ _LONGEST_REASON = 200  # characters
 
 @dataclass(frozen=True, eq=False)
 class FleetReport:
-    """The model of a fleet, and everything that stands out, the surest first."""
+    """The model of a fleet, everything that stands out, and where each row stands.
+
+    Attributes:
+        fleet: the model.
+        findings: the surest first.
+        moved_lidars: names of vehicles.
+        state: (n,) index into STATES. FAIL: that verdict, or the camera was moved in its mount.
+            WARN: that verdict, or no error bar.
+        reasons: (n,) in words; empty if PASS.
+    """
 
     fleet: FleetModel
     findings: Sequence[Finding]
     moved_lidars: Sequence[str]
+    state: NDArray[np.uint8]
+    reasons: Sequence[str]
 
 
 def write_fleet_report(out: str) -> FleetReport:
@@ -45,42 +53,26 @@ def write_fleet_report(out: str) -> FleetReport:
     Raises:
         CalibrationError: if no rows are there, or nothing can be written.
     """
-    newest, store = newest_rows(read_rows(out)), RowStore(out)
-    fleet = fit_fleet(observe(newest))
-    report = FleetReport(fleet, find_changes(fleet), moved_lidars(fleet))
-    status = assess_status(newest, report)
-    store.put(ESTIMATES_FILE, encode(estimates(fleet)))
-    store.put(MODEL_FILE, json.dumps(summary(report), indent=1).encode())
-    store.put(PAGE_FILE, page_html(report, status).encode())
+    report, store = report_of(newest_rows(read_rows(out))), Store(out)
+    store.put("estimates.parquet", _estimates(report.fleet))
+    store.put("fleet_model.json", json.dumps(_summary(report), indent=1).encode())
+    store.put("fleet.html", _page(report).encode())
     return report
 
 
-@dataclass(frozen=True, eq=False)
-class FleetStatus:
-    """One entry per row of the fleet.
-
-    Attributes:
-        state: (n,) index into STATES. FAIL: that verdict, or the camera was moved in its mount.
-            WARN: that verdict, or no error bar.
-        reasons: (n,) in words; empty if PASS.
-    """
-
-    state: NDArray[np.uint8]
-    reasons: list[str]
-
-
-def assess_status(rows: pa.Table, report: FleetReport) -> FleetStatus:
-    """Where every row stands."""
-    fleet, done = report.fleet, words(rows, "status") == "done"
-    verdict, measured = words(rows, "verdict"), fleet.observations.measured
+def report_of(rows: pa.Table) -> FleetReport:
+    """What rows show, one of each vehicle and camera."""
+    fleet = fit_fleet(observe(rows))
+    lidars, measured = moved_lidars(fleet), fleet.observations.measured
+    done, verdict = words(rows, "status") == "done", words(rows, "verdict")
     state = np.full(len(rows), _NO_RESULT, dtype=np.uint8)
     state[done] = _WARN
     state[measured & (verdict != "WARN")] = _PASS
     state[fleet.apart | (done & (verdict == "FAIL"))] = _FAIL
-    lidar = np.isin(fleet.observations.vehicle, np.array(report.moved_lidars, dtype=np.str_))
+    of_lidar = np.isin(fleet.observations.vehicle, np.array(lidars, dtype=np.str_))
     own = {
-        "the LiDAR was moved, or the rig taken apart": lidar,
-        "the camera was moved in its mount": fleet.apart & ~lidar,
+        "the LiDAR was moved, or the rig taken apart": of_lidar,
+        "the camera was moved in its mount": fleet.apart & ~of_lidar,
         "no error bar": ~measured & done & (verdict != "FAIL"),
     }
     given = [rows.column(name).to_pylist() if name in rows.column_names else [None] * len(rows)
@@ -89,10 +81,10 @@ def assess_status(rows: pa.Table, report: FleetReport) -> FleetStatus:
     for k, (why, error) in enumerate(zip(*given, strict=True)):
         of_row = [text for text, of in own.items() if of[k]]
         reasons.append("; ".join([*of_row, *(why or ()), *([error] if error else ())]))
-    return FleetStatus(state, reasons)
+    return FleetReport(fleet, find_changes(fleet), lidars, state, reasons)
 
 
-def estimates(fleet: FleetModel) -> pa.Table:
+def _estimates(fleet: FleetModel) -> pa.Table:
     """A row per vehicle and camera: its estimate with what the fleet knows."""
     of = fleet.observations
     lists = {
@@ -110,66 +102,61 @@ def estimates(fleet: FleetModel) -> pa.Table:
     })  # fmt: skip
 
 
-def summary(report: FleetReport) -> dict[str, Any]:
+def _summary(report: FleetReport) -> dict[str, Any]:
     """What is known of every model, and what happened, in plain numbers."""
-    return {
-        "format": FORMAT,
-        "models": {
-            name: {
-                "cameras": {camera: _mount(m, model.pooled) for camera, m in model.mounts.items()},
-                "moved_share": model.pooled.share_moved,
-            }
-            for name, model in report.fleet.models.items()
-        },
-        "findings": [
-            {"kind": each.kind, "text": each.text, "p_value": each.p_value,
-             "change": None if each.kind == "mount" else each.change.tolist(),
-             "sigma": None if each.kind == "mount" else each.sigma.tolist()}
-            for each in report.findings
-        ],
-        "moved_lidars": [*report.moved_lidars],
+    models = {
+        name: {"cameras": {camera: _mount(mount) for camera, mount in mounts.items()},
+               "moved_share": next(iter(mounts.values())).pooled.share_moved}
+        for name, mounts in report.fleet.mounts.items()
     }  # fmt: skip
+    findings = [
+        {"kind": each.kind, "text": each.text, "p_value": each.p_value,
+         "change": None if each.kind == "mount" else each.change.tolist(),
+         "sigma": None if each.kind == "mount" else each.sigma.tolist()}
+        for each in report.findings
+    ]  # fmt: skip
+    return {"format": "calibgraph-fleet-model/2", "models": models, "findings": findings,
+            "moved_lidars": [*report.moved_lidars]}  # fmt: skip
 
 
-def _mount(mount: Mount, pooled: Pooled) -> dict[str, Any]:
+def _mount(mount: Mount) -> dict[str, Any]:
     """Nominal pose, and the covariances of a further vehicle, and of vehicles within a batch."""
-    T, covariance = expected_pose(mount, pooled)
-    batches = dict(zip(mount.batches, mount.centers.batches.tolist(), strict=True))
-    return {"vehicles": len(mount.seen.vehicle), "T": T.tolist(),
-            "covariance_of_a_vehicle": covariance.tolist(),
+    batches = dict(zip(mount.batches, mount.T_batch.tolist(), strict=True))
+    return {"vehicles": len(mount.seen.vehicle), "T": mount.nominal.tolist(),
+            "covariance_of_a_vehicle": mount.covariance_of_a_vehicle().tolist(),
             "spread_within_a_batch": mount.spread.tolist(), "batches": batches}  # fmt: skip
 
 
-def page_html(report: FleetReport, status: FleetStatus) -> str:
+def _page(report: FleetReport) -> str:
     """One HTML page that needs nothing else: no network, no files beside it."""
     known = report.fleet.observations.day
     known = known[np.isfinite(known)]
     newest = str(np.datetime64(int(known.max()), "D")) if len(known) else ""
-    content = payload(report, status)
+    content = payload(report)
     template = load_template("page.html.j2", "calibgraph.fleet")
     return template.render(content=content, vehicles=len(content["vehicles"]), newest=newest)
 
 
-def payload(report: FleetReport, status: FleetStatus) -> dict[str, Any]:
+def payload(report: FleetReport) -> dict[str, Any]:
     """What the page's script reads: names once, numbers as integers."""
     of = report.fleet.observations
     order = np.lexsort([of.camera, of.vehicle])
     vehicles, first, vehicle = np.unique(of.vehicle[order], return_index=True, return_inverse=True)
-    named = {"model": of.model[order][first], "batch": of.batch[order][first],
+    texts = {"model": of.model[order][first], "batch": of.batch[order][first],
              "camera": of.camera[order],
-             "reason": [status.reasons[k][:_LONGEST_REASON] for k in order]}  # fmt: skip
-    names, index = {}, {}
-    for name, values in named.items():
-        found, numbers = np.unique(np.array(values, dtype=np.str_), return_inverse=True)
-        names[name], index[name] = found.tolist(), numbers.tolist()
+             "reason": [report.reasons[k][:_LONGEST_REASON] for k in order]}  # fmt: skip
+    named = {name: np.unique(np.array(each, dtype=np.str_), return_inverse=True)
+             for name, each in texts.items()}  # fmt: skip
     sigma = np.sqrt(np.diagonal(of.covariance, axis1=1, axis2=2))
+    names = [named[name][0].tolist() for name in ("camera", "model", "batch", "reason")]
     return {
-        "states": STATES, "vehicles": vehicles.tolist(), "cameras": names["camera"],
-        "models": names["model"], "batches": names["batch"], "reasons": names["reason"],
+        "states": STATES, "vehicles": vehicles.tolist(),
+        **dict(zip(("cameras", "models", "batches", "reasons"), names, strict=True)),
         "findings": [[finding.kind, finding.text] for finding in report.findings],
-        **index, "vehicle": vehicle.tolist(),
+        **{name: numbers.tolist() for name, (_, numbers) in named.items()},
+        "vehicle": vehicle.tolist(),
         "day": np.nan_to_num(of.day[order][first], nan=-1).astype(int).tolist(),
-        "state": status.state[order].tolist(),
+        "state": report.state[order].tolist(),
         **{name: _integers(np.where(of.measured[:, None], values, np.nan)[order])
            for name, values in (("deviation", report.fleet.deviation), ("sigma", sigma))},
     }  # fmt: skip

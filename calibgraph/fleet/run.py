@@ -3,32 +3,29 @@
 import hashlib
 import json
 import re
-import time
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from importlib import import_module
+from itertools import islice
 from typing import Any
 
 import pyarrow as pa
 
 from calibgraph.errors import CalibrationError, FileError, needs_extra
 from calibgraph.fleet.job import end_children, interrupt_jobs, run_job
-from calibgraph.fleet.manifest import Job, load_manifest
-from calibgraph.fleet.rows import SCHEMA, RowStore, bucket_of, job_keys
-from calibgraph.fleet.task import Limits, Outcome, Task, release, versions_text
+from calibgraph.fleet.manifest import Job, Key, load_manifest
+from calibgraph.fleet.rows import ROWS, SCHEMA, Store, read_rows
+from calibgraph.fleet.task import Limits, Outcome, Task, release
+from calibgraph.model.versions import package_versions
 from calibgraph.parallel import count_cores
 from calibgraph.progress import Progress, no_progress
 
 _READERS = 16  # threads that look at inputs: a listing of an object store takes 50 ms
 _AHEAD = 2000
 """Tasks submitted at a time: a manifest may have millions of rows, a cluster hundreds of cores."""
-_PUBLISH_EVERY_S = 5.0
-"""Rows wait this long for others of their bucket; so much work a command that is killed may lose.
-"""
-_WAIT_S = 1.0
 _STATE = ["vehicle", "recording", "status", "verdict", "error_kind", "input_hash", "versions"]
 
 
@@ -57,7 +54,7 @@ def run_fleet(
     limits: Limits | None = None,
     progress: Progress | None = None,
 ) -> Summary:
-    """Calibrate the vehicles of a manifest, each alone, and publish a row per camera.
+    """Calibrate the vehicles of a manifest, each alone, and write a row per camera.
 
     What an earlier run finished with the same inputs is not done again. A failed job is a row.
 
@@ -73,18 +70,26 @@ def run_fleet(
             another command writes there.
     """
     report, limits = progress or no_progress, limits or Limits()
-    found, store = load_manifest(manifest), RowStore(out)
+    found, store = load_manifest(manifest), Store(out)
     with store.locked():
-        before, hashes = _rows_of(store, found.jobs), _hashes(found.jobs, report)
-        done = _finished(store, before)
-        todo = [job for job in found.jobs if (*job.key, hashes[job.key]) not in done]
-        publisher = _Publisher(store, found.others, hashes)
+        rows, hashes = _known_rows(out, found.jobs), _hashes(found.jobs, report)
+        todo = [job for job in found.jobs if not _is_finished(rows[job.key], hashes[job.key])]
         tasks = [Task(job, limits, release()) for job in todo]
+        failed = 0
         with nullcontext(executor) if executor is not None else thread_executor() as opened:
-            _run(opened, tasks, publisher, report)
-        after = _rows_of(store, found.jobs)
-    verdicts = Counter(row["verdict"] for row in after if row["status"] == "done")
-    failures = Counter(row["error_kind"] for row in after if row["status"] != "done")
+            for count, (job, outcome) in enumerate(_outcomes(opened, tasks), start=1):
+                rows[job.key] = _rows_of(job, outcome, hashes[job.key])
+                table = pa.Table.from_pylist(rows[job.key], schema=SCHEMA)
+                others = found.others.take(pa.array([job.row] * len(table)))
+                for column in others.schema:
+                    table = table.append_column(column, others[column.name])
+                _write(store, job, outcome, table)
+                failed += outcome.error_kind is not None
+                stage = f"calibrating ({failed} failed)" if failed else "calibrating"
+                report(stage, count, len(tasks))
+    every = [row for job in found.jobs for row in rows[job.key]]
+    verdicts = Counter(row["verdict"] for row in every if row["status"] == "done")
+    failures = Counter(row["error_kind"] for row in every if row["status"] != "done")
     return Summary(len(found.jobs), len(found.jobs) - len(todo), dict(verdicts), dict(failures))
 
 
@@ -123,23 +128,16 @@ def dask_executor(address: str) -> Iterator[Executor]:
             executor.shutdown(wait=False)  # cancels what has not ended
 
 
-def _run(
-    executor: Executor, tasks: Sequence[Task], publisher: "_Publisher", report: Progress
-) -> None:
-    """Run all, and publish what is done even if this is interrupted."""
-    waiting, running = iter(tasks), dict[Future[Outcome], Task]()
-    try:
-        while True:
-            while len(running) < _AHEAD and (task := next(waiting, None)) is not None:
-                running[executor.submit(run_job, task)] = task
-            if not running:
-                return
-            for future in wait(running, _WAIT_S, FIRST_COMPLETED).done:
-                publisher.add(running.pop(future).job, _outcome_of(future))
-            publisher.publish(_PUBLISH_EVERY_S)
-            report(publisher.stage, publisher.count, len(tasks))
-    finally:
-        publisher.publish()
+def _outcomes(executor: Executor, tasks: Iterable[Task]) -> Iterator[tuple[Job, Outcome]]:
+    """Jobs with their outcomes, as they end."""
+    waiting, running = iter(tasks), dict[Future[Outcome], Job]()
+    while True:
+        for task in islice(waiting, _AHEAD - len(running)):
+            running[executor.submit(run_job, task)] = task.job
+        if not running:
+            return
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            yield running.pop(future), _outcome_of(future)
 
 
 def _outcome_of(future: Future[Outcome]) -> Outcome:
@@ -153,81 +151,54 @@ def _outcome_of(future: Future[Outcome]) -> Outcome:
         return Outcome(error_kind="worker died", error=lost)
 
 
-class _Publisher:
-    """Publishes outcomes, some at a time."""
-
-    def __init__(self, store: RowStore, others: pa.Table, hashes: dict[tuple[str, str], str]):
-        self._store, self._others, self._hashes = store, others, hashes
-        self._rows: list[dict[str, Any]] = []
-        self._manifest_rows: list[int] = []
-        self._published_s = time.monotonic()
-        self.count = self._failed = 0
-
-    @property
-    def stage(self) -> str:
-        """What goes on, in words."""
-        return f"calibrating ({self._failed} failed)" if self._failed else "calibrating"
-
-    def add(self, job: Job, outcome: Outcome) -> None:
-        """Take an outcome; its log is kept at once."""
-        common = {"vehicle": job.vehicle, "recording": job.recording, "seconds": outcome.seconds,
-                  "input_hash": self._hashes[job.key], "versions": versions_text()}  # fmt: skip
-        rows, end = [{**common, "status": "done", **cells} for cells in outcome.cameras], "done"
-        if outcome.error_kind is not None:
-            error = {"error_kind": outcome.error_kind, "error": outcome.error}
-            rows, end = [{**common, "camera": "", "status": "failed", **error}], str(outcome.error)
-        self._rows += rows
-        self._manifest_rows += [job.row] * len(rows)
-        self.count, self._failed = self.count + 1, self._failed + (outcome.error_kind is not None)
-        text = f"{job.vehicle}: {job.recording}\n{outcome.log}{outcome.seconds:8.1f} s  {end}\n"
-        self._store.put(f"_logs/{_log_name(job)}", text.encode())
-
-    def publish(self, every_s: float = 0.0) -> None:
-        """Publish all, if the last time is so long ago."""
-        if not self._rows or time.monotonic() - self._published_s < every_s:
-            return
-        table = pa.Table.from_pylist(self._rows, schema=SCHEMA)
-        others = self._others.take(pa.array(self._manifest_rows))
-        for name in others.column_names:
-            table = table.append_column(others.schema.field(name), others[name])
-        self._store.publish(table)
-        self._rows, self._manifest_rows = [], []
-        self._published_s = time.monotonic()
+def _rows_of(job: Job, outcome: Outcome, input_hash: str) -> list[dict[str, Any]]:
+    """A row per camera, or one of the failure."""
+    common = dict.fromkeys(_STATE) | {
+        "vehicle": job.vehicle, "recording": job.recording, "seconds": outcome.seconds,
+        "input_hash": input_hash, "versions": json.dumps(package_versions()),
+    }  # fmt: skip
+    if outcome.error_kind is None:
+        return [{**common, "status": "done", **cells} for cells in outcome.cameras]
+    error = {"error_kind": outcome.error_kind, "error": outcome.error}
+    return [{**common, "camera": "", "status": "failed", **error}]
 
 
-def _log_name(job: Job) -> str:
-    """A name of a file: vehicles may be called anything."""
-    number = hashlib.sha256("\n".join(job.key).encode()).hexdigest()[:8]
-    return f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', job.vehicle)[:100]}-{number}.log"
+def _write(store: Store, job: Job, outcome: Outcome, rows: pa.Table) -> None:
+    """Write the log of a job, then its rows."""
+    number = hashlib.sha256("\n".join(job.key).encode()).hexdigest()[:16]
+    name = f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', job.vehicle)[:100].lstrip('.')}-{number}"
+    text = f"{job.vehicle}: {job.recording}\n{outcome.log}{outcome.seconds:8.1f} s  "
+    store.put(f"_logs/{name}.log", f"{text}{outcome.error or 'done'}\n".encode())
+    store.put(f"{ROWS}/{name}.parquet", rows)
 
 
-def _rows_of(store: RowStore, jobs: Sequence[Job]) -> list[dict[str, Any]]:
-    """The states of these jobs as they are published."""
-    own, found = {job.key for job in jobs}, []
-    for bucket in sorted({bucket_of(job.vehicle) for job in jobs}):
-        rows = store.read(bucket)
-        mine = pa.array([key in own for key in job_keys(rows)], pa.bool_())
-        found += rows.filter(mine).select(_STATE).to_pylist()
+def _known_rows(out: str, jobs: Sequence[Job]) -> dict[Key, list[dict[str, Any]]]:
+    """The states of jobs that an earlier run wrote."""
+    found, own = defaultdict[Key, list[dict[str, Any]]](list), {job.key for job in jobs}
+    for row in read_rows(out, may_be_new=True).select(_STATE).to_pylist():
+        if (key := (row["vehicle"], row["recording"])) in own:
+            found[key].append(row)
+            version = json.loads(row["versions"]).get("calibgraph")
+            if version != release():
+                raise FileError(
+                    out, f"holds rows of calibgraph {version}, this is {release()}; choose another "
+                    "--out"
+                )  # fmt: skip
     return found
 
 
-def _finished(store: RowStore, rows: list[dict[str, Any]]) -> set[tuple[str, str, str]]:
-    """The keys and input hashes of what need not be done again."""
-    for version in {json.loads(row["versions"]).get("calibgraph") for row in rows} - {release()}:
-        raise FileError(
-            store.uri, f"holds rows of calibgraph {version}, this is {release()}; choose another "
-            "--out"
-        )  # fmt: skip
-    return {
-        (row["vehicle"], row["recording"], row["input_hash"])
+def _is_finished(rows: Sequence[dict[str, Any]], input_hash: str) -> bool:
+    """Whether a job need not be done again."""
+    return bool(input_hash and rows) and all(
+        row["input_hash"] == input_hash
+        and (row["status"] == "done" or row["error_kind"] == "bad input")
         for row in rows
-        if row["input_hash"] and (row["status"] == "done" or row["error_kind"] == "bad input")
-    }
+    )
 
 
-def _hashes(jobs: Sequence[Job], report: Progress) -> dict[tuple[str, str], str]:
+def _hashes(jobs: Sequence[Job], report: Progress) -> dict[Key, str]:
     """Of the inputs of all jobs; empty where they cannot be read: the job will fail by it."""
-    found = dict[tuple[str, str], str]()
+    found = dict[Key, str]()
     with ThreadPoolExecutor(_READERS) as pool:
         for job, text in zip(jobs, pool.map(_hash_of, jobs), strict=True):
             report("reading inputs", len(found), len(jobs))

@@ -1,13 +1,12 @@
 """What a worker gets and what it returns: a job with its limits, and the job's outcome."""
 
-import json
 import traceback
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from calibgraph.errors import CalibrationError
 from calibgraph.fleet.manifest import Job
-from calibgraph.model.versions import package_versions, version_of
+from calibgraph.model.versions import version_of
 
 ErrorKind = Literal["bad input", "io", "out of memory", "timeout", "worker died", "internal error"]
 
@@ -63,8 +62,3 @@ class Outcome:
 def release() -> str:
     """The version of this package."""
     return version_of("calibgraph")
-
-
-def versions_text() -> str:
-    """The versions that results depend on, as JSON."""
-    return json.dumps(package_versions())

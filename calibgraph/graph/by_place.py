@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -16,7 +16,6 @@ from factors import (
     BlockSums,
     PairBlock,
     ProjectionBlock,
-    free_lens_sums_factor,
     pair_block_factor,
 )
 
@@ -93,66 +92,37 @@ class QuadraticByPlace:
     Attributes:
         places: (p,) the places that have correspondences, in rising order.
         T_lidar_camera: per such place, the minimum.
-        information: (p, d, d) in the tangent there, positive definite: of the pose, d is 6; with a
-            time offset that is a variable, 7.
-        offsets: (p, d - 6) at the minima, in the units of the variables.
-        keys: (p,) of the variables that hold the offsets; empty if there are none.
+        information: (p, 6, 6) in the tangent there, positive definite.
     """
 
     places: Numbers
     T_lidar_camera: Sequence[gtsam.Pose3]
     information: Array
-    offsets: Array
-    keys: Sequence[int] = ()
 
     def with_variance(self, factor: float) -> QuadraticByPlace:
         """Multiply the variance of the matches."""
         return replace(self, information=self.information / factor)
 
     def sums(self, T_camera_cloud: Array) -> BlockSums:
-        """H, b and c of every place at a pose of its own, (P, 4, 4), stacked; without offsets."""
+        """H, b and c of every place at a pose of its own, (P, 4, 4), stacked."""
         count = len(T_camera_cloud)
         found = BlockSums(np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros(count))
         for row, place in enumerate(self.places.tolist()):
             T_lidar_camera = to_T_lidar_camera(T_camera_cloud[place])
             step = self.T_lidar_camera[row].localCoordinates(T_lidar_camera)
-            found.hessian[place] = self.information[row, :6, :6]
+            found.hessian[place] = self.information[row]
             found.gradient[place] = found.hessian[place] @ step
             found.cost[place] = step @ found.gradient[place]
         return found
 
-    def sums_in_time(self, T_camera_cloud: Array, values: Array) -> list[BlockSums]:
-        """H, b and c of every place with correspondences, by pose and offset.
-
-        Args:
-            T_camera_cloud: (p, 4, 4), one pose per place.
-            values: (p, 1) the offsets.
-        """
-        return [self._sums(row, T, values[row]) for row, T in enumerate(T_camera_cloud)]
-
-    def _sums(self, row: int, T_camera_cloud: Array, values: Array) -> BlockSums:
-        step = self.T_lidar_camera[row].localCoordinates(to_T_lidar_camera(T_camera_cloud))
-        step = np.append(step, values - self.offsets[row])
-        gradient = self.information[row] @ step
-        return BlockSums(self.information[row], gradient, step @ gradient)
-
     def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
-        """The quadratic of one place, on the variables of these keys and its offset.
-
-        Without an offset it is a stock factor.
-        """
-        rows = map(int, np.flatnonzero(self.places == place))
-        if self.keys:
-            return [
-                free_lens_sums_factor((cloud, matched, self.keys[row]), partial(self._sums, row), 1)
-                for row in rows
-            ]
+        """The quadratic of one place, a stock factor on the variables of these keys."""
         noise = gtsam.noiseModel.Gaussian.Information
         return [
             gtsam.BetweenFactorPose3(
                 cloud, matched, self.T_lidar_camera[row], noise(self.information[row])
             )
-            for row in rows
+            for row in np.flatnonzero(self.places == place).tolist()
         ]
 
 

@@ -183,13 +183,12 @@ class LatentPoseModel:
         Mounts before the distortion: in this order no exact tie is left to a weak variable.
         """
         distortion = [DISTORTION] if self.is_distorted else []
-        walks = [key for term in self.lenses.values() for key, _ in term.walk]
         lenses = [key(number) for key in (seen_lens_key, lens_key) for number in self.lenses]
         shown = [*map(matched_key, self.matched), *map(paired_key, self.paired)]
         bodies = map(body_key, self.lens_errors)
         poses = [*self.camera_keys, *map(aligned_key, self.aligned), *bodies]
         others = [key for key in poses if key not in self.reported_keys]
-        return [CLOUD, *shown, *others, *walks, *lenses, *distortion, *self.reported_keys]
+        return [CLOUD, *shown, *others, *lenses, *distortion, *self.reported_keys]
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:

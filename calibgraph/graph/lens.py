@@ -3,8 +3,7 @@
     prior    l_c at the lens of the rig, each parameter with a Cauchy loss
     matcher  l_c to s_c, the lens as the matches show it, displaced by the scan distortion and by
              their errors; these displace m_c, the pose as they show it, too
-    walk     e_cp to the next one in time, the last to s_c, of a lens that walks
-    data     correspondences of camera c at place p, on o_p, a_cp and s_c, or e_cp
+    data     correspondences of camera c at place p, on o_p, a_cp and s_c
 
 A parameter of l_c is in standard deviations of its prior. The prior has heavy tails: data that are
 sure of a wrong lens leave it, and data that are not stay with it.
@@ -35,13 +34,12 @@ from factors import (
     linear_factor,
     robust_noise,
 )
-from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
+from factors.free_lens import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
 from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
 
 TANGENTIAL_SHARE = 0.1
 _TAIL_SIGMAS = 2.0  # where the Cauchy loss of a prior bends
 _PLAIN = 2  # radial coefficients that are set free in a rig without distortion
-_STILL = 1e-4  # of a walk in no time: two places that were left together
 _EXACT = 1e-3  # prior standard deviations: less would lose digits
 
 
@@ -116,7 +114,6 @@ def _prior_sigmas(camera: Camera, default: LensSigmas) -> dict[LensPart, dict[st
     size = len(camera.distortion) or _PLAIN
     return {
         "focal": {FOCAL: focal},
-        "aspect": {ASPECT: default.aspect},
         "centre": {CENTRE_X: centre, CENTRE_Y: centre},
         "distortion": {
             name: radial if name[0] == "k" else TANGENTIAL_SHARE * radial
@@ -152,17 +149,12 @@ class LensTerm:
         by_distortion: (k, B) displacement of s_c by a unit of each scan distortion.
         compensating: (6, k) displacement of m_c by a unit of the difference of s_c and l_c that is
             no scan distortion: of the pose that fits best where the lens is wrong by as much.
-        earlier: value and standard deviation of a single parameter, in its unit, by data that are
-            in no other factor; None if there are none.
-        walk: keys of ``e_cp`` in the order of time, each with the variance of the walk to the next.
     """
 
     variable: LensVariable
     excess: Array
     by_distortion: Array
     compensating: Array
-    earlier: tuple[float, float] | None = None
-    walk: Sequence[tuple[int, float]] = ()
 
     def shifts(self, number: int, *, is_distorted: bool) -> dict[int, Array]:
         """By key, the (6, ...) displacements of m_c by l_c, s_c and the scan distortion."""
@@ -179,26 +171,11 @@ def lens_graph(lenses: Mapping[int, LensTerm], *, is_distorted: bool) -> gtsam.N
         unit = np.eye(len(term.variable.free))
         for row in unit:
             graph.add(linear_factor([lens_key(number)], [row[None]], tail))
-        if term.earlier is not None:
-            value, sigma = term.earlier
-            known = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
-            graph.add(gtsam.PriorFactorVector(lens_key(number), np.array([value]), known))
         keys, matrices = [lens_key(number), seen_lens_key(number)], [-unit, unit]
         if is_distorted:
             keys, matrices = [*keys, DISTORTION], [*matrices, -term.by_distortion]
         noise = gtsam.noiseModel.Gaussian.Covariance(term.excess + _EXACT**2 * unit)
         graph.add(linear_factor(keys, matrices, noise))
-        graph.push_back(walk_graph(number, term.walk))
-    return graph
-
-
-def walk_graph(number: int, walk: Sequence[tuple[int, float]]) -> gtsam.NonlinearFactorGraph:
-    """The walk of one parameter of a lens over the places that were left, to the present."""
-    graph = gtsam.NonlinearFactorGraph()
-    following = [*(key for key, _ in walk[1:]), seen_lens_key(number)]
-    for (key, variance), other in zip(walk, following, strict=False):
-        noise = gtsam.noiseModel.Isotropic.Variance(1, variance + _STILL**2)
-        graph.add(gtsam.BetweenFactorVector(key, other, np.zeros(1), noise))
     return graph
 
 
@@ -206,8 +183,7 @@ def start_lenses(lenses: Mapping[int, LensTerm]) -> gtsam.Values:
     """Both variables of each lens, where correspondences have been weighed and gated."""
     values = gtsam.Values()
     for number, term in lenses.items():
-        values.insert(lens_key(number), term.variable.values)
-        for key in (seen_lens_key(number), *(key for key, _ in term.walk)):
+        for key in (lens_key(number), seen_lens_key(number)):
             values.insert(key, term.variable.values)
     return values
 

@@ -7,15 +7,14 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import PairByPlace, QuadraticByPlace
+from calibgraph.graph.by_place import PairByPlace
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, paired_key
 from calibgraph.model.geometry import adjoints, invert_each
-from factors import BlockSums, pair_run_sums
+from factors import pair_run_sums
 
 
 @dataclass(eq=False)
@@ -64,14 +63,7 @@ class LinearData:
         poses = [values.atPose3(key).between(clouds[place]) for key, place in pairs]
         T_camera_cloud[places] = [pose.matrix() for pose in poses]
         if isinstance(block, FreeLensByPlace):
-            lens = [block.key] * len(keys)
-            free = block.sums(T_camera_cloud[places], values.atVector(block.key))
-            self._add_free_lens(places, (keys, lens), free, T_camera_cloud[places])
-            return
-        if isinstance(block, QuadraticByPlace) and block.keys:
-            offsets = np.array([*map(values.atVector, block.keys)])
-            free = block.sums_in_time(T_camera_cloud[places], offsets)
-            self._add_free_lens(places, (keys, block.keys), free, T_camera_cloud[places])
+            self._add_free_lens(block, keys, values, T_camera_cloud[places])
             return
         sums = block.sums(T_camera_cloud)
         by_cloud = -np.array([pose.AdjointMap() for pose in poses])
@@ -89,14 +81,15 @@ class LinearData:
 
     def _add_free_lens(
         self,
-        places: NDArray[np.int64],
-        keys: tuple[Sequence[int], Sequence[int]],
-        sums: Sequence[BlockSums],
+        block: FreeLensByPlace,
+        keys: Sequence[int],
+        values: gtsam.Values,
         T_camera_cloud: Array,
     ) -> None:
-        """The same with a free lens, on o_p^-1 a_cp and s_c, or e_cp."""
+        """The same with a free lens, on o_p^-1 a_cp and s_c."""
         by_cloud = -adjoints(T_camera_cloud)
-        for number, (place, key, lens_key) in enumerate(zip(places, *keys, strict=True)):
+        sums = block.sums(T_camera_cloud, values.atVector(block.key))
+        for number, (place, key) in enumerate(zip(block.places, keys, strict=True)):
             one, size = sums[number], len(sums[number].gradient)
             chain = np.hstack(
                 [np.vstack([by_cloud[number], np.zeros((size - 6, 6))]), np.eye(size)]
@@ -106,7 +99,7 @@ class LinearData:
             self.cost += float(one.cost)
             self.graph.push_back(
                 gtsam.HessianFactor(
-                    cloud_at_key(int(place)), key, lens_key,
+                    cloud_at_key(int(place)), key, block.key,
                     hessian[cloud, cloud], hessian[cloud, pose], hessian[cloud, lens], pull[cloud],
                     hessian[pose, pose], hessian[pose, lens], pull[pose],
                     hessian[lens, lens], pull[lens], float(one.cost),

@@ -5,8 +5,7 @@ prior and between factors are the paper's terms.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import combinations, pairwise
-from typing import Literal
+from itertools import pairwise
 
 import gtsam
 
@@ -68,15 +67,11 @@ def relative_prior_graph(
     T_hat_camera_lidar: Mapping[str, Array],
     *,
     weight: float,
-    pairs: Literal["spanning", "all"],
 ) -> gtsam.NonlinearFactorGraph:
     """The relative-pose priors, mu |log(T_hat_12^-1 T_2 T_1^-1)|^2, of Stage-1 estimates.
 
-    Over each camera and the next one (a spanning set), or over all pairs; empty if the weight is
-    zero.
+    Over each camera and the next one, a spanning set; empty if the weight is zero.
     """
-    names = list(T_hat_camera_lidar)
-    chosen = pairwise(names) if pairs == "spanning" else combinations(names, 2)
     return _graph(
         relative_prior_factor(
             pose_key(cameras, one),
@@ -84,7 +79,7 @@ def relative_prior_graph(
             relative_transform(T_hat_camera_lidar[two], T_hat_camera_lidar[one]),
             weight=weight,
         )
-        for one, two in chosen
+        for one, two in pairwise(T_hat_camera_lidar)
         if weight > 0
     )
 
@@ -123,7 +118,7 @@ def objective_graph(
             paper.
         blocks: per camera with correspondences; its scale and sigma are those of the loss.
         T_hat: per camera with a Stage-1 estimate, (4, 4) T_camera_lidar.
-        config: lambda, mu and the pairs of the relative prior.
+        config: lambda and mu.
         terms: which terms of Eq. 5 take part; with ``priors`` and ``stage1``, the priors alone.
     """
     cameras = list(rig.cameras)
@@ -136,8 +131,7 @@ def objective_graph(
         projection_graph(cameras, blocks),                 # sum rho(|w (u - pi(T_i, p))|^2)
         relative_pose_graph(cameras, rig.relative_poses),  # + measured relative poses (ours)
         prior_graph(cameras, T_hat, weight=lambda_),       # + lambda sum_i |log(T_hat_i^-1 T_i)|^2
-        relative_prior_graph(cameras, T_hat, weight=mu,    # + mu |log(T_hat_12^-1 T_2 T_1^-1)|^2
-                             pairs=config.relative_prior_pairs),
+        relative_prior_graph(cameras, T_hat, weight=mu),   # + mu |log(T_hat_12^-1 T_2 T_1^-1)|^2
     )
 # fmt: on
 

@@ -11,17 +11,12 @@ o_p   the cloud as it is displaced at place p
 a_cp  camera c as its matches at place p show it
 l_c   the lens of camera c, if it is estimated, in standard deviations of its prior
 s_c   that lens as its matches show it
-e_cp  that lens as its matches at place p showed it, where it walks from place to place
 """
 
 import gtsam
 
-from calibgraph.outputs import DOT_MARK
-
 CLOUD = int(gtsam.symbol("o", 0))
 DISTORTION = int(gtsam.symbol("d", 0))
-
-"""First line of a graph in Graphviz's language."""
 
 MOST_CAMERAS = 1000
 """``a3002`` is camera 2 at place 3."""
@@ -62,11 +57,6 @@ def seen_lens_key(camera: int) -> int:
     return int(gtsam.symbol("s", camera))
 
 
-def seen_lens_at_key(place: int, camera: int) -> int:
-    """Key of ``e_cp``."""
-    return int(gtsam.symbol("e", place * MOST_CAMERAS + camera))
-
-
 def cloud_at_key(place: int) -> int:
     """Key of ``o_p``."""
     return int(gtsam.symbol("p", place))
@@ -75,11 +65,3 @@ def cloud_at_key(place: int) -> int:
 def matched_at_key(place: int, camera: int) -> int:
     """Key of ``a_cp``."""
     return int(gtsam.symbol("a", place * MOST_CAMERAS + camera))
-
-
-def to_dot(graph: gtsam.NonlinearFactorGraph) -> str:
-    """A graph in Graphviz's language."""
-    values = gtsam.Values()
-    for key in graph.keyVector():
-        values.insert(key, gtsam.Pose3())
-    return f"{DOT_MARK}\n{graph.dot(values)}"

@@ -92,10 +92,9 @@ class RigGuess:
         cameras = {name: vars(guess) for name, guess in self.cameras.items()}
         return {"cameras": cameras, "search_deg": self.search_deg, "search_m": self.search_m}
 
-    def save(self, path: Path | str, *, first_line: str = "") -> None:
+    def save(self, path: Path | str) -> None:
         """Write the rig file, with the lines as comments."""
-        comments = "\n".join(f"# {line}" for line in self.lines)
-        self.rig.save(path, first_line=f"{first_line}\n{comments}" if first_line else comments)
+        self.rig.save(path, first_line="\n".join(f"# {line}" for line in self.lines))
 
 
 def guess_rig(
@@ -139,9 +138,14 @@ def guess_rig(
     tied = _tied_cameras(parts, said, set(missing) - set(search))
     unknown = [name for name in missing if name not in tied]
     if unknown and data is None:
-        raise _nothing_known(unknown[0])
+        raise RigError(
+            f"camera {unknown[0]!r}: nothing says where it is; describe it with "
+            f"--mount {unknown[0]}=WORDS ({GRAMMAR}), add a URDF or a sensor kit, or give "
+            "--dataset to search over all headings",
+            camera=unknown[0],
+        )
     level = {name: Mounting(0.0).T_camera_lidar(axis) for name in unknown}
-    placed = {name: one.T_camera_lidar for name, one in tied.items()}
+    placed = {name: T for name, (_, T) in tied.items()}
     rig = parts.to_rig({**said, **placed, **level}, size_px=size_px)
     found: dict[str, FoundCamera] = {}
     if unknown and data is not None:
@@ -151,39 +155,28 @@ def guess_rig(
         found = search_headings(dataset, rig, unknown, forward=axis, seed=seed, progress=progress)
         _require_found(found)
     rig = rig.moved_to({name: one.T_camera_lidar for name, one in found.items()})
-    by_words = {name: _of_words(mounting) for name, mounting in words.items()}
-    by_pair = {name: _of_pair(one, by_words[one.to]) for name, one in tied.items()}
-    by_search = {name: _of_search(one) for name, one in found.items()}
+    known = {
+        name: CameraGuess("words", one.rotation_sigma_deg, one.translation_sigma_m, "by words")
+        for name, one in words.items()
+    }
+    known |= {name: _by_pair(known[to], said[to], to, T) for name, (to, T) in tied.items()}
+    known |= {name: _by_search(one) for name, one in found.items()}
     by_file = CameraGuess("file", FILE_DEG, FILE_M, "by a file")
-    described = {**by_words, **by_pair, **by_search}
-    return RigGuess(rig, {name: described.get(name, by_file) for name in rig.cameras})
-
-
-@dataclass(frozen=True, eq=False)
-class _TiedCamera:
-    """A camera that relative poses tie to another.
-
-    Attributes:
-        to: the other.
-        T_camera_lidar: (4, 4).
-        apart_m: from the other.
-    """
-
-    to: str
-    T_camera_lidar: Array
-    apart_m: float
+    return RigGuess(rig, {name: known.get(name, by_file) for name in rig.cameras})
 
 
 def _tied_cameras(
     parts: RigParts, said: Mapping[str, Array], names: Collection[str]
-) -> dict[str, _TiedCamera]:
-    """The cameras that a relative pose ties to one with words, to the first if to several."""
-    tied: dict[str, _TiedCamera] = {}
+) -> dict[str, tuple[str, Array]]:
+    """The cameras that a relative pose ties to one with words, to the first if to several.
+
+    With the name of the other, and their own T_camera_lidar.
+    """
+    tied: dict[str, tuple[str, Array]] = {}
     for to, T in said.items():
         for name, T_camera_lidar in parts.tied_to(to, T).items():
             if name in names and name not in tied:
-                apart_m = np.linalg.norm(camera_center(T_camera_lidar) - camera_center(T))
-                tied[name] = _TiedCamera(to, T_camera_lidar, float(apart_m))
+                tied[name] = to, T_camera_lidar
     return tied
 
 
@@ -200,14 +193,6 @@ def _require_cameras(parts: RigParts, words: Mapping[str, Mounting], search: Seq
             )
 
 
-def _nothing_known(name: str) -> RigError:
-    return RigError(
-        f"camera {name!r}: nothing says where it is; describe it with --mount {name}=WORDS "
-        f"({GRAMMAR}), add a URDF or a sensor kit, or give --dataset to search over all headings",
-        camera=name,
-    )
-
-
 def _require_found(found: Mapping[str, FoundCamera]) -> None:
     missed = {name: one for name, one in found.items() if not one.accepted}
     if missed:
@@ -219,20 +204,15 @@ def _require_found(found: Mapping[str, FoundCamera]) -> None:
         )
 
 
-def _of_words(mounting: Mounting) -> CameraGuess:
-    rotation_deg, translation_m = mounting.rotation_sigma_deg, mounting.translation_sigma_m
-    return CameraGuess("words", rotation_deg, translation_m, "by words")
-
-
-def _of_pair(one: _TiedCamera, other: CameraGuess) -> CameraGuess:
+def _by_pair(other: CameraGuess, T_other_lidar: Array, to: str, T: Array) -> CameraGuess:
     """The other's sigmas, with its rotation error times the distance added to the translation."""
-    shift_m = one.apart_m * math.radians(other.rotation_sigma_deg)
+    apart_m = float(np.linalg.norm(camera_center(T) - camera_center(T_other_lidar)))
+    shift_m = apart_m * math.radians(other.rotation_sigma_deg)
     translation_m = math.hypot(other.translation_sigma_m, shift_m)
-    return CameraGuess("pair", other.rotation_sigma_deg, translation_m, f"by its pose to {one.to}")
+    return CameraGuess("pair", other.rotation_sigma_deg, translation_m, f"by its pose to {to}")
 
 
-def _of_search(one: FoundCamera) -> CameraGuess:
-    text = f"found with a z-score of {one.z_score:.1f}" + (
-        f", as {one.seen_by} sees it" if one.seen_by else ""
-    )
+def _by_search(one: FoundCamera) -> CameraGuess:
+    seen = f", as {one.seen_by} sees it" if one.seen_by else ""
+    text = f"found with a z-score of {one.z_score:.1f}{seen}"
     return CameraGuess("search", FOUND_DEG, FOUND_M, text, one.z_score)

@@ -13,7 +13,6 @@ from calibgraph.matching.structure.bodies import Body, lead, place
 from calibgraph.matching.structure.frame_cache import FrameCache, load_camera_frames
 from calibgraph.matching.structure.global_search import ALONE
 from calibgraph.matching.structure.matcher import SEARCH_FRAMES
-from calibgraph.matching.structure.pose_refinement import Candidate
 from calibgraph.matching.structure.pose_search import PoseSearch, SearchRange
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
@@ -80,7 +79,11 @@ def search_headings(
                 done = index * len(starts) + number
                 progress(f"searching all headings: {name}", done, len(names) * len(starts))
                 candidates.append(search.with_roll(place(body, start), 0.0, effort=1))
-            found[name] = seen or _best(candidates)
+            if seen is None:
+                best = max(candidates, key=lambda candidate: candidate.z_score)
+                T, needed = lead(best.body).T_camera_lidar, least_z_score(len(candidates))
+                seen = FoundCamera(T, best.z_score, needed)
+            found[name] = seen
     return found
 
 
@@ -101,8 +104,3 @@ def _place_by_others(
         if placed.accepted:
             return placed
     return None
-
-
-def _best(candidates: list[Candidate]) -> FoundCamera:
-    best = max(candidates, key=lambda candidate: candidate.z_score)
-    return FoundCamera(lead(best.body).T_camera_lidar, best.z_score, least_z_score(len(candidates)))

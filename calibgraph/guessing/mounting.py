@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal, cast
 
 from scipy.spatial.transform import Rotation
 
@@ -89,10 +89,9 @@ def check_forward(text: str) -> Forward:
     Raises:
         ValueError: if it is none.
     """
-    for axis in get_args(Forward):
-        if text == axis:
-            return axis  # type: ignore[no-any-return]
-    raise ValueError(f"forward axis {text!r}: expected one of {', '.join(get_args(Forward))}")
+    if text not in _FORWARD_DEG:
+        raise ValueError(f"forward axis {text!r}: expected one of {', '.join(_FORWARD_DEG)}")
+    return cast(Forward, text)
 
 
 def parse_mounting(text: str, camera: str) -> Mounting:

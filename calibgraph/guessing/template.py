@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from calibgraph.errors import FileError
-from calibgraph.files import write_text
+from calibgraph.files import require_new_file, write_text
 from calibgraph.guessing.lens_words import parse_lens
 from calibgraph.guessing.mounting import check_forward, parse_mounting
 from calibgraph.io.bags import is_bag
@@ -18,7 +18,6 @@ from calibgraph.io.images import IMAGE_SUFFIXES, image_size
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import FILL_IN, RIG_FILE
 from calibgraph.model.rig import RIG_FORMAT
-from calibgraph.outputs import yaml_mark
 from calibgraph.yaml_text import yaml_text
 
 
@@ -53,8 +52,7 @@ def write_rig_template(
     """
     folder = Path(folder)
     path = Path(out) if out is not None else folder / RIG_FILE
-    if path.exists() and not replace:
-        raise FileError(path, "is there already; --force replaces it")
+    require_new_file(path, ".yaml", ".yml", force=replace)
     write_text(path, rig_template(folder, mountings or {}, lenses or {}, forward=forward))
     return path
 
@@ -91,7 +89,7 @@ def rig_template(
     }
     head = (files("calibgraph.guessing") / "rig_head.txt").read_text(encoding="utf-8")
     head = head.format(
-        mark=yaml_mark("init"), fill_in=FILL_IN, folder=folder, clouds=clouds,
+        fill_in=FILL_IN, folder=folder, clouds=clouds,
         cameras=", ".join(cameras),
     )  # fmt: skip
     return head + yaml_text({"format": RIG_FORMAT, "lidar": "lidar", "cameras": cameras})
@@ -100,7 +98,9 @@ def rig_template(
 def _require_plain_folder(folder: Path) -> None:
     """Refuse a dataset that has its own lenses."""
     if is_bag(folder):
-        raise FileError(folder, "is a ROS bag with lenses of its own; calibgraph bag writes them")
+        raise FileError(
+            folder, "is a ROS bag with lenses of its own; calibgraph rig BAG writes them"
+        )
     if not folder.is_dir():
         raise FileError(folder, "no such folder; expected one with lidar/ and cameras/NAME/")
     if published_folder(folder) or (folder / CALIBRATION_NAME).is_file():

@@ -142,7 +142,10 @@ def load_dataset(
             data = _with_bag(data, path, prefix, bag)
         else:
             found = frames_of_folder(
-                path, list(data.rig.cameras), complete=frames is None, tolerance_s=bag.tolerance_s
+                path,
+                list(data.rig.cameras),
+                complete=frames is None,
+                sync_tolerance_s=bag.sync_tolerance_s,
             )
             data = _with_folder(data, path, prefix, found, interval_s=interval_s)
     if data.recorded == data.frames:
@@ -302,7 +305,7 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
                 f"has no metadata.yaml, as a ROS 2 bag that was not closed; name {recorded.name}, "
                 "or write the file with `ros2 bag reindex`",
             )
-    of_bags = bag is not None and replace(bag, tolerance_s=NEAR_S) != BagOptions()
+    of_bags = bag is not None and replace(bag, sync_tolerance_s=NEAR_S) != BagOptions()
     if of_bags and not any(map(is_bag, paths)):
         raise ValueError("options for ROS bags, such as --every-s, are given without a bag")
 

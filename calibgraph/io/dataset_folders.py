@@ -66,7 +66,7 @@ class FolderFrames(NamedTuple):
 
 
 def frames_of_folder(
-    folder: Path, cameras: Sequence[str], *, complete: bool = True, tolerance_s: float = NEAR_S
+    folder: Path, cameras: Sequence[str], *, complete: bool = True, sync_tolerance_s: float = NEAR_S
 ) -> FolderFrames:
     """The frames of a folder; where names are stamps, those with an image near enough.
 
@@ -75,7 +75,7 @@ def frames_of_folder(
         cameras: the rig's.
         complete: whether every cloud must have an image of every camera, and every image a cloud,
             where names are no stamps.
-        tolerance_s: largest difference of the stamps that name a cloud and its images.
+        sync_tolerance_s: largest difference of the stamps that name a cloud and its images.
     """
     published = published_folder(folder)
     if published is not None:
@@ -96,7 +96,7 @@ def frames_of_folder(
     if stamped and any(found.keys() != clouds.keys() for found in images.values()):
         of_images = {name: s for name, found in images.items() if (s := _stamps(found))}
         if of_images.keys() == images.keys():
-            return _paired_by_stamps(folder, stamped, of_images, tolerance_s=tolerance_s)
+            return _paired_by_stamps(folder, stamped, of_images, sync_tolerance_s=sync_tolerance_s)
     for name in cameras if complete else ():
         _require_pairs(folder, name, set(clouds), set(images[name]))
     return FolderFrames(frames_by_stem(clouds, images))
@@ -136,13 +136,13 @@ def _paired_by_stamps(
     clouds: TopicStamps,
     images: Mapping[str, TopicStamps],
     *,
-    tolerance_s: float,
+    sync_tolerance_s: float,
 ) -> FolderFrames:
     """Each cloud with the image of every camera that is nearest by its name, as in a bag."""
     frames = [FrameFiles(path.stem, path, {}) for path in clouds.paths]
     parts = []
     for name, found in images.items():
-        rows = nearest(clouds, found, round(tolerance_s * 1e9))
+        rows = nearest(clouds, found, round(sync_tolerance_s * 1e9))
         paired = np.flatnonzero(rows >= 0)
         if not len(paired):
             apart_ns = offsets_of(clouds, found)
@@ -151,9 +151,9 @@ def _paired_by_stamps(
                 else describe_spans({"clouds are from": clouds, "images from": found})
             )  # fmt: skip
             raise DatasetError(
-                f"{folder}: no cloud has an image of {name} within {tolerance_s:g} s by the stamps "
-                f"in their names: {said}; give a larger --tolerance-s, or name the "
-                "files by one clock",
+                f"{folder}: no cloud has an image of {name} within {sync_tolerance_s:g} s by the "
+                f"stamps in their names: {said}; give a larger sync_tolerance_s in --config, or "
+                "name the files by one clock",
                 camera=name,
             )
         for cloud in paired:
@@ -165,7 +165,8 @@ def _paired_by_stamps(
     complete = sum(len(frame.images) == len(images) for frame in frames)
     pairing = (
         f"{folder}: files are paired by the stamps in their names: {complete} of {len(frames)} "
-        f"clouds have all images within {tolerance_s:g} s (--tolerance-s); {'; '.join(parts)}"
+        f"clouds have all images within {sync_tolerance_s:g} s (sync_tolerance_s); "
+        + "; ".join(parts)
     )
     if not complete:
         raise DatasetError(f"{pairing}; calibrate the cameras apart")

@@ -72,7 +72,6 @@ class KeptFrame(Frame):
     def derive(self, key: Hashable, make: Callable[[], Derived]) -> Derived:
         """What follows from its files and the key, made once."""
         value: Derived = self.kept.get((self.index, key), make)
-        self.kept.keep_last(MAX_BYTES, lambda each: each.nbytes)
         return value
 
     def derive_for_all(self, key: Hashable, make: Callable[[], Common]) -> Common:
@@ -96,7 +95,7 @@ def keep_frames(data: Dataset) -> Dataset:
     """
     if any(isinstance(frame, KeptFrame) for frame in data.frames):
         return data
-    kept: KeyedCache[tuple[int, Hashable], Any] = KeyedCache()
+    kept: KeyedCache[tuple[int, Hashable], Any] = KeyedCache(MAX_BYTES)
     common: KeyedCache[Hashable, Any] = KeyedCache()
     frames = (
         KeptFrame(

@@ -17,7 +17,7 @@ from calibgraph.model.rig import RIG_FORMAT, Camera, Rig
 
 RIG_FILE, REFERENCE_FILE = "rig.yaml", "reference.yaml"
 FILL_IN = "FILL_IN"
-"""Stands for a value that the user of ``calibgraph init`` writes."""
+"""Stands for a value that the user of ``calibgraph rig`` writes."""
 
 
 def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
@@ -60,7 +60,7 @@ def _rig_of_file(path: Path) -> Rig:
     if "format" not in content:
         raise FileError(
             path, f"key 'format' is missing; add the line `format: {RIG_FORMAT}`, or make a rig "
-            "of a file of another program with calibgraph import"
+            "of a file of another program with calibgraph rig"
         )  # fmt: skip
     _require_filled(content, path)
     return checked_model(Rig, content, path)
@@ -110,7 +110,7 @@ def rig_file(path: Path | str) -> Path:
         raise FileError(
             path,
             f"{what if found is None else 'no such file or folder'}; name a rig file, a result, a "
-            "dataset folder with a rig.yaml (calibgraph init writes one), a folder of KITTI, "
+            "dataset folder with a rig.yaml (calibgraph rig writes one), a folder of KITTI, "
             "nuScenes or Argoverse 2, or a ROS bag",
         )
     return found

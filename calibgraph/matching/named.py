@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.io.dataset import Dataset
-from calibgraph.matching.protocol import FullMatcher, Matcher, to_full_matcher
+from calibgraph.matching.protocol import FullMatcher, Matcher
 from calibgraph.model.config import Stage1Source
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
@@ -42,28 +41,21 @@ def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int =
         FileError, CorrespondenceError: if it is a file, but not a table.
     """
     if isinstance(matcher, Correspondences):
-        return to_full_matcher(TableMatcher(matcher))
+        return FullMatcher(TableMatcher(matcher))
     if not isinstance(matcher, (str, Path)):
-        return to_full_matcher(matcher)
+        return FullMatcher(matcher)
     if str(matcher) == "structure":
         from calibgraph.matching.structure import StructureMatcher
 
-        return StructureMatcher(seed=seed)
+        return FullMatcher(StructureMatcher(seed=seed))
     if Path(matcher).suffix in (".parquet", ".csv"):
-        return to_full_matcher(TableMatcher(load_correspondences(matcher)))
+        return FullMatcher(TableMatcher(load_correspondences(matcher)))
     if str(matcher) == "cmrnext":
         raise ValueError(
-            "the matcher 'cmrnext' needs weights: --weights iter1.tar iter5.tar iter6.tar, or "
+            "the matcher 'cmrnext' needs weights: --weights iter1.tar --weights iter5.tar, or "
             "CmrNextMatcher([...]) of calibgraph.matching.cmrnext"
         )
     raise ValueError(
         f"unknown matcher {str(matcher)!r}; known are 'structure', 'cmrnext' and a table of "
         "correspondences (.parquet or .csv)"
     )
-
-
-if TYPE_CHECKING:  # mypy checks that the matchers of this package have every member
-    from calibgraph.matching.cmrnext import CmrNextMatcher
-    from calibgraph.matching.structure import StructureMatcher
-
-    _FULL_MATCHERS: tuple[type[FullMatcher], ...] = (StructureMatcher, CmrNextMatcher)

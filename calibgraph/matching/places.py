@@ -22,7 +22,7 @@ from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame, seconds_between
 from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
-from calibgraph.matching.camera_pairs.relative_pose import relative_pose
+from calibgraph.matching.camera_pairs.geometry import relative_pose
 from calibgraph.matching.camera_pairs.surfaces import planes_at
 from calibgraph.matching.cloud_similarity import (
     LEAST_UPRIGHT,

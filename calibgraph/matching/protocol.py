@@ -1,17 +1,7 @@
 """The matcher protocol: three members that every matcher has, and seven more that it may have.
 
 `Matcher` is the interface of a custom matcher. The program works with `FullMatcher`, which has all
-members; `to_full_matcher` adds defaults for missing ones. In calibration they are used in this
-order:
-
-1. `with_estimate`: the matcher for the parts of lens and clock that are estimated.
-2. `most_frames`: the largest number of frames that is used.
-3. `knows_motion`: whether frames may lack the motion that a clock is estimated by.
-4. `locate`: from where the rounds begin, and with which round.
-5. `match`: once per round, `rounds` at most; each is followed by a joint solve (`stage1`).
-6. `tracking_rounds`: run again from a start displaced from the result.
-7. `release`: no more rounds of this matcher follow, but one of another `with_estimate`, if any.
-8. `image_checks_can_fail`: whether the checks on images may FAIL the result.
+members, with defaults for missing ones; ``docs/matchers.md`` has them in a table.
 """
 
 from collections.abc import Callable, Sequence
@@ -74,61 +64,28 @@ class Matcher(Protocol):
         ...
 
 
-class FullMatcher(Matcher, Protocol):
-    """A matcher with every member."""
+class FullMatcher:
+    """A matcher with every member: the only place of the defaults.
 
-    @property
-    def most_frames(self) -> int | None:
-        """Most frames of a dataset to use, chosen of more; None (default) for all."""
-        ...
+    Attributes:
+        rounds, stage1: as of :class:`Matcher`.
+        most_frames: most frames of a dataset to use, chosen of more; None for all.
+        knows_motion: whether its tables have the motion of the LiDAR, ``twist_per_s``.
+        tracking_rounds: indices of the rounds to run from an estimate that is nearly right: for the
+            single frames of a drive, and from a start displaced from a result, which tests whether
+            the result is found again. If empty, single frames go through all rounds, and there is
+            no displaced start.
+        image_checks_can_fail: whether the checks on images may FAIL a result, or WARN at most: the
+            image evidence is measured by the matcher ``structure``, from which another matcher may
+            differ with good reason.
 
-    @property
-    def knows_motion(self) -> bool:
-        """Whether its tables have the motion of the LiDAR, ``twist_per_s``; by default not."""
-        ...
-
-    @property
-    def tracking_rounds(self) -> tuple[int, ...]:
-        """Indices of the rounds to run from an estimate that is nearly right.
-
-        They match the single frames of a drive, and a start displaced from a result, which tests
-        whether the result is found again. Empty (default): single frames go through all rounds, and
-        there is no displaced start.
-        """
-        ...
-
-    @property
-    def image_checks_can_fail(self) -> bool:
-        """Whether the checks on images may FAIL a result; if not (default), they WARN at most.
-
-        The image evidence is measured by the matcher ``structure``, from which another matcher may
-        differ with good reason.
-        """
-        ...
-
-    def with_estimate(self, parts: Sequence[LensPart]) -> "FullMatcher":
-        """The matcher for solves that estimate these parts of lens and clock; itself by default.
-
-        One that is not itself matches also after ``release`` of the other: it checks the time of
-        the images, if it has ``tracking_rounds``.
-        """
-        ...
-
-    def locate(
-        self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
-    ) -> Start:
-        """Find where the rounds begin; by default, at the initial guess."""
-        ...
-
-    def release(self) -> None:
-        """Release memory that is kept between rounds; does nothing by default."""
-        ...
-
-
-class MatcherWithDefaults:
-    """A matcher with defaults in place of the members that it lacks: the only place of defaults."""
+    Raises:
+        ValueError: if the matcher has less than one round.
+    """
 
     def __init__(self, matcher: Matcher) -> None:
+        if matcher.rounds < 1:
+            raise ValueError(f"the matcher has {matcher.rounds} rounds, expected at least 1")
         self._matcher = matcher
         self.rounds = matcher.rounds
         self.stage1: Stage1Source = matcher.stage1
@@ -136,22 +93,25 @@ class MatcherWithDefaults:
         self.knows_motion = bool(getattr(matcher, "knows_motion", False))
         self.tracking_rounds = tuple(getattr(matcher, "tracking_rounds", ()))
         self.image_checks_can_fail = bool(getattr(matcher, "image_checks_can_fail", False))
-        self._locate = getattr(matcher, "locate", None)
-        self._release = getattr(matcher, "release", None)
 
-    def with_estimate(self, parts: Sequence[LensPart]) -> FullMatcher:
-        """The matcher's own way, or the same matcher."""
+    def with_estimate(self, parts: Sequence[LensPart]) -> "FullMatcher":
+        """The matcher for solves that estimate these parts of lens and clock; itself by default.
+
+        One that is not itself matches also after ``release`` of the other: it checks the time of
+        the images, if it has ``tracking_rounds``.
+        """
         make = getattr(self._matcher, "with_estimate", None)
         made = self._matcher if make is None else make(parts)
-        return self if made is self._matcher else MatcherWithDefaults(made)
+        return self if made is self._matcher else FullMatcher(made)
 
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
     ) -> Start:
-        """The matcher's own start, or the initial guess."""
-        if self._locate is None:
+        """Find where the rounds begin; by default, at the initial guess."""
+        locate = getattr(self._matcher, "locate", None)
+        if locate is None:
             return Start(rig)
-        start: Start = self._locate(dataset, rig, out_of_time=out_of_time, progress=progress)
+        start: Start = locate(dataset, rig, out_of_time=out_of_time, progress=progress)
         return start
 
     def match(
@@ -162,18 +122,5 @@ class MatcherWithDefaults:
         return table.with_metadata({STAGE1: self.stage1, **table.metadata})
 
     def release(self) -> None:
-        """Release the memory that the matcher keeps between rounds."""
-        if self._release is not None:
-            self._release()
-
-
-def to_full_matcher(matcher: Matcher) -> FullMatcher:
-    """The matcher with every member.
-
-    Raises:
-        ValueError: if it has less than one round.
-    """
-    full = MatcherWithDefaults(matcher)
-    if full.rounds < 1:
-        raise ValueError(f"the matcher has {full.rounds} rounds, expected at least 1")
-    return full
+        """No more rounds follow: release memory that is kept between them; nothing by default."""
+        getattr(self._matcher, "release", lambda: None)()

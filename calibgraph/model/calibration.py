@@ -27,7 +27,6 @@ from calibgraph.model.rig import Rig
 from calibgraph.model.summary import Summary, summarize
 from calibgraph.model.verdict import Verdict, rig_verdict
 from calibgraph.model.versions import package_versions
-from calibgraph.outputs import require_writable
 
 FRAMES_SENTENCE = "p_camera = T_camera_lidar * p_lidar"
 TANGENT_SENTENCE = (
@@ -229,10 +228,10 @@ class Calibration:
         After an error none of them appears, and the YAML file is the last. Returns its path.
 
         Raises:
-            FileError: if a file of these names is there that is not of a result.
+            FileError: if a table of these names is there that is not of a result.
         """
         path = Path(folder) / result_files.CALIBRATION_FILE
-        require_writable(result_files.outputs_of_calibration(path.parent))
+        result_files.require_own_tables(path.parent)
         tables = {
             result_files.CORRESPONDENCES_FILE: self.correspondences,
             result_files.CAMERA_MATCHES_FILE: self.camera_matches,
@@ -247,12 +246,11 @@ class Calibration:
         return path
 
     def _save_table(self, table: Correspondences | CameraMatches | None, path: Path) -> str | None:
-        """Write a table, marked with the verdict; its SHA-256."""
+        """Write a table with the verdict in its metadata; its SHA-256."""
         if table is None:
             return None
-        status, written = result_files.VERDICT_KEY, result_files.WRITTEN_KEY
-        marks = {status: self.verdict.status, written: result_files.RESULT}
-        replace(table, metadata=table.metadata | marks).save(path)
+        verdict = {result_files.VERDICT_KEY: self.verdict.status}
+        replace(table, metadata=table.metadata | verdict).save(path)
         return sha256(path)
 
     def __repr__(self) -> str:

@@ -22,13 +22,11 @@ _FROM_RESULT = "Calibrate again with this result as the guess: the matcher then 
 _STRUCTURE = "Record where image and cloud both have structure: edges, poles, facades at 5 to 40 m."
 _FRAMES = "Look at the frames that disagree: leave out those in which a sensor moved or lagged."
 _SPREAD = "Give more matches, spread over the image and over distances."
-_LEARNED = "Use the matcher structure."
 
 _ESTIMATED_AS = {
     "focal_length": "focal",
     "distortion": "distortion",
     "principal_point": "centre",
-    "aspect_ratio": "aspect",
 }
 
 # fmt: off
@@ -52,7 +50,7 @@ CAUSES: dict[str, Cause] = {
         {
             "convention of the guess": "Undo the named mistake, and "
             "calibrate again.",
-            "guess_rotation": "", "guess_translation": "",
+            "guess_translation": "",
             "guess_length": "Give the translation of T_camera_lidar in metres.",
             "swapped_cameras": _SWAPPED,
             "point_distance": "Give the clouds in metres.",
@@ -86,7 +84,7 @@ CAUSES: dict[str, Cause] = {
             **{f"{by}{name}": "Check that intrinsics and image size belong to these images, or "
                f"estimate the lens: --estimate {part}."
                for by in ("lens_", "") for name, part in _ESTIMATED_AS.items()},
-            "lens_skew": "", "skew": "",
+            "lens_aspect_ratio": "", "aspect_ratio": "",
             "lens_prior": "Check that the lens belongs to these images; then correct the named "
             "value in the rig, or state intrinsics_sigma_px and distortion_sigma.",
             "focal_sensitivity": "Verify the focal length: here the position depends on it.",
@@ -105,7 +103,7 @@ CAUSES: dict[str, Cause] = {
     "priors": Cause(
         "priors and relative poses",
         "Check relative_poses and priors in the rig: p_a = T_a_b * p_b, and their sigmas.",
-        {"relative_pose": "", "pull_rotation": "", "pull_translation": "",
+        {"relative_pose": "",
          "prior_share": "Give this camera matches of its own, or check its priors: they decide."},
     ),
     "agreement": Cause(
@@ -120,13 +118,11 @@ CAUSES: dict[str, Cause] = {
         "wrong correspondences",
         "Look at the residuals of the matches in the report: too many are wrong.",
         {"competing_solution": "", "failed_frames": "",
-         "assumed_spread": "Leave loss_scale_px out of the config, or raise it.",
-         "start_dependence": _LEARNED, "memorization": _LEARNED},
+         "assumed_spread": "Leave loss_scale_px out of the config, or raise it."},
     ),
     "frames": Cause(
         "frames or places that contradict each other", _FRAMES,
-        {"halves_rotation": "", "halves_translation": "", "outlier_frames": "",
-         "place_distance": "", "place_inliers": "", "bootstrap_sigma": "",
+        {"outlier_frames": "", "place_distance": "", "place_inliers": "", "bootstrap_sigma": "",
          "disagreeing_frames": "Check whether the camera was moved.",
          "drift": "Check whether the camera's mount is loose."},
     ),
@@ -144,7 +140,6 @@ CAUSES: dict[str, Cause] = {
          "excluded": "To calibrate it by its own matches, take it out of excluded_cameras.",
          "correspondences_used": "Give at least 50 matches.",
          "frames": "Record at least 5 frames, 10 s apart.",
-         "difference between even and odd frames": "Record at least 5 frames, 10 s apart.",
          "image evidence": _STRUCTURE,
          "images": "Calibrate again from images and clouds.",
          "common_error": "State the error that all frames share (0 if none): common_deg and "

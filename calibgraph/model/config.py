@@ -17,7 +17,7 @@ TERMS: tuple[Terms, ...] = get_args(Terms)
 Stage1Source = Literal["pnp", "rig"]
 PresetName = Literal["kitti", "walkley", "auto"]
 Reported = Literal["alignment", "mount"]
-LensPart = Literal["focal", "aspect", "centre", "distortion", "offset", "readout"]
+LensPart = Literal["focal", "centre", "distortion", "offset", "readout"]
 
 Pixels = Annotated[float, Field(ge=1e-6, le=1e6)]
 Weight = Annotated[float, Field(ge=0, le=1e12)]
@@ -37,8 +37,6 @@ class Tracking(StrictNumbers):
             makes from one frame to the next. The model of a camera is constant until the residuals
             favour a walk: this one, a fifth of it, or five times it.
         walk_translation_m: the same of its position.
-        walk_time_offset_s: standard deviation of the random walk of a time offset, if that is
-            estimated, from one frame to the next: 1e-4 is 19 ms in an hour at 10 Hz; 0 is none.
         step_frames: frames that must agree on a new extrinsic before a step is reported.
         blind_frames: frames without usable matches before a camera is reported as blind.
     """
@@ -50,7 +48,6 @@ class Tracking(StrictNumbers):
     live_epochs: Annotated[int, Field(ge=1, le=100)] = 8
     walk_rotation_deg: Annotated[float, Field(gt=0, le=10)] = 1e-3
     walk_translation_m: Annotated[float, Field(gt=0, le=1)] = 5e-5
-    walk_time_offset_s: Annotated[float, Field(ge=0, le=1)] = 1e-4
     step_frames: Annotated[int, Field(ge=2, le=1000)] = 3
     blind_frames: Annotated[int, Field(ge=2, le=100_000)] = 20
 
@@ -81,7 +78,6 @@ class Config(StrictNumbers):
         preset: the preset these settings started from.
         prior_weight: lambda, the per-camera prior's weight.
         relative_prior_weight: mu, the relative-pose prior's weight.
-        relative_prior_pairs: ``spanning``: each camera with the next in the rig's order; or all.
         loss: name of the robust loss.
         loss_scale_px: delta. None: from the residuals' own spread, per camera.
         gate_px: tau, on the unweighted reprojection error. None: from the residuals' spread.
@@ -94,7 +90,6 @@ class Config(StrictNumbers):
         stage1: source of the per-camera estimates T_hat: ``pnp``, one extrinsic per frame,
             aggregated; or ``rig``, the extrinsics in the rig as they are. None: as the table's
             matcher states, else ``pnp``.
-        aggregate: how Stage 1 aggregates over frames.
         pnp_threshold_px: inlier threshold of the per-frame PnP.
         excluded_cameras: whose correspondences take no part. Such a camera is determined by
             relative poses or common features, else it stays where the rig has it and FAILs.
@@ -107,10 +102,9 @@ class Config(StrictNumbers):
         of: the poses that are reported: ``alignment``, where the points, as this LiDAR delivers
             them, meet the images; or ``mount``, where the sensors are, with a wider error bar.
         estimate: parts of each lens that are estimated with the extrinsics, by ``calibrate`` and
-            ``solve``: ``focal``, ``aspect`` (fx over fy), ``centre``, ``distortion``; ``lens`` is
-            focal, centre and distortion. Also ``offset``, how long after its cloud an image is
-            taken, and ``readout`` of a rolling shutter; ``clock`` is both. ``track`` follows
-            ``offset``.
+            ``solve``: ``focal``, ``centre``, ``distortion``; ``lens`` is all three. Also
+            ``offset``, how long after its cloud an image is taken, and ``readout`` of a rolling
+            shutter; ``clock`` is both.
         seed: of everything random.
         tracking: of the recalibration while driving.
     """
@@ -120,7 +114,6 @@ class Config(StrictNumbers):
     preset: PresetName = "auto"
     prior_weight: Weight = 1.0
     relative_prior_weight: Weight = 5.0
-    relative_prior_pairs: Literal["spanning", "all"] = "spanning"
     loss: LossName = "cauchy"
     loss_scale_px: Pixels | None = None
     gate_px: Pixels | None = None
@@ -131,7 +124,6 @@ class Config(StrictNumbers):
     grid_rows: Cells = 25
     matches_max: Annotated[int, Field(gt=0)] = 10_000
     stage1: Stage1Source | None = None
-    aggregate: Literal["median", "mean", "mode"] = "median"
     pnp_threshold_px: Pixels = 8.0
     excluded_cameras: tuple[str, ...] = ()
     tolerance_deg: Annotated[float, Field(gt=0, le=180)] = TOLERANCE[0]

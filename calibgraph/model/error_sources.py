@@ -33,8 +33,8 @@ MOST_TIMES = TIMES[-1]
 """Stands for any number of frames, and is no advice."""
 
 _ADVICE = {
-    UNMODELLED: "Leave --preset out: auto models the errors that frames of a place share and has "
-    "smaller error bars; the presets of the paper do not model them.",
+    UNMODELLED: "Leave preset out of --config: auto models the errors that frames of a place share "
+    "and has smaller error bars; the presets of the paper do not model them.",
     LENSES: "State how well lenses and clocks are known (intrinsics_sigma_px, distortion_sigma, "
     "time_offset_sigma_s), or calibrate them with a target.",
     ESTIMATED: "Estimate fewer parts of the lens (--estimate), state how well it is known "

@@ -16,7 +16,6 @@ _TIED, _TIED_SHARE = 0.999, 0.5
 _NONE = 0.005  # correlations that are shown as 0.00
 _NEEDED = {
     "focal": "several distances, towards the corners, too",
-    "aspect": "near things at the sides, above and below",
     "centre_x": "near and far things over the whole image",
     "centre_y": "near and far things over the whole image",
     "offset": "turns and changes of speed",
@@ -32,8 +31,8 @@ class LensEstimate:
     """One parameter of a camera's lens or clock.
 
     Attributes:
-        name: ``focal`` (the root of fx fy), ``aspect`` (fx / fy), ``centre_x``, ``centre_y``, a
-            distortion coefficient, or ``offset`` and ``readout`` of the clock.
+        name: ``focal`` (the root of fx fy), ``centre_x``, ``centre_y``, a distortion
+            coefficient, or ``offset`` and ``readout`` of the clock.
         unit: ``px``, ``s`` or empty.
         value: the estimate.
         sigma: its standard deviation: the marginal of the graph.
@@ -87,14 +86,6 @@ class LensEstimate:
         unit = f" {self.printed_unit}" if self.unit else ""
         return f"{self.name} {new} +- {sigma}{unit}, before {old}{unit}"
 
-    @property
-    def trade_off(self) -> str:
-        """Which change of the pose may be a change of it, in words; empty if none."""
-        if self.correlation <= _NONE:
-            return ""
-        pair = f"{self.name} with {self.direction} {self.correlation:.2f}"
-        return f"part of it may be the other, by their correlation: {pair}"
-
     def describe(self) -> str:
         """Whether the data determine it, and what it cannot be told from."""
         pair = f"with {self.direction} {self.correlation:.2f}" if self.correlation > _NONE else ""
@@ -124,8 +115,7 @@ def joint_parameters(lens: Sequence[LensEstimate]) -> list[str]:
 def with_sigmas(rig: Rig, lens: Mapping[str, tuple[LensEstimate, ...]]) -> Rig:
     """A rig with estimated lenses and clocks that states their standard deviations.
 
-    Of both coordinates of the centre, and of all radial coefficients, the larger; a rig has no
-    place for that of the aspect.
+    Of both coordinates of the centre, and of all radial coefficients, the larger.
     """
     if not lens:
         return rig

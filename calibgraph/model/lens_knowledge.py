@@ -8,12 +8,11 @@ from calibgraph.model.rig import Camera, IntrinsicsSigma, Rig
 class LensSigmas(NamedTuple):
     """Standard deviations of a lens where the rig states none.
 
-    Of the logarithms of both focal lengths and of fx / fy, of each coordinate of the centre [px],
+    Of the logarithm of both focal lengths, of each coordinate of the centre [px],
     and of radial coefficients; tangential ones have ``TANGENTIAL_SHARE`` of these.
     """
 
     focal: float
-    aspect: float
     centre_px: float
     radial: float
 
@@ -21,7 +20,7 @@ class LensSigmas(NamedTuple):
     def calibrated(camera: Camera) -> "LensSigmas":
         """Of a lens that was calibrated with a target: 0.2 %; of 1000 px, a centre to 2 px."""
         share = _CALIBRATED
-        return LensSigmas(share, share, share * camera.intrinsics_px.fx, share)
+        return LensSigmas(share, share * camera.intrinsics_px.fx, share)
 
     def state_in(self, camera: Camera) -> Camera:
         """A camera with these sigmas, unless it states its own."""
@@ -33,7 +32,7 @@ class LensSigmas(NamedTuple):
         return camera.model_copy(update={"intrinsics_sigma_px": sigma, "distortion_sigma": radial})
 
 
-IN_DOUBT = LensSigmas(0.02, 0.002, 5.0, 0.05)
+IN_DOUBT = LensSigmas(0.02, 5.0, 0.05)
 """Of a lens that is estimated, or known from words, a spec sheet or a field of view."""
 _CALIBRATED = 0.002
 

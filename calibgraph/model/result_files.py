@@ -1,52 +1,64 @@
-"""The files of a result in its folder, and the marks by which they are recognised."""
+"""The files of a result in its folder, and when they may be replaced."""
 
+import re
+from collections.abc import Iterable
 from pathlib import Path
 
-from calibgraph.outputs import PAGE_MARK, Output, is_marked
+from calibgraph.errors import FileError
+from calibgraph.file_sets import require_own_folder
+from calibgraph.files import sha256
 
 CALIBRATION_FORMAT = "calibgraph-calibration/1"
 CALIBRATION_FILE = "calibration.yaml"
 CORRESPONDENCES_FILE = "correspondences.parquet"
 CAMERA_MATCHES_FILE = "camera_matches.parquet"
+TABLES = CORRESPONDENCES_FILE, CAMERA_MATCHES_FILE
 REPORT_FILE = "report.html"
-_BY = "calibrate, solve or track"
-OVERLAYS = "overlay_*.png"
-PICTURES = (OVERLAYS, "track.png")
 
 VERDICT_KEY = "verdict"
 """In the metadata of a table: it is part of a result."""
-WRITTEN_KEY, MATCH, RESULT = "written_by", "calibgraph match", "calibgraph calibrate"
-"""In the metadata of a table: the command that wrote it."""
 
-_CALIBRATION_MARK = f"format: {CALIBRATION_FORMAT}\n".encode()
-_TABLE_MARK = f'"{VERDICT_KEY}": '.encode()
-
-
-def outputs_of_result(folder: Path) -> list[Output]:
-    """The files of a result in a folder: its pictures are those there, if a result is there."""
-    calibration = folder / CALIBRATION_FILE
-    pictures = [path for pattern in PICTURES for path in sorted(folder.glob(pattern))]
-    return [
-        *outputs_of_calibration(folder),
-        Output(folder / REPORT_FILE, _BY, (PAGE_MARK,)),
-        *(Output(path, _BY, (_CALIBRATION_MARK,), marked=calibration) for path in pictures),
-    ]
-
-
-def outputs_of_calibration(folder: Path) -> list[Output]:
-    """The calibration and its tables in a folder."""
-    return [
-        Output(folder / CALIBRATION_FILE, _BY, (_CALIBRATION_MARK,)),
-        Output(folder / CORRESPONDENCES_FILE, _BY, (_TABLE_MARK,)),
-        Output(folder / CAMERA_MATCHES_FILE, _BY, (_TABLE_MARK,)),
-    ]
+_FORMAT_LINE = f"format: {CALIBRATION_FORMAT}\n".encode()
+_HEAD_BYTES = 4096
 
 
 def is_calibration_file(path: Path) -> bool:
     """Whether a file is a result's."""
-    return is_marked(path, _CALIBRATION_MARK)
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return _FORMAT_LINE in file.read(_HEAD_BYTES)
 
 
-def table_mark(command: str) -> bytes:
-    """The part of a table's metadata that names the command which wrote it."""
-    return f'"{WRITTEN_KEY}": "{command}"'.encode()
+def require_result_folder(folder: Path, read: Iterable[Path] = ()) -> None:
+    """Check, before hours of work, that a result may be written into a folder.
+
+    Raises:
+        FileError: as of :func:`calibgraph.file_sets.require_own_folder`, if a file that would be
+            replaced is read, or as of :func:`require_own_tables`.
+    """
+    read = [path for path in read if path.exists()]
+    require_own_folder(folder, read)
+    for path in (folder / name for name in (CALIBRATION_FILE, *TABLES)):
+        if path.exists() and any(path.samefile(other) for other in read):
+            raise FileError(
+                path, "is read by this command, which would replace it; choose another --out"
+            )
+    require_own_tables(folder)
+
+
+def require_own_tables(folder: Path) -> None:
+    """Check that tables with the names of a result's are those that the result beside them names.
+
+    Raises:
+        FileError: if one is another.
+    """
+    calibration = folder / CALIBRATION_FILE
+    known = calibration.read_bytes() if calibration.is_file() else b""
+    for path in (folder / name for name in TABLES):
+        key = re.escape(f"{path.stem}_sha256: ".encode())
+        if path.exists() and not re.search(key + b"'?" + sha256(path).encode(), known):
+            raise FileError(
+                path, f"is not the table of a {CALIBRATION_FILE} beside it, and would be replaced; "
+                "move it, or choose another folder"
+            )  # fmt: skip

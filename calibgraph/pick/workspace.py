@@ -19,20 +19,16 @@ from calibgraph.io.frame import Frame
 from calibgraph.io.rigs import REFERENCE_FILE
 from calibgraph.matching.structure.visibility import find_in_view, find_visible
 from calibgraph.model.geometry import degrees_and_centimetres
-from calibgraph.model.result_files import WRITTEN_KEY, table_mark
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.outputs import Output, marked_yaml, yaml_mark
 from calibgraph.pick.estimate import Estimate, estimate_from_pairs, reference_rig
 from calibgraph.pick.session import (
     SESSION_FILE,
-    SESSION_FORMAT,
     Pair,
     open_session,
     to_table,
 )
 
 TABLE_FILE = "picked.parquet"
-_PICK = "calibgraph pick"
 _KEPT = 8  # clouds and images in memory
 _JPEG_QUALITY = 95
 _HIDDEN_SPACINGS = 1.5  # side of a cell in which near points hide far ones
@@ -90,8 +86,8 @@ class Workspace:
         """Write the pairs as a table, and the reference with its error bars."""
         rig = reference_rig(self._estimate)
         table, reference = self.folder / TABLE_FILE, self.folder / REFERENCE_FILE
-        to_table(self.session.pairs, **{WRITTEN_KEY: _PICK}).save(table)
-        rig.save(reference, first_line="\n".join([yaml_mark("pick"), *_sigmas(rig)]))
+        to_table(self.session.pairs).save(table)
+        rig.save(reference, first_line="\n".join(_sigmas(rig)))
         return [table, reference]
 
     def projected(self, index: int, name: str) -> NDArray[np.float32]:
@@ -120,15 +116,6 @@ class Workspace:
         image = self._frame(index, name).load_image(name, self.dataset.rig.cameras[name])
         _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         return data.tobytes()
-
-
-def outputs_of_pick(folder: Path) -> list[Output]:
-    """The files of a session in its folder."""
-    return [
-        Output(folder / SESSION_FILE, "pick", (SESSION_FORMAT.encode(),)),
-        Output(folder / TABLE_FILE, "pick", (table_mark(_PICK),)),
-        marked_yaml(folder / REFERENCE_FILE, "pick"),
-    ]
 
 
 def visible_points(points_lidar_m: Array, camera: Camera) -> NDArray[np.float32]:

@@ -15,9 +15,8 @@ from calibgraph.model.rig import Camera
 from calibgraph.model.threshold import Direction, beside, in_unit, is_reachable
 from calibgraph.model.verdict import Check, Verdict
 from calibgraph.report import plots
-from calibgraph.report.figure import ImageSize
-from calibgraph.report.match_errors import BeforeAfter, ReprojectionErrors
 from calibgraph.report.page_overlays import Overlays, width_on_page
+from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionErrors
 
 _WORST_FIRST = ("FAIL", "WARN", "PASS")
 
@@ -30,11 +29,6 @@ class CheckRow:
     found: str
     warn: str
     fail: str
-
-
-def check_rows(checks: Sequence[Check]) -> tuple[CheckRow, ...]:
-    """The rows of a camera's checks, the worst first."""
-    return tuple(check_row(check) for check in sorted(checks, key=_severity))
 
 
 def _severity(check: Check) -> int:
@@ -65,61 +59,29 @@ def _threshold(side: Direction, limit: float, unit: str) -> str:
 _DISTANCE_M = 10.0
 
 
-@dataclass(frozen=True)
-class WorkedPoint:
-    """One point from the LiDAR frame to the pixel, as text."""
-
-    matrix: str
-    pose: str
-    inverse: str
-    steps: str
-    origin: str
-
-
-def worked_point(camera: Camera, errors: ReprojectionErrors | None) -> WorkedPoint:
-    """Project the used correspondence nearest to 10 m, or a point on the optical axis."""
+def worked_point(camera: Camera, errors: ReprojectionErrors | None) -> str:
+    """Project the used correspondence nearest to 10 m, or a point on the optical axis, in lines."""
     T = camera.T_camera_lidar
     used = None if errors is None else errors.select(errors.is_inlier)
     if used is None or not len(used.frame):
-        point = point_in_lidar(T, np.array([0.0, 0.0, _DISTANCE_M]))
-        origin, matched = "a point 10 m ahead on the optical axis", ""
+        point, matched = point_in_lidar(T, np.array([0.0, 0.0, _DISTANCE_M])), ""
     else:
         row = int(np.argmin(np.abs(used.distances_m - _DISTANCE_M)))
-        point, pixel = used.points_lidar_m[row], used.pixels_px[row]
-        origin = f"a correspondence of frame {used.frame[row]}"
+        point, (u, v) = used.points_lidar_m[row], used.pixels_px[row]
         matched = (
-            f"\nmatched pixel            = ({pixel[0]:.2f}, {pixel[1]:.2f}) px, "
+            f"\nmatched pixel            = ({u:.2f}, {v:.2f}) px in frame {used.frame[row]}, "
             f"residual {used.sizes_px[row]:.2f} px"
         )
-    steps = _steps(camera, point) + matched
-    return WorkedPoint(matrix_text(T), pose_text(T), pose_text(invert(T)), steps, origin)
-
-
-def _steps(camera: Camera, point: Array) -> str:
-    T = camera.T_camera_lidar
-    rotated = T[:3, :3] @ point
-    p_camera = rotated + T[:3, 3]
-    pixel = camera.lens.project(p_camera[None])[0][0]
+    p_camera, k = T[:3, :3] @ point + T[:3, 3], camera.intrinsics_px
+    u, v = camera.lens.project(p_camera[None])[0][0]
+    distortion = ", ".join(f"{each:g}" for each in camera.distortion) or "none"
     return (
         f"p_lidar                  = {_vector(point)} m\n"
-        f"R p_lidar                = {_vector(rotated)} m\n"
-        f"p_camera = R p_lidar + t  = {_vector(p_camera)} m\n"
-        f"{_lens_steps(camera, p_camera)}\n"
-        f"projected pixel (u, v)   = ({pixel[0]:.2f}, {pixel[1]:.2f}) px"
+        f"p_camera = R p_lidar + t = {_vector(p_camera)} m\n"
+        f"lens                     = {camera.model}, fx {k.fx:.3f}, fy {k.fy:.3f}, "
+        f"cx {k.cx:.3f}, cy {k.cy:.3f}; distortion {distortion}\n"
+        f"projected pixel (u, v)   = ({u:.2f}, {v:.2f}) px{matched}"
     )
-
-
-def _lens_steps(camera: Camera, p_camera: Array) -> str:
-    """From p_camera to the pixel: the formula if the lens has no distortion, else its name."""
-    k = camera.intrinsics_px
-    if camera.model == "pinhole" and not any(camera.distortion):
-        x, y, z = p_camera
-        return (
-            f"u = fx x/z + cx          = {k.fx:.3f} * {x:.3f} / {z:.3f} + {k.cx:.3f}\n"
-            f"v = fy y/z + cy          = {k.fy:.3f} * {y:.3f} / {z:.3f} + {k.cy:.3f}"
-        )
-    coefficients = ", ".join(f"{c:g}" for c in camera.distortion)
-    return f"lens: {camera.model}, distortion {coefficients}"
 
 
 def _vector(values: Array) -> str:
@@ -140,38 +102,39 @@ def pose_text(T: Array) -> str:
     )
 
 
-Sigmas = tuple[list[float], list[float]]
-"""Standard deviations of rotation [deg] and translation [cm], per axis."""
-
-
 @dataclass(frozen=True, eq=False)
 class CameraSection:
     """What the template prints of one camera beside what the result has.
 
     Attributes:
-        rows: its checks.
+        rows: its checks, the worst first.
         moved: change from the guess.
-        sigmas, bootstrap: None where there are none, or they do not hold.
+        sigmas, bootstrap: (3,) of rotation [deg], and of translation [cm]; None where there are
+            none, or they do not hold.
         no_error_bar: why there is none; empty if there is one.
         overlays: None where there is no image.
         overlay_width_px: at most so wide they are shown.
         diagrams: pictures as data URIs, by the name of their caption in the template; those that
             the data allow.
+        matrix, pose, inverse: of T_camera_lidar, and of the ROS transform, as text.
         worked: one point step by step.
     """
 
     name: str
     anchor: str
     verdict: Verdict
-    rows: tuple[CheckRow, ...]
+    rows: Sequence[CheckRow]
     moved: PoseError
-    sigmas: Sigmas | None
-    bootstrap: Sigmas | None
+    sigmas: Sequence[Array] | None
+    bootstrap: Sequence[Array] | None
     no_error_bar: str
     overlays: Overlays | None
     overlay_width_px: int
     diagrams: Mapping[str, str]
-    worked: WorkedPoint
+    matrix: str
+    pose: str
+    inverse: str
+    worked: str
 
 
 def camera_section(
@@ -185,30 +148,24 @@ def camera_section(
 ) -> CameraSection:
     """Collect what the page shows of a camera."""
     camera, verdict = result.rig.cameras[name], result.camera_verdicts[name]
+    bootstrap = result.bootstrap.get(name) if result.error_bar_holds(name) else None
     return CameraSection(
         name=name,
         anchor=f"camera-{index}",
         verdict=verdict,
-        rows=check_rows(verdict.checks),
+        rows=[check_row(check) for check in sorted(verdict.checks, key=_severity)],
         moved=pose_error(result.T_camera_lidar[name], result.initial_rig.T_camera_lidar[name]),
-        sigmas=_sigmas(result, result.covariance, name),
-        bootstrap=_sigmas(result, result.bootstrap, name),
+        sigmas=result.error_bar(name),
+        bootstrap=None if bootstrap is None else degrees_and_centimetres(bootstrap),
         no_error_bar=_why_no_error_bar(result, name),
         overlays=overlays,
         overlay_width_px=width_on_page(camera),
         diagrams=diagrams,
+        matrix=matrix_text(camera.T_camera_lidar),
+        pose=pose_text(camera.T_camera_lidar),
+        inverse=pose_text(invert(camera.T_camera_lidar)),
         worked=worked_point(camera, None if errors is None else errors.after),
     )
-
-
-def _sigmas(
-    result: Calibration, covariances: Mapping[str, Array | None], name: str
-) -> Sigmas | None:
-    covariance = covariances.get(name) if result.error_bar_holds(name) else None
-    if covariance is None:
-        return None
-    rotation_deg, translation_cm = degrees_and_centimetres(covariance)
-    return rotation_deg.tolist(), translation_cm.tolist()
 
 
 def _why_no_error_bar(result: Calibration, name: str) -> str:
@@ -218,23 +175,18 @@ def _why_no_error_bar(result: Calibration, name: str) -> str:
 
 
 def camera_diagrams(result: Calibration, name: str, errors: BeforeAfter | None) -> dict[str, str]:
-    """Residuals, coverage, error bars and convergence of a camera, as data URIs by name."""
+    """Residuals, coverage, lens and convergence of a camera, as data URIs by name."""
     found: dict[str, str] = {}
     before, camera = result.initial_rig.cameras[name], result.rig.cameras[name]
     if errors is not None:
-        size, after = ImageSize.of(camera), errors.after
+        after = errors.after
         sigma_px = result.residuals[name].sigma_px
         found["residuals"] = plots.residual_scatter(after, sigma_px)
         found["by_distance"] = plots.residual_by_distance(after)
-        found["over_image"] = plots.residual_map(size, after)
-        found["coverage"] = plots.coverage(size, after)
-        found["distances"] = plots.distances(after)
+        found["over_image"] = plots.residual_map(camera, after)
+        found["coverage"] = plots.coverage(camera, after)
     if name in result.lens and has_other_lens(before, camera):
         found["lens"] = plots.lens_change(before, camera)
-    sigmas, bootstrap = result.error_bar(name), result.bootstrap.get(name)
-    if sigmas is not None:
-        others = None if bootstrap is None else degrees_and_centimetres(bootstrap)
-        found["error_bars"] = plots.error_bars(sigmas, others)
     rounds = [cameras[name] for cameras in result.rounds if name in cameras]
     if len(rounds) > 1:
         found["convergence"] = plots.convergence(rounds)

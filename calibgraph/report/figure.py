@@ -7,7 +7,7 @@ import io
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,18 +23,6 @@ if TYPE_CHECKING:
 WIDTH_IN = 4.4
 _DPI, _PICTURE_DPI = 150, 100
 _PALETTE_SIZE = 96  # colours of a picture; a palette makes it a third as large
-
-
-class ImageSize(NamedTuple):
-    """Width and height of a camera's images."""
-
-    width_px: int
-    height_px: int
-
-    @staticmethod
-    def of(camera: Camera) -> ImageSize:
-        """The size of a camera's images."""
-        return ImageSize(camera.width_px, camera.height_px)
 
 
 def new_figure(
@@ -68,17 +56,17 @@ def save_picture(figure: Figure, path: Path, metadata: Mapping[str, str] | None 
         write_atomically(path, lambda part: figure.savefig(part, format="png", metadata=metadata))
 
 
-def image_figure(size: ImageSize, right_in: float = 0.1) -> tuple[Figure, Axes]:
-    """A figure whose axes are the image, v downwards."""
+def image_figure(camera: Camera, right_in: float = 0.1) -> tuple[Figure, Axes]:
+    """A figure whose axes are a camera's image, v downwards."""
     left_in, below_in, above_in = 0.45, 0.25, 0.3
     width_in = WIDTH_IN - left_in - right_in
-    height_in = float(np.clip(width_in * size.height_px / size.width_px, 0.6, 5.0))
+    height_in = float(np.clip(width_in * camera.height_px / camera.width_px, 0.6, 5.0))
     full_in = below_in + height_in + above_in
     figure = new_figure(full_in)
     axes = figure.add_axes(
         (left_in / WIDTH_IN, below_in / full_in, width_in / WIDTH_IN, height_in / full_in)
     )
-    axes.set(xlim=(-0.5, size.width_px - 0.5), ylim=(size.height_px - 0.5, -0.5))
+    axes.set(xlim=(-0.5, camera.width_px - 0.5), ylim=(camera.height_px - 0.5, -0.5))
     axes.set(aspect="equal")
     axes.tick_params(labelsize=8)
     return figure, axes

@@ -1,4 +1,4 @@
-"""The frames of a result: the one whose images are shown, and where the files are now."""
+"""The frames of a result: what it was made from, and where the files are now."""
 
 import os
 from collections.abc import Mapping
@@ -12,11 +12,6 @@ from calibgraph.errors import DatasetError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame, hash_source
 from calibgraph.model.calibration import Calibration
-
-
-def middle_frame(result: Calibration) -> Mapping[str, Any] | None:
-    """The entry of the frame whose images are shown; None if the result names no frames."""
-    return result.frames[len(result.frames) // 2] if result.frames else None
 
 
 def recording_name(result: Calibration) -> str:

@@ -16,9 +16,9 @@ from calibgraph.model.result_files import (
     CAMERA_MATCHES_FILE,
     CORRESPONDENCES_FILE,
     REPORT_FILE,
-    outputs_of_result,
+    TABLES,
+    require_own_tables,
 )
-from calibgraph.outputs import require_writable
 from calibgraph.report.camera_section import camera_diagrams, camera_section
 from calibgraph.report.frames import recording_name
 from calibgraph.report.kit import load_template
@@ -105,9 +105,7 @@ def write_result(
     Returns:
         The files to name to the user.
     """
-    outputs = outputs_of_result(folder)
-    require_writable(outputs)
-    stale = [output.path for output in outputs if output.is_ours]
+    require_own_tables(folder)
     with written_together(folder, last=CALIBRATION_FILE) as new:
         written = [result.save(new)]
         tables = (new / CORRESPONDENCES_FILE, new / CAMERA_MATCHES_FILE)
@@ -122,6 +120,6 @@ def write_result(
             write_text(new / REPORT_FILE, render_page(result))
             written.append(new / REPORT_FILE)
         names = {path.name for path in new.iterdir()}
-    for path in (path for path in stale if path.name not in names):
-        path.unlink(missing_ok=True)  # of the result that this one replaces
+    for name in set(TABLES) - names:
+        (folder / name).unlink(missing_ok=True)  # of the result that this one replaces
     return [folder / path.name for path in written]

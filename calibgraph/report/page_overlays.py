@@ -19,9 +19,8 @@ from calibgraph.io.images import load_image
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
-from calibgraph.report.frames import middle_frame
-from calibgraph.report.match_errors import BeforeAfter, ReprojectionErrors
 from calibgraph.report.point_overlay import DEPTH_RANGE_M, depth_colours, draw_points, shrink
+from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionErrors
 
 Image = NDArray[np.uint8]
 
@@ -67,9 +66,9 @@ def draw_overlays(
     Returns:
         Per camera its pictures; the reason why the others are missing, None if none are.
     """
-    shown = middle_frame(result)
-    if shown is None:
+    if not result.frames:
         return {}, "the result was made from a table, which names no images"
+    shown = result.frames[len(result.frames) // 2]
     drawn: dict[str, Overlays] = {}
     try:
         cloud = load_entry_cloud(shown)[:, :3].astype(np.float64)

@@ -9,14 +9,13 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.report.figure import (
-    ImageSize,
     add_legend,
     image_figure,
     new_figure,
     set_octave_ticks,
     to_data_uri,
 )
-from calibgraph.report.match_errors import ReprojectionErrors
+from calibgraph.report.reprojection_errors import ReprojectionErrors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,8 +32,6 @@ _MIN_PER_BIN = 10
 ARROW_COLUMNS = 12  # cells across the image
 _COVERAGE_COLUMNS = 20
 _CONTOUR_FINENESS = 6  # points of a contour to a cell of an arrow
-_OCTAVES_M = (0.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, np.inf)
-_OCTAVE_NAMES = ("< 2", "2-4", "4-8", "8-16", "16-32", "32-64", "> 64")
 _ROUND_FACTORS = np.array([1.0, 2.0, 5.0, 10.0])
 _MIN_MOVE = 1e-4  # deg or cm: zero on a logarithmic axis
 
@@ -78,12 +75,12 @@ def residual_by_distance(errors: ReprojectionErrors) -> str:
     return to_data_uri(figure)
 
 
-def residual_map(size: ImageSize, errors: ReprojectionErrors) -> str:
+def residual_map(camera: Camera, errors: ReprojectionErrors) -> str:
     """The used matches in the image, and the mean residual of each cell as an arrow."""
-    figure, axes = image_figure(size)
+    figure, axes = image_figure(camera)
     inliers = errors.select(errors.is_inlier)
     axes.plot(*_thin(inliers.pixels_px).T, ".", color=_INLIER, markersize=2, alpha=0.35)
-    centres, means, cell_px = mean_residuals(size, inliers, ARROW_COLUMNS)
+    centres, means, cell_px = mean_residuals(camera, inliers, ARROW_COLUMNS)
     factor = arrow_factor(means, cell_px)
     _add_arrows(axes, centres, factor * means)
     title = f"mean residual per cell, drawn {factor:g} times as long"
@@ -95,8 +92,8 @@ def lens_change(before: Camera, camera: Camera) -> str:
     """How far the estimated lens sees each ray from where the rig's did: arrows, and contours."""
     from calibgraph.model.lens_difference import lens_difference
 
-    size, rows = ImageSize.of(camera), ARROW_COLUMNS // 2
-    figure, axes = image_figure(size)
+    size, rows = (camera.width_px, camera.height_px), ARROW_COLUMNS // 2
+    figure, axes = image_figure(camera)
     finer = _CONTOUR_FINENESS * np.array([ARROW_COLUMNS, rows])
     sides = [
         np.linspace(0.0, pixels - 1.0, count) for pixels, count in zip(size, finer, strict=True)
@@ -122,14 +119,14 @@ def _add_arrows(axes: Axes, starts: Array, vectors: Array) -> None:
     )  # fmt: skip
 
 
-def coverage(size: ImageSize, errors: ReprojectionErrors) -> str:
+def coverage(camera: Camera, errors: ReprojectionErrors) -> str:
     """Number of used matches in each cell of the image."""
     from matplotlib.ticker import MaxNLocator
 
-    figure, axes = image_figure(size, right_in=0.5)
+    figure, axes = image_figure(camera, right_in=0.5)
     pixels = errors.select(errors.is_inlier).pixels_px
-    extent = ((-0.5, size.width_px - 0.5), (-0.5, size.height_px - 0.5))
-    counts = sum_per_cell(pixels, size, _COVERAGE_COLUMNS)
+    extent = ((-0.5, camera.width_px - 0.5), (-0.5, camera.height_px - 0.5))
+    counts = sum_per_cell(pixels, camera, _COVERAGE_COLUMNS)
     shown = np.where(counts > 0, counts, np.nan)
     image = axes.imshow(
         shown, extent=(*extent[0], *extent[1][::-1]), cmap="YlGnBu", vmin=0,
@@ -141,53 +138,6 @@ def coverage(size: ImageSize, errors: ReprojectionErrors) -> str:
     whole = MaxNLocator(4, integer=True)
     figure.colorbar(image, cax=beside, ticks=whole).ax.tick_params(labelsize=8)
     return to_data_uri(figure)
-
-
-def distances(errors: ReprojectionErrors) -> str:
-    """Number of used matches by distance."""
-    figure = new_figure(2.5)
-    axes = figure.add_axes((0.13, 0.18, 0.84, 0.79))
-    counts, _ = np.histogram(errors.distances_m[errors.is_inlier], bins=np.array(_OCTAVES_M))
-    bars = axes.bar(_OCTAVE_NAMES, counts, color=_INLIER)
-    axes.bar_label(bars, fontsize=8)
-    axes.set(xlabel="distance from the camera [m]", ylabel="used matches")
-    axes.margins(y=0.15)
-    return to_data_uri(figure)
-
-
-def error_bars(sigmas: Sequence[Array], bootstrap: Sequence[Array] | None) -> str:
-    """Standard deviation per axis, of rotation and translation, beside the bootstrap's.
-
-    Args:
-        sigmas: (3,) rotation [deg], (3,) translation [cm].
-        bootstrap: the same of the bootstrap, or None.
-    """
-    figure = new_figure(2.5)
-    places = ((0.19, 0.12, 0.29, 0.76), (0.68, 0.12, 0.29, 0.76))
-    for index, (place, label) in enumerate(
-        zip(places, ("rotation [deg]", "translation [cm]"), strict=True)
-    ):
-        axes = figure.add_axes(place)
-        _bars(axes, sigmas[index], None if bootstrap is None else bootstrap[index])
-        axes.set_ylabel(label, labelpad=2)
-    if bootstrap is not None:
-        figure.legend(*axes.get_legend_handles_labels(), loc="upper center", ncols=2,
-                      frameon=False, fontsize=8)  # fmt: skip
-    return to_data_uri(figure)
-
-
-def _bars(axes: Axes, sigma: Array, other: Array | None) -> None:
-    places = np.arange(3)
-    shift = 0.0 if other is None else 0.13
-    style: dict[str, Any] = {"fmt": "o", "capsize": 5, "elinewidth": 2, "markersize": 4}
-    axes.errorbar(places - shift, np.zeros(3), sigma, color=_INLIER, label="by frames", **style)
-    if other is not None:
-        axes.errorbar(
-            places + shift, np.zeros(3), other, color=_OUTLIER, label="bootstrap", **style
-        )
-    axes.set_xticks(places, ["x", "y", "z"])
-    axes.axhline(0, color="0.7", linewidth=0.8, zorder=0)
-    axes.set_xlim(-0.6, 2.6)
 
 
 def convergence(rounds: Sequence[Mapping[str, Any]]) -> str:
@@ -258,29 +208,30 @@ _MIN_PER_CELL = 3  # for a mean
 
 
 def sum_per_cell(
-    pixels_px: Array, size: ImageSize, columns: int, values: Array | None = None
+    pixels_px: Array, camera: Camera, columns: int, values: Array | None = None
 ) -> Array:
     """(rows, columns) sum of (n,) values of the pixels in each cell, or their number.
 
     The cells are about square.
     """
-    rows = max(1, round(columns * size.height_px / size.width_px))
+    size = camera.width_px, camera.height_px
+    rows = max(1, round(columns * size[1] / size[0]))
     u, v = np.clip(pixels_px + 0.5, 0, size).T
     sums = np.histogram2d(v, u, (rows, columns), [(0, size[1]), (0, size[0])], weights=values)[0]
     return np.asarray(sums)
 
 
 def mean_residuals(
-    size: ImageSize, errors: ReprojectionErrors, columns: int
+    camera: Camera, errors: ReprojectionErrors, columns: int
 ) -> tuple[Array, Array, float]:
     """The mean residual of each cell that has at least three.
 
     Returns:
         (m, 2) centres of these cells [px], (m, 2) their means [px], the width of a cell [px].
     """
-    counts = sum_per_cell(errors.pixels_px, size, columns)
+    counts = sum_per_cell(errors.pixels_px, camera, columns)
     full = np.nonzero(counts >= _MIN_PER_CELL)
-    sums = [sum_per_cell(errors.pixels_px, size, columns, v)[full] for v in errors.vectors_px.T]
-    cell = np.array([size.width_px / columns, size.height_px / len(counts)])
+    sums = [sum_per_cell(errors.pixels_px, camera, columns, v)[full] for v in errors.vectors_px.T]
+    cell = np.array([camera.width_px / columns, camera.height_px / len(counts)])
     centres = (np.column_stack(full[::-1]) + 0.5) * cell - 0.5
     return centres, np.column_stack(sums) / counts[full][:, None], float(cell[0])

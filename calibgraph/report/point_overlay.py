@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.files import write_atomically
+from calibgraph.files import write_bytes
 from calibgraph.io.frame import Frame
 from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.model.verdict import Status
-from calibgraph.outputs import with_png_mark
 
 Image = NDArray[np.uint8]
 
@@ -48,7 +47,7 @@ def write_guess_overlays(frame: Frame, guess: Rig, folder: Path) -> list[Path]:
         CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
     """
     titles = {name: (f"{name}, frame {frame.name}: guess",) for name in guess.cameras}
-    return _write_overlays(frame, (guess,), titles, folder / "guess_{name}.png", command="doctor")
+    return _write_overlays(frame, (guess,), titles, folder / "guess_{name}.png")
 
 
 def _write_overlays(
@@ -56,8 +55,6 @@ def _write_overlays(
     rigs: tuple[Rig, ...],
     titles: Mapping[str, tuple[str, ...]],
     path: Path,
-    *,
-    command: str = "",
 ) -> list[Path]:
     """Per camera, the points as each rig places them, below each other."""
     cloud = frame.load_cloud()[:, :3].astype(np.float64)
@@ -73,7 +70,7 @@ def _write_overlays(
         ]
         paths.append(path.with_name(path.name.replace("{name}", name)))
         picture = shrink(np.vstack([*panels, _depth_bar(image.shape[1])]), _MAX_WIDTH_PX)
-        write_image(paths[-1], picture, command=command)
+        write_image(paths[-1], picture)
     return paths
 
 
@@ -107,17 +104,12 @@ def _dot_side(pixels: int, points: int) -> int:
     return int(np.clip(round(side), 1, _MAX_DOT_PX))
 
 
-def write_image(path: Path, image: Image, *, command: str = "") -> None:
-    """Write a BGR image as PNG, atomically, with the mark of a command if it has one."""
+def write_image(path: Path, image: Image) -> None:
+    """Write a BGR image as PNG, atomically."""
     encoded, data = cv2.imencode(".png", image)
     if not encoded:
         raise CalibrationError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")
-
-    def write(part: Path) -> None:
-        picture = data.tobytes()
-        part.write_bytes(with_png_mark(picture, command) if command else picture)
-
-    write_atomically(path, write)
+    write_bytes(path, data.tobytes())
 
 
 def depth_colours(distance_m: Array) -> Image:

@@ -14,7 +14,7 @@ from calibgraph.model.config import config_from
 from calibgraph.report.as_json import finite, result_summary
 from calibgraph.tracking import DurableCalibrator, Update, update_all, warm_up_tracker
 from calibgraph.tracking.frame_group import in_groups
-from calibgraph.tracking.offsets import require_offset_alone
+from calibgraph.tracking.state import require_poses_alone
 from calibgraph.tracking.stream_lines import frames_of_lines
 from calibgraph.tracking.streams import Refused
 from calibgraph.tracking.update import json_lines
@@ -39,7 +39,7 @@ def answer(held: Held, request: tuple[str, Path, bytes, str]) -> tuple[int, str]
         if method != "DELETE":
             if folder not in held:
                 given = config_from(json.loads(settings.read_text()), "config")
-                require_offset_alone(given)
+                require_poses_alone(given)
                 held[folder] = DurableCalibrator(folder / "state", load_rig(rig), given)
             if method == "POST":
                 return 200, _take_frames(held[folder], body)

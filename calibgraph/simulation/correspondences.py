@@ -18,6 +18,7 @@ Rng = np.random.Generator
 
 _STUCK_SIZE = 1.3  # the size of errors that the confidences of a stuck frame express
 _MAX_SIZE = 1.6  # largest size that a confidence expresses
+_MAX_TRIES = 1000
 
 
 @dataclass(frozen=True)
@@ -174,7 +175,6 @@ def _draw_polynomial(rng: Rng) -> Array:
     return np.asarray(drawn / np.sqrt(terms_squared.sum()))
 
 
-_MAX_TRIES = 1000
 _LIDAR_HEIGHT_M, _FAR_M = 1.73, 80.0
 _WALLS_M = (7.0, 12.0)
 _BEAMS_RAD = (math.radians(-25.0), math.radians(15.0))
@@ -277,28 +277,19 @@ def simulate_correspondences(
         ValueError: if a camera sees too few points.
     """
     rng = np.random.default_rng(seed)
-    matchers = matchers_of(rig, errors, seed)
-    tables = [
+    matchers = matchers_of(rig, errors, seed).items()
+    return concatenate([
         matcher.match(rng, name, frame, count=matches, depth_m=depth_m)
-        for frame in range(frames)
-        for name, matcher in matchers.items()
-    ]
-    return concatenate(tables)
+        for frame in range(frames) for name, matcher in matchers
+    ])  # fmt: skip
 
 
 def matchers_of(
     rig: Rig, errors: MatcherErrors | Mapping[str, MatcherErrors] | None, seed: int
 ) -> dict[str, SimulatedMatcher]:
     """A matcher per camera, numbered from 1: NumPy's generators of [seed, 0] and seed are equal."""
+    each = errors if isinstance(errors, Mapping) else dict.fromkeys(rig.cameras, errors)
     return {
-        name: SimulatedMatcher(camera, _errors_of(errors, name), [seed, number])
+        name: SimulatedMatcher(camera, each[name] or MatcherErrors(), [seed, number])
         for number, (name, camera) in enumerate(rig.cameras.items(), start=1)
     }
-
-
-def _errors_of(
-    errors: MatcherErrors | Mapping[str, MatcherErrors] | None, name: str
-) -> MatcherErrors:
-    if errors is None:
-        return MatcherErrors()
-    return errors if isinstance(errors, MatcherErrors) else errors[name]

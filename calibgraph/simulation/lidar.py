@@ -1,6 +1,6 @@
 """A spinning LiDAR in a simulated world."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -97,7 +97,7 @@ def scan(
         (n, 4) x y z [m] in the LiDAR's frame and intensity in 0 to 1, in random order.
     """
     shots = shot_directions(lidar)
-    fired = shot_directions(as_fired(lidar))
+    fired = shot_directions(lidar, lidar.errors.elevations_deg)
     directions, hits = cast_beams(world, lidar.errors, T_world_lidar, fired)
     albedo, incidence = find_albedos(world, directions, hits)
     gain = np.repeat(gains, len(shots) // len(gains))
@@ -112,19 +112,16 @@ def scan(
     return np.column_stack([xyz, intensity[order].clip(0, 1)]).astype(np.float32)
 
 
-def as_fired(lidar: Lidar) -> Lidar:
-    """The sensor with the elevations at which its beams are, in place of those it reports."""
-    wrong = lidar.errors.elevations_deg
-    if not wrong:
-        return lidar
-    elevations = np.add(lidar.elevations_deg, wrong)
-    return replace(lidar, elevations_deg=tuple(elevations.tolist()))
+def shot_directions(lidar: Lidar, errors_deg: tuple[float, ...] = ()) -> Array:
+    """(beams * steps, 3) unit vectors in the LiDAR's frame, beam by beam.
 
-
-def shot_directions(lidar: Lidar) -> Array:
-    """(beams * steps, 3) unit vectors in the LiDAR's frame, beam by beam."""
+    Args:
+        lidar: the sensor.
+        errors_deg: added to the elevations that it reports, per beam.
+    """
     azimuth_deg = np.arange(*lidar.azimuths_deg, lidar.azimuth_step_deg)
-    azimuth, elevation = np.meshgrid(np.radians(azimuth_deg), np.radians(lidar.elevations_deg))
+    elevations_deg = np.add(lidar.elevations_deg, errors_deg or 0.0)
+    azimuth, elevation = np.meshgrid(np.radians(azimuth_deg), np.radians(elevations_deg))
     flat = np.cos(elevation)
     shots = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)]
     return np.stack(shots, axis=-1).reshape(-1, 3)

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
@@ -107,10 +107,8 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     """
     out = Path(out)
     lidar = replace(lidar_of(beams), errors=_draw_errors(sensor_errors, beams, seed))
-    _require_range(frames, step_m)
-    _require_sizes(rig)
     guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
-    _require_empty(out)
+    _require_possible(out, rig, frames, step_m)
     progress = progress or no_progress
     progress("building the street", 0, frames)
     drive = build_drive(
@@ -179,7 +177,7 @@ def _write_scans(
         progress("scanning", frame, len(drive.T_world_lidar))
         rng = np.random.default_rng([seed, _SCAN, frame])
         cloud = scan(drive.world, lidar, gains, T_world_lidar, rng=rng)
-        _write_cloud(folder / f"{frame:06d}.npy", cloud)
+        write_atomically(folder / f"{frame:06d}.npy", partial(np.save, arr=cloud))
 
 
 def _write_images(folder: Path, rig: Rig, drive: Drive, seed: int, *, progress: Progress) -> None:
@@ -196,19 +194,12 @@ def _write_images(folder: Path, rig: Rig, drive: Drive, seed: int, *, progress: 
             write_bytes(folder / name / f"{frame:06d}.jpg", data.tobytes())
 
 
-def _write_cloud(path: Path, cloud: NDArray[np.float32]) -> None:
-    write_atomically(path, lambda temporary: np.save(temporary, cloud))
-
-
-def _require_range(frames: int, step_m: float) -> None:
+def _require_possible(out: Path, rig: Rig, frames: int, step_m: float) -> None:
     if not (frames >= 1 and 0 <= step_m * frames <= MAX_STREET_M):
         raise ValueError(
             f"{frames} frames, {step_m} m apart: expected at least 1 frame, and 0 to "
             f"{MAX_STREET_M} m in all"
         )
-
-
-def _require_sizes(rig: Rig) -> None:
     for name, camera in rig.cameras.items():
         width, height = camera.width_px, camera.height_px
         if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS:
@@ -216,10 +207,7 @@ def _require_sizes(rig: Rig) -> None:
                 f"camera {name!r} has {width}x{height} px: up to {MAX_SIDE_PX} a side and "
                 f"{MAX_PIXELS} in all can be simulated"
             )
-
-
-def _require_empty(out: Path) -> None:
     require_place_for_folder(out)
-    for path in (out / "lidar", out / "cameras", out / RIG_FILE, out / REFERENCE_FILE):
+    for path in (out / name for name in _WRITTEN):
         if path.exists():
             raise FileError(path, "is there already; write into another folder, or remove it")

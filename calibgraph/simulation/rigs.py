@@ -1,6 +1,6 @@
 """Rigs to simulate with, by name; their extrinsics are the truth."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,83 +35,7 @@ def rig_of(name: str) -> Rig:
     """
     if name not in _RIGS:
         raise ValueError(f"unknown rig {name!r}; known are {', '.join(_RIGS)}")
-    return Rig(cameras=_RIGS[name]())
-
-
-def _kitti() -> Cameras:
-    lens = (718.856, 718.856, 607.1928, 185.2157)
-    places = {"image_2": (0.27, 0.06, -0.08), "image_3": (0.27, -0.48, -0.08)}
-    views = {name: (xyz_m, (-0.1, 0.9, -0.4)) for name, xyz_m in places.items()}
-    return _alike(views, (1241, 376), lens)
-
-
-def _sample() -> Cameras:
-    """Small images: two cameras ahead, and a distorted one to the left."""
-    left, right = ((0.42, 0.26, -0.34), (6, 4, 0.5)), ((0.41, -0.25, -0.35), (-7, 3.5, -0.7))
-    to_the_left = ((0.08, 0.40, -0.30), (75, 5, 0.9))
-    wide, size = (-0.14, 0.035, 0.0006, -0.0004, -0.003), (640, 360)
-    return {
-        **_alike({"front_left": left}, size, (481.3, 480.6, 318.9, 181.2)),
-        **_alike({"front_right": right}, size, (478.2, 478.9, 321.4, 178.6)),
-        **_alike({"left": to_the_left}, size, (476.5, 477.1, 320.7, 180.9), wide),
-    }
-
-
-def _walkley() -> Cameras:
-    """The image size is the paper's; lenses and placement are ours."""
-    views: Views = {
-        "primary": ((0.35, 0.3, -0.25), (1.2, 2.1, 0.3)),
-        "secondary": ((0.35, -0.3, -0.25), (-0.8, 1.6, -0.5)),
-    }
-    distortion = (-0.11, 0.07, 0.0004, -0.0003)
-    return _alike(views, (1920, 1200), (1362.4, 1361.7, 958.3, 604.6), distortion)
-
-
-def _surround() -> Cameras:
-    views: Views = {
-        name: (0.45 * _outwards(yaw) + [0.1, 0.0, -0.3], (yaw, 3.0 + 0.4 * i, 0.5 - 0.3 * i))
-        for i, (name, yaw) in enumerate(_SURROUND_YAW_DEG.items())
-    }
-    distortion = (-0.16, 0.05, 0.0003, -0.0002)
-    return _alike(views, (1280, 800), (905.2, 904.6, 642.1, 396.8), distortion)
-
-
-def _fisheye() -> Cameras:
-    views: Views = {
-        name: (_outwards(yaw) * [1.6, 0.85, 0] + [0, 0, -0.7], (yaw, 20 + i, 0))
-        for i, (name, yaw) in enumerate(_FISHEYE_YAW_DEG.items())
-    }
-    lens, distortion = (385.0, 384.4, 641.5, 478.2), (0.05, -0.015, 0.004, -0.001)
-    return _alike(views, (1280, 960), lens, distortion, model="fisheye")
-
-
-def _omni() -> Cameras:
-    views: Views = {
-        "front": ((0.35, 0.0, -0.2), (2.0, 8.0, 0.5)),
-        "back": ((-0.4, 0.05, -0.25), (179, 9, 0)),
-    }
-    lens, distortion = (900.0, 898.5, 641.2, 637.4), (1.3, -0.02, 0.04, 0.0003, -0.0002)
-    return _alike(views, (1280, 1280), lens, distortion, model="omnidirectional")
-
-
-def _panorama() -> Cameras:
-    width, height = 2048, 1024
-    lens = (width / (2 * np.pi), height / np.pi, (width - 1) / 2, (height - 1) / 2)
-    views: Views = {"panorama": ((-0.1, 0.05, 0.25), (3.0, 2.0, -1.0))}
-    return _alike(views, (width, height), lens, model="equirectangular")
-
-
-_SURROUND_YAW_DEG = {
-    "front": 0.0, "front_left": 60.0, "back_left": 118.0, "back": 180.0, "back_right": -120.0,
-    "front_right": -59.0,
-}  # fmt: skip
-_FISHEYE_YAW_DEG = {"front": 0.0, "left": 91.0, "back": 180.0, "right": -89.0}
-
-_RIGS: dict[str, Callable[[], Cameras]] = {
-    "kitti": _kitti, "walkley": _walkley, "surround": _surround, "fisheye": _fisheye,
-    "omni": _omni, "panorama": _panorama, "sample": _sample,
-}  # fmt: skip
-RIG_NAMES = tuple(_RIGS)
+    return Rig(cameras={camera: each for group in _RIGS[name] for camera, each in group.items()})
 
 
 def _alike(
@@ -132,7 +56,7 @@ def _alike(
             intrinsics_px=Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy),
             distortion=distortion,
             T_camera_lidar=_mounted(xyz_m, yaw_pitch_roll_deg),
-        )
+        )  # fmt: skip
         for name, (xyz_m, yaw_pitch_roll_deg) in views.items()
     }
 
@@ -152,3 +76,68 @@ def _mounted(xyz_m: Array | tuple[float, ...], yaw_pitch_roll_deg: tuple[float, 
     turned = Rotation.from_euler("ZYX", yaw_pitch_roll_deg, degrees=True).as_matrix()
     R = _OPTICAL @ turned.T
     return transform(R, -R @ np.asarray(xyz_m))
+
+
+_PAIR_TURN_DEG = (-0.1, 0.9, -0.4)
+_SURROUND_YAW_DEG = {
+    "front": 0.0, "front_left": 60.0, "back_left": 118.0, "back": 180.0, "back_right": -120.0,
+    "front_right": -59.0,
+}  # fmt: skip
+_FISHEYE_YAW_DEG = {"front": 0.0, "left": 91.0, "back": 180.0, "right": -89.0}
+
+_RIGS: dict[str, list[Cameras]] = {
+    "kitti": [
+        _alike(
+            {"image_2": ((0.27, 0.06, -0.08), _PAIR_TURN_DEG),
+             "image_3": ((0.27, -0.48, -0.08), _PAIR_TURN_DEG)},
+            (1241, 376), (718.856, 718.856, 607.1928, 185.2157),
+        ),
+    ],
+    "walkley": [  # the image size is the paper's; lenses and placement are ours
+        _alike(
+            {"primary": ((0.35, 0.3, -0.25), (1.2, 2.1, 0.3)),
+             "secondary": ((0.35, -0.3, -0.25), (-0.8, 1.6, -0.5))},
+            (1920, 1200), (1362.4, 1361.7, 958.3, 604.6), (-0.11, 0.07, 0.0004, -0.0003),
+        ),
+    ],
+    "surround": [
+        _alike(
+            {name: (0.45 * _outwards(yaw) + [0.1, 0.0, -0.3], (yaw, 3.0 + 0.4 * i, 0.5 - 0.3 * i))
+             for i, (name, yaw) in enumerate(_SURROUND_YAW_DEG.items())},
+            (1280, 800), (905.2, 904.6, 642.1, 396.8), (-0.16, 0.05, 0.0003, -0.0002),
+        ),
+    ],
+    "fisheye": [
+        _alike(
+            {name: (_outwards(yaw) * [1.6, 0.85, 0] + [0, 0, -0.7], (yaw, 20 + i, 0))
+             for i, (name, yaw) in enumerate(_FISHEYE_YAW_DEG.items())},
+            (1280, 960), (385.0, 384.4, 641.5, 478.2), (0.05, -0.015, 0.004, -0.001),
+            model="fisheye",
+        ),
+    ],
+    "omni": [
+        _alike(
+            {"front": ((0.35, 0.0, -0.2), (2.0, 8.0, 0.5)),
+             "back": ((-0.4, 0.05, -0.25), (179, 9, 0))},
+            (1280, 1280), (900.0, 898.5, 641.2, 637.4), (1.3, -0.02, 0.04, 0.0003, -0.0002),
+            model="omnidirectional",
+        ),
+    ],
+    "panorama": [
+        _alike(
+            {"panorama": ((-0.1, 0.05, 0.25), (3.0, 2.0, -1.0))},
+            (2048, 1024), (2048 / (2 * np.pi), 1024 / np.pi, 2047 / 2, 1023 / 2),
+            model="equirectangular",
+        ),
+    ],
+    "sample": [  # small images: two cameras ahead, and a distorted one to the left
+        _alike({"front_left": ((0.42, 0.26, -0.34), (6, 4, 0.5))},
+               (640, 360), (481.3, 480.6, 318.9, 181.2)),
+        _alike({"front_right": ((0.41, -0.25, -0.35), (-7, 3.5, -0.7))},
+               (640, 360), (478.2, 478.9, 321.4, 178.6)),
+        _alike({"left": ((0.08, 0.40, -0.30), (75, 5, 0.9))},
+               (640, 360), (476.5, 477.1, 320.7, 180.9),
+               (-0.14, 0.035, 0.0006, -0.0004, -0.003)),
+    ],
+}  # fmt: skip
+RIG_NAMES = tuple(_RIGS)

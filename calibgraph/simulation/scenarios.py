@@ -64,18 +64,8 @@ def simulate_table(
 def scenario_of(name: str) -> Scenario:
     """A scenario by name.
 
-    Two resemble the paper's Stage-1 results, and nothing else of the paper. Ours below are medians
-    of 30 draws of 10 frames; 10 draws of 100 frames.
-
-    * ``kitti``: left 1.1; 2.6 cm, right 6.0; 6.2 cm, of which 6 cm to the side in both rows, so in
-      all frames; about 0.1 deg, between cameras 0.2 deg; confidences "high and uniform". (E_R of
-      0.002 and 0.001 deg at N = 10 contradict the axes in the same rows, 0.1 and 0.05 deg.) Ours:
-      left 2.1 cm, 0.13 deg; 1.8 cm, 0.09 deg; right 5.8 cm, 0.12 deg; 4.6 cm, 0.19 deg; between
-      0.23; 0.24 deg.
-    * ``walkley``: 151 and 42 cm, 0.9 and 0.6 deg; 87 and 109 cm, 1.1 and 1.7 deg, mostly along
-      the axis, no better with 100 frames than with 10: so most frames share their error. Ours:
-      85 and 69 cm, 1.0 and 0.8 deg; 51 and 87 cm, 0.8 and 1.4 deg.
-
+    ``kitti`` and ``walkley`` resemble the paper's Stage-1 results (``benchmarks/notes/paper.md``):
+    errors along the axes that most frames share, and confidences that are high or informative.
     ``surround`` and ``fisheye`` have six and four cameras and a matcher in between.
 
     Raises:

@@ -10,24 +10,8 @@ import cv2
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.simulation.paints import (
-    BARK,
-    BOARD,
-    CABIN,
-    COACHWORK,
-    GLASS,
-    LEAFY,
-    LEAVES,
-    PLAIN,
-    RUBBER,
-    SIGN,
-    SKIN,
-    SLATS,
-    STEEL,
-    TRIM,
-    Albedo,
-    Paint,
-)  # fmt: skip
+from calibgraph.simulation import paints
+from calibgraph.simulation.paints import Albedo, Paint
 
 STRETCH_M = 11.4
 UNIT_X, UNIT_Y, UNIT_Z = np.eye(3)
@@ -66,7 +50,7 @@ class Solid:
     base_m: tuple[float, ...]
     size_m: tuple[float, float, float]
     albedo: Albedo
-    paint: Paint = PLAIN
+    paint: Paint = paints.PLAIN
     yaw_deg: float = 0.0
     taper: tuple[float, float] = (1.0, 1.0)
     bumps: float = 0.0
@@ -84,58 +68,60 @@ class Solid:
 _Three = tuple[float, float, float]
 
 
-def box(base_m: _Three, size_m: _Three, albedo: Albedo, paint: Paint = PLAIN) -> Solid:
+def box(base_m: _Three, size_m: _Three, albedo: Albedo, paint: Paint = paints.PLAIN) -> Solid:
     """A box, its sides along the axes."""
     return Solid(round_axes=0, base_m=base_m, size_m=size_m, albedo=albedo, paint=paint)
 
 
-def cylinder(base_m: _Three, size_m: _Three, albedo: Albedo, paint: Paint = PLAIN) -> Solid:
+def cylinder(base_m: _Three, size_m: _Three, albedo: Albedo, paint: Paint = paints.PLAIN) -> Solid:
     """An upright cylinder."""
     return Solid(round_axes=2, base_m=base_m, size_m=size_m, albedo=albedo, paint=paint)
 
 
-def ellipsoid(base_m: _Three, size_m: _Three, albedo: Albedo, paint: Paint = PLAIN) -> Solid:
+def ellipsoid(base_m: _Three, size_m: _Three, albedo: Albedo, paint: Paint = paints.PLAIN) -> Solid:
     """An ellipsoid."""
     return Solid(round_axes=3, base_m=base_m, size_m=size_m, albedo=albedo, paint=paint)
 
 
 def _wheels(reach_m: float) -> tuple[Solid, ...]:
     places = ((x, y) for x in (-reach_m, reach_m) for y in (-0.78, 0.78))
-    return tuple(ellipsoid((*place, 0), (0.66, 0.36, 0.66), RUBBER) for place in places)
+    return tuple(ellipsoid((*place, 0), (0.66, 0.36, 0.66), paints.RUBBER) for place in places)
 
 
 CAR = (
-    box((0, 0, 0.28), (4.3, 1.76, 0.64), UNPAINTED, COACHWORK),
-    box((-0.25, 0, 0.92), (2.35, 1.56, 0.50), GLASS, CABIN),
+    box((0, 0, 0.28), (4.3, 1.76, 0.64), UNPAINTED, paints.COACHWORK),
+    box((-0.25, 0, 0.92), (2.35, 1.56, 0.50), paints.GLASS, paints.CABIN),
     box((-0.25, 0, 1.42), (2.40, 1.60, 0.06), UNPAINTED),
     *_wheels(1.35),
 )
 SLANTED_CAR = (  # a cabin that narrows towards the roof
-    box((0, 0, 0.28), (4.3, 1.76, 0.58), UNPAINTED, COACHWORK),
-    replace(box((-0.3, 0, 0.86), (2.9, 1.64, 0.56), GLASS, CABIN), taper=(0.62, 0.82)),
+    box((0, 0, 0.28), (4.3, 1.76, 0.58), UNPAINTED, paints.COACHWORK),
+    replace(
+        box((-0.3, 0, 0.86), (2.9, 1.64, 0.56), paints.GLASS, paints.CABIN), taper=(0.62, 0.82)
+    ),
     box((-0.3, 0, 1.42), (1.8, 1.36, 0.05), UNPAINTED),
     *_wheels(1.35),
 )
 VAN = (
-    box((-0.35, 0, 0.35), (4.1, 1.86, 1.95), UNPAINTED, COACHWORK),
+    box((-0.35, 0, 0.35), (4.1, 1.86, 1.95), UNPAINTED, paints.COACHWORK),
     box((2.15, 0, 0.35), (0.9, 1.8, 0.65), UNPAINTED),
-    replace(box((1.95, 0, 1.0), (1.3, 1.78, 0.95), GLASS, CABIN), taper=(0.45, 0.94)),
+    replace(box((1.95, 0, 1.0), (1.3, 1.78, 0.95), paints.GLASS, paints.CABIN), taper=(0.45, 0.94)),
     *_wheels(1.6),
 )
 FURNITURE = (  # of a stretch of pavement; y is from the kerb outwards
-    cylinder((0, 0.8, 0), (0.34, 0.34, 2.8), BARK),
-    replace(ellipsoid((0, 0.8, 2.1), (2.8, 2.8, 3.2), LEAVES, LEAFY), bumps=0.09),
-    cylinder((5, 0.7, 0), (0.16, 0.16, 6.5), STEEL),
-    box((5, -0.3, 6.4), (0.2, 2.0, 0.12), STEEL),
-    cylinder((-3, 0.6, 0), (0.09, 0.09, 2.7), STEEL),
-    box((-3, 0.6, 2), (0.12, 0.7, 0.7), SIGN, BOARD),
+    cylinder((0, 0.8, 0), (0.34, 0.34, 2.8), paints.BARK),
+    replace(ellipsoid((0, 0.8, 2.1), (2.8, 2.8, 3.2), paints.LEAVES, paints.LEAFY), bumps=0.09),
+    cylinder((5, 0.7, 0), (0.16, 0.16, 6.5), paints.STEEL),
+    box((5, -0.3, 6.4), (0.2, 2.0, 0.12), paints.STEEL),
+    cylinder((-3, 0.6, 0), (0.09, 0.09, 2.7), paints.STEEL),
+    box((-3, 0.6, 2), (0.12, 0.7, 0.7), paints.SIGN, paints.BOARD),
     cylinder((3, 0.9, 0), (0.6, 0.6, 1.2), UNPAINTED),
-    cylinder((-1.5, 0.3, 0), (0.2, 0.2, 1.0), TRIM),
+    cylinder((-1.5, 0.3, 0), (0.2, 0.2, 1.0), paints.TRIM),
 )
 TREE = (
-    cylinder((0, 0, 0), (0.42, 0.42, 4.0), BARK),
+    cylinder((0, 0, 0), (0.42, 0.42, 4.0), paints.BARK),
     *(
-        replace(ellipsoid(base, size, LEAVES, LEAFY), bumps=0.12)
+        replace(ellipsoid(base, size, paints.LEAVES, paints.LEAFY), bumps=0.12)
         for base, size in (
             ((0.2, 0.1, 2.6), (3.4, 3.2, 3.4)),
             ((-0.9, 0.7, 3.6), (2.6, 2.4, 2.6)),
@@ -144,12 +130,12 @@ TREE = (
     ),
 )
 PERSON = (
-    cylinder((0, 0, 0), (0.46, 0.46, 1.5), UNPAINTED, LEAFY),
-    ellipsoid((0, 0, 1.48), (0.22, 0.22, 0.28), SKIN),
+    cylinder((0, 0, 0), (0.46, 0.46, 1.5), UNPAINTED, paints.LEAFY),
+    ellipsoid((0, 0, 1.48), (0.22, 0.22, 0.28), paints.SKIN),
 )
 HEDGE = (
-    box((0, 0.2, 0), (11, 0.06, 1.3), BARK, SLATS),
-    box((0, 9.0, 0), (11, 1.2, 2.2), LEAVES, LEAFY),
+    box((0, 0.2, 0), (11, 0.06, 1.3), paints.BARK, paints.SLATS),
+    box((0, 9.0, 0), (11, 1.2, 2.2), paints.LEAVES, paints.LEAFY),
 )
 
 

@@ -10,55 +10,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.simulation import paints, solids
 from calibgraph.simulation.mesh import Mesh, join_meshes, mesh_of_solid, ribbon
-from calibgraph.simulation.paints import (
-    ASPHALT,
-    BARK,
-    BAY_M,
-    COLOURS,
-    FACADE,
-    GRASS,
-    KERB,
-    KERB_Y_M,
-    LANE_M,
-    LEAFY,
-    PAVING,
-    PLAIN,
-    ROAD,
-    ROOFING,
-    SLABS,
-    SLATS,
-    STEEL,
-    STOREY_M,
-    TILES,
-    TRIM,
-    Albedo,
-    Paint,
-)  # fmt: skip
-from calibgraph.simulation.solids import (
-    CAR,
-    FURNITURE,
-    HEDGE,
-    PERSON,
-    SLANTED_CAR,
-    STRETCH_M,
-    TREE,
-    UNPAINTED,
-    VAN,
-    Solid,
-    box,
-    cylinder,
-    place,
-)  # fmt: skip
+from calibgraph.simulation.paints import Albedo
+from calibgraph.simulation.solids import Solid, box, cylinder, place
 
 Rng = np.random.Generator
 
-LANE_Y_M = -LANE_M / 2
+LANE_Y_M = -paints.LANE_M / 2
 _PAVEMENT_Y_M, _GROUND_Y_M = 9.36, 24.0
 _WINDING = ((0.32, 150.0), (0.10, 64.0))  # amplitude of the heading [rad], wavelength [m]
 _STEP_M, _CLEAR_M = 1.0, 14.0
 _BALCONIES, _GABLE = 0.4, 0.6
-KINDS, _KIND_SHARES = (CAR, SLANTED_CAR, VAN), (0.3, 0.55, 0.15)
+KINDS, _KIND_SHARES = (solids.CAR, solids.SLANTED_CAR, solids.VAN), (0.3, 0.55, 0.15)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,24 +120,28 @@ def winding_line(length_m: float, layout: Layout, rng: Rng) -> Centreline:
 
 def build_street(line: Centreline, length_m: float, rng: Rng) -> Mesh:
     """Compose a street along a line; the lane at ``LANE_Y_M`` is free from 0 to ``length_m``."""
-    solids = [*draw_cars(line, length_m, rng), *_backdrop(line, rng)]
+    parts = [*draw_cars(line, length_m, rng), *_backdrop(line, rng)]
     for side in (1, -1):
-        solids += [*_houses(line, side, rng), *_roadside(line, side, rng)]
-    return join_meshes([*_ground(line), *map(mesh_of_solid, solids)])
+        parts += [*_houses(line, side, rng), *_roadside(line, side, rng)]
+    return join_meshes([*_ground(line), *map(mesh_of_solid, parts)])
 
 
 def _ground(line: Centreline) -> Iterator[Mesh]:
     """Road, kerbs, pavements and grass, and a plain to the horizon."""
-    yield mesh_of_solid(box((0, 0, -1.05), (4000, 4000, 1), GRASS, LEAFY))
-    yield _band(line, ((KERB_Y_M, 0), (-KERB_Y_M, 0)), ASPHALT, ROAD)
-    kerb, paving, lawn = (KERB_Y_M, 0.15), (KERB_Y_M + 0.16, 0.15), (_PAVEMENT_Y_M, 0.1)
+    yield mesh_of_solid(box((0, 0, -1.05), (4000, 4000, 1), paints.GRASS, paints.LEAFY))
+    yield _band(line, ((paints.KERB_Y_M, 0), (-paints.KERB_Y_M, 0)), paints.ASPHALT, paints.ROAD)
+    kerb, paving, lawn = (
+        (paints.KERB_Y_M, 0.15),
+        (paints.KERB_Y_M + 0.16, 0.15),
+        (_PAVEMENT_Y_M, 0.1),
+    )
     for side in (1, -1):
         for (y, z), (y_next, z_next), albedo, paint in (
-            ((KERB_Y_M, 0.0), kerb, KERB, PLAIN),
-            (kerb, paving, KERB, PLAIN),
-            (paving, (_PAVEMENT_Y_M, 0.15), PAVING, SLABS),
-            ((_PAVEMENT_Y_M, 0.15), lawn, KERB, PLAIN),
-            (lawn, (_GROUND_Y_M, 0.1), GRASS, LEAFY),
+            ((paints.KERB_Y_M, 0.0), kerb, paints.KERB, paints.PLAIN),
+            (kerb, paving, paints.KERB, paints.PLAIN),
+            (paving, (_PAVEMENT_Y_M, 0.15), paints.PAVING, paints.SLABS),
+            ((_PAVEMENT_Y_M, 0.15), lawn, paints.KERB, paints.PLAIN),
+            (lawn, (_GROUND_Y_M, 0.1), paints.GRASS, paints.LEAFY),
         ):
             yield _band(line, ((side * y, z), (side * y_next, z_next)), albedo, paint)
 
@@ -182,7 +150,7 @@ def _band(
     line: Centreline,
     edges_m: tuple[tuple[float, float], tuple[float, float]],
     albedo: Albedo,
-    paint: Paint,
+    paint: paints.Paint,
 ) -> Mesh:
     marks_m = line.along_m + line.layout.marks_from_m
     return ribbon(line.with_left, marks_m, edges_m, albedo=albedo, paint=paint)
@@ -199,7 +167,7 @@ def place_along(
 
 def draw_colour(rng: Rng) -> Albedo:
     """The colour of a car or a house."""
-    return COLOURS[rng.integers(len(COLOURS))]
+    return paints.COLOURS[rng.integers(len(paints.COLOURS))]
 
 
 def draw_cars(line: Centreline, length_m: float, rng: Rng) -> Iterator[Solid]:
@@ -225,35 +193,37 @@ def _houses(line: Centreline, side: int, rng: Rng) -> Iterator[Solid]:
     (fewest, most), setback_m = layout.storeys, layout.setback_m[0 if side > 0 else 1]
     while s < line.along_m[-1]:
         bays, storeys = int(rng.integers(3, 6)), int(rng.integers(fewest, most + 1))
-        front, middle = _PAVEMENT_Y_M + rng.uniform(0.3, 2.4), s + bays * BAY_M / 2
+        front, middle = _PAVEMENT_Y_M + rng.uniform(0.3, 2.4), s + bays * paints.BAY_M / 2
         front += setback_m / layout.width
         if rng.random() < layout.gap:
             yield from place_along(
-                line, HEDGE, s + 5.5, side * _PAVEMENT_Y_M, yaw_deg=turned, body=BARK
+                line, solids.HEDGE, s + 5.5, side * _PAVEMENT_Y_M, yaw_deg=turned, body=paints.BARK
             )
             yield from place_along(
-                line, TREE, s + 4, side * 13, yaw_deg=rng.uniform(0, 360), body=BARK
+                line, solids.TREE, s + 4, side * 13, yaw_deg=rng.uniform(0, 360), body=paints.BARK
             )
             s += 11
             continue
         parts, body = list(_house(bays, storeys, rng)), draw_colour(rng)
         yield from place_along(line, parts, middle, side * front, yaw_deg=turned, body=body)
-        s += bays * BAY_M + (rng.uniform(0.5, 3) if rng.random() < layout.gap else 0)
+        s += bays * paints.BAY_M + (rng.uniform(0.5, 3) if rng.random() < layout.gap else 0)
 
 
 def _house(bays: int, storeys: int, rng: Rng) -> Iterator[Solid]:
     """A house; its front is at y = 0, its middle at x = 0."""
-    width, depth, height = bays * BAY_M, 4 * BAY_M, storeys * STOREY_M
-    walls = box((0, depth / 2, 0), (width, depth, height), UNPAINTED, FACADE)
-    yield replace(walls, uv_from_m=(3 * BAY_M * rng.integers(100), 0.0))
+    width, depth, height = bays * paints.BAY_M, 4 * paints.BAY_M, storeys * paints.STOREY_M
+    walls = box((0, depth / 2, 0), (width, depth, height), solids.UNPAINTED, paints.FACADE)
+    yield replace(walls, uv_from_m=(3 * paints.BAY_M * rng.integers(100), 0.0))
     if rng.random() < _GABLE:
-        eaves = box((0, depth / 2, height), (width + 0.4, depth + 0.8, 2.8), TILES, ROOFING)
+        eaves = box(
+            (0, depth / 2, height), (width + 0.4, depth + 0.8, 2.8), paints.TILES, paints.ROOFING
+        )
         yield replace(eaves, taper=(0.97, 0.02))
     else:
-        yield box((0, depth / 2, height), (width + 0.3, depth + 0.3, 0.5), TRIM)
-    yield box((rng.uniform(-0.3, 0.3) * width, depth / 2, height), (0.7, 0.9, 3.6), BARK)
-    yield cylinder((width / 2 - 0.1, -0.08, 0), (0.12, 0.12, height), STEEL)
-    yield box((BAY_M * 1.5 - width / 2, -0.45, 0), (1.6, 0.9, 0.35), PAVING)
+        yield box((0, depth / 2, height), (width + 0.3, depth + 0.3, 0.5), paints.TRIM)
+    yield box((rng.uniform(-0.3, 0.3) * width, depth / 2, height), (0.7, 0.9, 3.6), paints.BARK)
+    yield cylinder((width / 2 - 0.1, -0.08, 0), (0.12, 0.12, height), paints.STEEL)
+    yield box((paints.BAY_M * 1.5 - width / 2, -0.45, 0), (1.6, 0.9, 0.35), paints.PAVING)
     if rng.random() < _BALCONIES:
         yield from _balconies(bays, storeys, rng)
 
@@ -261,23 +231,27 @@ def _house(bays: int, storeys: int, rng: Rng) -> Iterator[Solid]:
 def _balconies(bays: int, storeys: int, rng: Rng) -> Iterator[Solid]:
     for bay, storey in np.ndindex(bays, storeys - 1):
         if rng.random() < _BALCONIES:
-            x, z = (bay + 0.5 - bays / 2) * BAY_M, (storey + 1) * STOREY_M
-            yield box((x, -0.55, z), (2.0, 1.1, 0.14), TRIM)
-            yield box((x, -1.07, z + 0.14), (2.0, 0.05, 0.95), STEEL, SLATS)
+            x, z = (bay + 0.5 - bays / 2) * paints.BAY_M, (storey + 1) * paints.STOREY_M
+            yield box((x, -0.55, z), (2.0, 1.1, 0.14), paints.TRIM)
+            yield box((x, -1.07, z + 0.14), (2.0, 0.05, 0.95), paints.STEEL, paints.SLATS)
 
 
 def _roadside(line: Centreline, side: int, rng: Rng) -> Iterator[Solid]:
     """Furniture of the pavements, and people on them."""
     turned = 0.0 if side > 0 else 180.0
-    stretch_m = STRETCH_M * line.layout.spacing
+    stretch_m = solids.STRETCH_M * line.layout.spacing
     for s in np.arange(line.along_m[0], line.along_m[-1], stretch_m) + rng.uniform(-1, 1):
         colour, body = draw_colour(rng), draw_colour(rng)
-        yield from place_along(line, FURNITURE, s, side * KERB_Y_M, yaw_deg=turned, body=colour)
-        person, person_y = s + rng.uniform(-5, 5), side * (KERB_Y_M + rng.uniform(1.2, 2.8))
-        yield from place_along(line, PERSON, person, person_y, yaw_deg=0, body=body)
+        yield from place_along(
+            line, solids.FURNITURE, s, side * paints.KERB_Y_M, yaw_deg=turned, body=colour
+        )
+        person, person_y = s + rng.uniform(-5, 5), side * (paints.KERB_Y_M + rng.uniform(1.2, 2.8))
+        yield from place_along(line, solids.PERSON, person, person_y, yaw_deg=0, body=body)
         if rng.random() < line.layout.tree:
             yaw, tree_y = rng.uniform(0, 360), side * (_PAVEMENT_Y_M - 0.5)
-            yield from place_along(line, TREE, s + 7.5, tree_y, yaw_deg=yaw, body=BARK)
+            yield from place_along(
+                line, solids.TREE, s + 7.5, tree_y, yaw_deg=yaw, body=paints.BARK
+            )
 
 
 def _backdrop(line: Centreline, rng: Rng) -> Iterator[Solid]:
@@ -286,14 +260,14 @@ def _backdrop(line: Centreline, rng: Rng) -> Iterator[Solid]:
         x = line.xy_m[0, 0] - 40
         while x < line.xy_m[-1, 0] + 40:
             bays, storeys = int(rng.integers(4, 8)), int(rng.integers(3, 7))
-            xy = x + bays * BAY_M / 2, side * (48 + rng.uniform(-4, 4))
+            xy = x + bays * paints.BAY_M / 2, side * (48 + rng.uniform(-4, 4))
             body = draw_colour(rng)
             yield from place(_block(bays, 4, storeys), xy, yaw_deg=rng.normal(0, 4), body=body)
-            x += bays * BAY_M + rng.uniform(0, 8)
+            x += bays * paints.BAY_M + rng.uniform(0, 8)
     for s in line.along_m[[0, -1]]:
         yield from place_along(line, _block(4, 16, 3), s, 0, yaw_deg=0, body=draw_colour(rng))
 
 
 def _block(bays_along: int, bays_across: int, storeys: int) -> list[Solid]:
-    size = bays_along * BAY_M, bays_across * BAY_M, storeys * STOREY_M
-    return [box((0, 0, 0), size, UNPAINTED, FACADE)]
+    size = bays_along * paints.BAY_M, bays_across * paints.BAY_M, storeys * paints.STOREY_M
+    return [box((0, 0, 0), size, solids.UNPAINTED, paints.FACADE)]

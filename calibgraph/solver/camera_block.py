@@ -89,10 +89,6 @@ class CameraBlock:
         """(n,) of the bits of each point."""
         return hash_numbers(self.block.points_lidar_m)
 
-    def in_frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(n,) which correspondences belong to frames of some numbers."""
-        return np.repeat(np.isin(self.frame_numbers, numbers), self.frame_counts)
-
     def sorted_by(self, of_frame: NDArray[np.int64]) -> CameraBlock:
         """The same correspondences in the order of a number of their frames, (f,)."""
         return self.select(np.argsort(np.repeat(of_frame, self.frame_counts), kind="stable"))

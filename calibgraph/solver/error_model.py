@@ -87,11 +87,6 @@ class ErrorFit:
         unit = np.asarray(prior_sigmas)
         return unit * values, unit * np.sqrt(np.diag(covariance))
 
-    def drop_pose_graph(self) -> LatentPoseFit | None:
-        """The optimum without priors and measured relative poses, of the same ratios."""
-        model = replace(self.model, pose_graph=gtsam.NonlinearFactorGraph())
-        return fit_latent_poses(model, self.fit, relative_tolerance=_COARSE_TOLERANCE)
-
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
         """Per camera, (4, 4)."""

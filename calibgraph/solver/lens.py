@@ -72,32 +72,9 @@ def lens_term(
     counts = len(placed.block), len(placed.count_of_frame)
     of_poses = within.at_place(findings.place_variance)[placed.places]
     in_graph = np.linalg.inv(
-        information_in_graph(hessians, of_poses, within.least, lens).sum(axis=0)
+        _information_in_graph(hessians, of_poses, within.least, lens).sum(axis=0)
     )
-    shown = hessians.sum(axis=0), scatter, in_graph
-    return lens_term_of(lens, shown, counts, within, findings=findings)
-
-
-def lens_term_of(
-    lens: LensVariable,
-    shown: tuple[Array, Array, Array],
-    counts: tuple[float, float],
-    within: WithinPlace,
-    *,
-    findings: MatcherFindings,
-) -> LensTerm:
-    """The same from sums over matches.
-
-    Args:
-        lens: of the camera.
-        shown: (6 + k, 6 + k) Hessian of independent matches; sum of the outer products of the
-            gradients of frames; covariance of m_c and s_c by the matches and the poses of places.
-        counts: of matches and of frames.
-        within: what its matches of one place share.
-        findings: the matcher's error.
-    """
-    hessian, scatter, in_graph = shown
-    hessian = hessian + weak_information(lens)
+    hessian = hessians.sum(axis=0) + weak_information(lens)
     covariance = np.linalg.inv(hessian)
     scatter = _allow_for_few_frames(scatter, hessian, *counts)
     of_matches = MATCH_SHARE * counts[0] if any(findings.systematic_sigmas) else 0.0
@@ -145,7 +122,7 @@ def _stated_clock(camera: Camera) -> list[LensPart]:
     return [part for part, sigma in stated.items() if sigma]
 
 
-def information_in_graph(
+def _information_in_graph(
     hessians: Array, of_poses: Array, least: float, lens: LensVariable
 ) -> Array:
     """(p, 6 + k, 6 + k) of m_c and s_c by the matches and the pose of each place.

@@ -9,7 +9,7 @@ from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.solver.elimination import LatentPoseFit
-from factors.free_lens import ASPECT, FOCAL, OFFSET, READOUT
+from factors.free_lens import FOCAL, OFFSET, READOUT
 
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
 _UNITS = {FOCAL: "px", "centre_x": "px", "centre_y": "px", OFFSET: "s", READOUT: "s"}
@@ -73,7 +73,7 @@ def _unit(lens: LensVariable, row: int) -> float:
     """The prior standard deviation of a parameter, in its unit."""
     name, step = lens.free.parameters[row], lens.free.sigmas[row]
     of_rig = _in_its_unit(lens, name, np.zeros(len(lens.free)))
-    return step * of_rig if name in (FOCAL, ASPECT) else step
+    return step * of_rig if name == FOCAL else step
 
 
 def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
@@ -84,7 +84,6 @@ def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
         OFFSET: clock.offset_s,
         READOUT: clock.readout_s,
         FOCAL: float(np.sqrt(k.fx * k.fy)),
-        ASPECT: k.fx / k.fy,
         "centre_x": k.cx,
         "centre_y": k.cy,
     }

@@ -209,40 +209,24 @@ class Marginals:
         scatter = shared_scatter(findings or self.findings, T_camera_lidar, curvature, repeats)
         return curvature.sandwich(scatter)
 
-    @cached_property
-    def data_only(self) -> JointPoses | None:
-        """The solution of the correspondences alone; None where there is nothing else."""
-        if not self.at.objective.uses_correspondences or not self.at.objective.pose_graph.size():
+    @property
+    def _data_only(self) -> JointPoses | None:
+        """The solution of the correspondences alone; None where the terms do not use them."""
+        if not self.at.objective.uses_correspondences:
             return None
-        if (found := self._data_only_by_errors) is not None:
-            return found
+        alone = None if self.errors is None else self.errors.without_priors
+        if alone is None:
+            alone = fit_without_priors(self.at, self.findings, self.table.places)
+        if alone is not None:
+            return JointPoses.of(alone.fit)
         free = self.at.data_only()
-        if self.at.objective.config.preset == "auto":
-            return JointPoses(free.T_camera_lidar, None)
-        scatter = cluster_robust_covariance(free, free.curvature)
+        is_auto = self.at.objective.config.preset == "auto"
+        scatter = None if is_auto else cluster_robust_covariance(free, free.curvature)
         if scatter is None:
             return JointPoses(free.T_camera_lidar, None)
         shared = self._shared(free.objective, free.curvature)
         between = error_between(free.T_camera_lidar, free.objective.pairs)
         return JointPoses(free.T_camera_lidar, scatter + (shared + between))
-
-    @property
-    def _data_only_by_errors(self) -> JointPoses | None:
-        """The same by the error model, None where there is none."""
-        errors = self.errors
-        if (
-            errors is not None
-            and errors.without_priors is None
-            and not self.at.objective.rig.relative_poses
-        ):
-            fit = errors.drop_pose_graph()  # near its minimum already
-            if fit is not None and len(errors.model.blocks) == len(self.cameras):
-                return JointPoses.of(fit)
-        alone = None if errors is None else errors.without_priors
-        if alone is None:
-            places = self.table.places
-            alone = fit_without_priors(self.at, self.findings, places)
-        return None if alone is None else JointPoses.of(alone.fit)
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:
@@ -250,7 +234,7 @@ class Marginals:
         cameras = tuple(self.at.objective.blocks)
         measured = self.at.objective.rig.relative_poses
         pairs = [pair for pair in measured if pair.a in cameras and pair.b in cameras]
-        free = self.data_only if pairs else None
+        free = self._data_only if pairs else None
         if free is None:
             return ()
         mount = free.mount

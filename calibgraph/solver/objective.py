@@ -1,4 +1,4 @@
-"""The objective of the joint refinement (paper, Eq. 5), its minimum, and its outliers."""
+"""Eq. 5 with the matches of a solve: its minimum, its outliers; see ``graph.objective``."""
 
 from __future__ import annotations
 

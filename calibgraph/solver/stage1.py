@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
@@ -64,7 +64,7 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
     Args:
         rig: lenses; its extrinsics are used with ``config.stage1 == "rig"`` alone.
         table: preprocessed correspondences, those of a camera sorted by frame.
-        config: ``stage1``, ``aggregate``, ``pnp_threshold_px``, ``seed``.
+        config: ``stage1``, ``pnp_threshold_px``, ``seed``.
     """
     if config.stage1 == "rig":
         named = [name for name in rig.cameras if name in table.cameras]
@@ -81,7 +81,7 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
     poses = iter(searched)
     return {
         name: aggregate_frames(
-            *frames.with_poses({i: next(poses) for i in numbers}).solved, len(frames.runs), config
+            *frames.with_poses({i: next(poses) for i in numbers}).solved, len(frames.runs)
         )
         for name, frames, numbers in zip(rig.cameras, common, left, strict=True)
     }
@@ -160,22 +160,19 @@ def frames_from(
     return FramePoses(rows, runs, refined.T_camera_lidar, refined.found & majority)
 
 
-def aggregate_frames(
-    poses: Array, numbers: NDArray[np.int64], frames: int, config: Config
-) -> CameraStage1:
+def aggregate_frames(poses: Array, numbers: NDArray[np.int64], frames: int) -> CameraStage1:
     """One extrinsic over the frames of a camera.
 
     Args:
         poses: (f, 4, 4) T_camera_lidar of the frames that have one.
         numbers: (f,) of these frames.
         frames: how many there are in all.
-        config: ``aggregate``.
     """
     median = median_pose(poses) if len(poses) else None
     near = are_near_median(poses, median)
     kept, T_hat = poses[near], median
-    if config.aggregate != "median" or not near.all():
-        T_hat = aggregate(kept, config.aggregate) if len(kept) else None
+    if not near.all():
+        T_hat = median_pose(kept) if len(kept) else None
     return CameraStage1(
         T_camera_lidar=T_hat,
         by_frame=MappingProxyType(dict(zip(numbers.tolist(), poses, strict=True))),
@@ -206,46 +203,7 @@ def are_near_median(T_camera_lidar: Array, median: Array | None = None) -> NDArr
     return np.asarray(near[0] & near[1])
 
 
-def aggregate(T_camera_lidar: Array, how: str) -> Array:
-    """(4, 4) one extrinsic from those of several frames.
-
-    Args:
-        T_camera_lidar: (f, 4, 4), f >= 1.
-        how: ``median``: component-wise for the translation, geodesic L1 for the rotation;
-            ``mean``: arithmetic and chordal; ``mode``: half-sample mode of each component, the
-            rotation's in the tangent at its median.
-    """
-    if how == "median":
-        return median_pose(T_camera_lidar)
-    rotations, translations = _parts(T_camera_lidar)
-    if how == "mean":
-        return transform(rotations.mean(), translations.mean(axis=0))
-    if how == "mode":
-        median = geodesic_median(rotations)
-        tangents = (rotations * median.inv()).as_rotvec()
-        mode = np.array([half_sample_mode(column) for column in tangents.T])
-        translation = [half_sample_mode(column) for column in translations.T]
-        return transform(Rotation.from_rotvec(mode) * median, translation)
-    raise ValueError(f"unknown aggregate {how!r}; known are median, mean, mode")
-
-
 def median_pose(T_camera_lidar: Array) -> Array:
     """(4, 4) of (f, 4, 4): component-wise for the translation, geodesic L1 for the rotation."""
-    rotations, translations = _parts(T_camera_lidar)
-    return transform(geodesic_median(rotations), np.median(translations, axis=0))
-
-
-def _parts(T_camera_lidar: Array) -> tuple[Rotation, Array]:
-    """The rotations and (f, 3) translations of (f, 4, 4)."""
-    return Rotation.from_matrix(T_camera_lidar[:, :3, :3]), T_camera_lidar[:, :3, 3]
-
-
-def half_sample_mode(samples: Sequence[float] | Array) -> float:
-    """Mode of a sample: keep the densest half, again and again (Bickel and Fruehwirth 2006)."""
-    x = np.sort(np.asarray(samples, dtype=np.float64))
-    while len(x) > 2:  # noqa: PLR2004 - two values have no denser half
-        half = (len(x) + 1) // 2
-        widths = x[half - 1 :] - x[: len(x) - half + 1]
-        start = int(np.argmin(widths))
-        x = x[start : start + half]
-    return float(x.mean())
+    rotations = Rotation.from_matrix(T_camera_lidar[:, :3, :3])
+    return transform(geodesic_median(rotations), np.median(T_camera_lidar[:, :3, 3], axis=0))

@@ -42,7 +42,7 @@ def with_open_frames(state: State, *frames: LiveFrame) -> State:
 
 def begin_frames(state: State, frames: Sequence[Incoming]) -> State:
     """The state with frames begun, none of whose matches is absorbed."""
-    last, count, in_time = frames[-1], len(state.names), state.offsets is not None
+    last, count = frames[-1], len(state.names)
     found = [one.table.findings for one in frames if len(one.table)]
     state = changed(
         state,
@@ -51,10 +51,7 @@ def begin_frames(state: State, frames: Sequence[Incoming]) -> State:
         updates=state.updates + len(frames),
         findings=found[-1] if found else state.findings,
     )
-    empty = (
-        LiveFrame.empty(one.number, count, one.table.metadata.get(PLACE, ""), in_time=in_time)
-        for one in frames
-    )
+    empty = (LiveFrame.empty(f.number, count, f.table.metadata.get(PLACE, "")) for f in frames)
     return with_open_frames(state, *empty)
 
 
@@ -68,7 +65,7 @@ def blocks_by_camera(state: State, table: Correspondences) -> dict[int, CameraBl
     if not len(table):
         return {}
     kept = preprocess(rig_at(state, state.T_lidar_camera), table, state.config)
-    blocks = camera_blocks(state.rig_in_time, kept.table, state.config)
+    blocks = camera_blocks(state.rig, kept.table, state.config)
     return {state.names.index(name): block for name, block in blocks.items()}
 
 
@@ -128,11 +125,10 @@ def agrees_at_its_place(state: State, closed: ClosedPlaces, camera: int, own: Ou
     one, frame = state.cameras[camera], state.live_frames[-1]
     if one.summary.walk or state.config.preset != "auto" or not states_places(state):
         return False
-    even = state.offsets is not None
-    gated = Gated.at(own.T_lidar_camera, own.raw, one.scale, state.references[camera], even=even)
+    gated = Gated.at(own.T_lidar_camera, own.raw, one.scale, state.references[camera])
     if not gated.sums.matches[0]:
         return False
-    state = with_open_frames(state, frame.add(camera, gated, state.offsets))
+    state = with_open_frames(state, frame.add(camera, gated))
     window, _ = closed.with_open_epoch(state, None)
     place = window.places.index(frame.place)
     displaced = Linearization.at(window.model, window.values).distances[place, [0, 1 + camera]]
@@ -187,7 +183,7 @@ def absorb(
         raw, counts = gated.residuals.block, gated.sums.matches.astype(np.int64).tolist()
         for of_block, number in enumerate(raw.frame_numbers.tolist()):
             row = rows[number]
-            newest[row] = newest[row].add(camera, gated, state.offsets, row=of_block)
+            newest[row] = newest[row].add(camera, gated, row=of_block)
             used[row][camera] = counts[of_block]
         state = _count_absorbed(state, camera, gated)
     state = add_to_totals(with_open_frames(state, *newest), newest)
@@ -197,15 +193,15 @@ def absorb(
 def _gated(state: State, camera: int, block: CameraBlock) -> Gated | None:
     """The frames of a block with enough matches within the gate; None if there are none."""
     scale, reference = state.cameras[camera].scale, state.references[camera]
-    pose, even = state.T_lidar_camera[camera], state.offsets is not None
-    gated = Gated.at(pose, block, scale, reference, even=even)
+    pose = state.T_lidar_camera[camera]
+    gated = Gated.at(pose, block, scale, reference)
     enough = gated.sums.matches > 0
     if enough.all():
         return gated
     if not enough.any():
         return None
     kept = block.select(np.repeat(enough, block.frame_counts))
-    return Gated.at(pose, kept, scale, reference, even=even)
+    return Gated.at(pose, kept, scale, reference)
 
 
 def _count_absorbed(state: State, camera: int, gated: Gated) -> State:

@@ -9,27 +9,22 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.variables import lens_key
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
-from calibgraph.model.lens_estimate import LensEstimate, with_sigmas
 from calibgraph.model.rig import RelativePose, Rig
 from calibgraph.model.verdict import START, Check, Status, Verdict
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES
-from calibgraph.solver.lens_estimates import estimates_of
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.closed_places import ClosedPlaces
 from calibgraph.tracking.contradictions import contradicting, pairs_without
-from calibgraph.tracking.epoch_sums import estimates_of_halves, in_its_half
 from calibgraph.tracking.noise import median
-from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.shown_frames import groups_by_frames
 from calibgraph.tracking.sources import error_sources
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
-from calibgraph.tracking.window import AnyWindow
+from calibgraph.tracking.window import Window
 from calibgraph.trust.estimate import Estimate
 from calibgraph.trust.image_posteriors import ImagePosteriors, measured_pairs
 from calibgraph.trust.pose_posterior import PosePosterior, group_tied
@@ -55,24 +50,14 @@ class Assessment:
             with too few frames.
         verdicts: per camera.
         window: the graph at its optimum, until the next frame.
-        lens: per camera whose time offset is estimated, its estimate.
         pairs: the relative poses that take part.
     """
 
     T_lidar_camera: tuple[gtsam.Pose3, ...]
     joint_covariance: Array
     verdicts: dict[str, Verdict]
-    window: AnyWindow
-    lens: dict[str, tuple[LensEstimate, ...]]
+    window: Window
     pairs: tuple[RelativePose, ...] = ()
-
-    def offsets(self, state: State) -> Offsets | None:
-        """The time offsets with those of the graph; None if they are not estimated."""
-        offsets = state.offsets
-        if offsets is not None:
-            for name, (one,) in self.lens.items():
-                offsets = offsets.with_camera(state.names.index(name), one.value, one.sigma)
-        return offsets
 
     def newest(self, optimum: Optimum | None) -> Optimum | None:
         """The optimum of closed epochs, with the newer poses of this one."""
@@ -80,7 +65,7 @@ class Assessment:
         return None if optimum is None else optimum.updated(newer)
 
 
-def assess(state: State, closed: ClosedPlaces, window: AnyWindow | None) -> Assessment:
+def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessment:
     """Assess the present estimates.
 
     A relative pose that contradicts the correspondences of both its cameras takes no part, as in a
@@ -91,24 +76,19 @@ def assess(state: State, closed: ClosedPlaces, window: AnyWindow | None) -> Asse
         closed: its closed epochs.
         window: of the frame before, if of the same epoch.
     """
-    sums = closed.all_sums(state).pose
-    halves = closed.halves + in_its_half(state, state.epochs[-1], len(state.epochs) - 1)
-    window, conflicts = closed.graph(state, window)
+    sums = closed.all_sums(state)
+    window, conflicts = closed.with_open_epoch(state, window)
     keys, estimates = window.model.reported_keys, state.T_lidar_camera
     if state.config.preset == "auto":
         estimates = window.T_lidar_camera(keys)
     covariance, few = window.covariance(keys), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
     covariance[few], covariance[:, few] = np.nan, np.nan
-    verdicts, lens = {}, _lens_estimates(window)
-    apart = estimates_of_halves(state, halves)
+    verdicts = {}
     for camera, name in enumerate(state.names):
         own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
-        known = lens.get(name, ())
-        verdicts[name] = _verdict(
-            state, sums, camera, covariance, conflicts=own, halves=apart.get(camera), lens=known
-        )
+        verdicts[name] = _verdict(state, sums, camera, covariance, conflicts=own)
     pairs = pairs_without(state, contradicting(conflicts))
-    return Assessment(estimates, covariance, verdicts, window, lens, pairs)
+    return Assessment(estimates, covariance, verdicts, window, pairs)
 
 
 def with_images(
@@ -139,16 +119,6 @@ def with_images(
     return replace(assessment, joint_covariance=joint, verdicts=verdicts), images
 
 
-def _lens_estimates(window: AnyWindow) -> dict[str, tuple[LensEstimate, ...]]:
-    model, found = window.model, {}
-    for number, term in model.lenses.items():
-        keys = [lens_key(number), model.reported_keys[number]]
-        values = window.values.atVector(keys[0])
-        estimates = estimates_of(term.variable, values, window.covariance(keys))
-        found[model.cameras[number]] = estimates
-    return found
-
-
 def _verdict(
     state: State,
     sums: Sums,
@@ -156,8 +126,6 @@ def _verdict(
     covariance: Array,
     *,
     conflicts: tuple[Conflict, ...],
-    halves: tuple[Array, Array] | None,
-    lens: tuple[LensEstimate, ...],
 ) -> Verdict:
     name, one = state.names[camera], state.cameras[camera]
     if not one.started:
@@ -171,16 +139,13 @@ def _verdict(
         frames=int(sums.frames[camera]),
         covariance=None if np.isnan(own).any() else own,
         data_sigmas=sigmas_of_hessian(sums.hessian[camera]),
-        halves=halves,
         conflicts=conflicts,
-        pull=None,
         converged=True,
         terms="full",
         scatter_only=not state.findings.states_common_error,
         tolerance=state.config.tolerance,
-        lens=lens,
     )
-    return Verdict((*check_estimate(estimate), *_recent_checks(state, one, lens)))
+    return Verdict((*check_estimate(estimate), *_recent_checks(state, one)))
 
 
 def _stuck_check(one: CameraState, status: Status) -> Check:
@@ -197,7 +162,7 @@ def _start_check(state: State, one: CameraState) -> Verdict:
     return Verdict(tuple(Check(START, "WARN", reason) for reason in reasons))
 
 
-def _recent_checks(state: State, one: CameraState, lens: tuple[LensEstimate, ...]) -> list[Check]:
+def _recent_checks(state: State, one: CameraState) -> list[Check]:
     """Checks of a camera's last frames."""
     checks = []
     limit = state.config.tracking.blind_frames
@@ -209,7 +174,6 @@ def _recent_checks(state: State, one: CameraState, lens: tuple[LensEstimate, ...
         checks.append(Check("blind frames", "WARN", text, one.absent))
     if one.summary.walk:
         text = "drifts: the estimate follows, over fewer frames"
-        text += "".join(f"; {each.trade_off}" for each in lens if each.trade_off)
         checks.append(Check("drift", "WARN", text))
     agreements = [good for _, good in one.agreements]
     if agreements:
@@ -249,9 +213,9 @@ def _counts(one: CameraState) -> dict[str, int]:
 
 
 def rig_at(state: State, T_lidar_camera: Sequence[gtsam.Pose3]) -> Rig:
-    """The rig with these estimates, and the present time offsets."""
+    """The rig with these estimates."""
     estimates = zip(state.names, T_lidar_camera, strict=True)
-    return state.rig_in_time.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
+    return state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
 
 
 def second_moments(assessment: Assessment) -> Array:
@@ -274,10 +238,9 @@ def to_calibration(
     joint = assessment.joint_covariance
     known = None if np.isnan(joint).any() else joint
     mounts = None if known is None else images.widen(second_moments(assessment))
-    newest = replace(state, offsets=assessment.offsets(state))
-    rig = rig_at(newest, assessment.T_lidar_camera)
+    rig = rig_at(state, assessment.T_lidar_camera)
     return Calibration(
-        rig=with_sigmas(rig, assessment.lens),
+        rig=rig,
         initial_rig=state.rig,
         covariance=covariance_by_camera(assessment, state.names),
         joint_covariance=known,
@@ -293,6 +256,5 @@ def to_calibration(
         terms="full",
         config=state.config,
         error_sources=error_sources(state, known) if sources else {},
-        lens=assessment.lens,
         moves=tuple(map(str, state.moves)),
     )

@@ -26,9 +26,8 @@ from calibgraph.tracking.contradictions import (
     pose_priors,
     poses_by_name,
 )
-from calibgraph.tracking.epoch_sums import split_halves, sum_closed_epochs
+from calibgraph.tracking.epoch_sums import sum_closed_epochs
 from calibgraph.tracking.frozen import changed
-from calibgraph.tracking.offset_walk import sums_in_time, times_of, times_with, to_present
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_model import (
     FrameSpread,
@@ -46,10 +45,10 @@ from calibgraph.tracking.quadratics import (
 )
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, equation_5
-from calibgraph.tracking.window import AnyWindow, ClosedWindow, Window
+from calibgraph.tracking.window import Window
 
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
-STEPS = 5  # fits, and estimates of the variance ratios between them
+_ROUNDS = 2  # of estimates of the variance ratios, a fit after each
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,17 +78,13 @@ class ClosedPlaces:
     def of(state: State, *, fitted: bool = False) -> ClosedPlaces:
         """Of a state's closed epochs, at the optimum that the state has, or else fitted."""
         frames = [frame for epoch in state.epochs[:-1] for frame in epoch.frames]
-        if state.offsets is None:
-            sums = state.places.add(sums_by_place(frames))
-        else:  # a match of an earlier epoch is of another offset
-            sums, frames = sums_in_time(state), []
+        sums = state.places.add(sums_by_place(frames))
         for camera in state.drifting:
             sums = sums.without(camera)
         rows = {sums.names[row]: int(row) for row in np.flatnonzero(sums.frames.any(axis=1))}
-        times, seen = times_of(state), FrameSpread.of(state, sums)
-        data = PlaceData.of(state, earlier_quadratics(state, sums), frames, rows)
-        data = data.at_own_times(times)
-        model = place_model(state, sums, seen, data, times=times)
+        seen = FrameSpread.of(state, sums)
+        data = PlaceData.of(state, earlier_quadratics(state), frames, rows)
+        model = place_model(state, sums, seen, data)
         values = _start(state, model, data.names)
         if state.optimum is None or fitted:
             fit, dropped = fit_without_contradictions(state, sums, model, values)
@@ -99,22 +94,9 @@ class ClosedPlaces:
             fit = LatentPoseFit(Linearization.at(model, values), 0, True)
         return ClosedPlaces(state, sums, seen, data, fit, dropped)
 
-    def at_optimum(self, state: State) -> ClosedPlaces:
-        """The same as :meth:`of` a state with the optimum and the variance ratios found here."""
-        if state.offsets is not None:
-            return ClosedPlaces.of(state)
-        data = self.data.with_quadratics(state, earlier_quadratics(state, self.sums))
-        blocks = {
-            state.names[camera]: matches.with_variance(self.seen.least(camera))
-            for camera, matches in data.cameras.items()
-        }
-        model, values = self.fit.linear.model.with_blocks(blocks), self.fit.linear.values
-        fit = LatentPoseFit(Linearization.at(model, values), 0, True)
-        return changed(self, state=state, data=data, fit=fit, _pose_graphs={})
-
     def fitted(self, state: State) -> ClosedPlaces:
         """At the optimum for the variance ratios of the state."""
-        model = place_model(state, self.sums, self.seen, self.data, times=times_of(state))
+        model = place_model(state, self.sums, self.seen, self.data)
         fit, dropped = fit_without_contradictions(state, self.sums, model, self.fit.linear.values)
         return ClosedPlaces(state, self.sums, self.seen, self.data, fit, dropped)
 
@@ -127,19 +109,12 @@ class ClosedPlaces:
     @cached_property
     def quadratics(self) -> Quadratics:
         """The matches of the graph near its optimum."""
-        if self.state.offsets is not None:
-            return quadratics_of(self.state, self.sums)
         return linearized(self.data.names, self.data.cameras, self.fit)
 
     @cached_property
     def marginals(self) -> list[gtsam.GaussianFactorGraph]:
         """Per place, on what all places share."""
         return marginals_of_places(self.fit)
-
-    @cached_property
-    def halves(self) -> Sums:
-        """(n, 2) sums over every other closed epoch."""
-        return split_halves(self.state)
 
     @cached_property
     def _closed_sums(self) -> Sums:
@@ -158,7 +133,7 @@ class ClosedPlaces:
         self, state: State, more: Mapping[int, Sums] | None = None
     ) -> gtsam.NonlinearFactorGraph:
         """Eq. 5 of the paper with the sums of all frames, and more of some cameras."""
-        sums = self.all_sums(state).pose
+        sums = self.all_sums(state)
         for camera, own in (more or {}).items():
             sums = sums.replace_at(camera, sums[camera] + own)
         return equation_5(self._priors(), state.references, sums)
@@ -174,23 +149,15 @@ class ClosedPlaces:
         cameras = zip(self.state.cameras, self.sums.frames.sum(axis=0), strict=True)
         return all(count >= _SETTLED for one, count in cameras if one.started)
 
-    def graph(self, state: State, window: AnyWindow | None) -> tuple[AnyWindow, Conflicts]:
-        """The whole graph, and the conflicts of relative poses with correspondences.
+    def with_open_epoch(self, state: State, window: Window | None) -> tuple[Window, Conflicts]:
+        """The whole graph in iSAM2, and the conflicts of relative poses with correspondences.
 
         The window of the frame before, if it is of the same epoch, goes on if its graph allows.
         """
-        partial = state.drifting or state.offsets is not None or state.config.preset != "auto"
-        begun = state.epochs[-1].frames or not state.is_refined or self.state.sizes != state.sizes
-        if partial or begun or state.rig.relative_poses:  # these may contradict the newest frames
-            return self.with_open_epoch(state, window)
-        return ClosedWindow(self.fit.linear, self.data.names), {}
-
-    def with_open_epoch(self, state: State, window: AnyWindow | None) -> tuple[Window, Conflicts]:
-        """The same in iSAM2."""
         frames = state.epochs[-1].frames
         opened = (*frames, *state.live_frames[-1:])
         touched = {frame.place for frame in opened}
-        every = self._at_present(self.sums, touched).add(sums_by_place(frames))
+        every = self.sums.add(sums_by_place(frames))
         for camera in state.drifting:  # its sums are as if of the present place
             own = self.all_sums(state)[camera]
             every = every.with_camera_at(state.live_frames[-1].place, camera, own)
@@ -198,34 +165,23 @@ class ClosedPlaces:
         seen = self.seen if self.is_settled else FrameSpread.of(state, every)
         if state.config.preset == "auto":
             kept, rows = self._split(every, touched)
-            lasts = {every.names[row] for row in rows} - touched
-            every, touched = self._at_present(every, lasts), touched | lasts
-            if state.offsets is not None:
-                earlier, frames = quadratics_of(state, every, places=rows), ()
         else:  # the weights of a preset of the paper
             every = every.bounded(most=0)
             earlier = quadratics_of(state, every)
             frames, kept, rows = (), (), [0] if every.frames.any() else []
         data = PlaceData.of(state, earlier, frames, {every.names[row]: row for row in rows})
-        times = times_with(times_of(self.state), touched)
-        model = place_model(state, every, seen, data, times=times)
+        model = place_model(state, every, seen, data)
         conflicts = Conflicts()
         if state.rig.relative_poses:
             start = _start(state, model, data.names)
             before = changed(model, pose_graph=self._summary(kept))
             conflicts = find_conflicts(state, every, before, start)
         model = changed(model, pose_graph=self._pose_graph(kept, contradicting(conflicts)))
-        if isinstance(window, Window) and window.has_graph_of(model, data.names):
+        if window is not None and window.has_graph_of(model, data.names):
             window.exchange(model)
         else:
             window = Window(model, data.names, _start(state, model, data.names))
         return window, conflicts
-
-    def _at_present(self, sums: PlaceSums, names: set[str]) -> PlaceSums:
-        """Sums whose time offsets at some places are those of the open epoch."""
-        if self.state.offsets is None:
-            return sums
-        return to_present(self.state, sums, times_of(self.state), names)
 
     def _summary(self, kept: Rows) -> gtsam.NonlinearFactorGraph:
         """One factor that stands for some of the places."""
@@ -256,39 +212,16 @@ class ClosedPlaces:
         return kept, sorted(rows)
 
 
-def settle(state: State, *, together: bool) -> tuple[State, ClosedPlaces]:
-    """The state with optimum and variance ratios of its closed epochs.
-
-    When these are many an epoch changes little, and the frames after it do the work step by step;
-    but not if they come together.
-    """
-    at_once = together and state.optimum is not None
-    closed = ClosedPlaces.of(state, fitted=at_once)
-    state = changed(state, is_refined=together)
-    if at_once:  # this is where the first step leads
-        state = changed(state, optimum=closed.optimum)
-    elif closed.is_settled and not together:
-        return state, closed
-    for step in range(2 if at_once else 1, STEPS + 1):
-        state, closed = refine(state, closed, step)
-    return state, closed.at_optimum(state)
-
-
-def refine(state: State, closed: ClosedPlaces, step: int) -> tuple[State, ClosedPlaces]:
-    """One step towards optimum and variance ratios of the closed epochs.
-
-    The first is a fit, the second an estimate of the ratios; and so again while these change. The
-    next epoch goes on from there.
-    """
-    if step % 2:
-        if step == 1 or closed.state.sizes != state.sizes:
-            closed = closed.fitted(state)
-            state = changed(state, optimum=closed.optimum)
-    elif closed.state.sizes == state.sizes and closed.shows_ratios:
+def settle(state: State) -> State:
+    """The state with optimum and variance ratios of its closed epochs."""
+    closed = ClosedPlaces.of(state, fitted=True)
+    for _ in range(_ROUNDS if closed.shows_ratios else 0):
         found = estimate_variance_ratios(closed.fit, state.sizes)
-        if not found.is_near(state.sizes):
-            state = changed(state, sizes=found)
-    return state, closed
+        if found.is_near(state.sizes):
+            break
+        state = changed(state, sizes=found)
+        closed = closed.fitted(state)
+    return changed(state, optimum=closed.optimum)
 
 
 def _start(state: State, model: LatentPoseModel, names: Sequence[str]) -> gtsam.Values:

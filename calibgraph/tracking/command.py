@@ -15,16 +15,13 @@ from calibgraph.errors import CalibrationError, DatasetError, FileError
 from calibgraph.io.bags import BagOptions
 from calibgraph.io.dataset import load_dataset
 from calibgraph.matching.burnt_in import hide_burnt_in
-from calibgraph.matching.protocol import Matcher, to_full_matcher
+from calibgraph.matching.protocol import FullMatcher, Matcher
 from calibgraph.matching.same_images import require_different_images
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.clock import OF_IMAGES, require_motion
 from calibgraph.model.config import Config
 from calibgraph.model.places import as_groups
-from calibgraph.model.result_files import OVERLAYS, REPORT_FILE
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import START, Verdict
-from calibgraph.outputs import PAGE_MARK, is_marked
 from calibgraph.report.as_json import print_line, require_stdout
 from calibgraph.tracking.dataset_frames import DatasetDrive
 from calibgraph.tracking.durable import DurableCalibrator
@@ -129,9 +126,6 @@ def _result(
 
 def _write_results(folder: Path, result: Calibration, history: History | None) -> list[Path]:
     written = [result.save(folder)]
-    if is_marked(folder / REPORT_FILE, PAGE_MARK):  # of a result that this one replaces
-        for stale in (folder / REPORT_FILE, *folder.glob(OVERLAYS)):
-            stale.unlink(missing_ok=True)
     if history is not None:
         history.draw(folder / PICTURE)
         written.append(folder / PICTURE)
@@ -170,9 +164,7 @@ def _drive(settings: Tracking, matcher: Matcher, source: Sequence[Path]) -> Data
         data = load_dataset(source, settings.rig, bag=settings.bag, interval_s=settings.interval_s)
     except ValueError as error:  # of an option: a wrong argument of the user
         raise DatasetError(str(error)) from error
-    known = data.frames[0].twist_per_s is not None
-    require_motion(settings.config.estimate, is_known=known, how=OF_IMAGES)
-    full = to_full_matcher(matcher)
+    full = FullMatcher(matcher)
     require_different_images(data, settings.rig)
     data = hide_burnt_in(replace(data, frames=data.frames[:: settings.every]), settings.rig)
     return DatasetDrive(data, full, settings.config.changed(stage1=full.stage1))

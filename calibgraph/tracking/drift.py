@@ -48,7 +48,7 @@ def report_drift(state: State) -> tuple[State, list[Event]]:
     watch = state.drift
     if watch is None:
         return state, []
-    then, now = state.of_poses(watch.anchors), sum_epochs(state)
+    then, now = watch.anchors, sum_epochs(state)
     own, own_now = dict(enumerate(then.scatter)), dict(enumerate(now.scatter))
     steps, _ = steps_between(state, (then, own), (now, own_now))
     if watch.camera not in steps.cameras:

@@ -23,10 +23,8 @@ def to_arrays(epoch: Epoch) -> dict[str, Any]:
     return {
         "T_lidar_camera": epoch.T_lidar_camera,
         "distortion": epoch.distortion,
-        "width": epoch.width,
         "numbers": tuple(frame.number for frame in frames),
         "places": tuple(frame.place for frame in frames),
-        "twists_per_s": tuple(frame.twists_per_s for frame in frames),
         "sums": np.array([frame.sums.packed for frame in frames]),
         "cameras": {
             camera: _matches(frames, camera) for camera in range(len(epoch.T_lidar_camera))
@@ -36,14 +34,14 @@ def to_arrays(epoch: Epoch) -> dict[str, Any]:
 
 def from_arrays(held: dict[str, Any]) -> Epoch:
     """The epoch of which :func:`to_arrays` has made arrays."""
-    numbers, fields = held["numbers"], (held["T_lidar_camera"], held["distortion"], held["width"])
+    numbers, fields = held["numbers"], (held["T_lidar_camera"], held["distortion"])
     blocks = [dict[int, CameraBlock]() for _ in numbers]
     inliers = [dict[int, NDArray[np.bool_]]() for _ in numbers]
     for camera, matches in held["cameras"].items():
         for row, block, within in _blocks(matches, numbers):
             blocks[row][camera], inliers[row][camera] = block, within
     sums = map(Sums, held["sums"])
-    rows = zip(numbers, blocks, inliers, sums, held["places"], held["twists_per_s"], strict=True)
+    rows = zip(numbers, blocks, inliers, sums, held["places"], strict=True)
     return Epoch(tuple(LiveFrame(*row) for row in rows), *fields)
 
 

@@ -33,60 +33,47 @@ class EpochSummary:
         walks: (w,) sums, each discounted by its walk.
         evidence: (w,) log-likelihoods of the epochs, forgotten slowly.
         walk: which of the walks is selected.
-        halves: (2,) sums of every other epoch.
-        next_half: which of the two the next epoch is added to.
         ungated: of all matches, outliers too: Hessian by their weights, and gradient.
     """
 
     walks: Sums
     evidence: Array
     walk: int
-    halves: Sums
-    next_half: int
     ungated: Sums
 
     @staticmethod
-    def empty(width: int = 6) -> EpochSummary:
+    def empty() -> EpochSummary:
         """Over no epochs."""
         w = len(STRENGTHS)
-        walks, halves = Sums.zeros(w, width=width), Sums.zeros(2, width=width)
-        return EpochSummary(walks, np.zeros(w), 0, halves, 0, Sums.zeros())
+        return EpochSummary(Sums.zeros(w), np.zeros(w), 0, Sums.zeros())
 
     def shift_reference(self, step: Array) -> EpochSummary:
         """The sums about a reference that is moved by a tangent step."""
-        walks, halves = (sums.shift_reference(step) for sums in (self.walks, self.halves))
-        ungated = self.ungated.shift_reference(step[: self.ungated.width])
-        return changed(self, walks=walks, halves=halves, ungated=ungated)
+        walks, ungated = (sums.shift_reference(step) for sums in (self.walks, self.ungated))
+        return changed(self, walks=walks, ungated=ungated)
 
     def add(self, epoch: Sums, ungated: Sums) -> EpochSummary:
         """The sums with an epoch's added, taken at the same reference."""
-        return changed(
-            self,
-            walks=self.walks + epoch,
-            halves=self.halves + epoch[None] * np.eye(2)[self.next_half],
-            next_half=1 - self.next_half,
-            ungated=self.ungated + ungated,
-        )
+        return changed(self, walks=self.walks + epoch, ungated=self.ungated + ungated)
 
     def propagate(self, variance: Array, overconfidence: float) -> EpochSummary:
         """The sums after the random walk of an epoch.
 
         Args:
-            variance: (w, d) of the walks over the epoch.
+            variance: (w, 6) of the walks over the epoch.
             overconfidence: of the Hessian, see ``calibgraph.tracking.sums``.
         """
         walks, kept = self.walks.after_walk(variance, overconfidence)
-        by = kept[self.walk]
-        return changed(self, walks=walks, halves=self.halves * by, ungated=self.ungated * by)
+        return changed(self, walks=walks, ungated=self.ungated * kept[self.walk])
 
-    def update_evidence(self, walks: Sums, epoch: Sums, noise: Array) -> EpochSummary:
+    def update_evidence(self, epoch: Sums, noise: Array) -> EpochSummary:
         """The summary with the walks' evidence updated by how well each predicts an epoch.
 
         Args:
-            walks: (w,) the sums of the pose.
-            epoch: its sums, of the pose.
+            epoch: its sums.
             noise: (6, 6) covariance of such a gradient at the true extrinsic.
         """
+        walks = self.walks
         if not (walks.frames >= _LEAST_FRAMES).all():
             return self
         steps = np.linalg.solve(walks.hessian, -walks.gradient[..., None])[..., 0]

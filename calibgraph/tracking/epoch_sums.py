@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
-from calibgraph.arrays import Array
-from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.live_frames import Epoch
 from calibgraph.tracking.state import State
@@ -15,17 +11,12 @@ from calibgraph.tracking.sums import Sums
 
 
 def sum_epochs(state: State, before: int | None = None) -> Sums:
-    """(n,) over all frames, or those before a frame's number, of the poses alone."""
-    return state.of_poses(sum_all_epochs(state, before))
-
-
-def sum_all_epochs(state: State, before: int | None = None) -> Sums:
-    """The same with the time offsets, where they are estimated."""
+    """(n,) over all frames, or those before a frame's number."""
     return sum_closed_epochs(state, before) + _until(state.epochs[-1], before)
 
 
 def sums_before_epochs(state: State) -> Iterator[Sums]:
-    """(n,) over the frames before each live epoch, with the time offsets that are estimated."""
+    """(n,) over the frames before each live epoch."""
     sums = Sums.stack([one.summary.selected for one in state.cameras])
     for epoch in state.epochs:
         yield sums
@@ -40,37 +31,10 @@ def sum_closed_epochs(state: State, before: int | None = None) -> Sums:
     return sums
 
 
-def split_halves(state: State) -> Sums:
-    """(n, 2) sums over every other closed epoch; those of the open one are the next half's."""
-    halves = Sums.stack([one.summary.halves for one in state.cameras])
-    for age, epoch in enumerate(state.epochs[:-1]):
-        halves = halves + in_its_half(state, epoch, age)
-    return halves
-
-
-def in_its_half(state: State, epoch: Epoch, age: int) -> Sums:
-    """(n, 2) the sums of a live epoch, so many after the oldest, in the half that has it."""
-    half = np.array([one.summary.next_half + age for one in state.cameras])
-    weights: Array = np.eye(2)[half % 2]
-    return epoch.sums[:, None] * weights
-
-
-def estimates_of_halves(state: State, halves: Sums) -> dict[int, tuple[Array, Array]]:
-    """Two (4, 4) T_camera_lidar of each camera where both are determined."""
-    known = np.flatnonzero(halves.are_determined.all(axis=1))
-    sums, found = halves[known].pose, {}
-    steps = np.linalg.solve(sums.hessian, -sums.gradient[..., None])[..., 0]
-    for camera, (first, second) in zip(known.tolist(), steps, strict=True):
-        poses = map(state.references[camera].retract, (first, second))
-        one, two = map(to_T_camera_lidar, poses)
-        found[camera] = one, two
-    return found
-
-
 def _after_epoch(state: State, sums: Sums, epoch: Epoch) -> Sums:
     """The sums after the random walk of an epoch."""
     walks = [one.summary.walk for one in state.cameras]
-    if not any(walks) and state.offsets is None:
+    if not any(walks):
         return sums
     variance = state.walk_variance(STRENGTHS[walks], len(epoch.frames))
     return sums.after_walk(variance, state.all_overconfidence)[0]

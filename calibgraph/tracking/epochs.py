@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from operator import add
 
 import gtsam
@@ -10,16 +10,13 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
-from calibgraph.solver.camera_block import CameraBlock, merge
+from calibgraph.solver.camera_block import merge
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import STRENGTHS
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import Epoch, LiveFrame, inliers_of
-from calibgraph.tracking.offset_search import explaining_offsets, follow
-from calibgraph.tracking.offset_walk import add_epoch, bounded
-from calibgraph.tracking.offsets import Offsets, delayed
 from calibgraph.tracking.place_sums import sums_by_place
 from calibgraph.tracking.regate import regate
 from calibgraph.tracking.state import State
@@ -28,23 +25,16 @@ from calibgraph.tracking.sums import Sums, step_between, sums_of_matches
 from factors import to_runs
 
 
-def close_epoch(state: State, offsets: Offsets | None, sums: Sums) -> tuple[State, list[Event]]:
+def close_epoch(state: State) -> tuple[State, list[Event]]:
     """The state with its open epoch closed and a new one begun.
 
     A camera that drifts keeps the estimate of each epoch; any other has the newest in all of them.
-
-    Args:
-        state: after the last frame of the epoch.
-        offsets: the newest time offsets, if they are estimated.
-        sums: (n,) of all frames.
     """
-    if offsets is not None:
-        state = state.at_poses(follow(state, sums, offsets))
     epochs = tuple(_at_newest(state, epoch) for epoch in state.epochs)
     state = changed(state, epochs=epochs)
     if len(epochs) > state.config.tracking.live_epochs:
         state = _summarize_oldest(state)
-    state = _with_references(state, state.T_lidar_camera, offsets)
+    state = _with_references(state, state.T_lidar_camera)
     cameras = tuple(
         changed(one, scale=one.residuals.scale(state.config)) if one.started else one
         for one in state.cameras
@@ -52,7 +42,7 @@ def close_epoch(state: State, offsets: Offsets | None, sums: Sums) -> tuple[Stat
     state = changed(state, cameras=cameras)
     state = regate(state)
     epochs = state.epochs
-    following = Epoch.empty(state.T_lidar_camera, state.width)
+    following = Epoch.empty(state.T_lidar_camera)
     epochs = (*epochs[:-1], _with_distortion(state, epochs[-1]), following)
     return report_drift(changed(state, epochs=epochs))
 
@@ -71,16 +61,9 @@ def _with_distortion(state: State, epoch: Epoch) -> Epoch:
     return epoch
 
 
-def _with_references(
-    state: State, references: tuple[gtsam.Pose3, ...], offsets: Offsets | None
-) -> State:
+def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State:
     """The state with its sums about other references, but those of live frames."""
     steps = np.array([*map(step_between, state.references, references)])
-    if offsets is not None and state.offsets is not None:
-        offsets = changed(offsets, times=state.offsets.times)
-        later_s = offsets.values_s - state.offsets.values_s
-        steps = np.column_stack([steps, later_s])
-        state = _with_points_at(changed(state, offsets=offsets), later_s)
     cameras = tuple(
         changed(camera_state, summary=camera_state.summary.shift_reference(step))
         for camera_state, step in zip(state.cameras, steps, strict=True)
@@ -90,47 +73,6 @@ def _with_references(
         drift = changed(drift, anchors=drift.anchors.shift_reference(steps))
     places = state.places.shift_reference(steps)
     return changed(state, cameras=cameras, references=references, places=places, drift=drift)
-
-
-def at_explaining_offsets(
-    state: State, sums: Sums, blocks: Mapping[int, CameraBlock]
-) -> tuple[State, dict[int, CameraBlock]]:
-    """The state, and a frame's blocks, at the time offsets with which these agree.
-
-    Args:
-        state: before the frame.
-        sums: (n,) of all frames.
-        blocks: of the frame, per camera.
-    """
-    before, offsets = state.offsets, explaining_offsets(state, sums, blocks)
-    if offsets is None or before is None:
-        return state, {**blocks}
-    later_s = offsets.values_s - before.values_s
-    state = changed(state.at_poses(follow(state, sums, offsets)), optimum=None)
-    state = regate(_with_references(state, state.T_lidar_camera, offsets))
-    return state, {c: delayed(block, later_s[c]) for c, block in blocks.items()}
-
-
-def _with_points_at(state: State, later_s: Array) -> State:
-    """The state with the points of all kept matches some seconds later, (n,)."""
-    epochs = tuple(
-        changed(
-            epoch,
-            frames=tuple(
-                changed(f, raw={c: delayed(raw, later_s[c]) for c, raw in f.raw.items()})
-                for f in epoch.frames
-            ),
-        )
-        for epoch in state.epochs
-    )
-    cameras = tuple(
-        changed(
-            one,
-            outlier_frames=tuple(frame.delayed(seconds) for frame in one.outlier_frames),
-        )
-        for one, seconds in zip(state.cameras, later_s, strict=True)
-    )
-    return changed(state, epochs=epochs, cameras=cameras)
 
 
 def _summarize_oldest(state: State) -> State:
@@ -191,20 +133,14 @@ def _with_places(state: State, epoch: Epoch, drifted: Sequence[bool]) -> State:
         epoch: the epoch.
         drifted: per camera, whether it drifted before the epoch was summarized.
     """
-    parts, offsets = sums_by_place(_at_places(state, epoch)), state.offsets
-    if offsets is None:
-        places = state.places.add(parts).bounded()
-    else:
-        frames = len(epoch.frames)
-        summed = add_epoch(state, state.places, offsets.times, parts=parts, frames=frames)
-        places, times = bounded(state, *summed)
-        offsets = changed(offsets, times=times)
+    parts = sums_by_place(_at_places(state, epoch))
+    places = state.places.add(parts).bounded()
     for camera, (one, before) in enumerate(zip(state.cameras, drifted, strict=True)):
         if one.summary.walk:
             places = places.without(camera)
         elif before and parts:
             places = places.with_camera_at([*parts][-1], camera, one.summary.selected)
-    return changed(state, places=places, offsets=offsets)
+    return changed(state, places=places)
 
 
 def _update_evidence(state: State, camera: int, epoch: Epoch, by_places: Array) -> CameraState:
@@ -213,19 +149,14 @@ def _update_evidence(state: State, camera: int, epoch: Epoch, by_places: Array) 
     The scatter of epochs is updated here too: by now, a move within the epoch has been detected.
     """
     one, alone = state.cameras[camera], state.scatter_of_frames(camera)
-    score, sums = epoch.sums.pose.score[camera], state.of_pose(camera, epoch.sums[camera])
+    sums = epoch.sums[camera]
     noise = state.frame_noise(camera)
     if noise is None or alone is None or not sums.frames:
         return one
-    alone = alone + state.score_by_offset(camera, epoch.sums[camera]) / sums.frames
-    groups = tuple(group.add(score, int(sums.frames), alone) for group in one.groups)
+    groups = tuple(group.add(sums.score, int(sums.frames), alone) for group in one.groups)
     rows = pose_rows(camera)
-    if state.offsets is not None:
-        alone_7 = epoch.sums[camera].change(scatter=np.zeros((7, 7)))
-        noise = noise + state.of_pose(camera, alone_7).scatter / sums.frames
     noise = noise * sums.frames + sums.hessian @ by_places[rows, rows] @ sums.hessian
-    walks = state.of_pose(camera, one.summary.walks)
-    return changed(one, summary=one.summary.update_evidence(walks, sums, noise), groups=groups)
+    return changed(one, summary=one.summary.update_evidence(sums, noise), groups=groups)
 
 
 def _select_walks(state: State) -> State:

@@ -2,7 +2,7 @@
 
 Each is gated by itself, at the minimum of all; there is one solve and one assessment. Whatever may
 be more than a frame to absorb is left to the update of a single frame: a camera that starts, a
-frame that disagrees with the estimate or repeats another one, an error, a time offset to estimate.
+frame that disagrees with the estimate or repeats another one, an error.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def usual_frames(state: State, frames: Sequence[StreamFrame]) -> tuple[list[Inco
     Returns:
         The frames; per camera the preprocessed matches of all.
     """
-    if len(frames) < 2 or state.offsets is not None or may_have_moved(state):  # noqa: PLR2004
+    if len(frames) < 2 or may_have_moved(state):  # noqa: PLR2004
         return [], {}
     group = _alike(state, frames)
     if len(group) < 2:  # noqa: PLR2004

@@ -10,11 +10,12 @@ from operator import index
 import numpy as np
 
 from calibgraph.errors import CorrespondenceError
+from calibgraph.model.clock import unused_times
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import PLACES
+from calibgraph.model.rig import Rig
 from calibgraph.solver.repeats import REPEATED_SHARE, Hashes, hash_numbers, point_hashes
 from calibgraph.solver.shared_error import with_common_error
-from calibgraph.tracking.offsets import with_motion_in_use
 from calibgraph.tracking.state import State
 
 _LAST = 2**63 - 1  # other programs write it for "none"
@@ -67,7 +68,7 @@ def incoming(
     """
     table = with_common_error(table, state.config)
     if len(table):
-        table = with_motion_in_use(state.rig, state.config, table, state.knows_motion)
+        table = _with_motion_in_use(state.rig, table, state.knows_motion)
     table = with_metadata_per_frame(with_place(table, None))
     last = (state.frame, state.stamp_ns) if last is None else last
     number, stamp = number_and_stamp(table, frame, last)
@@ -81,6 +82,32 @@ def unsolvable(number: int, error: BaseException) -> CorrespondenceError:
         f"({str(error).strip().splitlines()[0]}); it is left out",
         frame=number,
     )
+
+
+def _with_motion_in_use(rig: Rig, table: Correspondences, before: bool | None) -> Correspondences:
+    """The matches of a frame, with the motion of the LiDAR where a clock uses it.
+
+    Args:
+        rig: with the clocks of its cameras.
+        table: the matches.
+        before: whether that of earlier frames is known; None if there are none.
+
+    Raises:
+        CorrespondenceError: if it is known of some frames alone.
+    """
+    known = table.twist_per_s is not None
+    used = any(c.time_offset_s or c.readout_s for c in rig.cameras.values())
+    if not used:
+        return replace(table, twist_per_s=None) if known else table
+    if before is not None and before != known:
+        found, earlier = ("no ", "one") if not known else ("a ", "none")
+        raise CorrespondenceError(
+            f"it has {found}motion of the LiDAR (twist_per_s), earlier frames have {earlier}; the "
+            "rig's time_offset_s and readout_s need it with every frame: give it or leave it out"
+        )
+    if before is None:
+        unused_times(rig, is_known=known)
+    return table
 
 
 def number_and_stamp(

@@ -13,12 +13,8 @@ from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
 from calibgraph.solver.curvature import robust_hessians_of
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.sums import Sums, step_between
 from factors import to_runs
-
-_POSE = 6
-_SHARES = 0.5, 1.0  # of the true Hessian in that by weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +46,6 @@ class Gated:
         scale: ResidualScale,
         reference: gtsam.Pose3,
         *,
-        even: bool = False,
         edges: NDArray[np.int64] | None = None,
     ) -> Gated:
         """The matches near the minimum.
@@ -60,8 +55,6 @@ class Gated:
             raw: all of them.
             scale: of the residuals.
             reference: T_lidar_camera at which the gradient is taken.
-            even: let the true Hessian be a multiple of that by weights. A time offset shows by
-                differences of frames, in which the scatter of true Hessians would count.
             edges: (f + 1,) of what counts as a frame; None: the frames.
         """
         residuals, edges = (
@@ -77,10 +70,6 @@ class Gated:
         here = block.frame_sums(pose, inside)
         hessian = robust_hessians_of(block, pose, here.hessian, to_runs(inside))
         hessian = hessian + residuals.gate_hessians(scale, edges)
-        if even:
-            shares = np.linalg.solve(here.hessian + WEAK, hessian)
-            share = np.trace(shares, axis1=1, axis2=2) / _POSE
-            hessian = np.clip(share, *_SHARES)[:, None, None] * here.hessian
         score = here.gradient
         sums = Sums.of(
             hessian=hessian,

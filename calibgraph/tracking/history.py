@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 _MOST_EVENTS = 1000
 _POSE = 6
-_NUMBERS = 7  # of a camera: its pose and its time offset
 _SAVED = "most", "stride", "updates", "origins", "begun", "frames", "entries", "events"
 
 
@@ -45,7 +44,7 @@ class History:
         self._origins: dict[str, Array] = {}  # T_camera_lidar that the entries are relative to
         self._begun: set[str] = set()
         self._frames = np.empty(0, dtype=np.int64)
-        self._entries = np.empty((0, 0, 2 * _NUMBERS))  # xi, offset, sigmas; NaN: not known
+        self._entries = np.empty((0, 0, 2 * _POSE))  # xi, sigmas; NaN: not known
         self._events: tuple[Event, ...] = ()
         self._newest: tuple[Update, Array] | None = None  # with its entries
 
@@ -81,7 +80,7 @@ class History:
 
     def _begin(self, update: Update) -> None:
         self._frames = np.empty(self._most, dtype=np.int64)
-        shape = self._most, len(update.T_camera_lidar), 2 * _NUMBERS
+        shape = self._most, len(update.T_camera_lidar), 2 * _POSE
         self._entries = np.full(shape, np.nan)
         self._origins = dict(update.T_camera_lidar)
 
@@ -96,7 +95,7 @@ class History:
             self._stride *= 2
 
     def _entries_of(self, update: Update) -> Array:
-        """(n, 14) of the cameras; those of the update before, if it was taken in with this one."""
+        """(n, 12) of the cameras; those of the update before, if it was taken in with this one."""
         before = self._newest
         if before is None or update.events or shared_parts(update) != shared_parts(before[0]):
             found = np.array([self._entry(update, name) for name in self._origins])
@@ -104,15 +103,13 @@ class History:
         return before[1]
 
     def _entry(self, update: Update, name: str) -> Array:
-        """(14,) xi in T_camera_lidar = exp(xi) origin, time offset, sigmas; NaN: not known."""
+        """(12,) xi in T_camera_lidar = exp(xi) origin, sigmas; NaN: not known."""
         covariance = update.covariance.get(name)
-        entry = np.full(2 * _NUMBERS, np.nan)
-        for one in update.lens.get(name, ()):
-            entry[_POSE], entry[-1] = one.value, one.sigma
+        entry = np.full(2 * _POSE, np.nan)
         if covariance is not None:  # a camera may have started in an earlier run
             self._begun.add(name)
             variances = np.diag(covariance)
-            entry[_NUMBERS:-1] = np.sqrt(np.where(variances >= 0, variances, np.nan))
+            entry[_POSE:] = np.sqrt(np.where(variances >= 0, variances, np.nan))
         if name in self._begun:
             entry[:_POSE] = twist_between(update.T_camera_lidar[name], self._origins[name])
         return entry
@@ -129,12 +126,7 @@ class History:
         steps = [gtsam.Pose3.Expmap(xi).matrix() for xi in entries[known, :_POSE]]
         xi = np.array([twist_between(step, steps[-1]) for step in steps])
         xi[-1] = 0.0  # up to rounding it is
-        offsets, sigma = entries[known, _POSE], entries[known, _NUMBERS:]
-        if np.isnan(offsets).all():
-            sigma = sigma[:, :_POSE]
-        else:
-            xi = np.column_stack([xi, offsets - offsets[-1]])
-        return Curve(self._frames[: self._held][known], xi, sigma)
+        return Curve(self._frames[: self._held][known], xi, entries[known, _POSE:])
 
     def draw(self, path: Path) -> None:
         """Draw all cameras' curves with their 3-sigma bands and the events; PNG, atomically.

@@ -51,8 +51,7 @@ class Curve:
         frames: (n,) numbers of frames, from its first own estimate to its newest.
         xi: (n, 6) of T_camera_lidar(frame) = exp(xi) T_camera_lidar(newest), xi = (rotation [rad],
             translation [m]) in the camera's axes. The last is zero.
-            Where time offsets are estimated, (n, 7) with offset(frame) - offset(newest) [s].
-        sigma: (n, 6) or (n, 7) standard deviations of xi; NaN with too few frames.
+        sigma: (n, 6) standard deviations of xi; NaN with too few frames.
     """
 
     frames: NDArray[np.int64]
@@ -70,15 +69,13 @@ def text_figure(text: str) -> Figure:
 def history_figure(
     curves: dict[str, Curve | None], events: Sequence[Event], first: int, newest: int
 ) -> Figure:
-    """A row per camera: rotation, translation, and the time offset where it is estimated."""
-    in_time = any(curve is not None and curve.xi.shape[1] > _POSE for curve in curves.values())
-    parts = _PARTS if in_time else _PARTS[:2]
+    """A row per camera: rotation and translation."""
     figure = new_picture(_WIDTH_IN, _FRAME_IN + _ROW_IN * len(curves))
-    panels = figure.subplots(len(curves), len(parts), sharex=True, squeeze=False)
+    panels = figure.subplots(len(curves), len(_PARTS), sharex=True, squeeze=False)
     zero = first if newest >= _LARGE_NUMBER else 0
     for (name, curve), row in zip(curves.items(), panels, strict=True):
         own = [e for e in events if e.camera in (name, None) and e.kind != "started"]
-        for panel, part in zip(row, parts, strict=True):
+        for panel, part in zip(row, _PARTS, strict=True):
             panel.set_xlim(first - zero, newest - zero)
             panel.set_ylabel(f"{_shortened(name)}\n{part.title}", parse_math=False)
             panel.grid(color="0.9", linewidth=0.8)
@@ -98,7 +95,7 @@ def history_figure(
 
 @dataclass(frozen=True)
 class _Part:
-    """A part of xi: its rows, what they are, and how many units one rad, m or s is."""
+    """A part of xi: its rows, what they are, and how many units one rad or m is."""
 
     rows: slice
     title: str
@@ -108,7 +105,6 @@ class _Part:
 _PARTS = (
     _Part(slice(0, 3), "rotation [deg]", float(np.degrees(1.0))),
     _Part(slice(3, 6), "translation [cm]", 100.0),
-    _Part(slice(6, 7), "time offset, less newest [ms]", 1000.0),
 )
 
 

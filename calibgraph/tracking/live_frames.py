@@ -10,15 +10,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.arrays import Array
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.gated import Gated
-from calibgraph.tracking.offset_sums import with_offset
-from calibgraph.tracking.offsets import Offsets, delayed, motion_in
 from calibgraph.tracking.sums import Sums
 
 NO_DISTORTION = DistortionEvidence.none(WEAK, places=1)
@@ -35,8 +32,6 @@ class LiveFrame:
         inliers: per camera, (m,) which of them are within the gate.
         sums: (n,) of them, per camera.
         place: name of the place that it is of; empty: not known.
-        twists_per_s: (n, 6) of the LiDAR, in the axes of each camera; None where no time offset is
-            estimated.
     """
 
     number: int
@@ -44,13 +39,6 @@ class LiveFrame:
     inliers: dict[int, NDArray[np.bool_]]
     sums: Sums
     place: str = ""
-    twists_per_s: Array | None = None
-
-    @property
-    def whole(self) -> Sums:
-        """(n,) its sums, with the time offset where that is estimated."""
-        known = self.twists_per_s
-        return self.sums if known is None else with_offset(self.sums, known)
 
     def without(self, camera: int) -> LiveFrame:
         """The frame without one camera's matches."""
@@ -59,26 +47,20 @@ class LiveFrame:
         sums = self.sums.replace_at(camera, Sums.zeros())
         return changed(self, raw=raw, inliers=inliers, sums=sums)
 
-    def add(self, camera: int, gated: Gated, offsets: Offsets | None, *, row: int = 0) -> LiveFrame:
+    def add(self, camera: int, gated: Gated, *, row: int = 0) -> LiveFrame:
         """The frame with a camera's matches: those of a row of the gated frames."""
         raw, inliers = gated.of_frame(row)
-        twists = self.twists_per_s
-        if twists is not None and offsets is not None and raw.block.motion is not None:
-            twists = twists.copy()
-            twists[camera] = offsets.adjoints[camera] @ raw.block.motion[0, :6]
         return changed(
             self,
             raw={**self.raw, camera: raw},
             inliers={**self.inliers, camera: inliers},
             sums=self.sums.replace_at(camera, gated.sums[row]),
-            twists_per_s=twists,
         )
 
     @staticmethod
-    def empty(number: int, cameras: int, place: str = "", *, in_time: bool = False) -> LiveFrame:
-        """A frame without matches; ``in_time``: with time offsets that are estimated."""
-        twists = np.zeros((cameras, 6)) if in_time else None
-        return LiveFrame(number, {}, {}, Sums.zeros(cameras), place, twists)
+    def empty(number: int, cameras: int, place: str = "") -> LiveFrame:
+        """A frame without matches."""
+        return LiveFrame(number, {}, {}, Sums.zeros(cameras), place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,18 +72,16 @@ class Epoch:
         T_lidar_camera: per camera, the estimate.
         distortion: per camera, of its matches in the scan distortion, as if of one place; in an
             open epoch, of the frames from which it has started there.
-        width: of its sums.
     """
 
     frames: tuple[LiveFrame, ...]
     T_lidar_camera: tuple[gtsam.Pose3, ...]
     distortion: tuple[DistortionEvidence, ...]
-    width: int = 6
 
     @staticmethod
-    def empty(T_lidar_camera: tuple[gtsam.Pose3, ...], width: int = 6) -> Epoch:
+    def empty(T_lidar_camera: tuple[gtsam.Pose3, ...]) -> Epoch:
         """Without frames."""
-        return Epoch((), T_lidar_camera, (NO_DISTORTION,) * len(T_lidar_camera), width)
+        return Epoch((), T_lidar_camera, (NO_DISTORTION,) * len(T_lidar_camera))
 
     @cached_property
     def sums(self) -> Sums:
@@ -110,8 +90,8 @@ class Epoch:
 
     def sums_of(self, frames: Iterable[LiveFrame]) -> Sums:
         """(n,) over some of its frames, per camera."""
-        none = Sums.zeros(len(self.T_lidar_camera), width=self.width)
-        return Sums.stack([none, *(frame.whole for frame in frames)]).total()
+        none = Sums.zeros(len(self.T_lidar_camera))
+        return Sums.stack([none, *(frame.sums for frame in frames)]).total()
 
     def with_distortion(self, camera: int, scale: ResidualScale) -> Epoch:
         """The epoch with a camera's evidence of the scan distortion computed anew.
@@ -144,11 +124,6 @@ class OutlierFrame:
     number: int
     raw: CameraBlock
     T_lidar_camera: gtsam.Pose3
-
-    def delayed(self, seconds: float) -> OutlierFrame:
-        """The frame with its points where they are some seconds later; its pose fits them."""
-        T_lidar_camera = motion_in(self.raw, seconds).compose(self.T_lidar_camera)
-        return changed(self, raw=delayed(self.raw, seconds), T_lidar_camera=T_lidar_camera)
 
 
 def inliers_of(frames: Iterable[LiveFrame], camera: int) -> CameraBlock | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import gtsam
 
@@ -13,10 +13,8 @@ from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
     cloud_at_key,
-    lens_key,
     matched_at_key,
     matched_key,
-    seen_lens_key,
 )
 from calibgraph.solver.elimination import start_values
 
@@ -31,7 +29,6 @@ class Optimum:
         clouds: per place, ``o_p``.
         matched: per place and camera (by its place in the rig), ``a_cp``.
         contradicting: places in ``rig.relative_poses`` of those that take no part.
-        lenses: by key, of the variables of ``calibgraph.graph.lens``.
     """
 
     shared: Mapping[int, gtsam.Pose3]
@@ -39,7 +36,6 @@ class Optimum:
     clouds: Mapping[str, gtsam.Pose3]
     matched: Mapping[str, Mapping[int, gtsam.Pose3]]
     contradicting: tuple[int, ...]
-    lenses: Mapping[int, Array] = field(default_factory=dict)
 
     @staticmethod
     def of(
@@ -52,16 +48,12 @@ class Optimum:
         matched: dict[str, dict[int, gtsam.Pose3]] = {name: {} for name in names}
         for place, camera in model.matched_places:
             matched[names[place]][camera] = values.atPose3(matched_at_key(place, camera))
-        lenses = {key(number) for key in (lens_key, seen_lens_key) for number in model.lenses}
-        walks = (key for term in model.lenses.values() for key, _ in term.walk)
-        vectors = {DISTORTION, *lenses, *walks}
         return Optimum(
-            {key: values.atPose3(key) for key in model.shared_keys if key not in vectors},
+            {key: values.atPose3(key) for key in model.shared_keys if key != DISTORTION},
             values.atVector(DISTORTION) if model.is_distorted else None,
             {name: values.atPose3(cloud_at_key(place)) for place, name in enumerate(names)},
             matched,
             contradicting,
-            {key: values.atVector(key) for key in sorted(lenses)},
         )
 
     def updated(self, newer: Optimum) -> Optimum:
@@ -72,7 +64,6 @@ class Optimum:
             {**self.clouds, **newer.clouds},
             {**self.matched, **newer.matched},
             self.contradicting,
-            {**self.lenses, **newer.lenses},
         )
 
     def values(
@@ -97,9 +88,6 @@ class Optimum:
         for key, pose in known.items():
             if values.exists(key):
                 values.update(key, pose)
-        for key, vector in self.lenses.items():
-            if values.exists(key):
-                values.update(key, vector)
         if model.is_distorted and self.distortion is not None:
             values.update(DISTORTION, self.distortion)
         return values

@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
-    BlockByPlace,
-    QuadraticByPlace,
     SummarizedByPlace,
 )
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
-from calibgraph.graph.variables import cloud_at_key, matched_at_key, seen_lens_key
+from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.error_components import error_components
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.curvature import convex_hessian
@@ -37,16 +35,7 @@ from calibgraph.solver.within_place import (
     relative_covariance,
     split_excess,
 )
-from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import LiveFrame, inliers_of
-from calibgraph.tracking.offset_terms import offset_term, walk_in_graph, with_shared_errors
-from calibgraph.tracking.offset_walk import (
-    Times,
-    at_own_times,
-    in_order_of_time,
-    walk_of,
-    walks_at,
-)
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.quadratics import Data, Quadratics, by_place
 from calibgraph.tracking.state import State
@@ -76,7 +65,6 @@ class FrameSpread:
         frames, the scatter is shrunk towards that of all its frames so far. Where the matcher
         states nothing of places it is wider if epochs scatter more than their frames suggest.
         """
-        sums = sums.pose
         (scatter, left), every = sums.within_places, sums.rows.total()
         hessian, reweighted, frames = every.hessian, every.reweighted, every.frames
         found = FrameSpread(np.tile(np.eye(6), (len(frames), 1, 1)), np.ones(len(frames)))
@@ -106,7 +94,7 @@ class FrameSpread:
         return WithinPlace(
             *self._excesses[camera],
             float(self.efficiency[camera]),
-            roots=np.linalg.cholesky(sums.rows.pose.reweighted[rows, camera] + WEAK),
+            roots=np.linalg.cholesky(sums.rows.reweighted[rows, camera] + WEAK),
             frames=sums.frames[rows, camera] / sums.places[rows, camera],
             alike=float(sums.alike[camera]),
         )
@@ -144,10 +132,7 @@ class PlaceData:
         ]
         kept, cameras = [frame for frame in frames if frame.place in places], dict[int, Data]()
         for camera, one in enumerate(state.cameras):
-            quadratic = by_place(state, camera, earlier.get(camera, {}), [*places])
-            if quadratic.keys:
-                cameras[camera] = quadratic
-                continue
+            quadratic = by_place(earlier.get(camera, {}), [*places])
             own = None if one.summary.walk else inliers_of(kept, camera)
             if own is not None:
                 block = block_by_place(own, one.scale, numbers)
@@ -157,29 +142,9 @@ class PlaceData:
                 cameras[camera] = quadratic
         return PlaceData([*places], np.array([*places.values()], dtype=np.int64), cameras)
 
-    def with_quadratics(self, state: State, earlier: Quadratics) -> PlaceData:
-        """The same matches with other quadratics of earlier ones."""
-        cameras = dict(self.cameras)
-        for camera, own in self.cameras.items():
-            if not isinstance(own, BlockByPlace):
-                quadratic = by_place(state, camera, earlier[camera], self.names)
-                several = isinstance(own, SummarizedByPlace)
-                cameras[camera] = changed(own, earlier=quadratic) if several else quadratic
-        return replace(self, cameras=cameras)
-
-    def at_own_times(self, times: Times) -> PlaceData:
-        """The same of closed places, each at the time offset of its own time."""
-        cameras = {
-            camera: at_own_times(camera, own, self.names, times)
-            if isinstance(own, QuadraticByPlace) and own.keys
-            else own
-            for camera, own in self.cameras.items()
-        }
-        return replace(self, cameras=cameras)
-
 
 def place_model(
-    state: State, sums: PlaceSums, seen: FrameSpread, data: PlaceData, *, times: Times
+    state: State, sums: PlaceSums, seen: FrameSpread, data: PlaceData
 ) -> LatentPoseModel:
     """The graph of some places, without any prior of a camera.
 
@@ -188,24 +153,12 @@ def place_model(
         sums: of all frames.
         seen: by the frames of each camera.
         data: the matches of the places.
-        times: of the time offsets of all places.
     """
     chosen, names = data.rows, state.names
-    blocks, shown, lenses = {}, {}, {}
+    blocks, shown = {}, {}
     for camera, matches in data.cameras.items():
         within = seen.within(sums, camera, chosen)
-        held: Data = matches
-        if isinstance(matches, QuadraticByPlace) and matches.keys:
-            rows = np.flatnonzero(sums.frames[:, camera])
-            order, frames = in_order_of_time(times, [sums.names[row] for row in rows])
-            own = seen.within(sums, camera, rows[order])
-            term = offset_term(state, camera, sums.rows[rows[order], camera], own, frames=frames)
-            walk = walk_of(camera, matches, data.names, times, step=walk_in_graph(state, camera))
-            lenses[camera] = replace(term, walk=walk)
-            of_poses = within.at_place(state.findings.place_variance)[matches.places]
-            shared = with_shared_errors(matches.information, of_poses, within.least)
-            held = replace(matches, information=shared)
-        blocks[names[camera]] = held.with_variance(within.least)
+        blocks[names[camera]] = matches.with_variance(within.least)
         shown[names[camera]] = within, _distortion(state, camera, len(chosen))
     components = variance_components(state.findings, names, shown, places=len(chosen))
     alike = np.where(sums.frames[chosen] > 0, sums.places[chosen], np.inf).min(axis=1)
@@ -219,7 +172,7 @@ def place_model(
     )
     components = state.sizes.scale(components)
     none = gtsam.NonlinearFactorGraph()
-    return LatentPoseModel(names, blocks, (), none, components, state.config.of, lenses)
+    return LatentPoseModel(names, blocks, (), none, components, state.config.of)
 
 
 def marginals_of_places(fit: LatentPoseFit) -> list[gtsam.GaussianFactorGraph]:
@@ -247,14 +200,9 @@ def summary_factor(
     graph, values = gtsam.NonlinearFactorGraph(), fit.linear.values
     if kept:
         joined = join_linear(*(marginals[place] for place in kept))
-        walks, offsets = walks_at(fit.linear.model.lenses, kept)
-        if offsets:
-            joined = join_linear(joined, walks.linearize(values))
-            joined = joined.eliminatePartialSequential(to_ordering(offsets))[1]
         factor, at = gtsam.HessianFactor(joined), gtsam.Values()
         for key in list(factor.keys()):
-            is_vector = gtsam.symbolChr(key) == gtsam.symbolChr(seen_lens_key(0))
-            at.insert(key, values.atVector(key) if is_vector else values.atPose3(key))
+            at.insert(key, values.atPose3(key))
         graph.add(gtsam.LinearContainerFactor(factor, at))
     return graph
 

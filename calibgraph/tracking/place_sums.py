@@ -27,7 +27,7 @@ def sums_by_place(frames: Sequence[LiveFrame]) -> dict[str, Sums]:
     """(n,) sums of some frames at each of their places."""
     by_place: dict[str, list[Sums]] = {}
     for frame in frames:
-        by_place.setdefault(frame.place, []).append(frame.whole)
+        by_place.setdefault(frame.place, []).append(frame.sums)
     return {name: Sums.stack(sums).total() for name, sums in by_place.items()}
 
 
@@ -48,15 +48,9 @@ class PlaceSums:
     older_squared: Array
 
     @staticmethod
-    def empty(cameras: int, width: int = 6) -> PlaceSums:
+    def empty(cameras: int) -> PlaceSums:
         """Of no frames."""
-        rows = Sums.zeros(1, cameras, width=width)
-        return PlaceSums((_OLDER,), rows, np.zeros(cameras), np.zeros(cameras))
-
-    @property
-    def pose(self) -> PlaceSums:
-        """The sums of the poses, time offsets at their references."""
-        return changed(self, rows=self.rows.pose)
+        return PlaceSums((_OLDER,), Sums.zeros(1, cameras), np.zeros(cameras), np.zeros(cameras))
 
     @property
     def frames(self) -> Array:
@@ -93,7 +87,7 @@ class PlaceSums:
         return about_means, np.maximum(self.frames.sum(axis=0) - means, 0.0)
 
     def shift_reference(self, steps: Array) -> PlaceSums:
-        """The sums about references that are moved by (n, d) tangent steps."""
+        """The sums about references that are moved by (n, 6) tangent steps."""
         return changed(self, rows=self.rows.shift_reference(steps))
 
     def add(self, parts: Mapping[str, Sums]) -> PlaceSums:
@@ -112,7 +106,7 @@ class PlaceSums:
         names = (*(self.names[row] for row in others), name)
         if name in self.names:
             return changed(self, names=names, rows=self.rows[[*others, self.names.index(name)]])
-        new = Sums.zeros(len(self.means), width=self.rows.width)
+        new = Sums.zeros(len(self.means))
         rows = [*(self.rows[row] for row in others), new]
         return changed(self, names=names, rows=Sums.stack(rows))
 
@@ -136,8 +130,7 @@ class PlaceSums:
 
     def without(self, camera: int) -> PlaceSums:
         """The sums without those of a camera."""
-        none = Sums.zeros(width=self.rows.width)
-        rows = self.rows.replace_at((slice(None), camera), none)
+        rows = self.rows.replace_at((slice(None), camera), Sums.zeros())
         kept = np.arange(len(self.means)) != camera
         return changed(
             self, rows=rows, means=self.means * kept, older_squared=self.older_squared * kept
@@ -153,5 +146,5 @@ class PlaceSums:
         """
         reweighted = positive_part(own.hessian)
         part = own.change(score=np.zeros_like(own.score), reweighted=reweighted)
-        none = Sums.zeros(len(self.means), width=own.width)
+        none = Sums.zeros(len(self.means))
         return self.without(camera).add({name: none.replace_at(camera, part)})

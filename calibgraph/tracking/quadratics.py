@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
@@ -20,43 +19,29 @@ from calibgraph.model.geometry import invert_each, to_T_lidar_camera
 from calibgraph.solver.curvature import convex_hessian
 from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.solver.within_place import WEAK
-from calibgraph.tracking.offset_terms import late_quadratic
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
 
 Data = BlockByPlace | QuadraticByPlace | SummarizedByPlace
-Quadratics = dict[int, dict[str, tuple[gtsam.Pose3, float, Array]]]
-"""Per camera and name of a place: T_lidar_camera and time offset [s] at the minimum; (d, d)
-information."""
-
-_WEAK_OFFSET = 0.01  # 1/s^2: of an offset within sight
+Quadratics = dict[int, dict[str, tuple[gtsam.Pose3, Array]]]
+"""Per camera and name of a place: T_lidar_camera at the minimum; (6, 6) information."""
 
 
 def by_place(
-    state: State,
-    camera: int,
-    known: Mapping[str, tuple[gtsam.Pose3, float, Array]],
-    names: Sequence[str],
+    known: Mapping[str, tuple[gtsam.Pose3, Array]], names: Sequence[str]
 ) -> QuadraticByPlace:
     """The quadratics of a camera at those of some places where it has one."""
     places = np.array([place for place, name in enumerate(names) if name in known], dtype=np.int64)
     chosen = [known[names[place]] for place in places]
-    if state.offsets is not None and chosen:
-        return late_quadratic(state, camera, places, chosen)
-    information = np.array([one for _, _, one in chosen]).reshape(-1, 6, 6)
-    poses, none = [pose for pose, _, _ in chosen], np.zeros((len(chosen), 0))
-    return QuadraticByPlace(places, poses, information, none)
+    information = np.array([one for _, one in chosen]).reshape(-1, 6, 6)
+    return QuadraticByPlace(places, [pose for pose, _ in chosen], information)
 
 
 def quadratics_of(
-    state: State,
-    sums: PlaceSums,
-    cameras: Iterable[int] | None = None,
-    *,
-    places: Iterable[int] | None = None,
+    state: State, sums: PlaceSums, cameras: Iterable[int] | None = None
 ) -> Quadratics:
-    """The quadratics of some cameras, or all, at some places, or all.
+    """The quadratics of some cameras, or all, at all places.
 
     As those of matches that are kept: with the gradient of the robust cost, near the optimum of the
     last epoch, and the Hessian by the weights of the matches there.
@@ -64,37 +49,29 @@ def quadratics_of(
     return {
         camera: {
             sums.names[row]: _quadratic(state, sums.rows[row, camera], sums.names[row], camera)
-            for row in (range(len(sums.names)) if places is None else places)
+            for row in range(len(sums.names))
             if sums.frames[row, camera]
         }
         for camera in (range(len(state.cameras)) if cameras is None else cameras)
     }
 
 
-def earlier_quadratics(state: State, sums: PlaceSums) -> Quadratics:
-    """Those of frames whose matches are not kept; with time offsets, of all frames of ``sums``."""
-    if state.offsets is not None:  # a match of an earlier epoch is of another offset
-        return quadratics_of(state, sums)
+def earlier_quadratics(state: State) -> Quadratics:
+    """Those of frames whose matches are not kept."""
     steady = [camera for camera, one in enumerate(state.cameras) if not one.summary.walk]
     return quadratics_of(state, state.places, steady)
 
 
-def _quadratic(
-    state: State, own: Sums, place: str, camera: int
-) -> tuple[gtsam.Pose3, float, Array]:
-    reference, true = state.references[camera], convex_hessian(own.hessian, own.reweighted)
-    if state.offsets is not None:  # poses at another offset may be far away
-        weak = block_diag(WEAK, _WEAK_OFFSET)
-        step = np.linalg.solve(true + weak, -own.gradient)
-        offset_s = float(state.offsets.values_s[camera] + step[6])
-        return reference.retract(step[:6]), offset_s, own.reweighted + weak
-    pose, information = state.pose_at(place, camera), own.reweighted + WEAK
+def _quadratic(state: State, own: Sums, place: str, camera: int) -> tuple[gtsam.Pose3, Array]:
+    reference, information = state.references[camera], own.reweighted + WEAK
+    pose = state.pose_at(place, camera)
     if pose is None:
+        true = convex_hessian(own.hessian, own.reweighted)
         step = np.linalg.solve(true + WEAK, -own.gradient)
     else:
         step = step_between(reference, pose)
         step = step - np.linalg.solve(information, own.gradient + own.hessian @ step)
-    return reference.retract(step), 0.0, information
+    return reference.retract(step), information
 
 
 def linearized(names: Sequence[str], cameras: Mapping[int, Data], fit: LatentPoseFit) -> Quadratics:
@@ -111,7 +88,6 @@ def linearized(names: Sequence[str], cameras: Mapping[int, Data], fit: LatentPos
         found[camera] = {
             names[place]: (
                 to_T_lidar_camera(T_camera_cloud[place]).retract(steps[place]),
-                0.0,
                 information[place],
             )
             for place in places

@@ -37,8 +37,7 @@ def regate(state: State) -> State:
             for row, rows in zip(own, found, strict=True):
                 inliers[row][camera] = rows
     gated = iter(
-        LiveFrame(f.number, f.raw, inliers[row], sums[row], f.place, f.twists_per_s)
-        for row, f in enumerate(live)
+        LiveFrame(f.number, f.raw, inliers[row], sums[row], f.place) for row, f in enumerate(live)
     )
     epochs = tuple(
         changed(epoch, frames=tuple(islice(gated, len(epoch.frames)))) for epoch in state.epochs
@@ -85,8 +84,6 @@ def _regate_camera(
     robust = robust_hessian(block, T_lidar_camera)
     residuals = BlockResiduals.at(to_T_camera_lidar(gate), raw)
     true = convex_hessian(robust + residuals.gate_hessians(scale)[0], robust)
-    if state.offsets is not None:
-        hessian = np.zeros_like(hessian)
     missing = true - hessian.sum(axis=0)
     shares = here.hessian @ np.linalg.solve(here.hessian.sum(axis=0) + WEAK, missing)
     hessian = hessian + (shares + shares.swapaxes(1, 2)) / 2
@@ -107,11 +104,11 @@ def _gate_pose(
 ) -> gtsam.Pose3:
     """Where the gate is drawn: the minimum of all matches, as in a batch.
 
-    That of the matches within a gate is drawn to where the gate was before. A camera that drifts,
-    or whose time offset is estimated, keeps its estimate, which later epochs have a part in.
+    That of the matches within a gate is drawn to where the gate was before. A camera that drifts
+    keeps its estimate, which later epochs have a part in.
     """
     one, reference = state.cameras[camera], state.references[camera]
-    if one.summary.walk or state.offsets is not None:
+    if one.summary.walk:
         return T_lidar_camera
     block, older = raw.with_scale(one.scale), one.summary.ungated
     for _ in range(_GATE_STEPS):

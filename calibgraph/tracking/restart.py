@@ -8,7 +8,6 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.camera_block import CameraBlock, merge
 from calibgraph.tracking.cause import Cause, Steps, find_cause
 from calibgraph.tracking.drift import follow_drift
@@ -18,8 +17,6 @@ from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.gated import Gated
 from calibgraph.tracking.live_frames import NO_DISTORTION, LiveFrame
-from calibgraph.tracking.offset_sums import with_offset
-from calibgraph.tracking.offset_terms import keep_offsets
 from calibgraph.tracking.outlier_frames import refine
 from calibgraph.tracking.start import absorb_frames
 from calibgraph.tracking.state import DriftWatch, State, replace_item
@@ -63,7 +60,6 @@ def restart_after_step(state: State, detected: DetectedStep) -> tuple[State, tup
     for camera in detected.found_by - set(steps.cameras):  # nothing to compare with
         if near := detected.outlier_frames.get(camera):
             targets[camera] = near[-1].T_lidar_camera
-    state = keep_offsets(state, targets, detected.since)
     for camera, T_lidar_camera in targets.items():
         state = _restart_camera(
             state, camera, T_lidar_camera, _blocks_since(state, detected, camera)
@@ -159,7 +155,7 @@ def _restart_camera(
     )
     camera_state = changed(
         camera_state,
-        summary=EpochSummary.empty(state.width),
+        summary=EpochSummary.empty(),
         outlier_frames=(),
         agreements=(),
         moved_at=state.updates,
@@ -186,8 +182,7 @@ def _with_anchor_at(drift: DriftWatch | None, camera: int, step: Array) -> Drift
     """The watch with one camera's anchor moved by the step of that camera."""
     if drift is None:
         return None
-    own = drift.anchors[camera]
-    own = own.shift_reference(np.pad(step, (0, own.width - len(step))))
+    own = drift.anchors[camera].shift_reference(step)
     return changed(drift, anchors=drift.anchors.replace_at(camera, own))
 
 
@@ -226,23 +221,7 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         own = Gated.at(T_lidar_camera, raw, scale, reference, edges=together).sums[0]
         if own.matches:
             found = found.replace_at(camera, own.change(frames=np.array(float(len(parts)))))
-    return _with_uncertain_offsets(state, found, detected)
-
-
-def _with_uncertain_offsets(state: State, sums: Sums, detected: DetectedStep) -> Sums:
-    """The (n,) sums of frames since a step, which do not show the offset themselves."""
-    if state.offsets is None:
-        return sums
-    twists = np.zeros((len(state.cameras), 6))
-    for camera, to_camera in enumerate(state.offsets.adjoints):
-        motions = (part.block.motion for part in _blocks_since(state, detected, camera))
-        own = [motion[0, :6] for motion in motions if motion is not None]
-        if own:
-            twists[camera] = to_camera @ np.mean(own, axis=0)
-    share = sums.frames / np.maximum(state.total_frames, 1.0)
-    scatter = [s * state.total[pose_rows(c), pose_rows(c)] for c, s in enumerate(share)]
-    sums = sums.change(scatter=np.array(scatter))
-    return state.of_poses(with_offset(sums, twists))
+    return found
 
 
 def _measure_steps(state: State, detected: DetectedStep) -> Measured:
@@ -251,8 +230,5 @@ def _measure_steps(state: State, detected: DetectedStep) -> Measured:
     new = [c for c in range(len(state.cameras)) if state.frame_noise(c) is None]
     guessed = {camera: after.hessian[camera] * _GUESSED_OVERCONFIDENCE for camera in new}
     own = {camera: before.scatter[camera] for camera in (*new, *state.drifting)}
-    if state.offsets is not None:
-        own = dict(enumerate(before.scatter))
-        guessed = {**dict(enumerate(after.scatter)), **guessed}
     by_places = shift_since(state, detected.since)
     return steps_between(state, (before, own), (after, guessed), by_places)

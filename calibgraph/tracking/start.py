@@ -11,8 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import CorrespondenceError
-from calibgraph.model.calibration import Calibration
-from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.rig import Rig
@@ -59,25 +57,13 @@ def _try_to_start(state: State, camera: int, table: Correspondences) -> State:
         return state
     rig = Rig(lidar=state.rig.lidar, cameras={name: state.rig.cameras[name]})
     try:
-        result = _solve(rig, concatenate(waiting), state.config)
+        result = solve(rig, concatenate(waiting), state.config)
     except CorrespondenceError as error:
         return _wait_longer(state, camera, (str(error),))
     if result.verdict.status == "FAIL":
         return _wait_longer(state, camera, result.camera_verdicts[name].reasons)
-    if state.offsets is not None and result.lens:
-        (offset,) = result.lens[name]
-        offsets = state.offsets.with_camera(camera, offset.value, offset.sigma)
-        state = changed(state, offsets=offsets)
     T_lidar_camera = to_T_lidar_camera(result.T_camera_lidar[name])
     return _start_camera(state, camera, T_lidar_camera)
-
-
-def _solve(rig: Rig, table: Correspondences, config: Config) -> Calibration:
-    """The batch; with the time offset as the rig states it, if few frames do not show it."""
-    result = solve(rig, table, config)
-    if result.verdict.status == "FAIL" and config.estimate:
-        return solve(rig, table, config.changed(estimate=()))
-    return result
 
 
 def _is_attempt_due(frames: int, first: int) -> bool:
@@ -117,9 +103,6 @@ def absorb_frames(
 
     Blocks of live frames are added to them; older ones are left out.
     """
-    if state.offsets is not None:
-        state = changed(state, offsets=state.offsets.with_axes(camera, T_lidar_camera))
-    even = state.offsets is not None
     by_number = {int(part.frame[0]): part for part in blocks}
     scale, reference = state.cameras[camera].scale, state.references[camera]
     epochs: list[Epoch] = []
@@ -128,11 +111,9 @@ def absorb_frames(
         frames = []
         for before in epoch.frames:
             frame, raw = before, by_number.get(before.number)
-            found = (
-                None if raw is None else Gated.at(T_lidar_camera, raw, scale, reference, even=even)
-            )
+            found = None if raw is None else Gated.at(T_lidar_camera, raw, scale, reference)
             if raw is not None and found is not None and found.sums.matches[0]:
-                frame = frame.add(camera, found, state.offsets)
+                frame = frame.add(camera, found)
                 used = int(found.sums.matches[0])
                 counts.update(absorbed=1, given=len(raw.frame), used=used)
             frames.append(frame)
@@ -165,5 +146,5 @@ def count_residuals(
 def _camera_block(state: State, camera: int, table: Correspondences) -> CameraBlock | None:
     """The preprocessed matches of one camera's frame, None if there are too few."""
     name = state.names[camera]
-    kept, rig = preprocess(state.rig, table, state.config), state.rig_in_time
-    return camera_blocks(rig, kept.table, state.config).get(name)
+    kept = preprocess(state.rig, table, state.config)
+    return camera_blocks(state.rig, kept.table, state.config).get(name)

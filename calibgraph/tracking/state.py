@@ -20,13 +20,10 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.camera_state import CameraState
-from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import NO_DISTORTION, Epoch, LiveFrame
 from calibgraph.tracking.noise import inflation, widening
-from calibgraph.tracking.offset_sums import without_offset
-from calibgraph.tracking.offsets import Offsets, require_offset_alone
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.sums import Sums
@@ -75,8 +72,6 @@ class State:
         findings: of the errors that frames share, by their matcher.
         sizes: of these, as the data show them, over what the matcher states.
         optimum: of the graph of the closed epochs; None where it is not known.
-        is_refined: whether it is exact, so that nothing is left to the frames of the open epoch.
-        offsets: time offsets of the cameras; None if they are not estimated.
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
         updates: number of updates.
@@ -98,8 +93,6 @@ class State:
     findings: MatcherFindings = MatcherFindings()
     sizes: VarianceRatios = VarianceRatios()
     optimum: Optimum | None = None
-    is_refined: bool = False
-    offsets: Offsets | None = None
     frame: int | None = None
     stamp_ns: int | None = None
     updates: int = 0
@@ -107,23 +100,25 @@ class State:
 
     @staticmethod
     def initial(rig: Rig, config: Config) -> State:
-        """Before the first frame."""
+        """Before the first frame.
+
+        Raises:
+            ValueError: if a lens or clock is to be estimated.
+        """
+        require_poses_alone(config)
         n = len(rig.cameras)
         guess = tuple(to_T_lidar_camera(T) for T in rig.T_camera_lidar.values())
-        require_offset_alone(config)
-        width = 7 if config.estimate else 6
         return State(
             rig=rig,
             config=config,
-            cameras=tuple(CameraState(summary=EpochSummary.empty(width)) for _ in range(n)),
+            cameras=tuple(CameraState() for _ in range(n)),
             references=guess,
-            epochs=(Epoch.empty(guess, width),),
+            epochs=(Epoch.empty(guess),),
             total=np.zeros((6 * n, 6 * n)),
             total_hessian=np.zeros((n, 6, 6)),
             total_frames=np.zeros(n),
-            places=PlaceSums.empty(n, width),
+            places=PlaceSums.empty(n),
             distortion=(NO_DISTORTION,) * n,
-            offsets=Offsets.initial(rig) if config.estimate else None,
         )
 
     @property
@@ -183,48 +178,12 @@ class State:
         """The state with further moves."""
         return changed(self, moves=(*self.moves, *events)[-_MOST_MOVES:])
 
-    @property
-    def width(self) -> int:
-        """Of sums over several frames: 7 with time offsets."""
-        return self.epochs[-1].width
-
-    @property
-    def rig_in_time(self) -> Rig:
-        """The initial guess, with the present time offsets."""
-        return self.rig if self.offsets is None else self.offsets.put_into(self.rig)
-
     def walk_variance(self, strengths: Array, frames: int) -> Array:
-        """(w, d) variance of walks of (w,) strengths over so many frames.
-
-        Of rotation and translation, in units of the configured walk, and of the time offset.
-        """
+        """(w, 6) variance of walks of (w,) strengths, in units of the configured one."""
         tracking = self.config.tracking
         rotation = np.radians(tracking.walk_rotation_deg) ** 2
         whole = np.repeat([rotation, tracking.walk_translation_m**2], 3) * frames
-        variance = np.outer(strengths**2, whole)
-        if self.offsets is None:
-            return variance
-        return np.insert(variance, 6, tracking.walk_time_offset_s**2 * frames, axis=1)
-
-    def of_poses(self, sums: Sums) -> Sums:
-        """(n,) sums of the poses alone: the offsets are as uncertain as their estimates."""
-        if self.offsets is None:
-            return sums
-        return without_offset(sums, self.offsets.sigmas_s**-2, self.all_overconfidence)
-
-    def score_by_offset(self, camera: int, sums: Sums) -> Array:
-        """(6, 6) covariance of the score of frames by the offset of their camera, by (7,) sums."""
-        if self.offsets is None:
-            return np.zeros((6, 6))
-        follows = sums.hessian[:6, 6] * self.offsets.sigmas_s[camera]
-        return np.outer(follows, follows)
-
-    def of_pose(self, camera: int, sums: Sums) -> Sums:
-        """The same of (...) sums of one camera."""
-        if self.offsets is None:
-            return sums
-        information = self.offsets.sigmas_s[camera] ** -2
-        return without_offset(sums, information, np.array(self.overconfidence(camera)))
+        return np.outer(strengths**2, whole)
 
     def frame_noise(self, index: int) -> Array | None:
         """(6, 6) scatter of one frame's gradient of a camera; None while it is unknown.
@@ -267,6 +226,19 @@ class State:
     def all_overconfidence(self) -> Array:
         """(n,) of all cameras."""
         return np.array([self.overconfidence(camera) for camera in range(len(self.cameras))])
+
+
+def require_poses_alone(config: Config) -> None:
+    """Refuse settings that a tracker cannot follow.
+
+    Raises:
+        ValueError: if a lens or clock is to be estimated.
+    """
+    if config.estimate:
+        raise ValueError(
+            f"while driving, lens and clock are not estimated; found {', '.join(config.estimate)}: "
+            "estimate them with `calibgraph solve`, whose result is a rig to track from"
+        )
 
 
 def block_diagonal(blocks: Array) -> Array:

@@ -36,7 +36,6 @@ from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.frame_order import Incoming
 from calibgraph.tracking.live_frames import Epoch, OutlierFrame
 from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
-from calibgraph.tracking.offsets import Offsets
 from calibgraph.tracking.optimum import Optimum
 from calibgraph.tracking.place_sums import PlaceSums
 from calibgraph.tracking.state import DriftWatch, State
@@ -45,7 +44,7 @@ from factors import Lens, ProjectionBlock
 
 Kind = Literal["state", "input", "history"]
 
-_VERSION = 11
+_VERSION = 12
 """Earlier ones held other sums, or were of another encoding."""
 
 _DIGEST = hashlib.sha256().digest_size
@@ -155,6 +154,6 @@ _KINDS: tuple[tuple[type, Callable[[Any], Any], Callable[[Any], Any]], ...] = (
       for kind in (State, CameraState, DriftWatch, OutlierFrame, GroupScatter, EpochSummary,
                    Sums, PlaceSums, Optimum, DistortionEvidence, MatcherFindings,
                    VarianceRatios, ResidualHistogram, ResidualScale, Correspondences, CameraBlock,
-                   ProjectionBlock, Lens, Event, Size, Offsets, Incoming)),
+                   ProjectionBlock, Lens, Event, Size, Incoming)),
 )  # fmt: skip
 _CODES = {kind: code for code, (kind, _, _) in enumerate(_KINDS)}

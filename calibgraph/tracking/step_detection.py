@@ -15,9 +15,7 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.cause import alarm_limit, squared_sigmas
 from calibgraph.tracking.epoch_sums import sums_before_epochs
-from calibgraph.tracking.frozen import changed
-from calibgraph.tracking.live_frames import Epoch, OutlierFrame
-from calibgraph.tracking.offset_terms import score_after
+from calibgraph.tracking.live_frames import OutlierFrame
 from calibgraph.tracking.outlier_frames import agrees
 from calibgraph.tracking.state import State
 from calibgraph.tracking.steps import shift_since
@@ -138,23 +136,6 @@ def detect_small_step(state: State) -> DetectedStep | None:
     return detected
 
 
-def _scattered_as_usual(state: State, epoch: Epoch) -> Sums:
-    """The (n,) sums of an epoch; with time offsets, scattered as frames about the means of epochs.
-
-    The scatter of its own frames is about the estimate, and so has a step in it.
-    """
-    if state.offsets is None:
-        return epoch.sums
-    poses = Sums.stack([one.sums.pose for one in state.epochs])
-    left = np.maximum(poses.frames - 1, 0).sum(axis=0)[:, None, None]
-    by_camera = poses.scatter_about_mean.sum(axis=0) / np.maximum(left, 1.0)
-    frames = [
-        changed(f, sums=f.sums.change(scatter=f.sums.frames[:, None, None] * by_camera))
-        for f in epoch.frames
-    ]
-    return epoch.sums_of(frames)
-
-
 @dataclass(frozen=True, eq=False)
 class _ScoreTests:
     """Whether a camera's frames before and after the start of an epoch contradict each other.
@@ -186,8 +167,8 @@ class _ScoreTests:
 
 def _score_tests(state: State) -> _ScoreTests:
     """Those of all cameras, at the starts of all live epochs but the first."""
-    sums = [_scattered_as_usual(state, epoch) for epoch in reversed(state.epochs)]
-    after = Sums.stack([*accumulate(sums)][::-1])
+    sums = accumulate(epoch.sums for epoch in reversed(state.epochs))
+    after = Sums.stack([*sums][::-1])
     before = Sums.stack([*sums_before_epochs(state)])
     ready = [one.started and one.groups[0].count >= _LEAST_EPOCHS for one in state.cameras]
     tested = (before.frames >= _BEFORE) & (after.frames > 0) & np.array(ready)
@@ -196,17 +177,10 @@ def _score_tests(state: State) -> _ScoreTests:
     tested[tested] = before[tested].are_determined
     epochs, cameras = np.nonzero(tested)
     before, after = before[tested], after[tested]
-    hessian = after.hessian[:, :6, :6]
-    if state.offsets is None:
-        score, covariance = _scores(before, after)
-        covariance = covariance * np.array([*map(state.inflation, cameras.tolist())])[:, None, None]
-    else:
-        numbered = enumerate(cameras.tolist())
-        pairs = [score_after(state, camera, before[k], after[k]) for k, camera in numbered]
-        score = np.array([each for each, _ in pairs]).reshape(-1, 6)
-        covariance = np.array([each for _, each in pairs]).reshape(-1, 6, 6)
+    score, covariance = _scores(before, after)
+    covariance = covariance * np.array([*map(state.inflation, cameras.tolist())])[:, None, None]
     limits = np.array([*map(alarm_limit, before.frames)])
-    return _ScoreTests(epochs, cameras, score, covariance, hessian, limits)
+    return _ScoreTests(epochs, cameras, score, covariance, after.hessian, limits)
 
 
 def _scores(before: Sums, after: Sums) -> tuple[Array, Array]:

@@ -33,8 +33,7 @@ from calibgraph.solver.residual_scale import ResidualScale
 from factors import smallest_scaled_eigenvalue, smallest_scaled_eigenvalues
 
 _POSE = 6
-_MATRICES, _VECTORS = ("hessian", "reweighted", "scatter"), ("gradient", "score")
-_WIDTHS = {d * (3 * d + 2) + 2: d for d in (_POSE, _POSE + 1)}
+_SQUARE, _SIZE = _POSE * _POSE, _POSE * (3 * _POSE + 2) + 2
 _STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away
 _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
@@ -43,11 +42,10 @@ _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near
 class Sums:
     """Sums over frames. The leading axes (...), of cameras, places or others, are alike in all.
 
-    Of the pose, d is 6; with the time offset [s] of the camera last, d is 7. What is summed are
-    views of one array, so that adding is one operation.
+    What is summed are views of one array, so that adding is one operation.
 
     Attributes:
-        packed: (..., 3 d^2 + 2 d + 2) of the properties, one after the other.
+        packed: (..., 122) of the properties, one after the other.
     """
 
     packed: Array
@@ -55,28 +53,21 @@ class Sums:
     @staticmethod
     def of(**values: Array) -> Sums:
         """Of all the properties."""
-        return Sums.zeros(*values["frames"].shape, width=values["gradient"].shape[-1]).change(
-            **values
-        )
+        return Sums.zeros(*values["frames"].shape).change(**values)
 
     @staticmethod
-    def zeros(*shape: int, width: int = _POSE) -> Sums:
-        """Over no frames, with these leading axes, and d."""
-        return Sums(np.zeros((*shape, width * (3 * width + 2) + 2)))
-
-    @property
-    def width(self) -> int:
-        """The number d."""
-        return _WIDTHS[self.packed.shape[-1]]
+    def zeros(*shape: int) -> Sums:
+        """Over no frames, with these leading axes."""
+        return Sums(np.zeros((*shape, _SIZE)))
 
     @property
     def hessian(self) -> Array:
-        """(..., d, d) true Hessian of the robust cost, in the tangent of T_lidar_camera."""
+        """(..., 6, 6) true Hessian of the robust cost, in the tangent of T_lidar_camera."""
         return self._matrix(0)
 
     @property
     def reweighted(self) -> Array:
-        """(..., d, d) Hessian by the matches' weights in the loss.
+        """(..., 6, 6) Hessian by the matches' weights in the loss.
 
         It is positive semidefinite, of however few.
         """
@@ -84,19 +75,18 @@ class Sums:
 
     @property
     def scatter(self) -> Array:
-        """(..., d, d) sum of the outer products of the gradients of ``score``."""
+        """(..., 6, 6) sum of the outer products of the gradients of ``score``."""
         return self._matrix(2)
 
     @property
     def gradient(self) -> Array:
-        """(..., d) at the reference, which ``State`` holds."""
-        d = self.width
-        return self.packed[..., -2 - 2 * d : -2 - d]
+        """(..., 6) at the reference, which ``State`` holds."""
+        return self.packed[..., -2 - 2 * _POSE : -2 - _POSE]
 
     @property
     def score(self) -> Array:
-        """(..., d) sum of the frames' gradients, each at the estimate of its time."""
-        return self.packed[..., -2 - self.width : -2]
+        """(..., 6) sum of the frames' gradients, each at the estimate of its time."""
+        return self.packed[..., -2 - _POSE : -2]
 
     @property
     def frames(self) -> Array:
@@ -109,25 +99,15 @@ class Sums:
         return self.packed[..., -1]
 
     def _matrix(self, place: int) -> Array:
-        d, shape = self.width, self.packed.shape[:-1]
-        return self.packed[..., place * d * d : (place + 1) * d * d].reshape(*shape, d, d)
+        rows = slice(place * _SQUARE, (place + 1) * _SQUARE)
+        return self.packed[..., rows].reshape(*self.packed.shape[:-1], _POSE, _POSE)
 
     @property
     def scatter_about_mean(self) -> Array:
-        """(..., d, d) of the frames' gradients."""
+        """(..., 6, 6) of the frames' gradients."""
         whole = np.maximum(self.frames, 1.0)[..., None, None]
         outer = self.score[..., :, None] * self.score[..., None, :]
         return np.asarray(self.scatter - outer / whole)
-
-    @property
-    def pose(self) -> Sums:
-        """The sums of the pose, the offset at its reference."""
-        if self.width == _POSE:
-            return self
-        rows = slice(_POSE)
-        vectors = {name: getattr(self, name)[..., rows] for name in _VECTORS}
-        matrices = {name: getattr(self, name)[..., rows, rows] for name in _MATRICES}
-        return Sums.of(**vectors, **matrices, frames=self.frames, matches=self.matches)
 
     @staticmethod
     def stack(parts: Sequence[Sums]) -> Sums:
@@ -167,7 +147,7 @@ class Sums:
         return Sums(self.packed.sum(axis=0))
 
     def shift_reference(self, steps: Array) -> Sums:
-        """The sums about references that are moved by (..., d) tangent steps."""
+        """The sums about references that are moved by (..., 6) tangent steps."""
         moved = (self.hessian @ steps[..., None])[..., 0]
         return self.change(gradient=self.gradient + moved)
 
@@ -178,17 +158,17 @@ class Sums:
         by the one by weights: the gain of a negative eigenvalue has a pole.
 
         Args:
-            variance: (..., d) of the walk.
+            variance: (..., 6) of the walk.
             overconfidence: (...) k of the module's description.
         """
         by, hessian = variance / np.asarray(overconfidence)[..., None], self.hessian
         values = np.linalg.eigvalsh(hessian)
         bad = (values[..., 0] < -_LEAST_EIGENVALUE * values[..., -1]) & variance.any(axis=-1)
         hessian = np.where(bad[..., None, None], self.reweighted, hessian)
-        gain = np.linalg.inv(np.eye(self.width) + hessian * by[..., None, :])
+        gain = np.linalg.inv(np.eye(_POSE) + hessian * by[..., None, :])
         hessian, back = gain @ hessian, gain.swapaxes(-1, -2)
         hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
-        kept = np.trace(gain[..., :_POSE, :_POSE], axis1=-2, axis2=-1) / _POSE
+        kept = np.trace(gain, axis1=-2, axis2=-1) / _POSE
         walked = (self * kept).change(
             hessian=hessian,
             gradient=(gain @ self.gradient[..., None])[..., 0],
@@ -199,7 +179,7 @@ class Sums:
     @property
     def are_determined(self) -> NDArray[np.bool_]:
         """(...) whether all directions of the pose are."""
-        hessians = self.pose.hessian
+        hessians = self.hessian
         values = smallest_scaled_eigenvalues(hessians.reshape(-1, _POSE, _POSE))
         return (values > _LEAST_EIGENVALUE).reshape(hessians.shape[:-2])
 

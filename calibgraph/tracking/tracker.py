@@ -26,8 +26,8 @@ from calibgraph.tracking.absorption import (
     select_agreeing,
 )
 from calibgraph.tracking.assessment import Assessment, MeasureOnFrames, assess, to_calibration
-from calibgraph.tracking.closed_places import STEPS, ClosedPlaces, refine, settle
-from calibgraph.tracking.epochs import at_explaining_offsets, close_epoch
+from calibgraph.tracking.closed_places import ClosedPlaces, settle
+from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_group import Blocks, usual_frames
 from calibgraph.tracking.frame_order import (
@@ -180,11 +180,6 @@ class IncrementalCalibrator:
 
     def _take(self, one: Incoming, table: Correspondences, blocks: Blocks) -> Update:
         """Absorb the blocks that agree, set aside the others, detect events."""
-        sums = self._closed.all_sums(self._state)
-        state, blocks = at_explaining_offsets(self._state, sums, blocks)
-        if state is not self._state:
-            self._state = state
-            self._rebuild()
         self._state, agreeing = select_agreeing(self._state, self._closed, blocks)
         self._state, (used,) = absorb(self._state, self._closed, agreeing)
         self._state, events = start_cameras(self._state, table, blocks)
@@ -196,7 +191,7 @@ class IncrementalCalibrator:
             self._state, moved = restart_after_step(self._state, detected)
             self._rebuild()
             seen += moved
-        events += seen + self._end_frames(1)
+        events += seen + self._end_frames()
         (update,) = make_updates(self._state, self._assess(), [(one, events, used)])
         return update
 
@@ -208,25 +203,16 @@ class IncrementalCalibrator:
             again = count_repeats(self._state, one.table, one.table)
             self._state, events = count_absent(again, own, one)
             taken.append((one, events, own))
-        taken[-1][1].extend(self._end_frames(len(group)))
+        taken[-1][1].extend(self._end_frames())
         return make_updates(self._state, self._assess(), taken)
 
-    def _end_frames(self, count: int) -> list[Event]:
-        """The rest of the work of some frames, and the end of the epoch if they fill it."""
-        frames = len(self._state.epochs[-1].frames)
-        for step in range(frames - count + 1, frames + 1):
-            self._refine(step)
-        if frames < self._state.config.tracking.epoch_frames:
+    def _end_frames(self) -> list[Event]:
+        """The end of the epoch if its frames fill it."""
+        if self._closed.state.findings != self._state.findings:
+            self._closed = ClosedPlaces.of(self._state)
+        if len(self._state.epochs[-1].frames) < self._state.config.tracking.epoch_frames:
             return []
-        return self._close_epoch(together=count > 1)
-
-    def _refine(self, step: int) -> None:
-        """Do a part of the work that the end of an epoch has left to the frames after it."""
-        state = self._state
-        if self._closed.state.findings != state.findings:
-            self._closed, state = ClosedPlaces.of(state), changed(state, is_refined=False)
-        if step <= STEPS and len(state.epochs) > 1 and not state.is_refined:
-            self._state, self._closed = refine(state, self._closed, step)
+        return self._close_epoch()
 
     def _assess(self) -> Assessment:
         """Assess the estimates, once: the sums over closed epochs are at hand."""
@@ -272,28 +258,27 @@ class IncrementalCalibrator:
         except StateError as error:
             raise FileError(path, f"{error}; track anew from a rig") from error
 
-    def _resume(self, state: State, closed: ClosedPlaces | None = None) -> None:
+    def _resume(self, state: State) -> None:
         """Continue from a state: at the start, at each new epoch, and after an error."""
         self._state = state
         self._epoch_start = state
         self._since_epoch_start = []
-        self._rebuild(closed)
+        self._rebuild()
 
-    def _rebuild(self, closed: ClosedPlaces | None = None) -> None:
+    def _rebuild(self) -> None:
         """Start from the state anew, after anything but a frame has changed it."""
-        self._closed, self._assessed = closed or ClosedPlaces.of(self._state), None
+        self._closed, self._assessed = ClosedPlaces.of(self._state), None
         self._state = at_minimum(self._state, self._closed)
 
-    def _close_epoch(self, *, together: bool) -> list[Event]:
+    def _close_epoch(self) -> list[Event]:
         """Summarize the oldest live epoch, test for a small step, begin another."""
-        state, offsets = self._state, self._state.offsets
+        state = self._state
         if self._assessed is not None and self._assessed[0].epochs[-1].frames:
             state = changed(state, optimum=self._assessed[1].newest(state.optimum))
-            offsets = self._assessed[1].offsets(state)
-        self._state, events = close_epoch(state, offsets, self._closed.all_sums(state))
+        self._state, events = close_epoch(state)
         detected = detect_small_step(self._state)
         if detected is not None:
             self._state, more = handle_small_step(self._state, detected)
             events += more
-        self._resume(*settle(self._state, together=together))
+        self._resume(settle(self._state))
         return events

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.model.lens_estimate import LensEstimate
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import Verdict
 from calibgraph.report.as_json import finite
@@ -38,7 +37,6 @@ class Update:
         events: the events detected with this frame.
         used: per camera whose matches were absorbed, how many.
         left_out: cameras whose matches disagree with the estimate, and were not absorbed.
-        lens: per camera whose time offset is estimated, its estimate.
     """
 
     frame: int
@@ -49,7 +47,6 @@ class Update:
     events: tuple[Event, ...]
     used: dict[str, int]
     left_out: tuple[str, ...]
-    lens: dict[str, tuple[LensEstimate, ...]] = field(default_factory=dict)
 
 
 def make_updates(
@@ -82,7 +79,6 @@ def make_updates(
             events=tuple(events),
             used={names[camera]: count for camera, count in used.items()},
             left_out=tuple(n for n in names if last[n] == ((one.number, False),)),
-            lens=dict(assessment.lens),
         )
         for one, events, used in taken
     ]
@@ -90,7 +86,7 @@ def make_updates(
 
 def shared_parts(update: Update) -> tuple[int, ...]:
     """Identities of what frames that are taken in at once share."""
-    parts = update.T_camera_lidar, update.covariance, update.verdicts, update.lens
+    parts = update.T_camera_lidar, update.covariance, update.verdicts
     return tuple(id(value) for part in parts for value in part.values())
 
 
@@ -136,7 +132,6 @@ def _estimate(update: Update, name: str) -> str:
         "cannot_tell": verdict.cannot_tell,
         "reasons": list(verdict.reasons),
         "actions": list(summarize({name: verdict}).actions),
-        **{key: value for one in update.lens.get(name, ()) for key, value in _offset(one).items()},
     }
     return f"{_json(name)}: {_json(content)[:-1]}"
 
@@ -144,14 +139,6 @@ def _estimate(update: Update, name: str) -> str:
 def _of_frame(update: Update, name: str) -> str:
     """The other members."""
     return f'"used": {update.used.get(name, 0)}, "left_out": {str(name in update.left_out).lower()}'
-
-
-def _offset(one: LensEstimate) -> dict[str, Any]:
-    return {
-        "time_offset_s": one.value,
-        "time_offset_sigma_s": one.sigma,
-        "time_offset": "; ".join(filter(None, (one.change, one.describe()))),
-    }
 
 
 def _event(event: Event) -> dict[str, Any]:

@@ -7,8 +7,7 @@
 
 Every frame exchanges errors and places: their covariances depend on all frames. What is reported is
 iSAM2's estimate and its joint marginal. Whatever else changes the graph, such as the end of an
-epoch or a place that is entered, begins another window. Before the first frame of an epoch the
-graph is that of the closed places, which is at its optimum: iSAM2 is not needed.
+epoch or a place that is entered, begins another window.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import LatentPoseModel, data_graph
 from calibgraph.graph.objective import join
-from calibgraph.solver.elimination import Linearization
 
 _RELINEARIZE = 1e-5  # rad and m: far below any sigma
 _MOST_STEPS = 20  # of Gauss-Newton: from frame to frame one or two do
@@ -62,8 +60,7 @@ class Window:
     def _update(
         self, model: LatentPoseModel, held: gtsam.NonlinearFactorGraph, start: gtsam.Values
     ) -> None:
-        parts = model.error_graph, model.lens_graph, model.place_graph, data_graph(model)
-        graph = join(held, *parts)
+        graph = join(held, model.error_graph, model.place_graph, data_graph(model))
         result = self._isam.update(graph, start, self._exchanged)
         self._exchanged = [*result.getNewFactorsIndices()][held.size() :]
         for _ in range(_MOST_STEPS):
@@ -78,30 +75,3 @@ class Window:
     def covariance(self, keys: Sequence[int]) -> Array:
         """Joint marginal of some variables, in their tangents."""
         return np.asarray(self._isam.jointMarginalCovariance(keys).fullMatrix())
-
-
-class ClosedWindow:
-    """The graph of the closed places near its optimum, while no frame has come since.
-
-    Args:
-        linear: linearized there: one step more is taken.
-        places: names of its places.
-
-    Raises:
-        RuntimeError: if a variable is not determined.
-    """
-
-    def __init__(self, linear: Linearization, places: Sequence[str]) -> None:
-        self._linear, self.model, self.places = linear, linear.model, tuple(places)
-        self.values = linear.values.retract(linear.step)
-
-    def T_lidar_camera(self, keys: Sequence[int]) -> tuple[gtsam.Pose3, ...]:
-        """The estimates of some poses."""
-        return tuple(map(self.values.atPose3, keys))
-
-    def covariance(self, keys: Sequence[int]) -> Array:
-        """Joint marginal of some variables, in their tangents."""
-        return self._linear.covariance_of(keys)
-
-
-AnyWindow = Window | ClosedWindow

@@ -1,1 +1,1 @@
-"""Can the result be used? A list of checks per camera; start at ``assess``."""
+"""Can the result be used? ``assess`` makes the checks, ``probability.judge`` the verdict."""

@@ -55,10 +55,10 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     swap_checks,                # are the images of two cameras swapped?
     point_distance_checks,      # are the points in metres?
     flat_evidence_checks,       # do the images leave the pose more open than the matches?
-    estimate_checks,            # residuals, sigmas, relative poses, halves, counts, convergence
+    estimate_checks,            # residuals, sigmas, relative poses, counts, convergence
     pair_agreement_checks,      # do two cameras' images agree with the correspondences?
     one_pose_checks,            # have two cameras one device's images?
-    matcher_checks,             # findings of the matcher: search, learned shares, z-score
+    matcher_checks,             # findings of the matcher: search, failed frames, z-score
     competing_solution_checks,  # do the left-out matches agree on another extrinsic?
     outlier_frame_checks,       # how many frames were left out?
     place_checks,               # does a place contradict the others?

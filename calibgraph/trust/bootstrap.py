@@ -66,7 +66,7 @@ def _solve_draw(
             reason = error
             continue
         return inliers.minimize(rough, solution.scales).T_camera_lidar
-    raise CorrespondenceError(f"bootstrap: {reason}; give more frames, or leave --bootstrap out")
+    raise CorrespondenceError(f"bootstrap: {reason}; give more frames, or leave bootstrap out")
 
 
 def _draw(block: Matches, drawn: NDArray[np.int64]) -> Matches:

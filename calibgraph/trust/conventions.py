@@ -283,7 +283,7 @@ def _sentence(error: str, cameras: Sequence[str]) -> str:
     images = f"the images of {' and '.join(cameras)}" if cameras else "the images"
     return (
         f"{images} fit clearly better if {in_words(error)}; undo it with "
-        f"calibgraph import RIG {options} --out FILE.yaml"
+        f"calibgraph rig RIG {options} --out FILE.yaml"
     )
 
 

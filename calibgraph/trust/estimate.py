@@ -26,10 +26,7 @@ class Estimate:
         covariance: (6, 6) of (rotation [rad], translation [m]), or None.
         data_sigmas: (6,) standard deviations if every correspondence were independent: rotation
             [rad], translation [m]; or None.
-        halves: (4, 4) T_camera_lidar from the even and from the odd frames, or None.
         conflicts: of the relative poses that name this camera.
-        pull: how far priors and relative poses pull it from its own solution [deg, cm]; None if
-            nothing pulls, or by less than ``pull_sigmas`` of that solution.
         converged: whether the last pass stopped by its tolerance.
         terms: of the objective.
         held: whether nothing determines it.
@@ -45,9 +42,7 @@ class Estimate:
     frames: int
     covariance: Array | None
     data_sigmas: Array | None
-    halves: tuple[Array, Array] | None
     conflicts: tuple[Conflict, ...]
-    pull: tuple[float, float] | None
     converged: bool
     terms: Terms
     held: bool = False

@@ -6,9 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Residuals
@@ -16,15 +14,13 @@ from calibgraph.model.error_components import error_components
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import (
-    pose_difference,
     pose_rows,
-    relative_transform,
     twist_between,
 )
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.solver.block_residuals import BlockResiduals
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
+from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.bootstrap import bootstrap_covariance
@@ -34,11 +30,8 @@ from calibgraph.trust.image_posteriors import (
     MeasurePosteriors,
     measured_pairs,
 )
-from calibgraph.trust.observability import prior_shares, shares_of_marginal
+from calibgraph.trust.observability import prior_shares
 from calibgraph.trust.pose_posterior import PosePosterior, group_tied, no_posteriors
-from calibgraph.trust.thresholds import limit
-
-_HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unknown
 
 Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
@@ -216,51 +209,8 @@ class Evidence:
     def prior_shares(self) -> dict[str, float]:
         """Per camera, which share of its result comes from priors and relative poses."""
         errors = self.solution.marginals.errors
-        if errors is None:
-            return prior_shares(self.solution, self.solution.fitted.robust_hessians)
-        return shares_of_marginal(self.solution, errors.fit.of_mount.covariance)
-
-    @cached_property
-    def even_frames(self) -> NDArray[np.int64]:
-        """Every other one of the frames that any camera has inliers in."""
-        blocks = self.solution.inliers.blocks.values()
-        return np.unique(np.concatenate([b.frame_numbers for b in blocks]))[::2]
-
-    @cached_property
-    def halves(self) -> dict[str, tuple[Array, Array]]:
-        """Per camera (4, 4) T_camera_lidar from the even and from the odd frames, if possible."""
-        inliers = self.solution.inliers
-        if not inliers.uses_correspondences:
-            return {}
-        solutions = []
-        even = {n: block.in_frames(self.even_frames) for n, block in inliers.blocks.items()}
-        for odd in (False, True):
-            half = {n: block.select(even[n] != odd) for n, block in inliers.blocks.items()}
-            if any(len(block.frame) < MIN_MATCHES for block in half.values()):
-                return {}
-            optimum = inliers.with_blocks(half).minimize(
-                self.solution.T_camera_lidar, self.solution.scales
-            )
-            solutions.append(optimum.T_camera_lidar)
-        return {name: (solutions[0][name], solutions[1][name]) for name in inliers.blocks}
-
-    def pull_of(self, camera: str) -> tuple[float, float] | None:
-        """How far priors and relative poses pull a camera from its own solution: deg, cm.
-
-        None if nothing pulls, or by less than ``pull_sigmas`` of the camera's own solution.
-        """
-        data_only = self.solution.marginals.data_only
-        if data_only is None or camera not in self.solution.inliers.blocks:
-            return None
-        own, covariance = data_only.T_camera_lidar[camera], data_only.covariance
-        joint = self.solution.T_camera_lidar[camera]
-        if covariance is not None:
-            first = 6 * tuple(self.solution.inliers.blocks).index(camera)
-            sigmas = np.sqrt(np.diag(covariance))[first : first + 6]
-            step = gtsam.Pose3.Logmap(gtsam.Pose3(relative_transform(joint, own)))
-            if np.abs(step / sigmas).max() < limit("pull_sigmas"):
-                return None
-        return pose_difference(joint, own)
+        known = None if errors is None else errors.fit.of_mount.covariance
+        return prior_shares(self.solution, known)
 
     def estimate(self, camera: str) -> Estimate:
         """The input of the checks of one camera's estimate.
@@ -276,9 +226,7 @@ class Evidence:
             frames=0 if block is None else len(block.frame_edges) - 1,
             covariance=self.covariance_by_matches(camera),
             data_sigmas=None if sigmas is None else sigmas[self.cameras.index(camera)],
-            halves=self.halves.get(camera),
             conflicts=tuple(c for c in conflicts if camera in (c.pair.a, c.pair.b)),
-            pull=self.pull_of(camera),
             converged=solution.optimum.converged,
             terms=solution.terms,
             held=camera in solution.held,

@@ -37,29 +37,29 @@ def guess_checks(evidence: Evidence) -> Checks:
 def compare_with_guess(guess: Array, result: Array, findings: MatcherFindings) -> list[Check]:
     """The distance of one camera's result from its guess, and the guess's length.
 
-    A result may lie as far away as its matcher searches.
+    A result may lie as far away as its matcher searches. One that is turned farther counts where a
+    convention error of the guess explains it.
 
     Args:
         guess: (4, 4) T_camera_lidar.
         result: (4, 4) T_camera_lidar.
         findings: of the matcher, with its range.
     """
-    rotation, translation = threshold("guess_rotation"), threshold("guess_translation")
     range_deg = math.sqrt(3) * (findings.range_rotation_deg or 0.0)
     range_m = math.sqrt(3) * (findings.range_translation_m or 0.0)
     degrees = angle_deg(guess[:3, :3] @ result[:3, :3].T)
     metres = float(np.linalg.norm(guess[:3, 3] - result[:3, 3]))
-    rows = (
-        (replace(rotation, warn=max(rotation.warn, range_deg)), degrees),
-        (replace(translation, warn=max(translation.warn, range_m)), metres),
-    )
-    is_far = any(row.grade(value) != "PASS" for row, value in rows)
+    row = threshold("guess_translation")
+    row = replace(row, warn=max(row.warn, range_m))
+    is_turned = degrees > max(limit("guess_rotation"), range_deg)
+    is_far = is_turned or row.grade(metres) != "PASS"
     error = convention_error_between(guess, result) if is_far else None
     advice = "" if error is None else f"it seems that {in_words(error)}"
-    return [
-        *(row.check(value, advice=advice) for row, value in rows),
-        threshold("guess_length").check(float(np.linalg.norm(guess[:3, 3]))),
-    ]
+    check = row.check(metres, advice=advice)
+    if error is not None and check.status == "PASS":
+        text = f"{check.text} and {degrees:.3g} deg: {advice}"
+        check = replace(check, status="WARN", text=text)
+    return [check, threshold("guess_length").check(float(np.linalg.norm(guess[:3, 3])))]
 
 
 def swap_checks(evidence: Evidence) -> Checks:

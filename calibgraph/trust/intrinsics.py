@@ -25,7 +25,6 @@ _NUMBERS = {
     "principal point": (Free.CENTRE_X, Free.CENTRE_Y),
     "distortion": (Free.RADIAL,),
     "aspect ratio": (Free.ASPECT,),
-    "skew": (Free.SKEW,),
 }
 _MAX_MATCHES = 20_000  # evenly chosen: bounds the time
 

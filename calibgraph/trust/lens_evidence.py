@@ -79,13 +79,13 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     moved[[*finer]] = change.values
     most = MAX_RADIAL / lens.free.sigmas[Free.RADIAL]
     moved[Free.RADIAL] = np.clip(moved[Free.RADIAL], -most, most)
-    refined = lens.put_into(apply_twist(camera, change.twist), moved[:-1])
+    refined = lens.put_into(apply_twist(camera, change.twist), moved)
     again = _with_lens(scorer, refined, scorer.score_together(images, refined, FINER))
     rest = _fit_at_peaks(scorer, refined, again, np.zeros(len(best)), places=places)
     if rest is None:
         return ()
     fine, units, parameters = rest.counted_from(moved), units_of(camera), []
-    for name, number in zip(NAMES, (*searched, Free.SKEW), strict=True):
+    for name, number in zip(NAMES, searched, strict=True):
         fit, others = fine if number in finer else rough, [n for n in finer if n != number]
         of = LensParameter.of(name, units[[number]], fit.free(*others, number))
         parameters.append(of)
@@ -103,12 +103,12 @@ def _with_lens(scorer: FrameScorer, camera: Camera, scores: ShiftScores) -> Shif
 
 
 def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: int) -> Array:
-    """The best twist and lens, (12,).
+    """The best twist and lens, (11,).
 
     Args:
         camera: at the result.
         scores: there, with the lens.
-        lens: numbers of its parameters that are searched. A skew moves pixels too little for it.
+        lens: numbers of its parameters that are searched.
         seed: of the search.
     """
     columns = [*range(6), *(6 + number for number in lens)]
@@ -128,7 +128,7 @@ def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: in
 def _fit_at_peaks(
     scorer: FrameScorer, camera: Camera, scores: ShiftScores, start: Array, *, places: Places
 ) -> LinearFit | None:
-    """Fit pose and lens to the groups' peaks next to a start, (12,); the scan may be distorted."""
+    """Fit pose and lens to the groups' peaks next to a start, (11,); the scan may be distorted."""
     if not len(scores.weights):
         return None
     table = extract_correspondences(scores, start, "camera")

@@ -1,8 +1,7 @@
 """The probability that a lens parameter is wrong, by the posterior of a free lens.
 
 A parameter is in standard deviations of a lens that was calibrated with a target, or of those that
-the rig states. Half of a skew, which no lens of a rig has, is a rotation about the axis; the other
-half is a field of displacements of its own.
+the rig states.
 """
 
 from __future__ import annotations
@@ -32,24 +31,22 @@ from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, FOCAL
 
 
 class Free(IntEnum):
-    """What is free, by number: parameters of a lens, and the skew."""
+    """What is free, by number: parameters of a lens."""
 
-    FOCAL, RADIAL, CENTRE_X, CENTRE_Y, ASPECT, SKEW = range(6)
+    FOCAL, RADIAL, CENTRE_X, CENTRE_Y, ASPECT = range(5)
 
 
+ASPECT_RATIO = "aspect ratio"
+"""No lens has it wrong by much; it is checked, and not estimated."""
 NAMES = {
     "focal length": ("focal", "a focal length {} % longer", "a focal length {} % shorter"),
     "distortion": ("distortion", "a k1 larger by {}", "a k1 smaller by {}"),
     "principal point": ("centre", "a principal point off by ({}) px", ""),
-    "aspect ratio": ("aspect", "a ratio fx / fy {} % larger", "a ratio fx / fy {} % smaller"),
-    "skew": (None, "a skew of {} % of fx", "a skew of -{} % of fx"),
+    ASPECT_RATIO: (None, "a ratio fx / fy {} % larger", "a ratio fx / fy {} % smaller"),
 }
 """Parameters that are judged: what ``--estimate`` calls them, and a lens with more or less."""
 TIME = "time offset"
 _WORDS = {**NAMES, TIME: ("offset", "images taken {} ms later", "images taken {} ms earlier")}
-
-SHAPES = "aspect ratio", "skew"
-"""Those that no lens has wrong by much."""
 
 RESIDUALS, IMAGES = "residuals over the image", "images"
 """What an estimate is by."""
@@ -69,8 +66,8 @@ _PART_OF = {
 _ESTIMATE = re.compile(r"(run with --estimate )[a-z,]+((?: --[a-z-]+ [\w.]+)?)")
 
 _NAMES = FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT
-_PARTS: tuple[LensPart, ...] = "focal", "aspect", "centre", "distortion"
-_SKEW_SIGMA = 0.002  # in parts of fx
+_PARTS: tuple[LensPart, ...] = "focal", "centre", "distortion"
+_ASPECT_SIGMA = 0.002
 _MOST_SIGMAS = 1e6  # enough for any probability
 _TINY = float(np.finfo(float).tiny)
 
@@ -78,25 +75,22 @@ _TINY = float(np.finfo(float).tiny)
 def lens_variable(camera: Camera) -> LensVariable:
     """The lens of a camera with the parameters that are checked, at its calibration."""
     all_of = LensVariable.of(camera, _PARTS, LensSigmas.calibrated(camera)).free
-    sigmas = dict(zip(all_of.parameters, all_of.sigmas, strict=True))
+    sigmas = dict(zip(all_of.parameters, all_of.sigmas, strict=True)) | {ASPECT: _ASPECT_SIGMA}
     free = FreeLens(camera.lens, _NAMES, tuple(sigmas[name] for name in _NAMES))
     return LensVariable(camera, free, np.zeros(len(free)))
 
 
 def units_of(camera: Camera) -> Array:
-    """(6,) standard deviations of what is free in a calibrated lens: relative, pixels, or of k1."""
-    return np.array([*lens_variable(camera).free.sigmas, _SKEW_SIGMA])
+    """(5,) standard deviations of what is free in a calibrated lens: relative, pixels, or of k1."""
+    return np.array(lens_variable(camera).free.sigmas)
 
 
 def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
-    """(6, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
-    free, T, k = lens_variable(camera).free, camera.T_camera_lidar, camera.intrinsics_px
+    """(5, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
+    free, T = lens_variable(camera).free, camera.T_camera_lidar
     points = (T[:3, :3] @ points_lidar_m.T + T[:3, 3:]).T
     fields = np.empty((len(Free), 2, len(points)))
-    free.fill_columns(camera.lens, points, fields[:-1])
-    half = 0.5 * _SKEW_SIGMA / free.sigmas[Free.FOCAL]
-    turned = half * np.array([[k.fx / k.fy], [k.fy / k.fx]])
-    np.multiply(fields[Free.FOCAL, ::-1], turned, out=fields[-1])
+    free.fill_columns(camera.lens, points, fields)
     return fields
 
 
@@ -149,8 +143,8 @@ class LensParameter:
 
         What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
         wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. An
-        aspect ratio or skew that no lens has counts even if the camera moves little when it is set
-        free: matches from rounds have followed it. At the default tolerance any size of it counts.
+        aspect ratio that no lens has counts even if the camera moves little when it is set free:
+        matches from rounds have followed it. At the default tolerance any size of it counts.
         At a wider one it counts if half of it, as an angle, exceeds what the tolerance adds to the
         default rotation.
         """
@@ -159,7 +153,7 @@ class LensParameter:
         moves = max(moved / most for moved, most in zip(self.moved, tolerance, strict=True))
         tolerated = self.size / moves if moves else math.inf
         counted = tolerated
-        if self.name in SHAPES:
+        if self.name == ASPECT_RATIO:
             wider = min(one / usual for one, usual in zip(tolerance, TOLERANCE, strict=True)) - 1
             counted = math.radians(TOLERANCE[0]) * max(wider, 0.0) / (self.units[0] / 2)
         wrong, share = limit("lens_wrong"), limit("lens_wrong_share")
@@ -195,8 +189,8 @@ def _beside_others(name: str, freed: Freed, others: int) -> tuple[Array, Array]:
 
     A focal length that is 1 % off is no less rare beside a distortion than alone. So the other
     unknowns have the errors of lens parameters, too: the mean and the covariance over all of their
-    combinations of usual and wrong. Not beside a shape: a wrong fy alone is a wrong focal length,
-    too, which stays free.
+    combinations of usual and wrong. Not beside an aspect ratio: a wrong fy alone is a wrong focal
+    length, too, which stays free.
 
     Args:
         name: of the unknowns.
@@ -205,7 +199,7 @@ def _beside_others(name: str, freed: Freed, others: int) -> tuple[Array, Array]:
     """
     first, last = slice(others), slice(others, None)
     values, covariance = freed.values, freed.covariance
-    if not others or name in SHAPES or not np.isfinite(covariance).all():
+    if not others or name == ASPECT_RATIO or not np.isfinite(covariance).all():
         return values[last], covariance[last, last]
     wrong = np.array([*product((False, True), repeat=others)])
     spreads = np.where(wrong, limit("lens_wrong"), 1.0)
@@ -267,7 +261,7 @@ def advise_together(checks: Sequence[Check]) -> list[Check]:
     parts = {_PART_OF[kind] for kind in look_wrong & _PART_OF.keys()}
     if len(parts) < 2:  # noqa: PLR2004
         return list(checks)
-    all_parts = ",".join(["lens", *sorted(parts & {"aspect", "offset"})])
+    all_parts = ",".join(["lens", *(parts & {"offset"})])
     found = (_ESTIMATE.search(check.text) for check in checks if check.status != "PASS")
     options = next((match[2] for match in found if match and match[2]), "")
     return [

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
 from calibgraph.arrays import Array
@@ -99,42 +97,27 @@ def depth_range(block: CameraBlock, T_camera_lidar: Array) -> tuple[float, float
     return quantile(distances, 0.02), quantile(distances, 0.98)
 
 
-def prior_shares(solution: Solution, robust_hessians: Mapping[str, Array]) -> dict[str, float]:
+def prior_shares(solution: Solution, covariance: Array | None) -> dict[str, float]:
     """Per camera, which share of its result comes from priors and relative poses, not from matches.
 
     It is the mean over the camera's six components of the priors' influence, the diagonal of
-    H^-1 H_prior: 0 if the matches decide alone, 1 if there are none.
+    C H_prior: 0 if the matches decide alone, 1 if there are none.
 
     Args:
         solution: of the joint solve.
-        robust_hessians: (6, 6) per camera with matches, there.
+        covariance: (6 N, 6 N) marginal C of its error model; None: of independent matches.
     """
     T_camera_lidar = solution.T_camera_lidar
     cameras = list(T_camera_lidar)
     priors = pose_hessian(solution.inliers.pose_graph, cameras, T_camera_lidar)
-    hessian = priors.copy()
-    for name, of_camera in robust_hessians.items():
+    known = _of_independent_matches(solution, priors) if covariance is None else covariance
+    influence = np.diag(known @ priors).reshape(-1, 6).mean(axis=1)
+    return dict(zip(cameras, np.clip(influence, 0.0, 1.0).tolist(), strict=True))
+
+
+def _of_independent_matches(solution: Solution, priors: Array) -> Array:
+    hessian, cameras = priors.copy(), list(solution.T_camera_lidar)
+    for name, of_camera in solution.fitted.robust_hessians.items():
         rows = pose_rows(cameras.index(name))
         hessian[rows, rows] += of_camera
-    return _mean_influence(np.linalg.pinv(hessian, hermitian=True) @ priors, cameras)
-
-
-def shares_of_marginal(solution: Solution, covariance: Array) -> dict[str, float]:
-    """As :func:`prior_shares`, beside matches that share their errors.
-
-    Args:
-        solution: of the joint solve.
-        covariance: (6 N, 6 N) marginal of its error model.
-    """
-    T_camera_lidar = solution.T_camera_lidar
-    cameras = list(T_camera_lidar)
-    priors = pose_hessian(solution.inliers.pose_graph, cameras, T_camera_lidar)
-    return _mean_influence(covariance @ priors, cameras)
-
-
-def _mean_influence(of_priors: Array, cameras: Sequence[str]) -> dict[str, float]:
-    influence = np.diag(of_priors).reshape(-1, 6)
-    return {
-        name: float(np.clip(influence[place].mean(), 0.0, 1.0))
-        for place, name in enumerate(cameras)
-    }
+    return np.asarray(np.linalg.pinv(hessian, hermitian=True))

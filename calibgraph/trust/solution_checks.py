@@ -1,4 +1,4 @@
-"""Checks of an estimate by its own numbers: residuals, sigmas, relative poses, halves, counts."""
+"""Checks of an estimate by its own numbers: residuals, sigmas, relative poses, counts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import angle_deg, camera_center
 from calibgraph.model.verdict import COMMON_ERROR, Check
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
@@ -113,29 +112,12 @@ def _check_relative_pose(conflict: Conflict) -> Check:
     return row.describe(sigmas, status, text, name=name)
 
 
-def pull_checks(estimate: Estimate) -> list[Check]:
-    """How far priors and relative poses pull the camera from its own solution."""
-    degrees, centimetres = estimate.pull or (0.0, 0.0)
-    return [
-        threshold("pull_rotation", estimate.tolerance).check(degrees),
-        threshold("pull_translation", estimate.tolerance).check(centimetres),
-    ]
-
-
-def halves_checks(estimate: Estimate) -> list[Check]:
-    """Whether even and odd frames give the same result, if the terms use the correspondences."""
-    if estimate.terms in ("stage1", "priors"):
-        text = f"the terms {estimate.terms!r} do not fit the correspondences: no error bar"
-        return [Check("terms", "WARN", text)]
-    rotation = threshold("halves_rotation", estimate.tolerance)
-    translation = threshold("halves_translation", estimate.tolerance)
-    if estimate.halves is None:
-        text = "the frames cannot be split into halves to check against each other"
-        return [Check(rotation.name, "WARN", text)]
-    even, odd = estimate.halves
-    degrees = angle_deg(even[:3, :3] @ odd[:3, :3].T)
-    centimetres = 100 * float(np.linalg.norm(camera_center(even) - camera_center(odd)))
-    return [rotation.check(degrees), translation.check(centimetres)]
+def terms_checks(estimate: Estimate) -> list[Check]:
+    """Whether the terms use the correspondences."""
+    if estimate.terms not in ("stage1", "priors"):
+        return []
+    text = f"the terms {estimate.terms!r} do not fit the correspondences: no error bar"
+    return [Check("terms", "WARN", text)]
 
 
 def count_checks(estimate: Estimate) -> list[Check]:
@@ -169,8 +151,7 @@ ESTIMATE_CHECKS: tuple[Callable[[Estimate], list[Check]], ...] = (
     sigma_checks,
     common_error_checks,
     relative_pose_checks,
-    pull_checks,
-    halves_checks,
+    terms_checks,
     count_checks,
     lens_prior_checks,
     convergence_checks,

@@ -27,13 +27,10 @@ _BEYOND = [NormalDist().inv_cdf(1 - PASS_BELOW / share / 2) for share in (_WRONG
 # fmt: off
 THRESHOLDS: tuple[Threshold, ...] = (
     # the guess
-    Threshold("guess_rotation", "distance from the guess", "at most", 30.0, 360.0, "deg",
+    Threshold("guess_translation", "distance from the guess", "at most", 2.0, math.inf, "m",
               "How far is the result from the guess?",
               "Farther, and beyond sqrt(3) times the matcher's range, the guess follows another "
               "convention.", "is T_camera_lidar inverted, or of other axes?"),
-    Threshold("guess_translation", "distance from the guess", "at most", 2.0, math.inf, "m",
-              "How far is the result from the guess?", "As for its rotation.",
-              "is T_camera_lidar inverted, or of other axes?"),
     Threshold("guess_length", "translation of the guess", "at most", 20.0, 100.0, "m",
               "Can the translation of the guess be in metres?", "Vehicles are shorter.",
               "is the translation of T_camera_lidar in millimetres?"),
@@ -66,22 +63,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "0.5 deg 2.0 to 3.4; a focal length 3 % off 2.8 to 3.8. Four is 0.5 deg or 11 cm.",
               "one of the two is wrong: check their intrinsics and the guesses, and that their "
               "images are of one instant and not swapped"),
-    Threshold("pull_rotation", "difference of the joint solution from the camera's own", "at most",
-              0.15, 1.0, "deg",
-              "How far do priors and relative poses pull a camera from its own solution?",
-              "As for sigma; FAIL only where the pull is gross. Counted beyond `pull_sigmas`.",
-              "priors or relative poses pull it; are they right?",
-              of_tolerance=True),
-    Threshold("pull_translation", "difference of the joint solution from the camera's own",
-              "at most", 5.0, 30.0, "cm", "The same.", "As for its rotation.",
-              "priors or relative poses pull it; are they right?",
-              of_tolerance=True),
-    Threshold("halves_rotation", "difference between even and odd frames", "at most", 0.2, 0.5,
-              "deg", "Do even and odd frames give the same result?", _COUNTED,
-              of_tolerance=True),
-    Threshold("halves_translation", "difference between even and odd frames", "at most", 6.0, 15.0,
-              "cm", "The same.", _COUNTED,
-              of_tolerance=True),
     Threshold("flat_evidence", "sigma by the images over that by the matches", "at most", 3.0,
               math.inf, "times", "Do the images leave the pose more open than the matches do?",
               "Poses near a result are within 3 sigma of the matches; a larger ratio is of poses "
@@ -94,12 +75,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "With fewer, the error bar is mostly a prior.",
               "the error bar is mostly a default, not measured"),
     # the matcher
-    Threshold("start_dependence", "start dependence", "at most", 0.25, 0.5, "share",
-              "How much of a displaced start does a learned matcher leave?", _CHOSEN,
-              "the network does not measure here"),
-    Threshold("memorization", "memorization", "at most", 0.3, 0.6, "share",
-              "How much of a displaced start does a learned matcher undo without the image?",
-              _CHOSEN, "the network reproduces the rig it was trained on, and pulls towards it"),
     Threshold("failed_frames", "failed frames", "at most", 0.3, 0.7, "share",
               "How many frames gave no matches?", _CHOSEN),
     Threshold("z_score", "z-score of image and cloud", "at least", 15.0, 8.0, "",
@@ -143,12 +118,12 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "Above half, it shows the priors more than the data."),
     # the lens, from the residuals and the images
     Threshold("lens", "probability of a wrong one", "at most", 0.005, 0.2, "share",
-              "Is focal length, principal point, distortion, fx / fy, skew or time of the images "
+              "Is focal length, principal point, distortion, fx / fy or time of the images "
               "wrong, so that the camera is off by more than the tolerance?",
               "The verdict's own cuts. By the posterior of a free lens or clock, once from the "
               "residuals and once from the images, and by `lens_wrong` etc.",
               "check the intrinsics, the image size, and that images are not undistorted twice, "
-              "cropped, scaled or sheared"),
+              "cropped or scaled"),
     Threshold("focal_sensitivity", "motion of the camera per 1 % of the focal length",
               "at most", 15.0, math.inf, "cm", "How much depends on the focal length?", _COUNTED,
               "verify the intrinsics, or give matches at more distances",
@@ -228,10 +203,8 @@ class Limit:
 
 # fmt: off
 LIMITS: tuple[Limit, ...] = (
-    Limit("pull_sigmas", 4.0, "sigma",
-          "A pull within this of what a camera's own solution leaves open is zero."),
     Limit("lens_wrong", _WRONG_SIGMAS, "sigma", "The error of a wrong lens parameter, in standard "
-          "deviations of a calibrated one: 0.2 % of the focal length, fx / fy and the skew, "
+          "deviations of a calibrated one: 0.2 % of the focal length and of fx / fy, "
           "0.002 focal lengths of the principal point, 0.002 of k1, 2 ms of the time of "
           "an image, or as the rig states."),
     Limit("lens_wrong_share", _WRONG_SHARE, "share", "So many are taken for wrong."),
@@ -244,6 +217,8 @@ LIMITS: tuple[Limit, ...] = (
           "next row, is the same solution: nearer ones differ in the matches at the gate alone.",
           of_tolerance=True),
     Limit("competing_translation", 10.0, "cm", "See the row above.", of_tolerance=True),
+    Limit("guess_rotation", 30.0, "deg", "A result that is turned farther from its guess, and "
+          "beyond sqrt(3) times the matcher's range, is compared with its convention errors."),
     Limit("swap_slack", 0.05, "m, rad", "Added in quadrature to the distances of swapped cameras: "
           "the usual error of a result is no evidence of a swap."),
     Limit("convention_rotation", 30.0, "deg", "A convention error explains a guess if, undone, it "

@@ -14,7 +14,6 @@ from calibgraph.io.rotations import quaternion_xyzw
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
-from calibgraph.outputs import VIEW_MARK
 from calibgraph.progress import Progress, no_progress
 from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
 
@@ -45,7 +44,7 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
     path, context, channels = Path(path), foxglove.Context(), dict[str, Any]()
 
     def write(temporary: Path) -> None:
-        options = foxglove.mcap.MCAPWriteOptions(profile=VIEW_MARK)
+        options = foxglove.mcap.MCAPWriteOptions(profile="calibgraph")
         with (
             temporary.open("wb") as file,
             foxglove.open_mcap(file, context=context, writer_options=options),

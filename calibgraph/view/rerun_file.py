@@ -10,7 +10,6 @@ from calibgraph.files import cannot_write, write_atomically
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Rig
-from calibgraph.outputs import VIEW_MARK
 from calibgraph.progress import Progress, no_progress
 from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
 
@@ -36,7 +35,7 @@ def write_rerun(result: Calibration, path: Path | str, *, progress: Progress = n
     path = Path(path)
 
     def write(temporary: Path) -> None:
-        recording = rr.RecordingStream(VIEW_MARK, recording_id=path.stem)
+        recording = rr.RecordingStream("calibgraph", recording_id=path.stem)
         recording.save(str(temporary))
         try:
             _log_result(rr, recording, result, progress)

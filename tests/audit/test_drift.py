@@ -9,7 +9,6 @@ import pytest
 
 import calibgraph
 from calibgraph import Calibration, CalibrationError, Check, Verdict
-from calibgraph.audit import drift_summary
 from tests.audit.drifting import draw, moved, template, twist
 
 FINE = {"tolerance_deg": 0.01, "tolerance_cm": 0.5}
@@ -39,7 +38,6 @@ def test_results_that_agree_are_ok() -> None:
         for each in entries:
             assert each.detectable is not None
             assert (each.detectable > 4 * each.sigma).all()
-            assert not each.deviation.flags.writeable
 
 
 def test_the_result_that_deviates_is_named_with_its_camera_axis_and_size() -> None:
@@ -51,12 +49,6 @@ def test_the_result_that_deviates_is_named_with_its_camera_axis_and_size() -> No
     assert abs(np.degrees(each.deviation[1]) - 1.0) < 4 * np.degrees(each.sigma[1])
     others = [e for name, all_ in found.cameras.items() for k, e in enumerate(all_) if k != 2]
     assert {e.status for e in others} == {"OK"}
-
-
-def test_a_change_within_the_tolerance_is_ok_and_named() -> None:
-    found = calibgraph.drift(results(1, r2={"left": twist("yaw", 0.3)}))
-    assert found.status == "OK"
-    assert "though significant: turned about y" in found.cameras["left"][2].reason
 
 
 def test_the_lidar_is_told_from_all_cameras() -> None:
@@ -231,16 +223,6 @@ def test_the_smallest_detectable_change_is_found_as_often_as_stated() -> None:
         each = calibgraph.drift(given, tolerance_deg=1e-6, tolerance_cm=1e-6).cameras["left"][2]
         found += k % 6 in each.axes
     assert abs(found - 0.9 * draws) < 4 * np.sqrt(draws * 0.9 * 0.1)
-
-
-def test_the_summary_holds_all_numbers_with_their_units() -> None:
-    found = calibgraph.drift(results(1, r2={"left": twist("yaw", 1.0)}))
-    summary = drift_summary(found)
-    assert summary["changed"] == [{"result": "2", "what": "left"}]
-    each = summary["cameras"]["left"]["results"]["2"]
-    assert each["axes"] == ["y (yaw)"]
-    assert each["deviation_deg"][1] == np.degrees(found.cameras["left"][2].deviation[1])
-    assert set(summary["cameras"]["left"]["trend"]) >= {"slope_deg", "slope_cm", "per"}
 
 
 @pytest.mark.realdata

@@ -1,4 +1,4 @@
-"""What the fleet's model learns from 500 vehicles whose deviations are known, and finds there."""
+"""What the fleet's model learns from vehicles whose deviations are known, from rows of any run."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import pyarrow as pa
 import pytest
 
 from calibgraph.audit.findings import Finding, find_changes, moved_lidars
-from calibgraph.audit.fleet_model import FleetModel, fit_fleet
-from calibgraph.audit.model import weighted_mean
-from calibgraph.audit.mounts import Centers, solve_centers
+from calibgraph.audit.fleet_model import FleetModel, Mount, fit_fleet, solve_centers
+from calibgraph.audit.model import Limits, compare, poses_of, weigh, weighted_mean
 from calibgraph.audit.observations import newest_rows, observe
+from calibgraph.errors import CalibrationError
+from calibgraph.fleet.page import STATES, payload, report_of
+from calibgraph.fleet.rows import SCHEMA
 from calibgraph.model.geometry import retract_all, to_T_lidar_camera, twists_between
 from tests.draws.fleets import CAMERAS, SPREAD, Fleet, errors_of, simulate_fleet
 
@@ -63,7 +65,7 @@ def test_moved_cameras_stand_apart_and_others_do_not(fitted: Fitted) -> None:
 
 def test_the_spread_of_vehicles_is_learnt(fitted: Fitted) -> None:
     """Of about 230 vehicles a standard deviation is known to 1 / sqrt(2 * 230), 4.7 %."""
-    mounts = [mount for model in fitted.model.models.values() for mount in model.mounts.values()]
+    mounts = [mount for each in fitted.model.mounts.values() for mount in each.values()]
     spreads = [mount.spread for mount in mounts if mount.camera not in ("rear", "right")]
     ratios = np.sqrt(np.array([np.diag(spread) for spread in spreads])) / SPREAD
     assert np.abs(ratios - 1).max() < 3.5 * 0.047
@@ -88,7 +90,7 @@ def test_a_camera_without_a_result_has_its_batchs_pose_with_the_spread_of_vehicl
 def test_few_vehicles_of_a_model_stay_as_they_are() -> None:
     rows = simulate_fleet(np.random.default_rng(0), 4).rows
     model = fit_fleet(observe(rows))
-    assert model.models == {}
+    assert model.mounts == {}
     assert np.array_equal(model.T_camera_lidar, model.observations.T_camera_lidar)
     assert np.isnan(model.deviation).all()
 
@@ -101,13 +103,14 @@ def test_sums_over_vehicles_are_the_graph_with_a_variable_per_vehicle() -> None:
     small = rng.normal(size=(8, 6)) * np.sqrt(np.diag(spread)) * 1e-3  # to first order
     T = retract_all(np.repeat(nominal[None], 8, axis=0), small)
     between = np.repeat(0.3 * spread[None], 2, axis=0)
-    start = Centers(nominal, spread, np.repeat(nominal[None], 2, axis=0), between)
+    seen, both = observe(simulate_fleet(rng, 1).rows), np.repeat(nominal[None], 2, axis=0)
+    start = Mount("", "", ("a", "b"), batch, seen, nominal, spread, both, between, spread)
 
     information, y = np.linalg.inv(noise + spread), twists_between(T, nominal)
     means, bars = zip(
         *(weighted_mean(y[batch == b], information[batch == b]) for b in (0, 1)), strict=True
     )
-    T_measured = retract_all(start.batches, -np.array(means))
+    T_measured = retract_all(both, -np.array(means))
     measured = np.arange(2), T_measured, np.array(bars)
     found = solve_centers(start, measured, between)
 
@@ -125,7 +128,7 @@ def test_sums_over_vehicles_are_the_graph_with_a_variable_per_vehicle() -> None:
     stock = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     marginals = gtsam.Marginals(graph, stock)
     for key, pose, bar in zip(
-        range(3), [found.nominal, *found.batches],
+        range(3), [found.nominal, *found.T_batch],
         [found.nominal_covariance, *found.batch_covariance], strict=True,
     ):  # fmt: skip
         assert np.allclose(to_T_lidar_camera(pose).matrix(), stock.atPose3(key).matrix(), atol=1e-9)
@@ -216,3 +219,88 @@ def test_findings_of_quiet_fleets_are_as_rare_as_promised() -> None:
         truth = simulate_fleet(np.random.default_rng(seed), 200, change_deg=0.0)
         wrong += bool(find_changes(fit_fleet(observe(truth.rows))))
     assert wrong <= 3
+
+
+BAR = np.array([np.radians(0.05)] * 3 + [0.005] * 3)
+
+
+@pytest.mark.parametrize("moved", range(5))
+def test_a_spread_of_zero_finds_the_result_that_drift_finds(moved: int) -> None:
+    """By the posterior of the cases and by the test: the same one, the same centre, for one."""
+    rng = np.random.default_rng(moved)
+    y = rng.normal(size=(5, 6)) * BAR
+    y[moved, moved] += 12 * BAR[moved]
+    noise = np.tile(np.diag(BAR**2), (5, 1, 1))
+    T = retract_all(np.tile(np.eye(4), (5, 1, 1)), -y)
+    poses = poses_of([*range(5)], T, noise, np.full(5, 1e6))
+    found = compare(poses, Limits(1e-4, np.full(2, 1e-9)))
+    center, _ = weighted_mean(poses.twist[found.agreeing], poses.information[found.agreeing])
+    spread = np.array([np.zeros((6, 6)), 1e4 * np.diag(BAR**2)])
+    posterior = weigh(poses.twist - center, noise, spread, 0.02)
+    assert (posterior.share[0] > 0.5).tolist() == found.agreeing.tolist()
+    assert np.flatnonzero(~found.agreeing).tolist() == [moved]
+    same, covariance = weighted_mean(poses.twist, posterior.information)
+    np.testing.assert_allclose(same, center, atol=0.01 * BAR.min())
+    expected = noise[0] + noise[0] / 4  # of the moved one: its own, and that of four others
+    np.testing.assert_allclose(found.covariance[moved], expected, rtol=1e-9)
+    np.testing.assert_allclose(covariance, noise[0] / 4, rtol=1e-3, atol=1e-12)
+
+
+def rows_of(**columns: list[object]) -> pa.Table:
+    """Three rows as `fleet` writes them: a result, one without an error bar, a failed vehicle."""
+    given: dict[str, list[object]] = {
+        "vehicle": ["a", "a", "b"], "camera": ["front", "rear", ""],
+        "status": ["done", "done", "failed"], "verdict": ["PASS", "WARN", None],
+        "reasons": [[], ["few frames"], None], "error": [None, None, "no images"],
+        "T_camera_lidar": [np.eye(4).ravel().tolist()] * 2 + [None],
+        "covariance": [np.eye(6).ravel().tolist(), None, None],
+        **columns,
+    }  # fmt: skip
+    fields = [field for field in SCHEMA if field.name in given]
+    arrays = {field.name: pa.array(given.pop(field.name), field.type) for field in fields}
+    return pa.table({**arrays, **{name: pa.array(values) for name, values in given.items()}})
+
+
+def test_rows_without_a_result_measure_nothing() -> None:
+    rows = rows_of()
+    of = observe(rows)
+    assert of.measured.tolist() == [True, False, False]
+    assert np.isnan(of.day).all()
+    assert of.covariates == {}
+    report = report_of(rows)
+    assert [STATES[s] for s in report.state] == ["PASS", "WARN", "NO RESULT"]
+    assert report.reasons == ["", "no error bar; few frames", "no images"]
+    assert payload(report)["vehicles"] == ["a", "b"]
+
+
+def test_columns_of_the_manifest_are_understood() -> None:
+    of = observe(
+        rows_of(
+            model=[2024, 2024, None], date=["2026-03-01", "2026-03-02T12:00:00", None],
+            mileage_km=[10, None, 30], seconds=[1.0, 2.0, 3.0],
+            probability_off=[0.1, 0.2, None],
+        )
+    )  # fmt: skip
+    assert of.model.tolist() == ["2024", "2024", ""]
+    assert of.day[1] - of.day[0] == 1.5
+    assert [*of.covariates] == ["mileage_km"]
+    assert np.isnan(of.covariates["mileage_km"]).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (pa.table({"vehicle": ["a"]}), "has no column 'camera', found vehicle; give the folder"),
+        (rows_of(date=["yesterday", "", ""]), "column 'date' holds what is no date"),
+    ],
+)
+def test_wrong_tables_are_one_line(rows: pa.Table, message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        observe(rows)
+
+
+def test_mounts_are_not_mixed_with_alignments() -> None:
+    """Rows without the column are alignments; a failed row is neither."""
+    assert observe(rows_of(of=["mount", "mount", None])).measured.any()
+    with pytest.raises(CalibrationError, match="vehicle 'a' are of mounts, those of 'a' of align"):
+        observe(rows_of(of=["mount", None, None]))

@@ -6,7 +6,7 @@ import pytest
 from calibgraph.audit.judgement import judge_deviation
 from calibgraph.audit.significance import POWER, Quantiles, Tolerance, detectable, tail_of_axis
 
-TOLERANCE = Tolerance(0.5, 10.0)
+TOLERANCE = Tolerance(0.5, 10.0).twist
 SIGMA = np.repeat([np.radians(0.09), 0.02], 3)
 COVARIANCE = np.diag(SIGMA**2)
 KNOWN = Quantiles.from_freedom(np.inf, tail_of_axis(3))
@@ -121,7 +121,7 @@ def test_a_tolerance_must_be_positive_and_finite(value: float) -> None:
 @pytest.mark.parametrize("times", [0.3, 0.9, 0.99, 1.01, 1.1, 3.0])
 def test_ok_never_stands_beside_a_detectable_change_above_the_tolerance(times: float) -> None:
     """Not even where the deviation itself is zero."""
-    largest = np.repeat(TOLERANCE.twist, 3) / detectable(np.ones(6), KNOWN.confident)
+    largest = np.repeat(TOLERANCE, 3) / detectable(np.ones(6), KNOWN.confident)
     covariance = np.diag((times * largest) ** 2)
     status, reason = judge_deviation(np.zeros(6), covariance, KNOWN, TOLERANCE)
     assert (status == "OK") == (times < 1)

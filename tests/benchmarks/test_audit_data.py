@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import audit
-from benchmarks.accuracy.audit import STREETS, Sources
+from benchmarks.accuracy.audit import STREETS
+from benchmarks.accuracy.scenes import Folders
 from tools.scenes.sensor_streets import ALIGNMENT, RIGS
 
 
@@ -26,7 +27,7 @@ def test_cameras_of_a_scene_are_at_the_mean_alignment_of_its_streets(
         mounts.moved_to({**mounts.T_camera_lidar, name: moved @ T}).save(folder / ALIGNMENT)
     monkeypatch.setattr(audit, "load_dataset", list)
 
-    streets, rig = Sources(tmp_path, tmp_path).load("scene_0")
+    streets, rig = audit.load("scene_0", Folders(tmp_path, tmp_path))
 
     assert len(streets) == STREETS
     assert (rig.T_camera_lidar[name] - T)[:, 3] == pytest.approx([0, 0.02, 0, 0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy import disjoint
-from benchmarks.accuracy.disjoint import Estimate, difference, repeat_covariances, report, split
+from benchmarks.accuracy.disjoint import difference, repeat_covariances, report, split
 from benchmarks.accuracy.ledger import Key, Record
 from calibgraph import Rig, solve
 from tests.trust.conftest import simulated
@@ -36,7 +36,7 @@ def test_right_error_bars_give_one_and_95_percent() -> None:
     noise = [rng.multivariate_normal(np.zeros(6), bar, draws) for bar in bars]
 
     def both(i: int) -> Record:
-        results = (Estimate(moved(noise[k][i]), 2 * bars[k], "PASS", bars[k]) for k in range(2))
+        results = ((moved(noise[k][i]), 2 * bars[k], "PASS", bars[k]) for k in range(2))
         return {**asdict(KEY), "cameras": {"left": difference(*results)}}
 
     rows = report([both(i) for i in range(draws)]).rows

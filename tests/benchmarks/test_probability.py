@@ -7,11 +7,11 @@ import pytest
 from benchmarks.accuracy.ledger import Record
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW
 from calibgraph.trust.probability import STRUCTURE, WORST
-from tools.probability import fit
-from tools.verdict_samples import (
+from tools.probability import (
     Sample,
     cuts,
     discrimination,
+    fit,
     probabilities,
     reliability,
     samples_of,

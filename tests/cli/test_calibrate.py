@@ -28,9 +28,10 @@ def solved(tmp_path_factory: pytest.TempPathFactory) -> CommandRun:
     """``solve`` of the problem, with seed 3."""
     problem = save_problem(tmp_path_factory.mktemp("problem"))
     out = problem / "result"
+    (problem / "seed.yaml").write_text("seed: 3\n")
     return run_command(
-        "solve", problem / "rig.yaml", problem / "table.parquet", "--out", out, "--seed", 3,
-        folder=out,
+        "solve", problem / "rig.yaml", problem / "table.parquet", "--out", out,
+        "--config", problem / "seed.yaml", folder=out,
     )  # fmt: skip
 
 

@@ -106,17 +106,12 @@ def test_a_result_that_was_doubtful_is_said_to_have_been(
 
 
 @pytest.mark.usefixtures("measured_once")
-def test_the_page_replaces_only_its_own(call: Call, tmp_path: Path) -> None:
-    page, other = tmp_path / "check.html", tmp_path / "report.html"
-    given = ("check", REFERENCE, SAMPLE, "--frames", "0", "--page")
-    for _ in range(2):
-        code, _, err = call(*given, page)
-        assert code == 3
-        assert err.rstrip().endswith(f"{page}: written")
+def test_the_page_shows_the_answer(call: Call, tmp_path: Path) -> None:
+    page = tmp_path / "check.html"
+    code, _, err = call("check", REFERENCE, SAMPLE, "--frames", "0", "--out", page)
+    assert code == 3
+    assert err.rstrip().endswith(f"{page}: written")
     assert '<strong class="big">CANNOT TELL</strong>' in page.read_text()
-    other.write_text('<meta name="generator" content="calibgraph">')
-    assert "was not written by calibgraph check" in error_line(*call(*given, other))
-    assert ".html" in error_line(*call(*given, tmp_path / "check.txt"))
 
 
 def test_a_malformed_result_is_refused_before_the_audit(
@@ -128,16 +123,3 @@ def test_a_malformed_result_is_refused_before_the_audit(
     deployed.write_text(re.sub(r"^verdict:\n(  .*\n)+", "verdict: PASS\n", text, flags=re.M))
     line = error_line(*call("check", deployed, SAMPLE, "--frames", "0"))
     assert f"{deployed}: verdict: " in line
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("missing.yaml", SAMPLE), "missing.yaml"),
-        ((REFERENCE, "missing"), "missing"),
-        ((REFERENCE, SAMPLE, "--tolerance-deg", "0"), "tolerance_deg must be positive"),
-        ((REFERENCE, SAMPLE, "--tolerance-cm", "nan"), "tolerance_cm must be positive"),
-    ],
-)
-def test_bad_input_is_one_line(call: Call, arguments: tuple[object, ...], words: str) -> None:
-    assert words in error_line(*call("check", *arguments))

@@ -37,7 +37,7 @@ def test_a_bag_without_transforms(call: Call, tmp_path: Path) -> None:
     from tests.io.bags.writing import Messages, sample_messages, without, write_bag
 
     bag = write_bag(tmp_path, "mcap", without(sample_messages(Messages("mcap")), "/tf_static"))
-    code, _, said = call("guess", bag, *mounts(MOUNTED), "--out", tmp_path / "rig.yaml")
+    code, _, said = call("rig", bag, *mounts(MOUNTED), "--out", tmp_path / "rig.yaml")
     assert code == 0
     frames = calibrate_and_export(call, bag, tmp_path, said)
     assert frames == [f"{name}_optical" for name in MOUNTED]  # those of the bag
@@ -57,7 +57,7 @@ def test_a_camchain(call: Call, tmp_path: Path) -> None:
         (data / "cameras" / cam).symlink_to(SAMPLE / "cameras" / name)
     words = mounts({"cam0": "front, 0.4 m ahead"})
     camchain_file, rig = tmp_path / "camchain.yaml", tmp_path / "rig.yaml"
-    code, _, said = call("guess", camchain_file, *words, "--out", rig)
+    code, _, said = call("rig", camchain_file, *words, "--out", rig)
     assert code == 0
     frames = calibrate_and_export(call, data, tmp_path, said)
     assert frames == [f"{name}_optical_frame" for name in names.values()]

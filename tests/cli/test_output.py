@@ -25,7 +25,7 @@ def run_in_shell(line: str) -> tuple[int, str]:
     "line",
     [
         f"{EVALUATE} --json | true",
-        pytest.param(f"init {SAMPLE} --out rig.yaml 2>&1 | true", marks=pytest.mark.slow),
+        pytest.param(f"rig {SAMPLE} --out rig.yaml 2>&1 | true", marks=pytest.mark.slow),
         "calibrate --help | true",
         "--version | true",
     ],

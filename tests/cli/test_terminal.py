@@ -43,7 +43,7 @@ def test_names_of_others_do_nothing_to_a_terminal(monkeypatch: pytest.MonkeyPatc
     screen, name = io.StringIO(), "a\x1b[2Jb\x7fc\x9b2Jd\u202ee"
     monkeypatch.setattr("sys.stderr", screen)
     console = terminal.terminal()
-    terminal.print_plain(console, name)
+    terminal.print_line(name)
     table = Table(name)
     table.add_row(name)
     console.print(table)

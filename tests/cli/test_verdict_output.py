@@ -38,9 +38,10 @@ def test_the_error_bar_of_cameras_and_pairs_is_printed(
 ) -> None:
     pair.save(tmp_path / "rig.yaml")
     simulate_correspondences(pair, frames=8, matches=100).save(tmp_path / "table.parquet")
+    (tmp_path / "config.yaml").write_text("bootstrap: 5\n")
     command = (
         "solve", tmp_path / "rig.yaml", tmp_path / "table.parquet", "--out", tmp_path / "out",
-        "--bootstrap", 5,
+        "--config", tmp_path / "config.yaml",
     )  # fmt: skip
     code, _, text = call(*command)
     assert code == 0

@@ -1,8 +1,11 @@
 """Rigs whose lenses are wrong in one way."""
 
 from calibgraph.model.config import LensPart
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import IntrinsicsSigma, Rig
 
+_EXACT = {
+    "intrinsics_sigma_px": IntrinsicsSigma(focal=1e-4, centre=1e-4), "distortion_sigma": 1e-7
+}  # fmt: skip
 _K1 = {"pinhole": 0, "fisheye": 0, "omnidirectional": 1}  # where it stands
 
 
@@ -28,4 +31,10 @@ def put_lens_error(rig: Rig, part: LensPart, error: float) -> Rig:
         }
         update["intrinsics_px"] = k.model_copy(update=wrong.get(part, {}))
         cameras[name] = camera.model_copy(update=update)
+    return rig.model_copy(update={"cameras": cameras})
+
+
+def with_known_lenses(rig: Rig) -> Rig:
+    """The rig that states its lenses to be known exactly: the bar of a mount leaves them out."""
+    cameras = {name: camera.model_copy(update=_EXACT) for name, camera in rig.cameras.items()}
     return rig.model_copy(update={"cameras": cameras})

@@ -9,13 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import (
-    LOSSES,
-    Lens,
-    ProjectionBlock,
-    block_factor,
-    projection_factor,
-)
+from factors import LOSSES, Lens, ProjectionBlock, block_factor, projection_factor, to_runs
 from tests.factors.blocks import KEY, LENSES, TRUTH, at, poses, with_loss, world
 
 EACH_LENS_AND_LOSS = [
@@ -123,17 +117,6 @@ def test_joined_blocks_are_the_block_of_all_rows(plain: bool) -> None:
     assert found.cost == expected.cost
 
 
-@pytest.mark.parametrize("count", [0, 40, 5000])
-def test_gradients_at_several_poses_are_those_at_each(count: int) -> None:
-    block = world(LENSES["pinhole"], count).rescale(scale=3.0, sigma=0.7)
-    poses = [TRUTH.retract(np.full(6, step)) for step in (0.0, 1e-3, -0.02)]
-    found = block.gradients_at_each(np.array([pose.inverse().matrix() for pose in poses]))
-    for gradient, pose in zip(found, poses, strict=True):
-        expected = block.sums(pose).gradient
-        scale = np.abs(expected).max() or 1.0  # sums in another order: rounding alone
-        np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-13 * scale)
-
-
 def test_other_whitening_leaves_the_correspondences_in_their_place() -> None:
     block = world(LENSES["pinhole"], 40)
     roots = np.random.default_rng(0).uniform(0.1, 1.0, (40, 3))
@@ -200,14 +183,17 @@ def test_too_few_points_give_a_singular_but_harmless_factor(count: int) -> None:
     np.testing.assert_allclose(error @ error, sums.cost, rtol=1e-9)
 
 
-def test_blocks_add() -> None:
+def test_sums_and_gradients_of_parts_add() -> None:
     block = with_loss(world(LENSES["radtan"], 5000), "cauchy")
-    whole = block.sums(TRUTH)
-    parts = block.frame_sums(TRUTH, [0, 700, 700, 3000, 5000])
+    whole, edges = block.sums(TRUTH), [0, 700, 700, 3000, 5000]
+    parts = block.frame_sums(TRUTH, edges)
     assert parts.cost[1] == 0.0
     np.testing.assert_allclose(parts.hessian.sum(axis=0), whole.hessian, rtol=1e-12)
     np.testing.assert_allclose(parts.gradient.sum(axis=0), whole.gradient, rtol=1e-9)
     np.testing.assert_allclose(parts.cost.sum(), whole.cost, rtol=1e-12)
+    T = TRUTH.inverse().matrix()[None]
+    np.testing.assert_allclose(block.gradients_at_each(T)[0], whole.gradient, rtol=1e-9)
+    assert not block.select(np.arange(0)).gradients_at_each(T).any()
 
 
 def test_every_point_behind_the_camera_is_finite_and_bounded() -> None:
@@ -279,3 +265,63 @@ def test_threads_get_the_sums_of_their_own_pose() -> None:
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda k: factor.error(at(many[k % 20])), range(400)))
     assert found == [alone[k % 20] for k in range(400)]
+
+
+EDGES = np.array([0, 300, 300, 900, 1000])
+
+
+def blocks(lens: str) -> list[ProjectionBlock]:
+    """Without whitening, with numbers, and with matrices."""
+    matrices = with_loss(world(LENSES[lens], 1000), "cauchy")
+    numbers = np.random.default_rng(1).uniform(0.2, 2, 1000)
+    root = np.column_stack([numbers, np.zeros(1000), numbers])
+    return [replace(matrices, sqrt_information=given) for given in (None, root)] + [matrices]
+
+
+def T_camera_lidar() -> np.ndarray:
+    return np.array([pose.inverse().matrix() for pose in poses()[1:]])  # some points lie behind
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_runs_at_poses_of_their_own_have_the_sums_of_their_blocks(lens: str) -> None:
+    T, scales = T_camera_lidar(), np.array([1.0, 2, 3, 4])
+    for block in blocks(lens):
+        found = block.run_sums(T, to_runs(EDGES), scales)
+        for i, (first, end) in enumerate(to_runs(EDGES)):
+            part = replace(block.select(np.arange(first, end)), scale=scales[i])
+            expected = part.sums(poses()[1 + i])
+            assert found.cost[i] == pytest.approx(expected.cost, rel=1e-12)
+            most = np.abs(expected.hessian).max(initial=1.0)
+            np.testing.assert_allclose(found.hessian[i], expected.hessian, atol=1e-12 * most)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_block_at_many_poses_has_the_gradients_and_costs_of_each(lens: str) -> None:
+    for block in blocks(lens):
+        each = [block.sums(pose) for pose in poses()[1:]]
+        gradients = np.array([one.gradient for one in each])
+        most = np.abs(gradients).max()  # sums in another order: rounding alone
+        found = block.gradients_at_each(T_camera_lidar())
+        np.testing.assert_allclose(found, gradients, rtol=0, atol=1e-13 * most)
+        costs = block.costs_at_each(T_camera_lidar())
+        np.testing.assert_allclose(costs, [one.cost for one in each], rtol=1e-12)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_norms_are_those_of_the_residuals_and_infinite_behind_the_camera(lens: str) -> None:
+    T = T_camera_lidar()
+    T[3] = np.diag([-1.0, 1, -1, 1]) @ T[0]
+    for block in blocks(lens):
+        norms = block.run_norms(T, to_runs(EDGES), factor=0.5)
+        residuals, projectable = block.run_residuals(T, to_runs(EDGES))
+        assert (np.isfinite(norms) == projectable).all()
+        assert projectable.all() == (lens == "equirectangular")  # a panorama sees behind
+        x, y = residuals.T
+        a, b, c = (np.ones((1000, 3)) * [1, 0, 1] if block.sqrt_information is None
+                   else block.sqrt_information).T  # fmt: skip
+        for found, expected in zip(
+            norms, (np.hypot(x, y), np.hypot(a * x + b * y, c * y)), strict=False
+        ):
+            np.testing.assert_allclose(
+                found[projectable], 0.5 * expected[projectable], rtol=1e-12, atol=1e-12
+            )

@@ -1,4 +1,4 @@
-"""The block factor with a free lens: by differences, by separate factors, by GTSAM's own."""
+"""The block factor with a free lens or clock: by differences, and by GTSAM's own factors."""
 
 from __future__ import annotations
 
@@ -8,21 +8,40 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import FreeLens, FreeLensBlock, Lens, free_lens_factor
+from factors import (
+    Clock,
+    FreeLens,
+    FreeLensBlock,
+    Lens,
+    ProjectionBlock,
+    displace,
+    free_lens_factor,
+)
 from factors.free_lens import COEFFICIENT_NUMBERS
 from tests.factors.blocks import KEY, LENSES, TRUTH, K, at, poses, world
 from tests.factors.test_block import together
 
-KEY_CLOUD, KEY_LENS = 6, 8
+KEY_CLOUD, KEY_LENS, FIRST_POINT = 6, 8, 100
 SIGMAS = {"focal": 0.002, "aspect": 0.001, "centre_x": 2.0, "centre_y": 3.0}
 FREE = [name for name in LENSES if name != "equirectangular"]
+TWIST = np.array([0.05, -0.03, 0.4, 9.0, 0.3, -0.1])
+HEIGHT_PX = 480
 
 
-def free(name: str) -> FreeLens:
-    """All parameters of a lens."""
+def free(name: str, *, clock: bool = False) -> FreeLens:
+    """All parameters of a lens, and of its clock."""
     lens = LENSES[name]
-    sigmas = SIGMAS | dict.fromkeys(COEFFICIENT_NUMBERS[lens.kind], 0.01)
-    return FreeLens(lens, tuple(sigmas), tuple(sigmas.values()))
+    sigmas = SIGMAS | dict.fromkeys(COEFFICIENT_NUMBERS[lens.kind], 0.01) if name in FREE else {}
+    if clock:
+        sigmas = {"offset": 0.02, **sigmas, "readout": 0.02}
+    return FreeLens(lens, tuple(sigmas), tuple(sigmas.values()), Clock(0.01, 0.005, HEIGHT_PX))
+
+
+def moving(name: str, count: int, *, alike: bool = False) -> ProjectionBlock:
+    """Correspondences of a LiDAR that moves, each with its own twist."""
+    block, rng = world(LENSES[name], count), np.random.default_rng(2)
+    twists = TWIST * (np.ones((count, 1)) if alike else rng.uniform(0.5, 1.5, (count, 6)))
+    return replace(block, motion=np.column_stack([twists, np.zeros(count)]))
 
 
 def with_lens(pose: gtsam.Pose3, values: np.ndarray) -> gtsam.Values:
@@ -31,15 +50,14 @@ def with_lens(pose: gtsam.Pose3, values: np.ndarray) -> gtsam.Values:
     return found
 
 
-@pytest.mark.parametrize("name", FREE)
-def test_derivatives_are_those_of_differences(name: str) -> None:
-    lens, rng = free(name), np.random.default_rng(1)
-    block = FreeLensBlock(world(LENSES[name], 50), lens)
-    values, pose, step = (
-        rng.standard_normal(len(lens)),
-        TRUTH.retract(rng.normal(size=6) / 50),
-        1e-5,
-    )
+@pytest.mark.parametrize(
+    ("name", "clock"), [*((name, False) for name in FREE), *((name, True) for name in LENSES)]
+)
+def test_derivatives_are_those_of_differences(name: str, clock: bool) -> None:
+    lens, rng = free(name, clock=clock), np.random.default_rng(1)
+    block = FreeLensBlock(moving(name, 50) if clock else world(LENSES[name], 50), lens)
+    values, step = rng.standard_normal(len(lens)), 1e-5
+    pose = TRUTH.retract(rng.normal(size=6) / 50)
     T = pose.inverse().matrix()
     columns = block.columns(T, values)
     for number, direction in enumerate(np.eye(6 + len(lens))):
@@ -88,34 +106,56 @@ def test_equals_factors_of_gtsam(stock, calibration, distortion, parameters) -> 
     names = ("focal", "aspect", "centre_x", "centre_y", *parameters)
     free_lens = FreeLens(lens, names, (1.0,) * len(names))
     block = replace(world(lens, 20), sqrt_information=None, loss="l2")
-    ours, theirs = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
-    ours.add(free_lens_factor([KEY, KEY_LENS], FreeLensBlock(block, free_lens)))
-    values = at(TRUTH.retract(np.full(6, 0.01)))
-    values.insert(KEY_LENS, calibration(K["fx"], K["fy"], 0.0, K["cx"], K["cy"], *distortion))
-    for number, (point, pixel) in enumerate(
-        zip(block.points_lidar_m, block.pixels_px, strict=True), start=100
-    ):
-        values.insert(number, point)
-        theirs.add(stock(pixel, gtsam.noiseModel.Unit.Create(2), KEY, number, KEY_LENS))
-    keys = gtsam.Ordering()
-    for key in (KEY, KEY_LENS):
-        keys.push_back(key)
-    whole = gtsam.Ordering(keys)
-    for number in range(100, 100 + len(block)):
-        whole.push_back(number)
-    size = 6 + 5 + len(parameters)
-    hessian, gradient = (part[:size, ...] for part in theirs.linearize(values).hessian(whole))
-    chain = np.zeros((size, 6 + len(names)))
+    pose = TRUTH.retract(np.full(6, 0.01))
+    theirs = at(pose)
+    theirs.insert(KEY_LENS, calibration(K["fx"], K["fy"], 0.0, K["cx"], K["cy"], *distortion))
+    factors = [
+        stock(pixel, gtsam.noiseModel.Unit.Create(2), KEY, number, KEY_LENS)
+        for number, pixel in enumerate(block.pixels_px, start=FIRST_POINT)
+    ]
+    chain = np.zeros((6 + 5 + len(parameters), 6 + len(names)))
     chain[:6, :6] = np.eye(6)
     chain[6, 6:8], chain[7, 6:8] = [K["fx"], K["fx"] / 2], [K["fy"], -K["fy"] / 2]
     chain[9:, 8:] = np.eye(2 + len(parameters))
-    here = with_lens(values.atPose3(KEY), np.zeros(len(names)))
-    found = ours.linearize(here).hessian(keys)
-    np.testing.assert_allclose(2 * ours.error(here), 2 * theirs.error(values), rtol=1e-9)
-    expected = chain.T @ hessian[:, :size] @ chain
+    ours = with_lens(pose, np.zeros(len(names)))
+    require_equal(FreeLensBlock(block, free_lens), ours, factors, theirs, [KEY, KEY_LENS], chain)
+
+
+def require_equal(
+    block: FreeLensBlock,
+    ours: gtsam.Values,
+    factors: list[gtsam.NonlinearFactor],
+    theirs: gtsam.Values,
+    keys: list[int],
+    chain: np.ndarray,
+) -> None:
+    """Error and linearization at ``ours`` are those of GTSAM's factors, one for each fixed point.
+
+    ``chain`` has the derivatives of their variables ``keys`` by pose and lens.
+    """
+    one, many = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    one.add(free_lens_factor([KEY, KEY_LENS], block))
+    for number, (factor, point) in enumerate(
+        zip(factors, block.block.points_lidar_m, strict=True), start=FIRST_POINT
+    ):
+        many.add(factor)
+        theirs.insert(number, point)
+    points = [*range(FIRST_POINT, FIRST_POINT + len(factors))]
+    size = len(chain)
+    order, whole = to_ordering([KEY, KEY_LENS]), to_ordering([*keys, *points])
+    hessian, gradient = (part[:size, ...] for part in many.linearize(theirs).hessian(whole))
+    found = one.linearize(ours).hessian(order)
+    np.testing.assert_allclose(2 * one.error(ours), 2 * many.error(theirs), rtol=1e-9)
+    expected, pulled = chain.T @ hessian[:, :size] @ chain, chain.T @ gradient
     np.testing.assert_allclose(found[0], expected, atol=1e-9 * np.abs(expected).max())
-    pulled = chain.T @ gradient
     np.testing.assert_allclose(found[1], pulled, atol=1e-9 * np.abs(pulled).max())
+
+
+def to_ordering(keys: list[int]) -> gtsam.Ordering:
+    order = gtsam.Ordering()
+    for key in keys:
+        order.push_back(key)
+    return order
 
 
 def test_a_displaced_cloud_is_a_displaced_camera() -> None:
@@ -133,13 +173,13 @@ def test_a_displaced_cloud_is_a_displaced_camera() -> None:
         slope = linear.gradientAtZero().at(key)
         for number in range(size):
             moved = step * np.eye(size)[number]
-            up, down = (graph.error(displace(values, key, s * moved)) for s in (1, -1))
+            up, down = (graph.error(moved_by(values, key, s * moved)) for s in (1, -1))
             np.testing.assert_allclose(
                 slope[number], (up - down) / (2 * step), rtol=1e-4, atol=1e-2
             )
 
 
-def displace(values: gtsam.Values, key: int, step: np.ndarray) -> gtsam.Values:
+def moved_by(values: gtsam.Values, key: int, step: np.ndarray) -> gtsam.Values:
     moved = gtsam.Values(values)
     if key == KEY_LENS:
         moved.update(key, values.atVector(key) + step)
@@ -153,3 +193,60 @@ def test_refuses_parameters_that_a_lens_does_not_have() -> None:
         FreeLens(LENSES["radtan"], ("k4",), (1.0,))
     with pytest.raises(ValueError, match="no free focal"):
         FreeLens(LENSES["equirectangular"], ("focal",), (1.0,))
+
+
+def test_equals_factors_of_gtsam_on_a_camera_that_moves_on() -> None:
+    """Stock factors on the pose exp(xi t) X of the camera at the time of its image."""
+    block = replace(moving("pinhole", 20, alike=True), sqrt_information=None, loss="l2")
+    free = FreeLens(LENSES["pinhole"], ("offset",), (1.0,))
+    calibration = gtsam.Cal3_S2(K["fx"], K["fy"], 0.0, K["cx"], K["cy"])
+    pose, late = TRUTH.retract(np.full(6, 0.01)), 0.05
+    moved = gtsam.Pose3.Expmap(late * TWIST) * pose
+    factors = [
+        gtsam.GenericProjectionFactorCal3_S2(
+            pixel, gtsam.noiseModel.Unit.Create(2), KEY, number, calibration
+        )
+        for number, pixel in enumerate(block.pixels_px, start=FIRST_POINT)
+    ]
+    chain = np.column_stack([np.eye(6), moved.inverse().AdjointMap() @ TWIST])
+    ours = with_lens(pose, np.array([late]))
+    require_equal(FreeLensBlock(block, free), ours, factors, at(moved), [KEY], chain)
+
+
+def test_points_that_have_been_moved_are_moved_on() -> None:
+    """A block at one clock has the residuals of the recorded points at that clock."""
+    free = FreeLens(LENSES["radtan"], ("offset", "readout"), (0.1, 0.1), Clock(0, 0, HEIGHT_PX))
+    block, values, T = moving("radtan", 40), np.array([0.4, -0.3]), TRUTH.inverse().matrix()
+    times_s = free.clock_at(values).times_s(block.pixels_px[:, 1])
+    points = displace(block.points_lidar_m, block.motion[:, :6], -times_s)
+    motion = np.column_stack([block.motion[:, :6], times_s])
+    moved = replace(block, points_lidar_m=points, motion=motion)
+    recorded, there = (FreeLensBlock(one, free).columns(T, values) for one in (block, moved))
+    np.testing.assert_allclose(there, recorded, atol=1e-9 * np.abs(recorded).max())
+
+
+def test_displacement_is_that_of_the_exponential() -> None:
+    points = np.random.default_rng(3).normal(0, 20, (30, 3))
+    for rate in (1.0, 1e-4, 0.0):
+        twist = TWIST * [rate, rate, rate, 1, 1, 1]
+        T = gtsam.Pose3.Expmap(0.3 * twist).matrix()
+        expected = points @ T[:3, :3].T + T[:3, 3]
+        np.testing.assert_allclose(displace(points, twist, 0.3), expected, atol=1e-9)
+
+
+def test_without_motion_or_at_rest_the_clock_is_not_observable() -> None:
+    free = FreeLens(LENSES["pinhole"], ("offset", "readout"), (0.02, 0.02))
+    still = world(LENSES["pinhole"], 20)
+    parked = replace(still, motion=np.zeros((20, 7)))
+    for block in (still, parked):
+        columns = FreeLensBlock(block, free).columns(TRUTH.inverse().matrix(), np.ones(2))
+        assert not columns[6:8].any()
+
+
+def test_the_motion_stays_with_its_correspondences() -> None:
+    block, rows = moving("pinhole", 12), np.array([7, 2, 5])
+    parts = [block.select(rows), block.select(np.arange(3)).rewhiten(None)]
+    expected = block.motion[[*rows, 0, 1, 2]]
+    joined = ProjectionBlock.join(parts)
+    np.testing.assert_array_equal(joined.motion, expected)
+    assert ProjectionBlock.join([world(LENSES["pinhole"], 4)] * 2).motion is None

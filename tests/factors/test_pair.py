@@ -17,12 +17,20 @@ from factors import (
     ProjectionBlock,
     SurfaceBlock,
     pair_block_factor,
+    pair_chain,
     pair_run_sums,
     pair_sums,
+    projection_residual,
+    ray_spreads,
+    robust_noise,
     unproject,
 )
+from factors.pair import factor_on_two_poses
 from tests.conftest import FORWARD, KANNALA, RADTAN5
-from tests.factors.pair_factors import epipolar_factor, pair_projection_factor, surface_factor
+
+Array = np.ndarray
+Residual = Callable[[gtsam.Pose3, gtsam.Pose3], tuple[Array, Array]]
+"""Of T_lidar_a and T_lidar_b: the residual [px] of one feature, and its derivative (n, 12)."""
 
 A, B = 3, 8
 K = {"fx": 718.0, "fy": 710.0, "cx": 607.0, "cy": 185.0}
@@ -61,19 +69,28 @@ class Features:
         self.pixels_b[wrong] += rng.uniform(-40, 40, (np.count_nonzero(wrong), 2))
 
     def separate(self, kind: str, loss: str, scale: float) -> gtsam.NonlinearFactorGraph:
+        """A factor of GTSAM for each feature, with its residual in numpy."""
         graph = gtsam.NonlinearFactorGraph()
-        options = {"loss": loss, "scale": scale}
-        for n, pixel_b in enumerate(self.pixels_b):
-            if kind == "epipolar":
-                pixels = self.pixels_a[n], pixel_b
-                graph.add(epipolar_factor(A, B, self.lenses, pixels, **options))
-            elif kind == "surface":
-                surface = self.rays_a[n], self.planes[n]
-                graph.add(surface_factor(A, B, self.lenses[1], *surface, pixel_b, **options))
-            else:
-                point = self.points_a[n]
-                graph.add(pair_projection_factor(A, B, self.lenses[1], point, pixel_b, **options))
+        unit = gtsam.noiseModel.Unit.Create(1 if kind == "epipolar" else 2)
+        noise = robust_noise(unit, loss=loss, scale=scale)
+        for n in range(len(self.pixels_b)):
+            graph.add(factor_on_two_poses(noise, A, B, self.residual(kind, n)))
         return graph
+
+    def residual(self, kind: str, n: int) -> Residual:
+        lens, pixel = self.lenses[1], self.pixels_b[n]
+        if kind == "epipolar":
+            rays = (self.rays_a[n], unproject(lens, pixel)[0][0])
+            return epipolar_residual(self.lenses, rays)
+        if kind == "surface":
+            return surface_residual(lens, self.rays_a[n], self.planes[n], pixel)
+
+        def of_point(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> tuple[Array, Array]:
+            T_a_b = T_lidar_a.between(T_lidar_b)
+            error, jacobian = projection_residual(lens, T_a_b, self.points_a[n], pixel)
+            return error, jacobian @ pair_chain(T_lidar_a, T_lidar_b)
+
+        return of_point
 
     def block(self, kind: str, loss: str = "cauchy", scale: float = 2.0) -> PairBlock:
         if kind == "epipolar":
@@ -82,6 +99,60 @@ class Features:
         if kind == "surface":
             return SurfaceBlock(lens, self.rays_a, self.planes, self.pixels_b, loss, scale)
         return ProjectionBlock(lens, self.points_a, self.pixels_b, loss=loss, scale=scale)
+
+
+def skew(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def surface_residual(lens_b: Lens, ray_a: Array, plane_per_m: Array, pixel_b_px: Array) -> Residual:
+    """Of a feature on a surface q, with q . p = 1 for its points p in the LiDAR frame."""
+
+    def residual(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> tuple[Array, Array]:
+        poses = T_lidar_a, T_lidar_b
+        (R_a, c_a), (R_b, c_b) = ((each.rotation().matrix(), each.translation()) for each in poses)
+        g, k = R_a.T @ plane_per_m, 1.0 - plane_per_m @ c_a
+        w = g @ ray_a / k
+        R_b_a, t = R_b.T @ R_a, R_b.T @ (c_a - c_b)
+        y = R_b_a @ ray_a + w * t
+        by_a = [
+            -R_b_a @ skew(ray_a) + np.outer(t, np.cross(ray_a, g)) / k,
+            w * R_b_a + w * np.outer(t, g) / k,
+        ]
+        pixel, by_point = lens_b.project_with_jacobian(y)
+        by_poses = np.hstack([*by_a, skew(y), -w * np.eye(3)])
+        return lens_b.subtract(pixel, pixel_b_px)[0], by_point[0] @ by_poses
+
+    return residual
+
+
+def epipolar_residual(lenses: tuple[Lens, Lens], rays: tuple[Array, Array]) -> Residual:
+    """Sampson's residual of a feature without depth."""
+    ray_a, ray_b = rays
+    spread_a, spread_b = (
+        ray_spreads(lens, ray[None])[0] for lens, ray in zip(lenses, rays, strict=True)
+    )
+
+    def residual(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> tuple[Array, Array]:
+        T_a_b = T_lidar_a.between(T_lidar_b)
+        R, t = T_a_b.rotation().matrix(), T_a_b.translation()
+
+        def form(x: Array, y: Array) -> tuple[float, Array]:
+            """C(x, y) and its derivative: d(R y) = R (omega x y), d t = R v."""
+            turned, normal = R @ y, np.cross(x, t)
+            by_rotation, by_translation = np.cross(y, R.T @ normal), R.T @ np.cross(turned, x)
+            return float(normal @ turned), np.concatenate([by_rotation, by_translation])
+
+        value, derivative = form(ray_a, ray_b)
+        sides = [form(side, ray_b) for side in spread_a.T]
+        sides += [form(ray_a, side) for side in spread_b.T]
+        square = sum(c * c for c, _ in sides)
+        half_of_square = np.sum([c * d for c, d in sides], axis=0)
+        over = 1.0 / np.sqrt(square)
+        jacobian = over * (derivative - value / square * half_of_square)
+        return np.array([value * over]), jacobian[None] @ pair_chain(T_lidar_a, T_lidar_b)
+
+    return residual
 
 
 KINDS = ("point", "surface", "epipolar")

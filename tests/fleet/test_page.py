@@ -13,15 +13,8 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from calibgraph.audit.findings import moved_lidars
-from calibgraph.audit.fleet_model import fit_fleet
-from calibgraph.audit.observations import observe
-from calibgraph.fleet.page import (
-    STATES,
-    FleetReport,
-    assess_status,
-    write_fleet_report,
-)
+from calibgraph.fleet.page import STATES, report_of, write_fleet_report
+from calibgraph.fleet.rows import ROWS, Store
 from tests.draws.fleets import SPREAD, simulate_fleet
 from tests.report.browsing import browser, render
 
@@ -42,9 +35,9 @@ def rows() -> pa.Table:
     return column(column(table, "status", status), "verdict", verdict)
 
 
-def report(rows: pa.Table, folder: Path) -> Path:
+def page_of(rows: pa.Table, folder: Path) -> Path:
     """The page of rows in a folder, beside them."""
-    parquet.write_table(rows, folder / "rows.parquet")
+    Store(str(folder)).put(f"{ROWS}/all.parquet", rows)
     write_fleet_report(str(folder))
     return folder / "fleet.html"
 
@@ -53,13 +46,12 @@ def report(rows: pa.Table, folder: Path) -> Path:
 def page(rows: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of these rows; the first vehicle has a name that would end the script."""
     hostile = column(rows, "vehicle", [HOSTILE] * 6 + rows["vehicle"].to_pylist()[6:])
-    return report(hostile, tmp_path_factory.mktemp("page"))
+    return page_of(hostile, tmp_path_factory.mktemp("page"))
 
 
 def test_states_follow_status_verdict_and_deviation(rows: pa.Table) -> None:
-    fleet = fit_fleet(observe(rows))
-    asked = FleetReport(fleet, [], moved_lidars(fleet))
-    states = np.array(STATES)[assess_status(rows, asked).state]
+    report = report_of(rows)
+    fleet, states = report.fleet, np.array(STATES)[report.state]
     assert set(states[:6]) == {"NO RESULT"}
     assert set(states[6:12]) == {"FAIL"}
     verdict = np.asarray(rows["verdict"].to_pylist())[12:]
@@ -108,7 +100,7 @@ def test_filters_sorting_and_details_work(page: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_ten_thousand_vehicles_open_in_about_a_second(tmp_path: Path) -> None:
-    page = report(simulate_fleet(np.random.default_rng(9), 10_000).rows, tmp_path)
+    page = page_of(simulate_fleet(np.random.default_rng(9), 10_000).rows, tmp_path)
     assert page.stat().st_size < 6e6
     script = """document.title =
         [rows.length, document.querySelectorAll(".row").length, performance.now()].join(" ");"""

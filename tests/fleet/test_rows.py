@@ -1,84 +1,70 @@
+"""Rows and inputs at local paths and at URIs."""
+
 from __future__ import annotations
 
 import itertools
+import os
+import shutil
+import sys
 import threading
 from pathlib import Path
 
+import fsspec
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
 from calibgraph import CalibrationError, FileError
-from calibgraph.fleet.rows import SCHEMA, RowStore, bucket_of, read_rows
+from calibgraph.fleet.rows import ROWS, SCHEMA, Store, read_rows
+from calibgraph.fleet.run import run_fleet
+from calibgraph.fleet.uris import fetch, fingerprint, in_arrow, join, read_bytes
+from tests.draws.fleets import write_fleet
 
 
-def rows(*vehicles: str, camera: str = "front", **others: object) -> pa.Table:
-    made = [
-        {"vehicle": name, "camera": camera, "recording": "drive", "status": "done"}
-        for name in vehicles
-    ]
-    table = pa.Table.from_pylist(made, schema=SCHEMA)
+def publish(uri: str, vehicle: str, camera: str = "front", **others: object) -> None:
+    row = {"vehicle": vehicle, "camera": camera, "recording": "drive", "status": "done"}
+    table = pa.Table.from_pylist([row], schema=SCHEMA)
     for name, value in others.items():
-        table = table.append_column(name, pa.array([value] * len(vehicles)))
-    return table
+        table = table.append_column(name, pa.array([value]))
+    Store(uri).put(f"{ROWS}/{vehicle}.parquet", table)
 
 
-def test_rows_of_one_job_replace_each_other(tmp_path: Path) -> None:
-    store = RowStore(str(tmp_path / "out"))
-    store.publish(rows("a", "b", camera=""))
-    store.publish(rows("a", camera="front"))
-    store.publish(rows("a", camera="left"))
-    found = read_rows(str(tmp_path / "out")).select(["vehicle", "camera"]).to_pylist()
-    assert sorted(tuple(row.values()) for row in found) == [("a", "left"), ("b", "")]
+@pytest.mark.parametrize("kind", ["local", "memory"])
+def test_rows_of_one_job_replace_each_other(tmp_path: Path, kind: str) -> None:
+    """A column that only some rows have is null in the others."""
+    out = str(tmp_path / "out [1]") if kind == "local" else "memory://fleet-rows"
+    publish(out, "a", "")
+    publish(out, "b", "", batch="2026-03")
+    publish(out, "a", "left")
+    Store(out).put("estimates.parquet", pa.table({"vehicle": ["c"]}))  # no rows
+    found = read_rows(out).select(["vehicle", "camera", "batch"]).to_pylist()
+    assert sorted(map(str, found)) == sorted(map(str, [
+        {"vehicle": "a", "camera": "left", "batch": None},
+        {"vehicle": "b", "camera": "", "batch": "2026-03"},
+    ]))  # fmt: skip
 
 
-def test_columns_that_only_some_rows_have_are_null_in_the_others(tmp_path: Path) -> None:
-    store = RowStore(str(tmp_path))
-    store.publish(rows("a"))
-    store.publish(rows("a-2", batch="2026-03"))
-    found = read_rows(str(tmp_path))
-    by_vehicle = dict(zip(found["vehicle"].to_pylist(), found["batch"].to_pylist(), strict=True))
-    assert by_vehicle == {"a": None, "a-2": "2026-03"}
-
-
-def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
-    path = tmp_path / f"bucket={bucket_of('a'):02x}" / "rows.parquet"
-    path.parent.mkdir()
-    parquet.write_table(pa.table({"x": [1]}), path)
-    before = path.read_bytes()
-    with pytest.raises(FileError, match="is not of a fleet of format calibgraph-fleet/1"):
-        RowStore(str(tmp_path)).publish(rows("a"))
-    assert path.read_bytes() == before
-
-
-def test_rows_are_kept_on_a_store_that_is_not_local() -> None:
-    store = RowStore("memory://fleet-rows")
-    store.publish(rows("a", "b"))
-    store.publish(rows("b"))
-    assert sorted(read_rows("memory://fleet-rows")["vehicle"].to_pylist()) == ["a", "b"]
-
-
-def test_an_empty_place_is_refused() -> None:
+def test_places_without_rows_are_one_line(tmp_path: Path) -> None:
+    (tmp_path / "damaged" / ROWS).mkdir(parents=True)
+    (tmp_path / "damaged" / ROWS / "a.parquet").write_bytes(b"PAR1")
+    for place in (tmp_path, tmp_path / "none", tmp_path / "damaged"):
+        with pytest.raises(FileError, match="give what calibgraph fleet wrote"):
+            read_rows(str(place))
     with pytest.raises(CalibrationError, match="--out is empty"):
-        RowStore("")
-
-
-def test_a_folder_without_rows_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match="give what calibgraph fleet wrote"):
-        read_rows(str(tmp_path))
-    with pytest.raises(FileError, match="give what calibgraph fleet wrote"):
-        read_rows(str(tmp_path / "none"))
+        Store("")
+    parquet.write_table(pa.table({"x": [1]}), tmp_path / "one.parquet")
+    assert len(read_rows(str(tmp_path / "one.parquet"))) == 1
 
 
 def test_a_reader_finds_whole_rows_while_they_are_replaced(tmp_path: Path) -> None:
-    store, stop = RowStore(str(tmp_path)), threading.Event()
-    store.publish(rows("a"))
+    publish(str(tmp_path), "a")
+    stop = threading.Event()
 
     def replace() -> None:
         for length in itertools.cycle((1, 2000)):
             if stop.is_set():
                 return
-            store.publish(rows("a", note="x" * length))
+            publish(str(tmp_path), "a", note="x" * length)
 
     writer = threading.Thread(target=replace)
     writer.start()
@@ -88,3 +74,82 @@ def test_a_reader_finds_whole_rows_while_they_are_replaced(tmp_path: Path) -> No
         stop.set()
         writer.join()
     assert lengths == [1] * 200
+
+
+@pytest.fixture
+def drive() -> str:
+    """A recording on a store that is not local."""
+    memory = fsspec.filesystem("memory")
+    if memory.exists("/logs"):
+        memory.rm("/logs", recursive=True)
+    memory.pipe({"/logs/drive/lidar/0.npy": b"cloud", "/logs/drive/rig.yaml": b"rig"})
+    return "memory://logs/drive"
+
+
+def test_remote_data_are_copied_up_to_the_limit_and_local_ones_read_in_place(
+    tmp_path: Path, drive: str
+) -> None:
+    with pytest.raises(FileError, match="expected up to 7e-09; see --fetch-gb"):
+        fetch(drive, tmp_path, 7)
+    assert not list(tmp_path.iterdir())
+    copied = fetch(drive, tmp_path, 1e6)
+    assert copied == tmp_path / "drive"
+    assert (copied / "lidar" / "0.npy").read_bytes() == b"cloud"
+    assert fetch(f"{drive}/rig.yaml", tmp_path, 1e6).read_bytes() == b"rig"
+    assert fetch(str(copied), tmp_path / "none", 0) == copied
+
+
+def test_fingerprints_change_with_a_remote_file(drive: str) -> None:
+    before = fingerprint(drive)
+    assert fingerprint(drive) == before
+    fsspec.filesystem("memory").pipe_file("/logs/drive/rig.yaml", b"other")
+    assert fingerprint(drive) != before
+    with pytest.raises(FileNotFoundError):
+        fingerprint("memory://logs/none")
+
+
+def test_relative_paths_start_at_the_folder() -> None:
+    assert (join("s3://logs", "a/b"), join("", "a")) == ("s3://logs/a/b", "a")
+    for absolute in ("/a", "s3://a", "zip://a::b.zip"):
+        assert join("folder", absolute) == absolute
+
+
+def test_tables_in_an_archive_are_fetched_solved_and_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_fleet(tmp_path / "in", 1).parent
+    archive = shutil.make_archive(str(tmp_path / "logs"), "zip", folder)
+    text = "vehicle,recording,rig\n"
+    for name in ("car-00000", "none"):
+        text += f"{name},zip://{name}.parquet::{archive},zip://nominal.yaml::{archive}\n"
+    (tmp_path / "fleet.csv").write_text(text)
+    (tmp_path / "scratch").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
+    out = str(tmp_path / "out")
+    summary = run_fleet(str(tmp_path / "fleet.csv"), out)
+    assert summary.failures == {"bad input": 1}
+    (error,) = [row["error"] for row in read_rows(out).to_pylist() if row["error"]]
+    assert f"zip://none.parquet::{archive}" in error
+    assert sum(summary.verdicts.values()) == 2
+    assert not list((tmp_path / "scratch").iterdir())
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fleet.csv")
+    with pytest.raises(FileError, match="is no file that can be read"):
+        read_bytes(str(tmp_path / "fleet.csv"), 1000)
+
+
+def test_what_arrow_reads_is_none_of_pythons() -> None:
+    """Its threads would need the interpreter to drop it, which may have ended by then."""
+    content = os.urandom(100)
+    before = sys.getrefcount(content)
+    reader = in_arrow(content)
+    assert sys.getrefcount(content) == before
+    assert (reader.read(), in_arrow(b"").read()) == (content, b"")
+
+
+def test_without_fsspec_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(CalibrationError, match=r"pip install 'calibgraph\[fleet\]'"):
+        read_bytes("fleet.csv", 1000)

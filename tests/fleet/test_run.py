@@ -23,7 +23,7 @@ from calibgraph import load_correspondences, load_rig, solve
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.fleet.job import run_job
 from calibgraph.fleet.manifest import load_manifest
-from calibgraph.fleet.rows import RowStore, read_rows
+from calibgraph.fleet.rows import Store, read_rows
 from calibgraph.fleet.run import Summary, dask_executor, run_fleet, thread_executor
 from calibgraph.fleet.task import Limits, Task, release
 from tests.draws.fleets import write_fleet
@@ -177,7 +177,7 @@ def test_missing_recordings_become_rows_that_are_tried_again(tmp_path: Path) -> 
 
 
 def test_two_commands_do_not_write_to_one_folder(folder: Path, tmp_path: Path) -> None:
-    with RowStore(str(tmp_path)).locked(), pytest.raises(FileError, match="another command writes"):
+    with Store(str(tmp_path)).locked(), pytest.raises(FileError, match="another command writes"):
         run_fleet(str(folder / "fleet.csv"), str(tmp_path))
 
 
@@ -217,7 +217,7 @@ def test_a_killed_command_leaves_rows_that_the_next_one_keeps(tmp_path: Path) ->
 
 
 def files_below(out: Path) -> list[Path]:
-    return list(out.glob("bucket=*/rows.parquet"))
+    return list(out.glob("rows/*.parquet"))
 
 
 def children() -> list[psutil.Process]:

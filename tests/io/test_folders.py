@@ -267,7 +267,7 @@ def test_files_that_stamps_do_not_pair_are_left_out_and_counted(sample: Path) ->
 
 @pytest.mark.parametrize(
     ("later_ms", "message"),
-    [(80, r"\+80 ms \(median\), at most 80: 0.80 m at 10 m/s; give a larger --tolerance-s"),
+    [(80, r"\+80 ms \(median\), at most 80: 0.80 m at 10 m/s; give a larger sync_tol"),
      (1e9, r"clouds are from 1403636579.000 to .* images from 1404636579.000")],
 )  # fmt: skip
 def test_stamps_that_are_far_apart_are_named(later_ms: float, message: str, sample: Path) -> None:
@@ -275,7 +275,7 @@ def test_stamps_that_are_far_apart_are_named(later_ms: float, message: str, samp
     with pytest.raises(DatasetError, match=message):
         load_dataset(sample)
     if later_ms < 100:  # noqa: PLR2004
-        assert len(load_dataset(sample, bag=BagOptions(tolerance_s=0.1)).frames) == 6
+        assert len(load_dataset(sample, bag=BagOptions(sync_tolerance_s=0.1)).frames) == 6
 
 
 @pytest.mark.parametrize(

@@ -306,9 +306,9 @@ def test_no_size_drops_the_cache_of_windows(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_what_was_used_last_is_kept_up_to_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_frames, "MAX_BYTES", 2 * size(100))
     frame, made = keep_frames(calibgraph.load_dataset(SAMPLE)).frames[0], list[str]()
     assert isinstance(frame, KeptFrame)
-    monkeypatch.setattr(kept_frames, "MAX_BYTES", 2 * size(100))
 
     def derive(key: str) -> None:
         frame.derive(key, lambda: made.append(key) or of(100))

@@ -1,4 +1,4 @@
-"""Frames near each other are of one place."""
+"""Clouds of one place are alike, and frames near each other are of one place."""
 
 from __future__ import annotations
 
@@ -15,13 +15,134 @@ import calibgraph
 from calibgraph import Dataset, Rig
 from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import keep_frames
+from calibgraph.io.rigs import load_rig
 from calibgraph.matching import places
+from calibgraph.matching.cloud_similarity import Z_UP, UprightCloud, align_with_any, find_up
 from calibgraph.matching.places import Motion, PlaceFinder, PlaceWalk, find_places, motions
 from calibgraph.model.geometry import invert, transform
 from tests.conftest import SAMPLE, make_camera
-from tests.matching.streets import STOPS, displaced, scan_at
 
 Array = NDArray[np.float64]
+
+
+def _boxes(seed: int) -> Array:
+    """(n, 2, 3) lower and upper corners: houses along the x axis, and lower things."""
+    rng = np.random.default_rng(seed)
+    n, ahead = 50, np.arange(-50.0, 100.0, 15.0)
+    houses = [(x, y) for x in ahead for y in (-16.0, 16.0)]
+    corner = np.vstack([houses, np.column_stack([rng.uniform(-50, 100, n), rng.uniform(4, 12, n)])])
+    corner[len(houses) :, 1] *= rng.choice([-1, 1], n)
+    corner += rng.uniform(-2, 2, corner.shape)
+    size = rng.uniform((0.3, 0.3, 1), (3, 2, 4), (len(corner), 3))
+    size[: len(houses)] = rng.uniform((6, 4, 5), (12, 8, 12), (len(houses), 3))
+    low = np.column_stack([corner - size[:, :2] / 2, np.zeros(len(corner))])
+    return np.stack([low, low + size], axis=1)
+
+
+_BOXES = _boxes(seed=0)
+_AZIMUTH, _ELEVATION = np.meshgrid(np.radians(range(360)), np.radians(range(-20, 12)))
+_FLAT = np.cos(_ELEVATION)
+_RAYS = np.stack([_FLAT * np.cos(_AZIMUTH), _FLAT * np.sin(_AZIMUTH), np.sin(_ELEVATION)], -1)
+
+
+def _pose(x_m: float) -> Array:
+    T_world_lidar = np.eye(4)
+    T_world_lidar[:3, 3] = x_m, 0.0, 1.8
+    return T_world_lidar
+
+
+STOPS = [_pose(9.0 * number) for number in range(6)]
+"""(4, 4) T_world_lidar of a vehicle that drives along the street."""
+
+
+def scan_at(T_world_lidar: Array, seed: int) -> NDArray[np.float32]:
+    """(n, 3) the points that a LiDAR of 32 beams sees up to 80 m, with 2 cm of noise."""
+    rays = _RAYS.reshape(-1, 3)
+    direction, origin = rays @ T_world_lidar[:3, :3].T, T_world_lidar[:3, 3]
+    with np.errstate(divide="ignore"):
+        range_m = np.where(direction[:, 2] < 0, -origin[2] / direction[:, 2], np.inf)
+        inverse = 1.0 / direction
+    for box in _BOXES:  # a ray is inside between its last entry and its first exit of three slabs
+        at = np.sort((box[:, None] - origin) * inverse, axis=0)
+        enters, leaves = at[0].max(axis=1), at[1].min(axis=1)
+        hit = (enters > 0) & (enters < np.minimum(leaves, range_m))
+        range_m[hit] = enters[hit]
+    range_m += np.random.default_rng(seed).normal(0, 0.02, len(range_m))
+    seen = range_m < 80
+    return (rays[seen] * range_m[seen, None]).astype(np.float32)
+
+
+def displaced(T_world_lidar: Array, *, left_m: float, turned_deg: float) -> Array:
+    """(4, 4) the pose beside a stop."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", turned_deg, degrees=True).as_matrix()
+    T[1, 3] = left_m
+    return T_world_lidar @ T
+
+
+def cloud_at(T_world_lidar: Array, seed: int = 0) -> UprightCloud:
+    return UprightCloud.from_cloud(scan_at(T_world_lidar, seed))
+
+
+@pytest.mark.parametrize(("stop", "turned_deg"), [(0, 77.0), (1, 0.0), (1, 180.0)])
+def test_the_motion_between_two_scans_of_a_place_is_found(stop: int, turned_deg: float) -> None:
+    """It decides about 20 m: a twentieth is enough, and the turn between two images from above."""
+    T_first = STOPS[0]
+    T_now = displaced(STOPS[stop], left_m=2.0, turned_deg=turned_deg)
+    first, now = cloud_at(T_first), cloud_at(T_now, seed=1)
+    found = align_with_any(now, [first])
+    assert found is not None
+    row, T_now_first = found
+    assert row == 0
+    off = T_now_first @ invert(T_first) @ T_now
+    assert np.linalg.norm(off[:3, 3]) < 1.0
+    assert np.degrees(Rotation.from_matrix(off[:3, :3]).magnitude()) < 1.5
+
+
+def test_other_places_are_not_aligned() -> None:
+    """40 m on in the same street, and in another one."""
+    now = cloud_at(STOPS[5])
+    other = UprightCloud.from_cloud(np.load(SAMPLE / "lidar" / "000000.npy"))
+    assert align_with_any(now, [cloud_at(STOPS[0]), other]) is None
+
+
+def test_of_many_known_places_the_nearest_is_found() -> None:
+    known = [cloud_at(T) for T in STOPS]
+    now = cloud_at(displaced(STOPS[3], left_m=1.0, turned_deg=5.0), seed=1)
+    found = align_with_any(now, known)
+    assert found is not None and found[0] == 3
+
+
+def test_where_nothing_is_upright_nothing_is_known() -> None:
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(-40, 40, (5000, 2)), rng.normal(-1.8, 0.01, 5000)])
+    empty = np.empty((0, 4), np.float32)
+    for cloud in (flat, empty):
+        assert (
+            align_with_any(UprightCloud.from_cloud(cloud), [UprightCloud.from_cloud(cloud)]) is None
+        )
+    assert align_with_any(UprightCloud.from_cloud(flat), []) is None
+
+
+AXES = {
+    "optical": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+    "on its side": Rotation.from_euler("x", 90, degrees=True).as_matrix(),
+    "upside down": Rotation.from_euler("x", 180, degrees=True).as_matrix(),
+    "tilted": Rotation.from_euler("yx", (45, 20), degrees=True).as_matrix(),
+}
+
+
+@pytest.mark.parametrize("axes", AXES)
+def test_up_is_found_in_clouds_of_other_axes_by_cameras_and_ground(axes: str) -> None:
+    """To 3 deg, as exactly as the ground is level; with z up nothing is turned, to the last bit."""
+    rig, cloud = load_rig(SAMPLE / "reference.yaml"), np.load(SAMPLE / "lidar" / "000000.npy")
+    cameras = [*rig.T_camera_lidar.values()]
+    assert find_up(cloud, cameras) is Z_UP
+    T_axes_lidar = transform(AXES[axes])
+    turned = cloud[:, :3] @ AXES[axes].T
+    R_up_axes = find_up(turned, [T @ invert(T_axes_lidar) for T in cameras])
+    assert R_up_axes is not None
+    assert (R_up_axes @ AXES[axes])[2, 2] > np.cos(np.radians(3.0))
 
 
 def driving(step_m: float) -> Motion:

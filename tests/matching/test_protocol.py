@@ -12,7 +12,8 @@ import pytest
 import calibgraph
 from calibgraph import Config, Correspondences, Dataset, Rig
 from calibgraph.errors import CorrespondenceError
-from calibgraph.matching.protocol import Start, to_full_matcher
+from calibgraph.matching.named import find_matcher
+from calibgraph.matching.protocol import FullMatcher, Start
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.progress import Progress, no_progress
 from calibgraph.rounds import match_in_rounds
@@ -86,7 +87,7 @@ def test_a_matcher_may_know_what_is_estimated_beside_the_pose() -> None:
             other.rounds = 1 + len(parts)
             return other
 
-    plain, knowing = (to_full_matcher(each) for each in (Minimal(), Knowing()))
+    plain, knowing = (FullMatcher(each) for each in (Minimal(), Knowing()))
     assert plain.with_estimate(("focal",)) is plain
     assert knowing.with_estimate(("focal", "offset")).rounds == 3
 
@@ -161,8 +162,6 @@ def test_findings_of_the_start_and_of_the_last_round_are_in_the_table(
 
 FINDINGS = MatcherFindings(
     z_score={"left": 17.5},
-    start_dependence={"left": 0.1},
-    memorization={"left": 0.9},
     failed_share={"left": 0.25},
     found={"left": 18.0},
     missed={"right": 3.0},
@@ -194,3 +193,35 @@ def test_findings_survive_a_file(truth: Rig, tmp_path: Path) -> None:
 def test_findings_of_another_kind_are_errors(metadata: dict[str, object], words: str) -> None:
     with pytest.raises(CorrespondenceError, match=words):
         MatcherFindings.from_metadata(metadata)
+
+
+@pytest.fixture(scope="module")
+def table(truth: Rig) -> Correspondences:
+    return calibgraph.simulate_correspondences(truth, frames=4, matches=20)
+
+
+@pytest.mark.parametrize("source", ["memory", ".parquet", ".csv"])
+def test_a_table_matches_the_frames_of_the_dataset(
+    table: Correspondences, truth: Rig, tmp_path: Path, source: str
+) -> None:
+    path = tmp_path / f"table{source}"
+    if source != "memory":
+        table.save(path)
+    matcher = find_matcher(table if source == "memory" else path)
+    data = calibgraph.load_dataset(SAMPLE, truth).select("1:3")
+    rows = matcher.match(data, truth, round_index=0, progress=no_progress)
+    assert set(np.unique(rows.frame)) == {1, 2}
+    assert len(rows) == np.count_nonzero(np.isin(table.frame, (1, 2)))
+    assert (matcher.rounds, matcher.stage1, matcher.tracking_rounds) == (1, "pnp", ())
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("cmrnext", "the matcher 'cmrnext' needs weights"),
+        ("sift", "unknown matcher 'sift'; known are 'structure', 'cmrnext' and a table"),
+    ],
+)
+def test_other_names_are_errors(name: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        find_matcher(name)

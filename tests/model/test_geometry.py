@@ -1,11 +1,14 @@
-"""Directions and derivatives of SE(3), by worked points and finite differences."""
+"""Directions and derivatives of SE(3), metrics and perturbations, by values worked by hand."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import gtsam
 import numpy as np
 import pytest
 
+from calibgraph import Rig, evaluate, perturb
 from calibgraph.model.geometry import (
     angle_deg,
     invert,
@@ -21,6 +24,7 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
     twist_between,
 )
+from calibgraph.model.metrics import pose_error
 from tests.conftest import make_camera
 
 # A quarter turn about z and a shift: p_a = (-y, x, z) + (1, 2, 3).
@@ -72,24 +76,23 @@ def test_angles_and_distances_of_extrinsics_are_those_of_the_cameras() -> None:
     assert angle_deg(QUARTER[:3, :3]) == pytest.approx(90.0)
 
 
+def differences(function: Callable[[np.ndarray], np.ndarray], size: int) -> np.ndarray:
+    """The Jacobian at zero, by central differences: exact to eps / step = 1e-10."""
+    steps = 1e-6 * np.eye(size)
+    return np.column_stack([(function(xi) - function(-xi)) / 2e-6 for xi in steps])
+
+
 def test_the_covariance_of_a_pair_follows_from_finite_differences() -> None:
     """Of xi in T_b_a = exp(xi) estimate, by perturbing both extrinsics on the left."""
     T_a, T_b = random_transform(1), random_transform(2)
     T_b_a = relative_transform(T_b, T_a)
-    step = 1e-6
-    jacobian = np.zeros((6, 12))
-    for axis in range(12):
-        ends = []
-        for sign in (1, -1):
-            xi = np.zeros(12)
-            xi[axis] = sign * step
-            moved = relative_transform(exp(xi[6:]) @ T_b, exp(xi[:6]) @ T_a)
-            ends.append(twist_between(moved, T_b_a))
-        jacobian[:, axis] = (ends[0] - ends[1]) / (2 * step)
+    jacobian = differences(
+        lambda xi: twist_between(relative_transform(exp(xi[6:]) @ T_b, exp(xi[:6]) @ T_a), T_b_a),
+        12,
+    )
     root = np.random.default_rng(3).standard_normal((12, 12))
     joint = root @ root.T
     expected = jacobian @ joint @ jacobian.T
-    # Central differences: rounding eps / step = 1e-10, truncation step^2 = 1e-12, times |joint|.
     tolerance = 1e-8 * np.abs(expected).max()
     np.testing.assert_allclose(
         relative_covariance(joint, 0, 1, T_b_a), expected, rtol=0, atol=tolerance
@@ -123,21 +126,90 @@ def test_many_poses_move_as_gtsam_moves_each(size: float) -> None:
 def test_the_covariance_of_ros_is_that_of_the_moved_pose() -> None:
     """By finite differences of the pose in the LiDAR frame, over each direction of xi."""
     T = make_camera((0.3, 0.2, -0.1), yaw_deg=35).T_camera_lidar
-    step = 1e-6
-    jacobian = np.empty((6, 6))
-    for k in range(6):
-        poses = []
-        for sign in (1, -1):
-            xi = np.zeros(6)
-            xi[k] = sign * step
-            poses.append(np.linalg.inv(gtsam.Pose3.Expmap(xi).matrix() @ T))
-        plus, minus = poses
-        turn = (plus[:3, :3] @ minus[:3, :3].T) / (2 * step)
+    here = np.linalg.inv(T)
+
+    def moved(xi: np.ndarray) -> np.ndarray:
+        """Shift and turn of the camera, in axes of the LiDAR."""
+        there = np.linalg.inv(exp(xi) @ T)
+        turn = there[:3, :3] @ here[:3, :3].T
         axis = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
-        jacobian[:3, k] = (plus[:3, 3] - minus[:3, 3]) / (2 * step)
-        jacobian[3:, k] = 0.5 * np.array(axis)
+        return np.concatenate([there[:3, 3] - here[:3, 3], 0.5 * np.array(axis)])
+
+    jacobian = differences(moved, 6)
     root = np.random.default_rng(3).normal(size=(6, 6))
     covariance = root @ root.T
     expected = jacobian @ covariance @ jacobian.T
     # Central differences: rounding 1e-16 / 1e-6, of values up to about 10.
     np.testing.assert_allclose(ros_pose_covariance(covariance, T), expected, atol=1e-7)
+
+
+def turned_about(axis: str, degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    T = np.eye(4)
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    T[[i, i, j, j], [i, j, i, j]] = [c, -s, s, c]
+    return T
+
+
+@pytest.mark.parametrize(("axis", "name"), [("x", "pitch"), ("y", "yaw"), ("z", "roll")])
+def test_rotations_are_named_for_a_camera_that_looks_along_z(
+    axis: str, name: str, pair: Rig
+) -> None:
+    reference = pair.T_camera_lidar["left"]
+    error = pose_error(turned_about(axis, 3.0) @ reference, reference)
+    assert error.rotation_error_deg == pytest.approx(3.0)
+    for each in ("roll", "pitch", "yaw"):
+        expected = 3.0 if each == name else 0.0
+        assert getattr(error, f"{each}_deg") == pytest.approx(expected, abs=1e-9)
+
+
+def test_translations_are_differences_of_t_in_camera_axes(pair: Rig) -> None:
+    reference = pair.T_camera_lidar["left"]
+    estimate = reference.copy()
+    estimate[:3, 3] += [0.03, -0.04, 0.0]
+    error = pose_error(estimate, reference)
+    assert (error.x_cm, error.y_cm, error.z_cm) == pytest.approx((3, -4, 0))
+    assert error.translation_error_cm == pytest.approx(5)
+    assert error.rotation_error_deg == 0
+
+
+def test_pairs_compare_the_pose_between_cameras(pair: Rig) -> None:
+    """Moving the LiDAR moves both cameras and not what lies between them."""
+    shift = turned_about("z", 1.0)
+    shift[:3, 3] = [0.1, 0.2, 0.3]
+    both = pair.moved_to({n: T @ shift for n, T in pair.T_camera_lidar.items()})
+    errors = evaluate(both, pair)
+    assert errors.cameras["left"].rotation_error_deg == pytest.approx(1.0)
+    assert errors.pairs["left->right"].rotation_error_deg == pytest.approx(0, abs=1e-9)
+    assert errors.pairs["left->right"].translation_error_cm == pytest.approx(0, abs=1e-9)
+    right = pair.T_camera_lidar["right"].copy()
+    right[0, 3] += 0.05
+    one = evaluate(pair.moved_to({"right": right}), pair)
+    assert one.pairs["left->right"].x_cm == pytest.approx(5)
+    assert one.cameras["left"].translation_error_cm == 0
+
+
+@pytest.mark.parametrize("degrees", [0, 1e-7, 1e-3, 1, 90, 179.999])
+def test_angles_are_exact_from_tiny_to_large(degrees: float) -> None:
+    assert angle_deg(turned_about("y", degrees)[:3, :3]) == pytest.approx(degrees, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_perturb_displaces_by_exactly_what_it_says(pair: Rig, seed: int) -> None:
+    moved = perturb(pair, rotation_deg=20, translation_m=1.5, seed=seed)
+    deltas = [moved.T_camera_lidar[n] @ np.linalg.inv(T) for n, T in pair.T_camera_lidar.items()]
+    for delta in deltas:
+        assert angle_deg(delta[:3, :3]) == pytest.approx(20, abs=1e-9)
+        assert np.linalg.norm(delta[:3, 3]) == pytest.approx(1.5, abs=1e-12)
+    assert np.abs(deltas[0] - deltas[1]).max() > 0.1  # independent per camera
+
+
+def test_perturb_uniform_stays_in_its_box(pair: Rig) -> None:
+    shifts = []
+    for seed in range(100):
+        moved = perturb(pair, rotation_deg=20, translation_m=1.5, seed=seed, uniform=True)
+        delta = moved.T_camera_lidar["left"] @ np.linalg.inv(pair.T_camera_lidar["left"])
+        shifts.append(delta[:3, 3])
+    assert np.abs(shifts).max() <= 1.5
+    # Uniform on +-1.5: a standard deviation of 1.5 / sqrt(3), known from 300 draws to 4 %.
+    assert np.std(shifts) == pytest.approx(1.5 / np.sqrt(3), rel=0.15)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,15 +13,10 @@ import pytest
 from calibgraph import Rig, evaluate, load_dataset, load_rig, perturb
 from calibgraph.pick.server import PickServer
 from calibgraph.pick.workspace import Workspace
+from tests.chromium import CHROMIUM, axe, in_chromium, sync_api
 from tests.conftest import SAMPLE
 
-sync_api = pytest.importorskip("playwright.sync_api")
-axe = pytest.importorskip("axe_playwright_python.sync_playwright")
-CHROMIUM = shutil.which("chromium")
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium"),
-]
+pytestmark = in_chromium
 MARGIN_PX = 40  # of the image, at which a pair may be picked
 
 

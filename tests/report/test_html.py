@@ -1,9 +1,10 @@
-"""The page: everything of a result, nothing fetched, whatever is missing."""
+"""The page: everything of a result, nothing fetched, whatever is missing; its numbers are right."""
 
 from __future__ import annotations
 
 import html
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,18 @@ import pytest
 from markupsafe import escape
 from scipy.spatial.transform import Rotation
 
-from calibgraph import Calibration, Check, Rig, Verdict
+import calibgraph
+from calibgraph import Calibration, Check, Rig, Verdict, perturb
+from calibgraph.errors import DatasetError
 from calibgraph.model.lens_estimate import LensEstimate
-from tests.report.conftest import solve_simulated, write_page
+from calibgraph.report.camera_section import worked_point
+from calibgraph.report.frames import relocate_frames
+from calibgraph.report.plots import ARROW_COLUMNS, arrow_factor, mean_residuals
+from calibgraph.report.reprojection_errors import constrained, errors_before_after
+from calibgraph.solver.whitening import constrained_error_px
+from tests.conftest import SAMPLE, CommandRun
+from tests.report.browsing import render
+from tests.report.conftest import read_page, solve_simulated, write_page
 
 pytestmark = pytest.mark.usefixtures("blank_diagrams")
 
@@ -34,7 +44,7 @@ def test_a_solved_table_is_reported_without_overlays(
     assert f'<strong class="big">{status}</strong>' in text
     assert text.count("Overlays are left out:") == 1
     assert "Pictures of the residuals are left out" not in text
-    assert "One standard deviation, about and along" in text
+    assert "Error bar per axis: one standard deviation, about and along it" in text
     for name in solved_pair.rig.cameras:
         assert f"Residuals over the image of {name}" in text
     for check in solved_pair.camera_verdicts["left"].checks:
@@ -87,6 +97,142 @@ def test_a_camera_that_failed_has_no_error_bar(solved_pair: Calibration, tmp_pat
     assert "Least certain: right, " in text
     assert "Error bar per axis: unknown, since the verdict is FAIL" in text
     assert "unknown: the verdict of a camera is FAIL" in text  # of left->right
-    assert text.count('alt="Error bars of ') == 1
     assert result.error_bar("left") is None and result.error_bar("right") is not None
     assert result.error_bar("left->right") is None and result.sigmas("left") is not None
+
+
+def test_images_before_and_after_are_in_the_page(
+    calibrated_sample: CommandRun, sample_result: Calibration
+) -> None:
+    text = read_page(calibrated_sample.folder / "report.html")
+    assert text.count("data:image/jpeg") == 3 * 4 + 1  # and one pair of cameras
+    assert "Overlays are left out" not in text
+    for name in sample_result.rig.cameras:
+        for when in ("before", "after"):
+            assert f'alt="{name} {when}, coloured by residual"' in text
+    for key in sample_result.config.model_dump():
+        assert key in text
+    for path, digest in sample_result.inputs.items():
+        assert f"{digest}  {path}" in text
+    assert sample_result.versions["numpy"] in text
+
+
+def test_missing_images_are_one_line_and_the_rest_is_there(
+    sample_result: Calibration, tmp_path: Path
+) -> None:
+    gone = tuple(
+        {**frame, "cloud": "/nowhere/a.bin", "images": dict.fromkeys(frame["images"], "/nowhere")}
+        for frame in sample_result.frames
+    )
+    text = write_page(replace(sample_result, frames=gone), tmp_path)
+    assert "<b>Overlays are left out:</b> /nowhere/a.bin: no such file; check the path." in text
+    assert "data:image/jpeg" not in text
+    assert "Residuals over the image of left" in text
+
+
+def test_a_guess_that_projects_no_point_is_drawn(
+    sample_result: Calibration, tmp_path: Path
+) -> None:
+    flip = np.diag([-1.0, 1.0, -1.0, 1.0])
+    backwards = {name: flip @ T for name, T in sample_result.initial_rig.T_camera_lidar.items()}
+    guess = sample_result.initial_rig.moved_to(backwards)
+    # With several rounds, the last began near the result, so that there are matches to draw.
+    turned = replace(sample_result, initial_rig=guess, rounds=2 * sample_result.rounds)
+    assert write_page(turned, tmp_path).count("data:image/jpeg") == 3 * 4 + 1
+
+
+def test_a_dataset_that_has_moved_is_found(sample_result: Calibration, tmp_path: Path) -> None:
+    moved = Path(shutil.copytree(SAMPLE, tmp_path / "moved"))
+    dataset = calibgraph.load_dataset(moved)
+    found = relocate_frames(sample_result, dataset)
+    assert [frame["name"] for frame in found.frames] == [f["name"] for f in sample_result.frames]
+    assert all(frame["cloud"].startswith(str(moved)) for frame in found.frames)
+    assert relocate_frames(replace(sample_result, frames=()), dataset).frames == found.frames
+    with pytest.raises(DatasetError, match="has no frame number 3 named '000003'"):
+        relocate_frames(sample_result, dataset.select("0:3"))
+
+
+def test_another_recording_with_the_same_names_is_refused(
+    sample_result: Calibration, tmp_path: Path
+) -> None:
+    other = Path(shutil.copytree(SAMPLE, tmp_path / "other"))
+    first, second = sorted((other / "cameras" / "left").iterdir())[:2]
+    shutil.copy(second, first)
+    with pytest.raises(DatasetError, match=f"{first}: is not what the result was made from"):
+        relocate_frames(sample_result, calibgraph.load_dataset(other))
+
+
+def test_vectors_of_edges_have_the_length_that_the_gate_compares() -> None:
+    rng = np.random.default_rng(0)
+    residuals, normals = rng.normal(0, 3, (2, 50, 2))
+    edges = np.column_stack(
+        [normals[:, 0] ** 2, normals[:, 0] * normals[:, 1], normals[:, 1] ** 2]
+    ) + np.outer(rng.integers(0, 2, 50), [0.5, 0.1, 0.7])
+    lengths = np.hypot(*constrained(residuals, edges).T)
+    np.testing.assert_allclose(lengths, constrained_error_px(residuals, edges), atol=1e-9)
+    np.testing.assert_array_equal(constrained(residuals, None), residuals)
+
+
+def test_errors_are_those_at_the_guess_and_at_the_result(
+    pair_without_outliers: Calibration,
+) -> None:
+    result = pair_without_outliers
+    left = errors_before_after(result)["left"]
+    # The median of 1600 two-dimensional errors of 1 px per axis is 1.177 px, to some 2 percent.
+    assert np.median(left.after.sizes_px) == pytest.approx(1.177, rel=0.1)
+    assert np.median(left.before.sizes_px) > 10 * np.median(left.after.sizes_px)
+    assert np.median(left.after.sizes_px) == pytest.approx(result.residuals["left"].median_px)
+    assert abs(np.count_nonzero(left.after.is_inlier) - result.counts["left"]["used"]) < 10
+
+
+def test_arrows_are_the_mean_of_their_cell(solved_pair: Calibration) -> None:
+    after = errors_before_after(solved_pair)["left"].after
+    shifted = replace(after, vectors_px=np.tile([0.5, -0.25], (len(after.frame), 1)))
+    camera = solved_pair.rig.cameras["left"]
+    _, means, cell_px = mean_residuals(camera, shifted, ARROW_COLUMNS)
+    assert len(means) > 0
+    np.testing.assert_allclose(means, np.tile([0.5, -0.25], (len(means), 1)))
+    assert 0.3 * cell_px < arrow_factor(means, cell_px) * np.hypot(0.5, 0.25) <= 0.9 * cell_px
+
+
+def test_the_worked_point_is_right(pair_without_outliers: Calibration) -> None:
+    camera = pair_without_outliers.rig.cameras["left"]
+    worked = worked_point(camera, errors_before_after(pair_without_outliers)["left"].after)
+    numbers = {
+        line.split("=")[0].strip(): [float(n) for n in re.findall(r"-?\d+\.\d+", line)]
+        for line in worked.splitlines()
+    }
+    T = camera.T_camera_lidar
+    p_camera = T[:3, :3] @ numbers["p_lidar"] + T[:3, 3]
+    np.testing.assert_allclose(numbers["p_camera"], p_camera, atol=2e-3)
+    u, v = numbers["projected pixel (u, v)"]
+    # x and z have three digits, at about 10 m: half a millimetre is 0.04 px.
+    np.testing.assert_allclose(camera.lens.project(p_camera[None])[0][0], (u, v), atol=0.1)
+    matched_u, matched_v, size = numbers["matched pixel"]
+    assert np.hypot(u - matched_u, v - matched_v) == pytest.approx(size, abs=0.02)
+
+
+def test_a_browser_shows_it_without_errors_and_without_a_network(
+    calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
+    page = calibrated_sample.folder / "report.html"
+    for width in (1280, 500):
+        rendering = render(page, tmp_path, width)
+        assert rendering.errors == []
+        assert rendering.requests == []
+        assert rendering.picture.shape[1] == width
+        green = (rendering.picture[:400, :60] == (0x3F, 0x61, 0)).all(axis=2)  # BGR: PASS
+        assert green.sum() > 500
+        assert rendering.picture[400:].std() > 20  # not blank: the overlays
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", ["kitti_odometry/sequences/00", "surround6"])
+def test_real_recordings_are_reported(realdata: Path, name: str, tmp_path: Path) -> None:
+    guess = perturb(calibgraph.load_rig(realdata / name), rotation_deg=1, translation_m=0.1)
+    result = calibgraph.calibrate(realdata / name, guess)
+    text = write_page(result, tmp_path)
+    pairs = 0 if result.camera_matches is None else len(result.camera_matches.pairs())
+    assert text.count("data:image/jpeg") == 4 * len(result.rig.cameras) + pairs
+    rendering = render(tmp_path / "report.html", tmp_path)
+    assert (rendering.errors, rendering.requests) == ([], [])

@@ -1,10 +1,14 @@
-"""The simulated LiDAR: ranges, dropouts and intensities."""
+"""The simulated LiDAR: ranges, dropouts, intensities, and its errors."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calibgraph import Rig, simulate_street
 from calibgraph.simulation.lidar import (
     lidar_of,
     return_chance,
@@ -12,8 +16,9 @@ from calibgraph.simulation.lidar import (
     shot_directions,
 )
 from calibgraph.simulation.recording import Drive
-from calibgraph.simulation.world import cast, find_albedos
-from tests.simulation.conftest import SCAN
+from calibgraph.simulation.scan_errors import ScanErrors, foremost
+from calibgraph.simulation.world import Hits, cast, find_albedos
+from tests.simulation.conftest import SCAN, small_camera
 
 pytestmark = pytest.mark.usefixtures("open3d")
 
@@ -59,3 +64,77 @@ def test_32_beams_cover_a_sector_and_the_others_a_full_turn() -> None:
     azimuth_deg = np.degrees(np.arctan2(sector[:, 1], sector[:, 0]))
     assert len(sector) == 32 * 400 and len(full) == 16 * 1800
     assert np.isclose(azimuth_deg.min(), -46.0) and np.isclose(azimuth_deg.max(), 113.6)
+
+
+EXACT = replace(SCAN, range_noise_m=0.0, dropout=0.0)
+
+
+def scanned(drive: Drive, errors: ScanErrors, frame: int = 0) -> np.ndarray:
+    T, rng = drive.T_world_lidar[frame], np.random.default_rng(1)
+    return scan(drive.world, replace(EXACT, errors=errors), np.ones(16), T, rng=rng).astype(float)
+
+
+def elevations_deg(cloud: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arctan2(cloud[:, 2], np.hypot(cloud[:, 0], cloud[:, 1])))
+
+
+def test_points_lie_at_the_elevations_that_are_reported(drive: Drive) -> None:
+    """The ranges are those of where the beams are: 0.5 degrees higher."""
+    cloud = scanned(drive, ScanErrors(elevations_deg=(0.5,) * 16))
+    reported = np.array(SCAN.elevations_deg)
+    nearest = np.abs(elevations_deg(cloud)[:, None] - reported).min(axis=1)
+    assert nearest.max() < 1e-3
+    flat = cloud[:, :2] / np.linalg.norm(cloud[:, :2], axis=1)[:, None]
+    fired = np.radians(elevations_deg(cloud) + 0.5)
+    rays = np.column_stack([flat * np.cos(fired)[:, None], np.sin(fired)])
+    T = drive.T_world_lidar[0]
+    truth = cast(drive.world, T[:3, 3], (rays @ T[:3, :3].T).astype(np.float32)).distance_m
+    error = np.linalg.norm(cloud[:, :3], axis=1) - truth
+    assert np.mean(np.abs(error) < 0.02) > 0.98  # single precision, at the edges of objects
+
+
+def test_a_moving_sensor_is_behind_when_it_looks_right_and_ahead_when_left(drive: Drive) -> None:
+    whole = scanned(drive, ScanErrors(motion_m=0.4))
+    T = drive.T_world_lidar[0]
+    azimuth = np.arctan2(whole[:, 1], whole[:, 0])
+    origins = T[:3, 3] + 0.4 * (azimuth / (2 * np.pi))[:, None] * T[:3, 0]
+    ranges = np.linalg.norm(whole[:, :3], axis=1)
+    rays = (whole[:, :3] / ranges[:, None] @ T[:3, :3].T).astype(np.float32)
+    assert np.mean(np.abs(cast(drive.world, origins, rays).distance_m - ranges) < 0.02) > 0.98
+
+
+def hits(*distances: float) -> list[Hits]:
+    """Of one shot of seven rays."""
+    one = np.zeros((1, 2), np.float32)
+    return [
+        Hits(np.array([d], np.float32), np.array([k], np.int32), one)
+        for k, d in enumerate(distances)
+    ]
+
+
+def test_of_a_wide_beam_the_foremost_surface_returns_that_two_parts_meet() -> None:
+    both = foremost(hits(20.0, 10.0, 10.1, 20.0, 20.1, 20.0, 20.0))
+    assert both.distance_m[0] == pytest.approx(10.05) and both.triangle[0] in {1, 2}
+    one = foremost(hits(20.0, 10.0, 20.1, 20.0, 20.1, 20.0, 20.0))
+    assert one.distance_m[0] == pytest.approx(20.03, abs=0.01)
+    slanted = foremost(hits(10.0, 10.4, 10.8, 11.2, 11.6, 12.0, 12.4))
+    assert slanted.distance_m[0] == pytest.approx(11.2)
+    sky = foremost(hits(*[np.inf] * 7))
+    assert np.isinf(sky.distance_m[0])
+    edge = foremost(hits(np.inf, 10.0, 10.0, *[np.inf] * 4))
+    assert edge.distance_m[0] == pytest.approx(10.0)
+
+
+def test_a_size_gives_other_clouds_and_a_wrong_one_is_refused(tmp_path: Path) -> None:
+    rig = Rig(cameras={"front": small_camera("pinhole")})
+    clouds = []
+    for name, size in (("plain", 0.0), ("usual", 1.0)):
+        simulate_street(tmp_path / name, rig, beams=16, frames=1, seed=5, sensor_errors=size)
+        clouds.append(np.load(tmp_path / name / "lidar" / "000000.npy"))
+    assert clouds[1].shape != clouds[0].shape or not np.allclose(clouds[1], clouds[0])
+    with pytest.raises(ValueError, match="sensor errors of -1"):
+        simulate_street(tmp_path / "wrong", rig, beams=16, frames=1, sensor_errors=-1)
+    three = ScanErrors(elevations_deg=(0.1, 0.0, 0.1))
+    with pytest.raises(ValueError, match="errors of 3 elevations for 16 beams"):
+        simulate_street(tmp_path / "wrong", rig, beams=16, frames=1, sensor_errors=three)
+    assert not (tmp_path / "wrong").exists()

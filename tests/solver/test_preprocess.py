@@ -1,8 +1,9 @@
-"""The filters keep the right rows; a table in parts gives what the whole table gives."""
+"""The filters keep the right rows, in parts as of the whole table; weights; the robust spread."""
 
 from __future__ import annotations
 
 import tracemalloc
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,15 @@ from calibgraph import (
 from calibgraph.io import correspondence_tables
 from calibgraph.solver import preprocess
 from calibgraph.solver.preprocess import Preprocessed
+from calibgraph.solver.residual_scale import (
+    iterate_spread,
+    quantile,
+    quantiles,
+    robust_spread,
+    robust_spreads,
+)
+from calibgraph.solver.whitening import constrained_error_px, sqrt_information
+from tests.model.tables import table as small_table
 
 to_arrow = Correspondences.to_arrow
 
@@ -72,16 +82,23 @@ def saved(table: Correspondences, path: Path, **options: Any) -> Path:
     return path
 
 
-def by_hand(rig: Rig, table: Correspondences, config: Config) -> dict[str, list[int]]:
-    """Per camera the rows that the filters keep, one row after the other (no cap)."""
+def by_hand(
+    rig: Rig, table: Correspondences, config: Config
+) -> tuple[dict[str, list[int]], dict[str, Counter[str]]]:
+    """Per camera the rows that the filters keep, one row after the other (no cap), and counts."""
+    counts = {name: Counter[str]() for name in rig.cameras}
     best: dict[tuple[str, int, int, int], int] = {}
     for row in range(len(table)):
         name = table.cameras[table.camera_index[row]]
         camera = rig.cameras[name]
         p = camera.T_camera_lidar @ [*table.points_lidar_m[row], 1.0]
-        seen = camera.lens.project(p[:3])[1][0]
-        if not seen or table.confidence[row] < np.float32(config.confidence_min):
+        counts[name]["given"] += 1
+        if not camera.lens.project(p[:3])[1][0]:
             continue
+        counts[name]["projectable"] += 1
+        if table.confidence[row] < np.float32(config.confidence_min):
+            continue
+        counts[name]["confident"] += 1
         u, v = table.pixels_px[row] + 0.5
         column = min(max(int(np.floor(u / camera.width_px * config.grid_columns)), 0), 39)
         line = min(max(int(np.floor(v / camera.height_px * config.grid_rows)), 0), 24)
@@ -91,7 +108,8 @@ def by_hand(rig: Rig, table: Correspondences, config: Config) -> dict[str, list[
     kept: dict[str, list[int]] = {name: [] for name in rig.cameras}
     for (name, *_), row in best.items():
         kept[name].append(row)
-    return kept
+        counts[name]["best_in_cell"] += 1
+    return kept, counts
 
 
 def assert_same(found: Preprocessed, expected: Preprocessed) -> None:
@@ -108,10 +126,11 @@ def assert_same(found: Preprocessed, expected: Preprocessed) -> None:
 def test_preprocessing_keeps_what_is_kept_by_hand(mixed_rig: Rig) -> None:
     table, config = shuffled(mixed_rig, 1), Config(confidence_min=0.4)
     kept = preprocess.preprocess(mixed_rig, table, config)
-    for name, rows in by_hand(mixed_rig, table, config).items():
+    by_camera, counts = by_hand(mixed_rig, table, config)
+    for name, rows in by_camera.items():
         order = sorted(rows, key=lambda row: (table.frame[row], row))
         assert kept.table.of_camera(name).point_index.tolist() == order
-        assert kept.counts[name]["best_in_cell"] == len(rows)
+        assert counts[name].items() <= kept.counts[name].items()
 
 
 @pytest.mark.usefixtures("small_parts")
@@ -185,26 +204,90 @@ def test_memory_does_not_grow_with_the_table(pair: Rig) -> None:
     assert peak_bytes(24) < 1.1 * peak_bytes(6)
 
 
-def test_preprocessing_counts_at_every_filter(pair: Rig) -> None:
+def test_the_cap_keeps_the_most_confident_of_every_frame(pair: Rig) -> None:
     given = simulate_correspondences(pair, frames=3, matches=400)
-    points = given.points_lidar_m.copy()
-    points[:50] *= -1  # behind the camera
-    behind = Correspondences.from_arrays(
-        camera=np.array(given.cameras)[given.camera_index],
-        frame=given.frame,
-        pixels_px=given.pixels_px,
-        points_lidar_m=points,
-        confidence=given.confidence,
-    )
     config = Config(confidence_min=0.5, matches_max=100)
-    kept = preprocess.preprocess(pair, behind, config)
-    counts = kept.counts["left"]
-    assert counts["given"] == 1200
-    assert counts["projectable"] == 1150
-    assert counts["confident"] == np.count_nonzero(behind.of_camera("left").confidence[50:] >= 0.5)
-    assert counts["best_in_cell"] < counts["confident"]
-    assert counts["capped"] == 300
-    per_frame = np.bincount(kept.table.of_camera("left").frame)
-    assert per_frame.tolist() == [100, 100, 100]
-    # The cap keeps the most confident.
+    kept = preprocess.preprocess(pair, given, config)
+    assert kept.counts["left"]["capped"] == 300
+    assert np.bincount(kept.table.of_camera("left").frame).tolist() == [100, 100, 100]
     assert kept.table.confidence.min() > config.confidence_min + 0.1
+
+
+def test_weights_are_the_papers() -> None:
+    given = small_table(confidence=[0.05, 0.25, 1.0, 0.7])
+    assert sqrt_information(given, Config()) is None
+    roots = sqrt_information(given, Config(confidence_weights=True))
+    expected = np.sqrt([0.1, 0.25, 1.0, 0.7])
+    np.testing.assert_allclose(roots[:, 0], expected, rtol=1e-6)
+    np.testing.assert_allclose(roots[:, 2], expected, rtol=1e-6)
+    assert not roots[:, 1].any()
+
+
+def test_whitening_is_a_root_of_the_information() -> None:
+    information = np.array([[4.0, 1.0, 2.0], [1, 1, 1], [0, 0, 9], [9, 0, 0]])
+    roots = sqrt_information(small_table(information_px=information), Config())
+    for (uu, uv, vv), (a, b, c) in zip(information, roots, strict=True):
+        S = np.array([[a, b], [0, c]])
+        np.testing.assert_allclose(S.T @ S, [[uu, uv], [uv, vv]], atol=1e-12)
+
+
+def test_the_error_of_an_edge_is_the_distance_from_it() -> None:
+    residuals = np.array([[3.0, 4.0], [3.0, 4.0], [3.0, 4.0]])
+    information = np.array([[1.0, 0, 1], [7.0, 0, 0], [0.5, 0.5, 0.5]])
+    expected = [5.0, 3.0, 7 / np.sqrt(2)]
+    np.testing.assert_allclose(constrained_error_px(residuals, information), expected)
+    np.testing.assert_allclose(constrained_error_px(residuals, None), 5.0)
+
+
+def test_the_spread_of_a_core_is_found_under_a_broad_background() -> None:
+    rng = np.random.default_rng(0)
+    for inliers in (1.0, 0.6, 0.3):
+        core = np.hypot(*rng.standard_normal((2, 4000))) / 1.17741
+        values = np.concatenate([core, rng.uniform(0, 300, round(4000 * (1 / inliers - 1)))])
+        assert robust_spread(values) == pytest.approx(1.0, rel=0.05)
+    # Values without a core have the spread of all of them.
+    assert robust_spread(rng.uniform(0, 300, 4000)) == pytest.approx(150, rel=0.05)
+    assert robust_spread(np.zeros(10)) == 0.0
+
+
+def sorted_spread(values: np.ndarray) -> float:
+    """By its definition, on sorted values."""
+    ordered = np.sort(values)
+
+    def quantile_below(limit: float, share: float) -> float:
+        below = ordered[ordered <= limit]
+        return float(np.quantile(below, share)) if len(below) else np.nan
+
+    return iterate_spread(quantile_below)
+
+
+@pytest.mark.parametrize("count", [1, 2, 30, 700, 3000, 20_000])
+def test_the_spread_is_that_of_sorted_values(count: int) -> None:
+    """Whatever their size, with equal ones among them, and far outliers."""
+    rng = np.random.default_rng(count)
+    for unit in (1e-7, 1e-2, 1.0, 1e6):
+        values = unit * np.abs(rng.standard_normal(count))
+        values[: count // 3] = values[-1]
+        values[count // 2 :: 7] *= 1e4
+        # Interpolation between two values is rounded in another order.
+        assert robust_spread(values) == pytest.approx(sorted_spread(values), rel=1e-12)
+
+
+def test_runs_have_the_spread_of_their_finite_values() -> None:
+    values = np.abs(np.random.default_rng(1).standard_normal(1000))
+    values[100:110] = np.inf
+    runs = np.array([[0, 400], [400, 1000], [100, 110]])
+    found = robust_spreads(values, runs)
+    finite = values[:400][np.isfinite(values[:400])]
+    assert found.tolist() == [robust_spread(finite), robust_spread(values[400:]), np.inf]
+
+
+@pytest.mark.parametrize("count", [1, 2, 30, 3000, 20_000])
+def test_quantiles_are_those_of_numpy(count: int) -> None:
+    values = np.random.default_rng(count).exponential(5.0, count)
+    for share in (0.0, 0.02, 0.5, 0.98, 1.0):
+        # Interpolation between two values is rounded in another order.
+        assert quantile(values, share) == pytest.approx(np.quantile(values, share), rel=1e-14)
+    runs = np.array([[0, count], [count // 2, count]])
+    expected = [np.median(values[slice(*run)]) for run in runs]
+    np.testing.assert_allclose(quantiles(values, runs, 0.5), expected, rtol=1e-14)

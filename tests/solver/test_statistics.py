@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import gtsam
@@ -10,11 +11,15 @@ import pytest
 from scipy.stats import chi2
 
 import calibgraph
-from calibgraph import Config, MatcherErrors, Rig, simulate_correspondences
+from calibgraph import Config, Correspondences, MatcherErrors, Rig, simulate_correspondences
+from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import relative_covariance
-from calibgraph.model.rig import IntrinsicsSigma
+from calibgraph.model.lens_knowledge import LensSigmas
 from calibgraph.solver.joint import solve_joint
+from tests.draws.lenses import put_lens_error, with_known_lenses
 from tests.draws.places import draw_places
+from tests.solver.test_clock import STRAIGHT, late, with_times
+from tests.solver.test_lens import simulated, squared_errors
 
 pytestmark = pytest.mark.statistics
 
@@ -40,7 +45,6 @@ def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> Non
         solved = solve_joint(pair, table)  # without the checks, which take most of a solve's time
         found, true = solved.T_camera_lidar, pair.T_camera_lidar
         joint = solved.marginals.scatter
-        assert joint is not None
         T_right_left = found["right"] @ np.linalg.inv(found["left"])
         xi_pair = error(T_right_left, true["right"] @ np.linalg.inv(true["left"]))
         for name, xi, covariance in (
@@ -60,16 +64,6 @@ def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> Non
         else:
             assert 0.5 < np.mean(values) / 6 < 1.4, name
             assert inside >= 0.9, name
-
-
-def with_known_lenses(rig: Rig) -> Rig:
-    """No lens is wrong in the draws; the error bar of a mount has the usual errors of lenses."""
-    exact = {
-        "intrinsics_sigma_px": IntrinsicsSigma(focal=1e-4, centre=1e-4),
-        "distortion_sigma": 1e-7,
-    }
-    cameras = {name: camera.model_copy(update=exact) for name, camera in rig.cameras.items()}
-    return rig.model_copy(update={"cameras": cameras})
 
 
 @pytest.mark.parametrize("places", [1, 5])
@@ -92,9 +86,78 @@ def test_the_reported_covariance_covers_draws_of_data(
         truth = drawn.aligned if of == "alignment" else drawn.rig.T_camera_lidar
         for name, T in truth.items():
             covariance = result.covariance[name]
-            assert covariance is not None
             xi = error(result.T_camera_lidar[name], T)
             found.setdefault(name, []).append(float(xi @ np.linalg.solve(covariance, xi)))
     for name, values in found.items():
         assert 0.5 < np.mean(values) / 6 < 1.0, name
         assert np.mean(np.array(values) < chi2.ppf(0.95, 6)) >= 0.93, name
+
+
+Drawn = tuple[Rig, Correspondences, Rig, Config]
+"""The rig that is given, its table, the true rig, and the settings."""
+
+
+def of_lens(part: str, error: float) -> Callable[[int], Drawn]:
+    """A lens that is wrong in one part, which is estimated."""
+
+    def draw(seed: int) -> Drawn:
+        truth, table = simulated(seed, frames=30, matches=100)
+        return put_lens_error(truth, part, error), table, truth, Config(estimate=part)
+
+    return draw
+
+
+def of_clock(offset_s: float, readout_s: float) -> Callable[[int], Drawn]:
+    """A clock that is estimated."""
+
+    def draw(seed: int) -> Drawn:
+        truth, table = late(offset_s, readout_s, seed)
+        return truth, table, truth, Config(estimate="clock")
+
+    return draw
+
+
+def of_stated_clock(seed: int) -> Drawn:
+    """An alignment with an offset of the clock of which the rig states the sigma."""
+    sigma_s = 0.01
+    offset_s = sigma_s * np.random.default_rng([seed, 1]).standard_normal()
+    truth, table = late(offset_s, 0.0, seed, np.tile(STRAIGHT, (30, 1)))
+    return with_times(truth, time_offset_sigma_s=sigma_s), table, truth, Config()
+
+
+def of_mount(seed: int) -> Drawn:
+    """A mount, with the lenses of good calibrations."""
+    truth, table = simulated(seed, frames=30, matches=100)
+    rng, cameras = np.random.default_rng([seed, 1]), {}
+    for name, camera in truth.cameras.items():
+        sigmas = LensSigmas.calibrated(camera)
+        lens = LensVariable.of(camera, ("focal", "centre", "distortion"), sigmas)
+        cameras[name] = lens.put_into(camera, rng.standard_normal(len(lens.free)))
+    return truth.model_copy(update={"cameras": cameras}), table, truth, Config(of="mount")
+
+
+@pytest.mark.parametrize(
+    ("draw", "draws", "independent"),
+    [
+        *(
+            (of_lens(part, error), 40, 40)  # as if both cameras erred alike
+            for part, error in (
+                ("focal", 0.003), ("focal", 0.05), ("centre", 10.0), ("distortion", 0.1),
+                ("lens", 0.0),
+            )
+        ),
+        *((of_clock(*times_s), 40, 40) for times_s in ((0.005, 0.0), (0.1, 0.03))),
+        (of_stated_clock, 40, 40),
+        (of_mount, 60, 120),
+    ],
+)  # fmt: skip
+def test_errors_are_as_large_as_the_error_bar_says(
+    draw: Callable[[int], Drawn], draws: int, independent: int
+) -> None:
+    """Mean NEES over 6: 0.8 to 1.25, give or take three standard deviations of its draws."""
+    squared = list[float]()
+    for seed in range(draws):
+        rig, table, truth, config = draw(seed)
+        squared += squared_errors(solve_joint(rig, table, config), truth)
+    scatter = 3 * np.sqrt(2 / 6 / independent)
+    assert 0.8 - scatter < np.mean(squared) / 6 < 1.25 + scatter

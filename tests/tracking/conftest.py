@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import sys
-import tempfile
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -49,7 +47,7 @@ def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def piped(monkeypatch: pytest.MonkeyPatch, call: Call) -> Callable[..., tuple[int, str, str]]:
+def piped(monkeypatch: pytest.MonkeyPatch, call: Call) -> Call:
     """Run ``track RIG -`` with bytes, or a file, on standard input."""
 
     def run(rig: Path, given: Any, *options: object) -> tuple[int, str, str]:
@@ -58,11 +56,3 @@ def piped(monkeypatch: pytest.MonkeyPatch, call: Call) -> Callable[..., tuple[in
         return call("track", rig, "-", *options)
 
     return run
-
-
-@pytest.fixture
-def memory() -> Iterator[Path]:
-    """A folder in memory, where thousands of databases are opened: syncing costs nothing there."""
-    place = "/dev/shm" if Path("/dev/shm").is_dir() else None
-    with tempfile.TemporaryDirectory(dir=place) as folder:
-        yield Path(folder)

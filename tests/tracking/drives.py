@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 
 from calibgraph import (
@@ -55,6 +56,20 @@ def drive(
 ) -> list[Correspondences]:
     rig_at = moved_later(rig, frames if moves_at is None else moves_at)
     settings: dict[str, Any] = {"matches": 60, "errors": ERRORS, "seed": 1, **options}
+    return list(simulate_drive(rig_at, frames=frames, **settings))
+
+
+def moved(rig: Rig, name: str, step: np.ndarray) -> Rig:
+    T = gtsam.Pose3.Expmap(step).matrix()
+    return rig.moved_to({name: T @ rig.T_camera_lidar[name]})
+
+
+def step_of(deg: float, cm: float) -> np.ndarray:
+    return np.array([0, np.radians(deg), 0, cm / 100, 0, 0])
+
+
+def drive_at(rig_at: Callable[[int], Rig], frames: int, **options: Any) -> list[Correspondences]:
+    settings = {"matches": 100, "errors": ERRORS, "seed": 1, **options}
     return list(simulate_drive(rig_at, frames=frames, **settings))
 
 

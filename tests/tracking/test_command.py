@@ -1,42 +1,35 @@
-"""The command `track`: its output, its sources, its standard streams."""
+"""The command track: its output, its sources, signals, and folders that grow."""
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from pyarrow import parquet
 
-from calibgraph import (
-    Correspondences,
-    Rig,
-    concatenate,
-    perturb,
-)
-from calibgraph.io.rigs import load_rig
-from tests.conftest import Call, make_camera, stereo_relative_pose
+from calibgraph import Config, Correspondences, concatenate
+from calibgraph.tracking import command
+from calibgraph.tracking.command import Tracking, track
+from tests.conftest import Call
 from tests.tracking.drives import (
     FRAMES,
     World,
     as_lines,
     content_of,
-    drive,
     file_lines,
     frames_in,
-    pair_of,
 )
 
 to_arrow = Correspondences.to_arrow
 pytestmark = pytest.mark.usefixtures("no_picture")
-
-
-# What it gives
 
 
 def test_every_update_is_a_line_of_json(world: World, call: Call, tmp_path: Path) -> None:
@@ -53,7 +46,7 @@ def test_every_update_is_a_line_of_json(world: World, call: Call, tmp_path: Path
 
 @pytest.mark.parametrize("kind", ["lines", "by camera", "csv", "folder"])
 def test_every_source_gives_the_same_lines(
-    kind: str, world: World, call: Call, piped: Callable[..., Any], tmp_path: Path
+    kind: str, world: World, call: Call, piped: Call, tmp_path: Path
 ) -> None:
     out = ("--out", tmp_path / "out")
     whole = concatenate(world.tables)
@@ -84,7 +77,7 @@ def test_every_nth_frame_is_taken_also_after_a_restart(
 ) -> None:
     half = tmp_path / "half.parquet"
     concatenate(world.tables[:8]).save(half)
-    every = ("--every", 3, "--out", tmp_path / "out")
+    every = ("--step", 3, "--out", tmp_path / "out")
     _, first, _ = call("track", world.rig, half, *every)
     _, second, err = call("track", world.rig, world.source, *every)
     assert frames_in(first) == [0, 3, 6] and frames_in(second) == [9, 12]
@@ -96,7 +89,7 @@ def test_every_nth_frame_is_taken_also_after_a_restart(
 
 @pytest.mark.parametrize("numbers", [(10**18, 10**8), (-(2**63), 1), (-5, 1), (2**63 - 15, 1)])
 def test_frame_numbers_may_be_any_of_64_bits(
-    numbers: tuple[int, int], world: World, piped: Callable[..., Any], tmp_path: Path
+    numbers: tuple[int, int], world: World, piped: Call, tmp_path: Path
 ) -> None:
     first, step = numbers
     contents = [content_of(table) for table in world.tables]
@@ -113,27 +106,18 @@ def test_frame_numbers_may_be_any_of_64_bits(
     assert json.loads(out.splitlines()[-1])["stamp_ns"] == 10**18 + FRAMES - 1
 
 
-@pytest.mark.parametrize("key", ["frame", "stamp_ns"])
-def test_a_number_that_nothing_can_follow_is_left_out(
-    key: str, world: World, piped: Callable[..., Any], tmp_path: Path
-) -> None:
-    contents = [content_of(table) for table in world.tables]
-    for place, content in enumerate(contents):
-        content["stamp_ns"] = 10**18 + place
-    wrong = {**contents[6], key: 2**63 - 1}
-    given = [json.dumps(c).encode() + b"\n" for c in (*contents[:6], wrong, *contents[6:])]
-    code, out, err = piped(world.rig, b"".join(given), "--out", tmp_path / "out")
-    assert code == 0
-    assert frames_in(out) == [content["frame"] for content in contents]
-    assert f"its {'number' if key == 'frame' else key} {2**63 - 1} is the largest" in err
-
-
 @pytest.mark.parametrize(
-    ("key", "number"),
-    [("frame", 2**63 - 2), ("frame", 2**53), ("frame", 10**13), ("stamp_ns", 2**63 - 2)],
+    ("key", "number", "reason"),
+    [
+        ("frame", 2**63 - 1, f"its number {2**63 - 1} is the largest"),
+        ("stamp_ns", 2**63 - 1, f"its stamp_ns {2**63 - 1} is the largest"),
+        ("frame", 2**63 - 2, f"{2**63 - 2} is far beyond"),
+        ("frame", 10**13, f"{10**13} is far beyond"),
+        ("stamp_ns", 2**63 - 2, f"{2**63 - 2} is far beyond"),
+    ],
 )
 def test_a_number_far_beyond_the_last_one_does_not_make_all_others_late(
-    key: str, number: int, world: World, piped: Callable[..., Any], tmp_path: Path
+    key: str, number: int, reason: str, world: World, piped: Call, tmp_path: Path
 ) -> None:
     contents = [content_of(table) for table in world.tables]
     for place, content in enumerate(contents):
@@ -143,33 +127,7 @@ def test_a_number_far_beyond_the_last_one_does_not_make_all_others_late(
     code, out, err = piped(world.rig, b"".join(given), "--out", tmp_path / "out")
     assert code == 0
     assert frames_in(out) == [content["frame"] for content in contents]
-    assert f"{number} is far beyond" in err
-
-
-@pytest.mark.parametrize("kind", ["one", "mixed", "tied"])
-def test_any_rig_continues_with_the_same_lines(
-    kind: str, mixed_rig: Rig, call: Call, tmp_path: Path
-) -> None:
-    tied = pair_of()
-    truth = {
-        "one": Rig(cameras={"only": make_camera()}),
-        "mixed": mixed_rig,
-        "tied": tied.model_copy(update={"relative_poses": (stereo_relative_pose(tied),)}),
-    }[kind]
-    guess = perturb(truth, rotation_deg=1, translation_m=0.1, seed=2)
-    guess.save(tmp_path / "rig.yaml")
-    guess = load_rig(tmp_path / "rig.yaml")
-    tables = drive(truth)
-    concatenate(tables[:9]).save(tmp_path / "begin.parquet")
-    concatenate(tables).save(tmp_path / "whole.parquet")
-    arguments = ("--out", tmp_path / "out")
-    _, first, _ = call("track", tmp_path / "rig.yaml", tmp_path / "begin.parquet", *arguments)
-    code, second, _ = call("track", tmp_path / "rig.yaml", tmp_path / "whole.parquet", *arguments)
-    assert code == 0
-    assert (first + second).splitlines() == file_lines(guess, tables[:9], tables[9:])
-
-
-# Sources that hold nothing, and standard streams that are closed
+    assert reason in err
 
 
 def test_a_reader_that_goes_away_ends_it_with_all_saved(
@@ -185,3 +143,86 @@ def test_a_reader_that_goes_away_ends_it_with_all_saved(
     assert "the reader of standard output is gone" in err and "Traceback" not in err
     code, out, _ = call(*arguments)
     assert code == 0 and out.splitlines() == world.file_lines[1:]
+
+
+class Feed:
+    """Lines, one a read; before the one of a given number something is done."""
+
+    def __init__(self, lines: Sequence[bytes], number: int, act: Callable[[], None]) -> None:
+        self._lines = iter(lines)
+        self._left = number
+        self._act = act
+
+    def read1(self, _: int) -> bytes:
+        if self._left == 0:
+            self._act()
+        self._left -= 1
+        return next(self._lines, b"")
+
+    read = read1
+
+    def fileno(self) -> int:
+        raise OSError("not a file")
+
+
+@pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(("at", "expected"), [(10, 0), (3, 1)])
+def test_a_signal_ends_it_with_the_code_of_the_verdict(
+    kind: int, at: int, expected: int, world: World, piped: Call, tmp_path: Path
+) -> None:
+    lines = as_lines(world.tables).splitlines(keepends=True)
+    before = signal.getsignal(kind)
+    feed = Feed(lines, at, lambda: signal.raise_signal(kind))
+    code, first, err = piped(world.rig, feed, "--out", tmp_path / "out")
+    assert code == expected
+    assert "Traceback" not in err and (tmp_path / "out" / "calibration.yaml").is_file()
+    assert signal.getsignal(kind) is before
+    assert len(first.splitlines()) in (at, at + 1)
+    _, second, _ = piped(world.rig, as_lines(world.tables), "--out", tmp_path / "out")
+    assert (first + second).splitlines() == world.lines
+
+
+def test_a_second_signal_ends_it_at_once_and_loses_nothing(
+    world: World, monkeypatch: pytest.MonkeyPatch, piped: Call, tmp_path: Path
+) -> None:
+    given: list[str] = []
+
+    def write(line: str) -> None:
+        given.append(line)
+        if len(given) == 4:  # as if this line were never taken
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+
+    lines = io.BytesIO(as_lines(world.tables))
+    wanted = Tracking(rig=world.guess, config=Config(), out=tmp_path)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may ignore it
+    try:
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(command, "print_line", write)
+            patch.setattr(sys, "stdin", SimpleNamespace(buffer=lines))
+            track(wanted, [Path("-")], notify=print)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    _, out, _ = piped(world.rig, as_lines(world.tables), "--out", tmp_path)
+    assert given[:3] + out.splitlines() == world.lines
+
+
+def test_a_growing_folder_is_followed_until_a_signal(
+    world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    given: list[str] = []
+
+    def write(line: str) -> None:
+        """After each file is done, the next one comes."""
+        given.append(line)
+        if len(given) == FRAMES:
+            signal.raise_signal(signal.SIGTERM)
+        elif len(given) % 7 == 0:
+            concatenate(world.tables[7:]).save(folder / "2.parquet")
+
+    monkeypatch.setattr(command, "print_line", write)
+    concatenate(world.tables[:7]).save(folder / "1.parquet")
+    code, _, _ = call("track", world.rig, folder, "--follow", "--out", tmp_path / "out")
+    assert code == 0 and given == world.lines

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -25,7 +24,6 @@ from calibgraph import (
 from calibgraph.cli import app
 from calibgraph.tracking import durable
 from calibgraph.tracking.history import History
-from tests.conftest import SAMPLE
 from tests.tracking.drives import (
     FRAMES,
     World,
@@ -38,9 +36,6 @@ from tests.tracking.drives import (
 MOST_TOGETHER = 10  # frames of one write, up to the end of an epoch: all its lines come again
 
 pytestmark = pytest.mark.usefixtures("no_picture")
-
-
-# Kills
 
 
 def _command(arguments: list[str], lines: Path, snapshot_every: int) -> None:
@@ -69,7 +64,7 @@ class Killed:
         before = self.lines
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(
-            ["tests.tracking.test_command_kills", "pyarrow.parquet", "calibgraph.cli.tables"]
+            ["tests.tracking.test_command_kills", "pyarrow.parquet", "calibgraph.report.tables"]
         )
         process = context.Process(
             target=_command, args=(self.arguments, self.path, self.snapshot_every)
@@ -147,24 +142,8 @@ def kill_often(folder: Path, kills: int, longest_s: float, seed: int) -> int:
 @pytest.mark.ci
 @pytest.mark.slow
 def test_random_kills_lose_nothing_and_change_nothing(tmp_path: Path) -> None:
-    assert kill_often(tmp_path, kills=5, longest_s=0.6, seed=int.from_bytes(os.urandom(4))) >= 1
-
-
-@pytest.mark.statistics
-def test_forty_random_kills_under_load_lose_nothing_and_change_nothing(
-    tmp_path: Path,
-) -> None:
-    spin = "while True: pass"
-    load = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(os.cpu_count() or 1)]
-    try:
-        kill_often(tmp_path, kills=40, longest_s=1.0, seed=int.from_bytes(os.urandom(4)))
-    finally:
-        for process in load:
-            process.kill()
-            process.wait()
-
-
-# Back-pressure
+    kills = int(os.environ.get("CALIBGRAPH_TEST_KILLS", "5"))
+    assert kill_often(tmp_path, kills, longest_s=0.6, seed=int.from_bytes(os.urandom(4))) >= 1
 
 
 @pytest.fixture
@@ -228,31 +207,3 @@ def test_a_slow_reader_slows_an_endless_writer_down_in_constant_memory(
     assert running.wait() in (0, 1)
     assert all(json.loads(line) for line in rest.splitlines())
     writer.join()
-
-
-@pytest.mark.statistics
-def test_the_structure_matcher_continues_after_kills_and_around_corrupt_files(
-    tmp_path: Path,
-) -> None:
-    """The sample and three frames more: an image cut short, an empty image, a cloud cut short."""
-    data = tmp_path / "data"
-    shutil.copytree(SAMPLE, data)
-    places = [*(data / "cameras").iterdir(), data / "lidar"]
-    for place in places:
-        for path in sorted(place.iterdir())[:4]:
-            shutil.copy(path, path.with_stem(f"{int(path.stem) + 6:06d}"))
-    for path, size in (
-        (data / "cameras" / "left" / "000006.jpg", 500),
-        (data / "cameras" / "left" / "000007.jpg", 0),
-        (data / "lidar" / "000008.npy", 60),
-    ):
-        path.write_bytes(path.read_bytes()[:size])
-    arguments = [str(data), str(data), "--matcher", "structure", "--out"]
-    whole = Killed(arguments + [str(tmp_path / "whole")], tmp_path / "whole.jsonl")
-    assert whole.run(None)
-    assert [json.loads(line)["frame"] for line in whole.lines] == [0, 1, 2, 3, 4, 5, 9]
-    killed = Killed(arguments + [str(tmp_path / "killed")], tmp_path / "killed.jsonl")
-    for count in (1, 3, 5, 6):
-        killed.run(lambda done=count: len(set(killed.lines)) >= done)
-    assert killed.run(None)
-    assert killed.acknowledged() == whole.lines

@@ -1,4 +1,4 @@
-"""A tracker on disk: crashes, damage, other rigs, a full disk."""
+"""A tracker on disk: crashes, damage, other rigs, a full disk, and bytes that are no state."""
 
 from __future__ import annotations
 
@@ -6,29 +6,35 @@ import shutil
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
+import msgpack
 import numpy as np
 import pytest
 
 from calibgraph import (
     CorrespondenceError,
     DurableCalibrator,
+    FileError,
     IncrementalCalibrator,
+    Rig,
     concatenate,
     perturb,
 )
-from calibgraph.tracking import command, durable, tracker
-from calibgraph.tracking.state_database import DATABASE
+from calibgraph.tracking import durable, tracker
+from calibgraph.tracking.state_bytes import Kind, encode
+from calibgraph.tracking.state_database import DATABASE, StateDatabase
 from calibgraph.tracking.update import json_line
 from tests.conftest import KANNALA, Call
 from tests.tracking.drives import (
-    FRAMES,
-    Crashed,
     World,
+    drive_at,
     file_lines,
     files_in,
+    moved,
     pair_of,
+    step_of,
 )
 
 pytestmark = pytest.mark.usefixtures("no_picture")
@@ -40,23 +46,23 @@ def test_a_refused_update_changes_neither_the_tracker_nor_the_disk(
     good = world.tables[7]
     stamps = np.full(len(good), 5, np.int64)
     wrong = (
-        world.tables[3],
-        world.tables[6],
-        replace(good, cameras=("left", "stranger")),
-        concatenate([good, world.tables[8]]),
-        good.select(slice(0, 0)),
-        replace(good, stamp_ns=stamps),
-        replace(good, metadata={"place": 1.5}),
-        replace(good, metadata={"place": "\ud800"}),
-        replace(good, cameras=("left", "right", "\ud800")),
+        (world.tables[3], "comes after frame 6"),
+        (world.tables[6], "comes again"),
+        (replace(good, cameras=("left", "stranger")), "'stranger'"),
+        (concatenate([good, world.tables[8]]), "one"),
+        (good.select(slice(0, 0)), "which frame"),
+        (replace(good, stamp_ns=stamps), "stamp_ns 5 is not after 5"),
+        (replace(good, metadata={"place": 1.5}), "place"),
+        (replace(good, metadata={"place": "\ud800"}), "place"),
+        (replace(good, cameras=("left", "right", "\ud800")), "camera"),
     )
     with DurableCalibrator(tmp_path, world.guess) as calibrator:
         for table in world.tables[:6]:
             calibrator.update(table)
         calibrator.update(replace(world.tables[6], stamp_ns=stamps[: len(world.tables[6])]))
         before = calibrator.tracker.to_bytes(), files_in(tmp_path)
-        for table in wrong:
-            with pytest.raises(CorrespondenceError):
+        for table, reason in wrong:
+            with pytest.raises(CorrespondenceError, match=reason):
                 calibrator.update(table)
             assert (calibrator.tracker.to_bytes(), files_in(tmp_path)) == before
         with pytest.raises(CorrespondenceError, match="is of frame 7, not 9"):
@@ -69,9 +75,6 @@ def test_a_refused_update_changes_neither_the_tracker_nor_the_disk(
                 calibrator.update(good, place=place)
         assert (calibrator.tracker.to_bytes(), files_in(tmp_path)) == before
         assert calibrator.update(good, frame=np.int64(7)).frame == 7
-
-
-# State
 
 
 def test_a_state_of_another_rig_or_config_is_refused_in_one_line(
@@ -118,17 +121,6 @@ def test_a_damaged_snapshot_is_named_and_costs_nothing(
     assert [line for line in err.splitlines() if line.startswith("warning: ")] == [
         f"warning: {path}: the snapshot after input 6 is damaged: not used"
     ]
-
-
-def test_a_state_of_another_version_is_refused_in_one_line(
-    world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(IncrementalCalibrator, "to_bytes", lambda self: b"other")
-        call("track", world.rig, world.source, "--out", tmp_path)
-    code, _, err = call("track", world.rig, world.source, "--out", tmp_path)
-    assert code == 2
-    assert "holds a state of another version" in err and err.count("\n") == 1
 
 
 def test_a_tracker_that_throws_leaves_the_state_as_it_was(
@@ -190,32 +182,98 @@ def test_of_updates_in_one_write_a_kill_leaves_all_or_none(
         )
 
 
-@pytest.mark.parametrize(
-    ("at", "begin", "end"), [(0, 0, 1), (4, 4, 5), (9, 5, 14), (10, 5, 14), (13, 5, 14)]
-)
-def test_after_a_crash_the_lines_of_the_last_write_come_again(  # noqa: PLR0913
-    at: int,
-    begin: int,
-    end: int,
-    world: World,
-    call: Call,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
+def test_a_saved_tracker_continues_with_the_same_numbers(pair: Rig, tmp_path: Path) -> None:
+    """Saved while starting, between epochs, within one, with outlier frames, after a step.
+
+    An epoch has 10 frames: each goes on to the end of the one after it.
+    """
+    after = moved(pair, "left", step_of(0.5, 3))
+    tables = drive_at(lambda frame: after if frame >= 42 else pair, 56, failed_share=0.1)
+    tracker, whole = IncrementalCalibrator(pair), []
+    for frame, table in enumerate(tables):
+        if frame in (3, 5, 29, 43, 50):
+            tracker.save(tmp_path / str(frame))
+        whole.append(tracker.update(table))
+    for saved in tmp_path.iterdir():
+        resumed, cut = IncrementalCalibrator.load(saved), int(saved.name)
+        for table, expected in zip(tables[cut : cut + 12], whole[cut : cut + 12], strict=True):
+            found = resumed.update(table)
+            assert found.events == expected.events and found.verdicts == expected.verdicts
+            for name, T in expected.T_camera_lidar.items():
+                np.testing.assert_array_equal(found.T_camera_lidar[name], T)
+                np.testing.assert_array_equal(found.covariance[name], expected.covariance[name])
+
+
+def sealed(body: bytes, kind: Kind = "state") -> bytes:
+    """With the mark and the checksum of a whole file of this version."""
+    mark = encode({}, "history").partition(b"\n")[0].replace(b"history", kind.encode())
+    return mark + b"\n" + sha256(body).digest() + body
+
+
+def array(dtype: str, shape: list[int], data: bytes) -> msgpack.ExtType:
+    return msgpack.ExtType(0, msgpack.packb([dtype, shape, data]))
+
+
+WRONG = [
+    None, True, 5, -1, 2**64 - 1, 1.5, "text", b"bytes", [], {}, {"a": 1}, {5: None}, [1, []],
+    [None, None], [[], []], [5, None], ["5", []], [{}, {}], [1, 2, 3], msgpack.Timestamp(5),
+    [None, msgpack.Timestamp(5)], {"_frames": []}, {"most": "5"},
+    array("<f8", [2**62, 4], b""), array("<f8", [2**40, 2**40], b""), array("<f8", [], bytes(8)),
+    array("<f8", [-4, 1], bytes(8)), [array("<f8", [1], bytes(8)), []],
+    msgpack.ExtType(1, b""), msgpack.ExtType(1, msgpack.packb("no pose")),
+    msgpack.ExtType(2, msgpack.packb({})), msgpack.ExtType(4, msgpack.packb([])),
+    msgpack.ExtType(20, msgpack.packb({"cameras": 5})),
+]  # fmt: skip
+
+
+BODIES = [
+    *map(msgpack.packb, WRONG),
+    b"",
+    b"\xc1",
+    msgpack.packb([1, 2])[:-1],
+    msgpack.packb(msgpack.ExtType(99, b"")),
+    msgpack.packb(msgpack.ExtType(0, msgpack.packb(["|O8", [1], bytes(8)]))),
+    msgpack.packb(msgpack.ExtType(0, msgpack.packb(["<f8", [2], bytes(8)]))),
+    msgpack.packb(msgpack.ExtType(4, msgpack.packb({"unknown": 1}))),
+    b"\x91" * 100_000,
+]
+
+
+@pytest.mark.parametrize("body", BODIES, ids=range(len(BODIES)))
+def test_content_of_a_wrong_kind_is_refused_though_its_checksum_is_right(
+    pair: Rig, tmp_path: Path, body: bytes
 ) -> None:
-    """Between the disk and the line: the line was not printed. The snapshots are every 5 frames."""
-    monkeypatch.setattr(durable, "_SNAPSHOT_EVERY", 5)
-    given: list[str] = []
+    path = tmp_path / "saved"
+    path.write_bytes(sealed(body))
+    with pytest.raises(FileError, match="is no tracker's state") as error:
+        IncrementalCalibrator.load(path)
+    assert "\n" not in str(error.value)
+    DurableCalibrator(tmp_path / "state", pair).close()
+    with closing(StateDatabase(tmp_path / "state")) as database:
+        database.append(sealed(body, "input"))
+    with pytest.raises(FileError, match=r"of another version.*is no tracker's input") as error:
+        DurableCalibrator(tmp_path / "state", pair)
+    assert "\n" not in str(error.value)
 
-    def write(line: str) -> None:
-        if len(given) == at:
-            raise Crashed
-        given.append(line)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(command, "print_line", write)
-        with pytest.raises(Crashed):
-            call("track", world.rig, world.source, "--out", tmp_path)
-    code, out, err = call("track", world.rig, world.source, "--out", tmp_path)
-    assert code == 0
-    assert given == world.file_lines[:at] and out.splitlines() == world.file_lines[begin:]
-    assert f"{FRAMES - end} updates" in err
+def test_spoilt_bytes_are_refused_or_taken_though_their_checksum_is_right(
+    pair: Rig, tmp_path: Path
+) -> None:
+    """Cut short, and with other bytes, as no disk makes them: what reads them has to notice."""
+    tracker = IncrementalCalibrator(pair)
+    for table in drive_at(lambda _: pair, 6):
+        tracker.update(table)
+    body = tracker.to_bytes().partition(b"\n")[2][32:]
+    rng, refused = np.random.default_rng(0), 0
+    for _ in range(100):
+        spoilt = bytearray(body)
+        for place in rng.integers(0, len(body), rng.choice([1, 3, 30])):
+            spoilt[place] = rng.integers(256)
+        path = tmp_path / "saved"
+        path.write_bytes(sealed(bytes(spoilt[: rng.choice([len(body), place])])))
+        try:
+            IncrementalCalibrator.load(path)
+        except FileError as error:
+            assert "\n" not in str(error)
+            refused += 1
+    assert refused > 30

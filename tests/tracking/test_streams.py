@@ -1,30 +1,265 @@
-"""Sources of frames: folders, pipes, what is refused at once."""
+"""Sources of frames: tables, JSON lines, folders, pipes; what is refused."""
 
 from __future__ import annotations
 
+import io
+import json
 import os
-import signal
-import subprocess
-import sys
-import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
+import numpy as np
+import pyarrow as pa
 import pytest
+from pyarrow import parquet
 
-from calibgraph import FileError
-from calibgraph.tracking import streams
-from calibgraph.tracking.streams import frames_of
-from tests.tracking.stream_data import (
-    line,
-    outcomes,
-    table,
+from calibgraph import Correspondences, FileError
+from calibgraph.tracking import stream_lines, streams
+from calibgraph.tracking.streams import Refused, StreamFrame, frames_of
+
+to_arrow = Correspondences.to_arrow
+
+COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
+
+
+def table(frames: list[int], *, camera: str = "left", **changes: Any) -> Correspondences:
+    """One row per given frame number; its pixel's column is the number of its row."""
+    n = len(frames)
+    columns: dict[str, Any] = {
+        "camera": camera,
+        "frame": np.array(frames, np.int64),
+        "pixels_px": np.column_stack([np.arange(n), np.zeros(n)]),
+        "points_lidar_m": np.tile([10.0, 0.0, 0.0], (n, 1)),
+    }
+    return Correspondences.from_arrays(**(columns | changes))
+
+
+def spoilt(given: pa.Table, column: str, row: int, value: object) -> pa.Table:
+    """An Arrow table with one value replaced."""
+    index = given.column_names.index(column)
+    values = given[column].to_pylist()
+    values[row] = value
+    return given.set_column(index, column, pa.array(values))
+
+
+def camera(n: int = 1, **changes: Any) -> dict[str, Any]:
+    return {key: [1.5] * n for key in COORDINATES} | changes
+
+
+def line(frame: Any = 7, **changes: Any) -> bytes:
+    """A line of JSON with one camera, or with other keys."""
+    return json.dumps({"frame": frame, "cameras": {"left": camera()}} | changes).encode() + b"\n"
+
+
+def of_bytes(data: bytes) -> list[StreamFrame | Refused]:
+    return list(frames_of("-", stdin=io.BytesIO(data)))
+
+
+def outcomes(items: Any) -> list[int | str]:
+    """Frame numbers, and the messages in between."""
+    return [item.frame if isinstance(item, StreamFrame) else item.message for item in items]
+
+
+def refusal(data: bytes) -> str:
+    """The message of the first of two lines; the second, good one must come through."""
+    message, frame = outcomes(of_bytes(data.rstrip(b"\n") + b"\n" + line(8)))
+    assert frame == 8
+    assert isinstance(message, str)
+    assert message.startswith("standard input, line 1: ")
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv"])
+def test_a_table_gives_its_frames_in_ascending_order(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"table{suffix}"
+    stamps = {"stamp_ns": [30, 10, 20, 31]}
+    table([3, 1, 2, 3], camera="left", metadata={"matcher": "m"}, **stamps).save(path)
+    frames = list(frames_of(path))
+    assert outcomes(frames) == [1, 2, 3]
+    last = frames[-1]
+    assert isinstance(last, StreamFrame)
+    assert last.table.pixels_px[:, 0].tolist() == [0, 3]
+    assert last.table.frame.tolist() == [3, 3]
+    assert last.table.stamp_ns is not None and last.table.stamp_ns.tolist() == [30, 31]
+    if suffix == ".parquet":
+        assert last.table.metadata == {"matcher": "m"}
+
+
+@pytest.mark.parametrize("row_group_size", [1, 2, 3, 5, 100])
+@pytest.mark.parametrize(
+    "numbers", [[0, 0, 1, 2, 2, 2, 2, 2, 5], [1, 0, 2, 2, 3, 2, 4, 9, 5], [7] * 9, [3, 2, 1, 0]]
 )
+def test_row_groups_do_not_show(row_group_size: int, numbers: list[int], tmp_path: Path) -> None:
+    path = tmp_path / "table.parquet"
+    parquet.write_table(to_arrow(table(numbers)), path, row_group_size=row_group_size)
+    frames = [item for item in frames_of(path) if isinstance(item, StreamFrame)]
+    assert [item.frame for item in frames] == sorted(set(numbers))
+    for item in frames:
+        rows = np.flatnonzero(np.array(numbers) == item.frame)
+        assert item.table.pixels_px[:, 0].tolist() == rows.tolist()
 
-# Folders
+
+@pytest.mark.parametrize("row_group_size", [2, 100])
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("u_px", np.nan, "pixel must be finite"),
+        ("u_px", None, "column 'u_px' is empty"),
+        ("camera", None, "column 'camera' is empty"),
+        ("confidence", 1e300, "confidence must lie in"),
+        ("confidence", 0.0, "confidence must lie in"),
+    ],
+)
+def test_a_wrong_value_refuses_its_frame_alone(
+    row_group_size: int, column: str, value: object, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "table.parquet"
+    wrong = spoilt(to_arrow(table([0, 0, 1, 1, 2])), column, 2, value)
+    parquet.write_table(wrong, path, row_group_size=row_group_size)
+    first, refused, last = outcomes(frames_of(path))
+    assert (first, last) == (0, 2)
+    assert str(refused).startswith(f"{path}: frame 1 is left out; among its rows, row 0")
+    assert message in str(refused)
+
+
+def test_a_file_that_is_no_table_is_refused_in_one_line(tmp_path: Path) -> None:
+    good = to_arrow(table([0]))
+    wrong = {
+        "is missing": good.drop_columns(["u_px"]),
+        "unknown column 'weight'": good.append_column("weight", pa.array([1.0])),
+        "holds no rows": good.slice(0, 0),
+        "must hold whole numbers": spoilt(good, "frame", 0, 0.5),
+        "the metadata has the wrong type": good.replace_schema_metadata({"matcher": "no JSON"}),
+    }
+    path = tmp_path / "table.parquet"
+    for message, arrow in wrong.items():
+        parquet.write_table(arrow, path)
+        (refused,) = outcomes(frames_of(path))
+        assert message in str(refused)
+        assert str(path) in str(refused)
+    for name, data in {
+        "cut.parquet": path.read_bytes()[:-9], "empty.parquet": b"", "empty.csv": b"",
+        "names.csv": b"camera,fr\xffame\nleft,1\n",
+    }.items():  # fmt: skip
+        (tmp_path / name).write_bytes(data)
+        (refused,) = outcomes(frames_of(tmp_path / name))
+        assert "\n" not in str(refused)
+        assert name in str(refused)
+
+
+def test_a_damaged_row_group_ends_the_table_after_the_good_ones(tmp_path: Path) -> None:
+    path = tmp_path / "table.parquet"
+    numbers = np.repeat(np.arange(4), 1000).tolist()
+    parquet.write_table(to_arrow(table(numbers)), path, row_group_size=1000, compression="gzip")
+    group = parquet.ParquetFile(path).metadata.row_group(2)
+    data = bytearray(path.read_bytes())
+    start = group.column(2).data_page_offset
+    data[start : start + group.column(2).total_compressed_size // 2] = b"\xff" * (
+        group.column(2).total_compressed_size // 2
+    )
+    path.write_bytes(data)
+    *frames, refused = outcomes(frames_of(path))
+    assert frames == [0, 1]
+    assert "cannot be read as Parquet" in str(refused)
+
+
+# JSON lines
+
+
+def test_a_json_line_is_a_frame() -> None:
+    left = camera(2, confidence=[0.5, 1], point_index=[3, -1], u_px=[1, 2])
+    right = camera(1, i_uu_px=[2], i_uv_px=[0.5], i_vv_px=[1])
+    (item,) = of_bytes(
+        line(cameras={"right": right, "left": left}, stamp_ns=2**62, metadata={"matcher": "m"})
+    )
+    assert isinstance(item, StreamFrame)
+    assert (item.frame, item.table.metadata) == (7, {"matcher": "m"})
+    assert item.table.stamp_ns is not None and set(item.table.stamp_ns) == {2**62}
+    assert item.table.counts() == {"left": 2, "right": 1}
+    left_rows, right_rows = item.table.of_camera("left"), item.table.of_camera("right")
+    assert left_rows.pixels_px.tolist() == [[1, 1.5], [2, 1.5]]
+    assert left_rows.confidence.tolist() == [0.5, 1]
+    assert left_rows.point_index.tolist() == [3, -1]
+    assert left_rows.information_px.tolist() == [[1, 0, 1]] * 2
+    assert right_rows.information_px.tolist() == [[2, 0.5, 1]]
+    assert right_rows.point_index.tolist() == [-1]
+    assert right_rows.confidence.tolist() == [1]
+
+
+def test_a_line_of_metadata_alone_holds_for_the_frames_after_it() -> None:
+    header = {"metadata": {"systematic_rotation_rad": 0.001, "matcher": "mine"}}
+    lines = [line(1), json.dumps(header).encode(), line(2), line(3, metadata={"matcher": "other"})]
+    first, second, third = of_bytes(b"\n".join(each.strip() for each in lines))
+    assert [type(item) for item in (first, second, third)] == [StreamFrame] * 3
+    assert not first.table.findings.states_common_error
+    assert second.table.metadata == {"systematic_rotation_rad": 0.001, "matcher": "mine"}
+    assert third.table.metadata == {"systematic_rotation_rad": 0.001, "matcher": "other"}
+
+
+@pytest.mark.parametrize("cameras", [{}, {"left": camera(0)}])
+def test_a_frame_without_rows_is_a_frame(cameras: dict[str, Any]) -> None:
+    (item,) = of_bytes(line(9, cameras=cameras, stamp_ns=5, metadata={"k": 1}))
+    assert isinstance(item, StreamFrame)
+    assert (item.frame, len(item.table)) == (9, 0)
+    assert item.table.cameras == tuple(cameras)
+    assert item.table.metadata == {"k": 1}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (line()[:-9], "is not JSON"),
+        (b"\xfe\xfe", "is not JSON"),
+        (b"[" * 100_000, "is not JSON (recursion limit exceeded"),
+        (b"[1]", "expected keys with values, as in {key: value}, found [1]"),
+        (b'{"frame": ' + b"9" * 5000 + b', "cameras": {}}', "is not JSON (number out of range"),
+        (b'{"frame": 7}', "key 'cameras' is missing"),
+        (line(weather="rain"), "unknown key 'weather'; remove it"),
+        (line(1.0), "frame: Input should be a valid integer, found 1.0"),
+        (line(2**63), "frame: Input should be less than 9223372036854775808, found"),
+        (line(cameras={"left": camera(depth=[1])}), "unknown key 'cameras.left.depth'"),
+        (line(cameras={"left": camera(u_px=[True])}), "u_px.0: Input should be a valid number"),
+        (line(cameras={"left": camera(u_px=[10**400])}), "u_px.0: Input should be a valid number"),
+        (line().replace(b"[1.5]", b"[1e999]"), "pixel must be finite"),
+        (line(cameras={"left": camera(u_px=[1, 2])}), "differ in length: {'u_px': 2, 'v_px': 1"),
+        (line(cameras={"left": camera(point_index=[2**63])}), "point_index.0: Input should be"),
+        (line(cameras={"left": camera(i_uu_px=[1])}), "has only ['i_uu_px'] of"),
+        (line(cameras={str(i): camera(0) for i in range(1001)}), "at most 1000 items"),
+    ],
+)
+def test_a_wrong_line_is_refused_and_the_next_one_read(wrong: bytes, message: str) -> None:
+    assert message in refusal(wrong)
+
+
+def test_a_line_that_is_too_long_is_refused_without_being_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(stream_lines, "MAX_LINE_BYTES", 100_000)
+    long = b'{"frame": "' + b"x" * 1_000_000 + b'"}'
+    assert "is longer than 100000 bytes" in refusal(long)
+    # Neither does one byte too many pass, nor is one that just fits refused.
+    fits = line()[:-1].ljust(100_000)
+    assert outcomes(of_bytes(fits)) == [7]
+    assert "is longer than" in refusal(fits + b" ")
+    assert len(outcomes(of_bytes(long))) == 1
+
+
+def test_json_lines_cut_or_damaged_anywhere_raise_nothing() -> None:
+    data = line(1) + line(2)
+    for cut in range(len(data)):
+        items = outcomes(of_bytes(data[:cut]))
+        assert items[: cut // len(line(1))] == [1][: cut // len(line(1))]
+        assert len(items) <= 2
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        flipped = np.frombuffer(data, np.uint8).copy()
+        flipped[rng.integers(0, len(data), rng.integers(1, 4))] = rng.integers(256)
+        for item in of_bytes(flipped.tobytes()):
+            assert isinstance(item, StreamFrame) or "\n" not in item.message
 
 
 def test_a_folder_gives_its_tables_in_the_order_of_their_names(tmp_path: Path) -> None:
@@ -92,9 +327,6 @@ def test_a_followed_file_is_read_when_it_is_complete(tmp_path: Path) -> None:
     writer.join()
 
 
-# Waiting and stopping
-
-
 @pytest.fixture
 def pipe() -> Iterator[tuple[BinaryIO, BinaryIO]]:
     """The reading and the writing end of a pipe."""
@@ -128,33 +360,6 @@ def test_a_waiting_stream_ends_when_it_is_stopped(
     until = time.monotonic() + 0.05
     assert outcomes(frames) == []
     assert time.monotonic() < until + 5 * streams.POLL_S
-
-
-def test_a_signal_ends_the_waiting_for_standard_input() -> None:
-    program = """
-        import signal, sys
-        from calibgraph.tracking.streams import frames_of
-        stopped = []
-        signal.signal(signal.SIGTERM, lambda *_: stopped.append(1))
-        for item in frames_of("-", stop=lambda: bool(stopped)):
-            print(item, flush=True)
-        print("ended", flush=True)
-    """
-    with subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(program)],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    ) as process:  # fmt: skip
-        assert process.stdin and process.stdout and process.stderr
-        process.stdin.write(line(1))
-        process.stdin.flush()
-        assert b"StreamFrame(frame=1" in process.stdout.readline()
-        process.send_signal(signal.SIGTERM)
-        assert process.stdout.readline() == b"ended\n"
-        assert process.wait() == 0
-        assert process.stderr.read() == b""
-
-
-# Sources
 
 
 def test_a_source_that_is_none_is_refused_at_once(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Images of another time: seen by the motion of the LiDAR, and only where it tells."""
+"""Images of another time, and motions in other units: seen by the motion of the LiDAR."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 
-from calibgraph import Config, Correspondences, Rig, solve
+from calibgraph import Config, Correspondences, Dataset, Frame, Rig, solve
 from calibgraph.io.bags import MESSAGE_SUFFIX
-from calibgraph.io.dataset import Dataset
-from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import keep_frames
 from calibgraph.io.motion import ScanMotion
-from calibgraph.matching.protocol import Matcher, to_full_matcher
+from calibgraph.matching.protocol import FullMatcher, Matcher
 from calibgraph.matching.run import MatchingRun
+from calibgraph.model.geometry import invert
 from calibgraph.model.verdict import Check
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.joint import solve_joint
@@ -28,8 +28,10 @@ from calibgraph.trust.clock_checks import (
     image_offset_checks,
 )
 from calibgraph.trust.lens_parameter import RESIDUALS, LensParameter
+from calibgraph.trust.motion_checks import motion_doubts
 from calibgraph.trust.run_evidence import RunEvidence
 from factors import Clock
+from tests.conftest import make_pair
 from tests.draws.clocks import draw_twists, put_clock_error
 from tests.solver.test_lens import FIVE_SIGMAS, simulated
 
@@ -43,7 +45,6 @@ def fit(offset_s: float, twists: np.ndarray | None = None) -> LensParameter:
     (name, camera), *_ = rig.cameras.items()
     late = put_clock_error(table, rig, twists, Clock(offset_s)).of_camera(name)
     found = fit_offset(camera, late, 0.0)
-    assert found is not None
     return found
 
 
@@ -114,7 +115,7 @@ def run_of(
     data = Dataset(rig=rig, frames=tuple(frames), folders=())
     solution = solve_joint(rig, found, Config())
     run = MatchingRun(
-        data, to_full_matcher(matcher), rig, found, solution, rounds=(), watch=Stopwatch()
+        data, FullMatcher(matcher), rig, found, solution, rounds=(), watch=Stopwatch()
     )
     return RunEvidence(run, {})
 
@@ -144,24 +145,15 @@ def test_the_times_of_a_rig_stand_where_the_motion_of_a_bag_is_known() -> None:
     assert {check.status for of in checks.values() for check in of} == {"PASS"}
 
 
-def registered(
-    stems: Sequence[str], folder: str, suffix: str, step_m: float, monkeypatch: pytest.MonkeyPatch
-) -> list[Frame]:
-    """Frames that have moved ahead by ``step_m`` from one to the next; their clouds fit exactly."""
-    T = np.eye(4)
-    T[0, 3] = step_m
+def register_clouds(poses: Sequence[np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clouds of frames at these poses fit exactly."""
 
-    def fit(target: np.ndarray, source: np.ndarray, _: Path) -> np.ndarray:
-        steps = round(float(source[0, 0] - target[0, 0]))
-        return np.asarray(np.linalg.matrix_power(T if steps > 0 else np.linalg.inv(T), abs(steps)))
+    def register(target: int, source: int, _: Path) -> np.ndarray:
+        return np.asarray(invert(poses[target]) @ poses[source])
 
-    monkeypatch.setattr("calibgraph.io.frame.register", fit)
-    monkeypatch.setattr("calibgraph.io.frame.prepare_scan", lambda points: points)
-    monkeypatch.setattr(
-        Frame, "load_cloud", lambda self: np.full((1, 4), self.index, dtype=np.float32)
-    )
-    paths = [Path(folder) / f"{stem}{suffix}" for stem in stems]
-    return [Frame(n, stem, paths[n], {}) for n, stem in enumerate(stems)]
+    monkeypatch.setattr("calibgraph.io.frame.register", register)
+    monkeypatch.setattr("calibgraph.io.frame.prepare_scan", lambda points: int(points[0, 0]))
+    monkeypatch.setattr(Frame, "load_cloud", lambda frame: np.full((1, 4), frame.index))
 
 
 @pytest.mark.parametrize(
@@ -180,14 +172,70 @@ def test_clouds_are_as_far_apart_as_their_stamps_or_numbers_say(
 ) -> None:
     rig, table, _ = late_by(0.0)
     suffix = MESSAGE_SUFFIX if suffix == ".message" else suffix
-    frames = registered(stems, "drive", suffix, 2.0, monkeypatch)
-    kept = keep_frames(Dataset(rig=rig, frames=tuple(frames), folders=()))
+    ahead = gtsam.Pose3(gtsam.Rot3(), np.array([2.0, 0.0, 0.0])).matrix()
+    register_clouds([np.linalg.matrix_power(ahead, n) for n in range(len(stems))], monkeypatch)
+    frames = tuple(Frame(n, s, Path("drive") / f"{s}{suffix}", {}) for n, s in enumerate(stems))
+    kept = keep_frames(Dataset(rig=rig, frames=frames, folders=()))
     moved, by_scans = _with_known_motion(kept)
     assert moved is not None and by_scans
     for frame in moved.frames:
-        assert frame.twist_per_s is not None
         np.testing.assert_allclose(frame.twist_per_s, [0, 0, 0, 2.0 / apart_s, 0, 0], atol=1e-9)
     matcher = Recorder(replace(table, twist_per_s=None))
     checks = image_offset_checks(run_of(matcher, rig, kept.frames, table))
     told = ["successive clouds are taken to be 0.1 s apart" in c[0].text for c in checks.values()]
     assert told == [is_told] * len(rig.cameras)
+
+
+FRAMES = 30
+STAMPED = [str(1_533_151_603_547_590 + 100_000 * n) for n in range(FRAMES)]  # microseconds
+NUMBERED = [f"{n:06d}" for n in range(FRAMES)]
+KMH = np.array([1, 1, 1, 3.6, 3.6, 3.6])
+
+
+@pytest.fixture
+def drive(monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
+    """(n, 6) twists of a car in town, of which neighbouring clouds 0.1 s apart show the steps."""
+    t = 0.1 * np.arange(FRAMES)
+    yaw, ahead, none = 0.3 * np.sin(2 * t), 8.0 + np.sin(t), np.zeros(FRAMES)
+    twists = np.column_stack([0.02 * np.sin(5 * t), 0.02 * np.cos(7 * t), yaw, ahead, none, none])
+    poses = [np.eye(4)]
+    for twist in twists:
+        poses.append(poses[-1] @ gtsam.Pose3.Expmap(0.1 * twist).matrix())
+    register_clouds(poses, monkeypatch)
+    return (twists[:-1] + twists[1:]) / 2
+
+
+def doubts(told: np.ndarray, stems: list[str]) -> list[str]:
+    motions = [ScanMotion(tuple(twist.tolist()), 0.0) for twist in np.vstack([told[:1], told])]
+    frames = [
+        Frame(n, stem, Path("drive") / f"{stem}.bin", {}, find_motion=lambda n=n: motions[n])
+        for n, stem in enumerate(stems)
+    ]
+    return motion_doubts(Dataset(rig=make_pair(), frames=tuple(frames), folders=()))
+
+
+@pytest.mark.parametrize("stems", [STAMPED, NUMBERED])
+def test_a_right_motion_raises_no_doubt_and_km_per_h_do(
+    stems: list[str], drive: np.ndarray
+) -> None:
+    assert doubts(drive, stems) == []
+    (text,) = doubts(drive * KMH, stems)
+    assert text.endswith("is it in km/h?")
+    (text,) = doubts(drive * np.repeat([1.0, 0.5], 3), stems)
+    assert text.endswith("check its unit")
+
+
+@pytest.mark.parametrize("order", [[0, 2, 1], [2, 1, 0], [1, 2, 0]])
+def test_turns_about_other_axes_are_named(order: list[int], drive: np.ndarray) -> None:
+    told = drive.copy()
+    told[:, order] = drive[:, :3]
+    (text,) = doubts(told, STAMPED)
+    names = ", ".join(("wx", "wy", "wz")[axis] for axis in order)
+    assert f"{names} in the place of wx, wy, wz would fit" in text
+
+
+def test_where_clouds_are_further_apart_than_usual_the_speed_per_turn_counts(
+    drive: np.ndarray,
+) -> None:
+    """Every frame is 0.36 s after the one before, which no name says."""
+    assert doubts(drive / 3.6, NUMBERED) == []

@@ -1,20 +1,110 @@
+"""Mistakes in guess and inputs: named before the search, by its images, and by the result."""
+
 from __future__ import annotations
 
+import logging
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import calibgraph
-from calibgraph import MatcherErrors, Rig, solve
+from calibgraph import Intrinsics, MatcherErrors, Rig, load_calibration, load_rig, solve
 from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.geometry import T_OPTICAL_LINK
+from calibgraph.model.verdict import Check
+from calibgraph.trust.assess import implausible_checks
+from calibgraph.trust.conventions import (
+    convention_error_between,
+    correct_guess,
+    in_words,
+    likely_intended_guess,
+    undo_convention_errors,
+)
 from calibgraph.trust.guess import (
     compare_with_guess,
     compare_with_other_guesses,
     compare_with_range,
     describe_other_frame,
 )
+from calibgraph.trust.inputs import check_inputs
+from tests.conftest import SAMPLE, Call, make_camera
 from tests.trust.conftest import named, simulated
+
+RIG = load_rig(SAMPLE)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A copy of the sample's first frames."""
+    copy = Path(shutil.copytree(SAMPLE, tmp_path / "sample"))
+    for path in (*copy.glob("lidar/*"), *copy.glob("cameras/*/*")):
+        if path.stem > "000001":
+            path.unlink()
+    return copy
+
+
+def with_principal_point(cx: float, cy: float) -> calibgraph.Rig:
+    left = RIG.cameras["left"]
+    lens = Intrinsics(**{**left.intrinsics_px.model_dump(), "cx": cx, "cy": cy})
+    cameras = {**RIG.cameras, "left": left.model_copy(update={"intrinsics_px": lens})}
+    return RIG.model_copy(update={"cameras": cameras})
+
+
+def test_the_sample_has_no_warning() -> None:
+    assert check_inputs(calibgraph.load_dataset(SAMPLE), RIG) == ()
+
+
+def test_a_rig_whose_cameras_all_see_no_point_is_refused_before_the_search(
+    folder: Path, call: Call
+) -> None:
+    for path in (folder / "lidar").iterdir():
+        cloud = np.load(path)
+        cloud[:, :2] *= -1
+        np.save(path, cloud)
+    code, _, err = call("calibrate", folder, "--out", folder / "out")
+    assert code == 2
+    assert err.count("turned by 180 deg about z (its x points behind, y right, z up)") == 1
+    assert "left: by the guess, no point of the cloud lies in the image" in err
+    assert not (folder / "out").exists()
+
+
+def test_a_camera_of_several_that_sees_no_point_is_a_warning() -> None:
+    T = RIG.T_camera_lidar["left"].copy()
+    T[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ T[:3, :3]  # to the right, where the LiDAR is blind
+    warnings = check_inputs(calibgraph.load_dataset(SAMPLE), RIG.moved_to({"left": T}))
+    assert warnings == ("left: by the guess, no point of the cloud lies in the image",)
+
+
+@pytest.mark.usefixtures("no_image_checks")
+def test_warnings_are_logged_and_recorded_and_nothing_is_printed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    data = calibgraph.load_dataset(SAMPLE).select("0:2")
+    table = calibgraph.simulate_correspondences(RIG, frames=2, matches=200, seed=1)
+    with caplog.at_level(logging.WARNING, "calibgraph"):
+        result = calibgraph.calibrate(data, with_principal_point(80, 45), table)
+    assert result.warnings == tuple(caplog.messages)
+    assert "principal point (80, 45)" in result.warnings[0]
+    assert load_calibration(result.save(tmp_path)).warnings == result.warnings
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("limits", "expected"), [((None, None), "FAIL"), ((1.0, 2.0), "WARN")])
+def test_a_failure_is_explained_but_not_decided_by_values_of_the_rig(
+    limits: tuple[float | None, float | None], expected: str
+) -> None:
+    failed = Check("z-score", "FAIL", "", 3.0, *limits)
+    rig = with_principal_point(80, 45)
+    ((name, (check,)),) = implausible_checks(rig, {"left": [failed]}).items()
+    assert (name, check.status) == ("left", expected)
+    assert check.text.startswith("principal point (80, 45)")
+    passed = Check("z-score", "PASS", "", 30.0)
+    assert implausible_checks(rig, {"left": [passed]}) == {}
 
 
 def test_an_inverted_guess_is_named_though_the_result_is_right(pair: Rig) -> None:
@@ -98,3 +188,109 @@ def test_guesses_from_another_frame_of_the_vehicle_are_named(pair: Rig) -> None:
         exact["left"], left["left"], MatcherFindings(range_translation_m=0.3), text
     )
     assert check.status == "FAIL" and text in check.text
+
+
+SLOW = pytest.mark.slow
+ERRORS = tuple(undo_convention_errors(np.eye(4)))
+
+
+def test_every_error_has_its_words_and_is_recognised_by_undoing_it() -> None:
+    """The corrections of a wrong guess hold the right one, under the error's name."""
+    truth = make_camera((0.8, 0.3, -0.4), yaw_deg=50).T_camera_lidar
+    found = {error: convention_error_between(mistaken(error, truth), truth) for error in ERRORS}
+    assert found == {error: error for error in ERRORS}
+    assert len({in_words(error) for error in ERRORS}) == len(ERRORS) == 12 + 23
+
+
+@pytest.mark.parametrize(
+    ("error", "seed"),
+    [
+        ("inverse", 1),
+        ("camera-upside-down", 4),
+        pytest.param("cloud-ahead-right-down", 3, marks=SLOW),
+        pytest.param("camera-flu", 2, marks=SLOW),
+        pytest.param("cloud-behind-right-up", 3, marks=SLOW),
+        pytest.param("cloud-right-ahead-up", 4, marks=SLOW),
+        pytest.param("cloud-right-down-ahead", 5, marks=SLOW),
+        pytest.param("cloud-ahead-down-left", 6, marks=SLOW),
+        pytest.param("cloud-down-left-ahead", 7, marks=SLOW),
+        pytest.param("camera-clockwise", 8, marks=SLOW),
+        pytest.param("camera-counterclockwise", 9, marks=SLOW),
+    ],
+)
+def test_a_mistake_is_recognised_by_the_images_at_a_rough_guess(error: str, seed: int) -> None:
+    rough = rough_guess(seed)
+    T = {name: mistaken(error, T) for name, T in rough.T_camera_lidar.items()}
+    wrong = rough.moved_to(T)
+    found = likely_intended_guess(one_frame(), wrong)
+    assert f"fit clearly better if {in_words(error)}; undo it" in found
+    assert f"--correct {error} " in found
+    undone = correct_guess(wrong, [error])
+    for name, camera in undone.cameras.items():
+        np.testing.assert_allclose(camera.T_camera_lidar, rough.T_camera_lidar[name], atol=1e-9)
+
+
+def test_mirrored_images_are_named(tmp_path: Path) -> None:
+    """The principal point is that of the mirrored image, so that only its content is wrong."""
+    copy = tmp_path / "sample"
+    shutil.copytree(SAMPLE, copy)
+    for path in (copy / "cameras" / "left").iterdir():
+        cv2.imwrite(str(path), cv2.flip(cv2.imread(str(path)), 1))
+    found = likely_intended_guess(calibgraph.load_dataset(copy, frames="0:3"), rough_guess(5))
+    assert found is not None and found.startswith("the images of left are mirrored")
+
+
+@pytest.mark.parametrize(("rotation_deg", "translation_m"), [(4.0, 0.3), (20.0, 1.5)])
+def test_no_mistake_is_seen_in_a_guess_that_is_only_rough(
+    rotation_deg: float, translation_m: float
+) -> None:
+    rough = rough_guess(6, rotation_deg, translation_m)
+    assert likely_intended_guess(one_frame(), rough) is None
+
+
+def one_frame() -> calibgraph.Dataset:
+    """The first of the sample: a mistake is seen in one already."""
+    return calibgraph.load_dataset(SAMPLE, frames="0")
+
+
+def rough_guess(seed: int, rotation_deg: float = 4.0, translation_m: float = 0.3) -> calibgraph.Rig:
+    """The sample's rig, some way off."""
+    truth = calibgraph.load_rig(SAMPLE / "reference.yaml")
+    return calibgraph.perturb(
+        truth, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed
+    )
+
+
+def mistaken(error: str, truth: np.ndarray) -> np.ndarray:
+    """The guess that has the convention error of that name."""
+    inverse, wrong = np.linalg.inv(truth), truth.copy()
+    x, y, z, w = Rotation.from_matrix(truth[:3, :3]).as_quat()
+    kind, *sides = error.split("-")
+    if "millimetres" in error:
+        wrong = inverse if kind == "inverse" else wrong
+        wrong[:3, 3] *= 1000
+    elif error == "inverse-camera-flu":
+        wrong = np.linalg.inv(np.linalg.inv(T_OPTICAL_LINK) @ truth)
+    elif error == "inverse":
+        wrong = inverse
+    elif error == "camera-flu":
+        wrong = np.linalg.inv(T_OPTICAL_LINK) @ truth
+    elif kind == "cloud":
+        axes = {"ahead": (1, 0, 0), "behind": (-1, 0, 0), "left": (0, 1, 0), "right": (0, -1, 0),
+                "up": (0, 0, 1), "down": (0, 0, -1)}  # fmt: skip
+        wrong[:3, :3] = truth[:3, :3] @ np.array([axes[side] for side in sides])
+    elif kind == "camera":
+        # What is to the right of a camera that was turned clockwise is above in the guess's axes.
+        degrees = {"upside": 180, "clockwise": 90, "counterclockwise": -90}[sides[0]]
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+        wrong = turn @ truth
+    elif error == "position":
+        wrong[:3, 3] = inverse[:3, 3]
+    elif error == "transposed":
+        wrong[:3, :3] = truth[:3, :3].T
+    elif error == "wxyz":
+        wrong[:3, :3] = Rotation.from_quat([w, x, y, z]).as_matrix()
+    else:
+        wrong[:3, :3] = Rotation.from_quat([y, z, w, x]).as_matrix()
+    return wrong

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
-import cv2
 import gtsam
 import numpy as np
 import pytest
@@ -32,7 +30,7 @@ from tests.conftest import SAMPLE
 NAME = "front_left"
 
 
-FOCAL, RADIAL, CENTRE_X, _, ASPECT, SKEW = Free
+FOCAL, RADIAL, CENTRE_X, _, ASPECT = Free
 CALIBRATED = 0.002  # one standard deviation of a calibrated lens
 
 
@@ -122,24 +120,3 @@ def test_the_lens_is_applied_to_points_where_they_are_when_they_are_seen(
     step = gtsam.Pose3.Expmap(-0.05 * twist).matrix()
     expected = scores.points_lidar_m @ step[:3, :3].T + step[:3, 3]
     np.testing.assert_allclose(seen.value.args[0], expected, atol=1e-9)
-
-
-@pytest.mark.parametrize("skew", [pytest.param(-0.03, marks=pytest.mark.slow), 0.03])
-def test_sheared_images_are_named_and_measured(truth: Camera, tmp_path: Path, skew: float) -> None:
-    k = truth.intrinsics_px
-    lean = skew * k.fx / k.fy
-    shear = np.array([[1.0, lean, -lean * k.cy], [0.0, 1.0, 0.0]])
-    # As in a calibration: half of a skew is a rotation.
-    turned = apply_twist(truth, np.array([0.0, 0.0, skew / 2, 0.0, 0.0, 0.0]))
-    dataset = calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: turned}))
-    frames = []
-    for frame in dataset.frames:
-        image = frame.load_image(NAME, truth)
-        path = tmp_path / f"{frame.index}.png"
-        cv2.imwrite(str(path), cv2.warpAffine(image, shear, image.shape[1::-1]))
-        frames.append(replace(frame, image_paths={NAME: path}))
-    found = measure(turned, replace(dataset, frames=tuple(frames)))
-    assert CALIBRATED * found[4].values[0] == pytest.approx(skew, abs=0.007)
-    status = statuses(found)
-    assert status["skew"] != "PASS"
-    assert status["distortion"] == status["principal point"] == "PASS"

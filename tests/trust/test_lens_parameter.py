@@ -63,7 +63,7 @@ def test_the_other_parameter_is_usual_or_wrong(other: float) -> None:
 
 
 def test_a_shape_that_no_lens_has_counts_though_it_hardly_moves_the_camera() -> None:
-    assert estimate("skew", 0.03, 0.002, 0.1).probability() > 0.9  # noqa: PLR2004
+    assert estimate("aspect ratio", 0.03, 0.002, 0.1).probability() > 0.9  # noqa: PLR2004
     assert estimate("focal length", 0.03, 0.002, 0.1).probability() < 1e-6  # noqa: PLR2004
 
 
@@ -78,5 +78,4 @@ def test_of_several_parameters_that_look_wrong_all_are_estimated_together() -> N
     assert [text.rpartition(" ")[2] for text in (texts[0], texts[2])] == ["lens", "lens"]
     assert texts[1] == right.text
     of_shape = advise_together([focal, aspect])
-    assert all(check.text.endswith("run with --estimate lens,aspect") for check in of_shape)
-    assert [check.value for check in of_shape] == [focal.value, aspect.value]
+    assert of_shape == [focal, aspect] and "--estimate" not in aspect.text

@@ -1,4 +1,4 @@
-"""The verdict on a table's findings: the same for a matcher's own run and a later solve."""
+"""The verdict on a table's findings, and on a matcher that is run again from elsewhere."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import Any
 import pytest
 
 import calibgraph
-from calibgraph import Correspondences, Rig
+from calibgraph import Correspondences, Rig, simulate_correspondences
+from calibgraph.rounds import match_in_rounds
+from calibgraph.trust.rematch_checks import compare_ends
+from tests.conftest import SAMPLE
 
 STATED = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
 
@@ -22,14 +25,9 @@ def table(pair: Rig) -> Correspondences:
     ("findings", "status"),
     [
         ({}, "PASS"),
-        ({"start_dependence": 0.1, "memorization": 0.1, "failed_share": 0.1}, "PASS"),
-        ({"start_dependence": 0.3}, "WARN"),
-        ({"start_dependence": 0.9}, "FAIL"),
-        ({"start_dependence": float("nan")}, "FAIL"),
-        ({"memorization": 0.4}, "WARN"),
-        ({"memorization": 1.0}, "FAIL"),
-        ({"memorization": -0.5}, "PASS"),
+        ({"failed_share": 0.1}, "PASS"),
         ({"failed_share": 0.5}, "WARN"),
+        ({"failed_share": float("nan")}, "FAIL"),
         ({"failed_share": 1.0}, "FAIL"),
     ],
 )
@@ -60,8 +58,8 @@ def test_a_camera_that_features_place_elsewhere_is_no_pass_with_both_statements(
 def test_malformed_findings_are_refused(
     pair: Rig, table: Correspondences, nonsense: object
 ) -> None:
-    with pytest.raises(calibgraph.CorrespondenceError, match="memorization"):
-        calibgraph.solve(pair, replace(table, metadata={"memorization": nonsense}))
+    with pytest.raises(calibgraph.CorrespondenceError, match="failed_share"):
+        calibgraph.solve(pair, replace(table, metadata={"failed_share": nonsense}))
 
 
 def test_a_matchers_own_error_is_reported_once(pair: Rig) -> None:
@@ -133,3 +131,71 @@ def test_a_camera_that_few_frames_do_not_show_fails_for_that_reason(pair: Rig) -
     assert result.summary.actions[0].startswith("left: Record at least 5 frames")
     assert not [text for text in result.verdict.reasons if "swapped" in text]
     assert result.camera_verdicts["right"].status == "WARN"
+
+
+def silent(what: str, done: int, total: int) -> None:
+    """No-op progress callback."""
+
+
+class Simulated:
+    """A matcher whose correspondences fit one rig after the other, with rounds for near starts."""
+
+    rounds, stage1, tracking_rounds = 1, "rig", (0,)
+
+    def __init__(self, seen: list[Rig]) -> None:
+        self.seen = seen
+
+    def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN201
+        return simulate_correspondences(self.seen.pop(0), frames=6, matches=100)
+
+
+class Scored(Simulated):
+    """A simulated matcher that also reports z-scores."""
+
+    def __init__(self, seen: list[Rig], z_scores: list[dict[str, float]]) -> None:
+        super().__init__(seen)
+        self.z_scores = z_scores
+
+    def match(self, dataset, rig, *, round_index, progress):  # noqa: ANN001, ANN201
+        table = super().match(dataset, rig, round_index=round_index, progress=progress)
+        return replace(table, metadata={"z_score": self.z_scores.pop(0)})
+
+
+@pytest.fixture
+def truth() -> Rig:
+    return calibgraph.load_rig(SAMPLE / "reference.yaml")
+
+
+def test_a_matcher_that_comes_back_passes(truth: Rig) -> None:
+    matched = match_in_rounds(SAMPLE, truth, Simulated([truth, truth]), progress=silent)
+    for checks in compare_ends(matched.rematch).values():
+        assert [check.status for check in checks] == ["PASS", "PASS"]
+
+
+def test_a_matcher_that_ends_elsewhere_fails(truth: Rig) -> None:
+    other = calibgraph.perturb(truth, rotation_deg=1, translation_m=0.1, seed=1)
+    matched = match_in_rounds(SAMPLE, truth, Simulated([truth, other]), progress=silent)
+    for checks in compare_ends(matched.rematch).values():
+        assert checks[0].status == "FAIL" and checks[0].value == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_camera_is_taken_from_where_image_and_cloud_agree_clearly_better(truth: Rig) -> None:
+    """All cameras end 8 cm off at first; only of one is the second end clearly better."""
+    off = calibgraph.perturb(truth, rotation_deg=0.1, translation_m=0.08, seed=1)
+    agreed = [
+        {"front_left": 16.0, "front_right": 20.0, "left": 18.0},
+        {"front_left": 18.0, "front_right": 20.1, "left": 17.0},
+    ]
+
+    matched = match_in_rounds(SAMPLE, truth, Scored([off, truth], agreed), progress=silent)
+    errors = calibgraph.evaluate(matched.solution.solved_rig, truth).cameras
+    assert errors["front_left"].translation_error_cm < 1
+    for name in ("front_right", "left"):
+        assert errors[name].translation_error_cm == pytest.approx(8, abs=1)
+    expected = {"front_left": 18.0, "front_right": 20.0, "left": 18.0}
+    assert matched.correspondences.metadata["z_score"] == expected
+    for checks in compare_ends(matched.rematch).values():  # two different ends are a warning
+        assert checks[1].status == "WARN" and checks[1].value == pytest.approx(8, abs=1)
+    began = calibgraph.evaluate(matched.solution.rig, truth).cameras
+    assert began["left"].translation_error_cm < 1e-6  # the guess, of the first rounds
+    assert began["front_left"].translation_error_cm > 1  # of the second, displaced from an end

@@ -1,19 +1,20 @@
+"""From checks to the probability of an error; the table of thresholds; no false PASS."""
+
 from __future__ import annotations
 
+import json
 import math
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from calibgraph import Config, Rig, load_calibration, solve
-from calibgraph.model.verdict import (
-    FAIL_ABOVE,
-    PASS_BELOW,
-    Check,
-    ErrorProbability,
-    Verdict,
-)
+from calibgraph.model.threshold import Threshold
+from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, Check, ErrorProbability, Verdict
 from calibgraph.trust.probability import (
     STRUCTURE,
     TABLES,
@@ -22,14 +23,23 @@ from calibgraph.trust.probability import (
     probability_of_checks,
     probability_outside,
 )
-from calibgraph.trust.thresholds import THRESHOLDS, threshold
+from calibgraph.trust.thresholds import THRESHOLDS, limit, threshold
+from tests.conftest import ROOT
 from tests.trust.conftest import simulated
 
 WIDE = np.diag([0.003, 0.002, 0.004, 0.03, 0.05, 0.02]) ** 2
 
 
 @pytest.mark.parametrize("row", THRESHOLDS, ids=lambda row: row.key)
-def test_a_check_that_gets_worse_is_never_less_severe(row) -> None:  # type: ignore[no-untyped-def]
+def test_a_row_grades_from_pass_to_fail_and_what_gets_worse_is_never_less_severe(
+    row: Threshold,
+) -> None:
+    beyond = 1 if row.direction == "at most" else -1
+    assert beyond * row.fail > beyond * row.warn
+    assert row.check(row.warn).status == "PASS"
+    assert row.check(row.fail).status == "WARN"
+    assert row.check(row.fail + beyond).status == ("WARN" if math.isinf(row.fail) else "FAIL")
+    assert row.check(math.nan).status == row.grade(math.nan) == "FAIL"
     far = row.fail if math.isfinite(row.fail) else 10 * abs(row.warn) + 1
     values = np.linspace(row.warn - 2 * (far - row.warn), far + 2 * (far - row.warn), 401)
     severities = [row.check(value).severity for value in values]
@@ -55,7 +65,6 @@ def test_without_a_doubt_a_result_passes_and_a_check_nobody_has_seen_fails_it(mo
     new = Check("new", "FAIL", "", 3.5, 1.0, 2.0)
     assert judge([new], 0.0, (0.5, 10.0), model).status == "FAIL"
     not_found = judge([Check("search", "FAIL", "not found")], 0.0, (0.5, 10.0), model)
-    assert not_found.error_probability is not None
     assert not_found.error_probability.by_checks == 1
 
 
@@ -160,3 +169,64 @@ def test_the_tolerance_is_a_setting_and_the_probability_is_kept(pair: Rig, tmp_p
     assert "off by more than 0.001 deg or 0.01 cm" in strict.verdict.reasons[0]
     strict.save(tmp_path / "out")
     assert load_calibration(tmp_path / "out").camera_verdicts == strict.camera_verdicts
+
+
+def test_a_limit_grows_with_the_tolerance_and_is_exact_at_the_default() -> None:
+    assert [limit("competing_rotation", (deg, 10.0)) for deg in (0.1, 0.5, 1.0)] == [0.3, 0.3, 0.6]
+    assert limit("competing_translation", (0.1, 30.0)) == pytest.approx(30.0)
+    assert limit("swap_slack", (5.0, 100.0)) == limit("swap_slack")
+
+
+OFF_DEG, OFF_CM = 0.5, 10.0
+RIGHT_DEG, RIGHT_CM = 0.15, 4.0
+KINDS = (
+    "good,random,swapped,shuffled,focal_5,focal_3,principal,distorted,mirrored,wall,far_away,"
+    "two_poses_60,few_frames,time_offset,units"
+)
+
+
+def cameras_of(tmp_path: Path, *options: object) -> list[dict[str, Any]]:
+    """Run the benchmark: the verdict and the error of each camera's result, with its kind."""
+    out = tmp_path / "cases.jsonl"
+    module = "benchmarks.accuracy.verdicts"
+    command = [sys.executable, "-m", module, "--set", "count", "--out", out, *options]
+    subprocess.run(list(map(str, command)), cwd=ROOT, check=True, capture_output=True)
+    cases = [json.loads(line) for line in out.read_text().splitlines()]
+    assert not any("crash" in case for case in cases)
+    return [{**one, "kind": c["kind"]} for c in cases for one in c.get("cameras", {}).values()]
+
+
+def is_off(camera: dict[str, Any]) -> bool:
+    return camera["error_deg"] > OFF_DEG or camera["error_cm"] > OFF_CM
+
+
+@pytest.mark.statistics
+def test_wrong_tables_do_not_pass_and_good_ones_do_not_fail(tmp_path: Path) -> None:
+    cameras = cameras_of(tmp_path, "--tables", 4, "--kinds", KINDS)
+    off = [camera for camera in cameras if is_off(camera)]
+    assert len(off) > 60
+    assert not [(c["kind"], c["error_deg"], c["error_cm"]) for c in off if c["status"] == "PASS"]
+    good = [camera["status"] for camera in cameras if camera["kind"] == "good"]
+    assert good and "FAIL" not in good and "PASS" in good
+
+
+@pytest.mark.realdata
+def test_good_recordings_do_not_fail(tmp_path: Path, realdata: Path) -> None:
+    several = ("--data", 1, "--first", 2)  # 06, 07 and 08: one place alone may be off by more
+    cameras = cameras_of(tmp_path, *several, "--kinds", "good", "--realdata", realdata)
+    right = [
+        camera["status"]
+        for camera in cameras
+        if camera["error_deg"] < RIGHT_DEG and camera["error_cm"] < RIGHT_CM
+    ]
+    assert right and "FAIL" not in right
+    assert "PASS" not in [camera["status"] for camera in cameras if is_off(camera)]
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("kind", ["swapped", "focal_5", "mirrored"])
+def test_wrong_recordings_do_not_pass(kind: str, tmp_path: Path, realdata: Path) -> None:
+    cameras = cameras_of(tmp_path, "--data", 1, "--kinds", kind, "--realdata", realdata)
+    off = [camera for camera in cameras if is_off(camera)]
+    assert off
+    assert not [(c["error_deg"], c["error_cm"]) for c in off if c["status"] == "PASS"]

@@ -96,6 +96,11 @@ class World:
             )
         )
 
+    @property
+    def data(self) -> Correspondences:
+        """The table of the truth."""
+        return self.table()
+
     def drawn(self) -> dict[str, Any]:
         """All numbers but the rig."""
         values = {k: v for k, v in vars(self).items() if k not in ("truth", "errors")}

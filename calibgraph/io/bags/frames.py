@@ -70,7 +70,7 @@ def frames_of_bag(path: Path, cameras: Mapping[str, Camera], options: BagOptions
     images = {name: each.image for name, each in topics.cameras.items()}
     stamps, lenses = _read(bag, topics, options)
     clouds = stamps[topics.lidar]
-    tolerance_ns = round(options.tolerance_s * _S)
+    tolerance_ns = round(options.sync_tolerance_s * _S)
     pairs = {n: nearest(clouds, stamps[topic], tolerance_ns) for n, topic in images.items()}
     complete = np.flatnonzero(np.all([rows >= 0 for rows in pairs.values()], axis=0))
     summary = _summary(stamps, topics, pairs, complete, options=options)
@@ -185,7 +185,7 @@ def _summary(
     clouds = stamps[topics.lidar]
     parts = [
         f"{len(clouds.paths)} clouds, {len(complete)} with all images within "
-        f"{options.tolerance_s:g} s"
+        f"{options.sync_tolerance_s:g} s"
     ]
     for name, rows in pairs.items():
         images = stamps[topics.cameras[name].image]
@@ -213,11 +213,11 @@ def _advice(stamps: Mapping[str, TopicStamps], topics: RigTopics, pairs: Mapping
     apart = offsets_of(stamps[topics.lidar], stamps[topics.cameras[worst].image])
     if len(apart):
         return (
-            f"the nearest images of {describe_offsets(worst, apart)}; give --stamps record if the "
-            "clocks differ, or a larger --tolerance-s if that is acceptable"
+            f"the nearest images of {describe_offsets(worst, apart)}; set stamps: record in "
+            "--config if the clocks differ, or a larger sync_tolerance_s if that is acceptable"
         )
     both = {topic: stamps[topic] for topic in (topics.lidar, topics.cameras[worst].image)}
     return (
-        f"the stamps of {describe_spans(both)} do not meet; give --stamps record if the clocks "
-        "differ, or a larger --tolerance-s"
+        f"the stamps of {describe_spans(both)} do not meet; set stamps: record in --config if "
+        "the clocks differ, or a larger sync_tolerance_s"
     )

@@ -24,8 +24,8 @@ class BagOptions:
             and that of the ``odometry``; those that are
             not given are found by their types.
         every_s: seconds between frames; only their surroundings are read. All frames if None.
-        tolerance_s: largest difference of the stamps of a cloud and its images, also of folders
-            whose files are named by stamps.
+        sync_tolerance_s: largest difference of the stamps of a cloud and its images, also of
+            folders whose files are named by stamps.
         stamps: ``header``, those of the sensors; or ``record``, when a message was recorded, for
             sensors whose clocks differ.
         motion: how clouds are corrected for the motion of the vehicle, to the median stamp of a
@@ -40,7 +40,7 @@ class BagOptions:
 
     topics: Mapping[str, str] = field(default_factory=dict)
     every_s: float | None = None
-    tolerance_s: float = NEAR_S
+    sync_tolerance_s: float = NEAR_S
     stamps: Stamps = "header"
     motion: Motion = "none"
     beside: tuple[Path, ...] = ()
@@ -49,8 +49,10 @@ class BagOptions:
         object.__setattr__(self, "topics", MappingProxyType(dict(self.topics)))
         if self.every_s is not None and not self.every_s > 0:
             raise ValueError(f"every_s must be positive, found {self.every_s}")
-        if not self.tolerance_s >= 0:
-            raise ValueError(f"tolerance_s must not be negative, found {self.tolerance_s}")
+        if not self.sync_tolerance_s >= 0:
+            raise ValueError(
+                f"sync_tolerance_s must not be negative, found {self.sync_tolerance_s}"
+            )
         if self.stamps not in get_args(Stamps):
             raise ValueError(f"stamps {self.stamps!r}: known are {', '.join(get_args(Stamps))}")
         if self.motion not in get_args(Motion):

@@ -107,9 +107,9 @@ class BagRig:
                 f"{camera.where}: no static transforms connect the LiDAR's frame {self.lidar!r} "
                 f"with the frame {frame!r} of camera {name!r}: "
                 f"{self.transforms.why_apart(frame, self.lidar)}. If another bag of the drive has "
-                "them, give it too, or write `calibgraph bag OTHER_BAG --out rig.yaml`; else "
-                "describe the mounting to calibgraph guess, or import the bag with a URDF; then "
-                "give the rig (--rig)",
+                "them, give it too, or write `calibgraph rig OTHER_BAG --out rig.yaml`; else "
+                "describe the mounting with calibgraph rig BAG --mount, or give it the bag with a "
+                "URDF; then give the rig (--rig)",
                 camera=name,
             )
         extrinsic = {

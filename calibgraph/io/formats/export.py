@@ -7,14 +7,13 @@ from typing import Final
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.files import read_yaml, require_place_for_folder, write_text
+from calibgraph.files import read_yaml, require_new_file, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
 from calibgraph.io.formats.documents import commented
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.io.formats.rig_export import RigExport, prepare_export
 from calibgraph.io.formats.transforms import TRANSFORMS, write_transforms
 from calibgraph.io.formats.writers import (
-    LENS_MARK,
     kitti_statement,
     write_camera_infos,
     write_json,
@@ -26,7 +25,6 @@ from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.rig import Rig, rigid_transform
-from calibgraph.outputs import Output, is_marked, require_writable
 
 Writer = Callable[[RigExport], str | Mapping[str, str]]
 """Of one file, or of the files of a folder by name."""
@@ -40,11 +38,10 @@ WRITERS: Final[Mapping[str, Writer]] = {
     "json": write_json,
 }
 _WITH_BASE = "autoware"
-_WITHOUT_COMMENTS, _FOLDER = "kitti", "camera_info"
-_MARKS = (b"calibgraph export", b"calibgraph_export")
+_WITHOUT_COMMENTS = "kitti"
 
 
-def export_calibration(
+def export_calibration(  # noqa: PLR0913
     source: Calibration | Rig | Path | str,
     path: Path | str,
     format: str,
@@ -54,13 +51,13 @@ def export_calibration(
     camera_frame: str | None = None,
     T_base_lidar: Array | None = None,
     even_if_failed: bool = False,
+    force: bool = False,
 ) -> tuple[Path, ...]:
     """Write a calibration for another program, with its direction and a worked point.
 
     Args:
         source: a result or a rig, or the path of one.
-        path: the file to write, of ``camera_info`` the folder. Only a file that was exported before
-            is replaced; in the folder those of other cameras are removed, unless some are named.
+        path: the file to write, of ``camera_info`` the folder.
         format: a name of ``calibgraph.io.formats.names.EXPORT_FORMATS``.
         cameras: names of those to write; all if None.
         lidar_frame: frame id of the LiDAR; the rig's name of it if None.
@@ -69,6 +66,7 @@ def export_calibration(
         T_base_lidar: (4, 4) pose of the LiDAR in ``sensor_kit_base_link`` (autoware); the
             identity if None.
         even_if_failed: whether to write cameras whose verdict is FAIL.
+        force: whether to replace files that are there.
 
     Returns:
         The files: one, and for ``kitti``, which has no comments, a text file beside it; for
@@ -89,7 +87,7 @@ def export_calibration(
     )
     if isinstance(found, Calibration) and not even_if_failed:
         _require_not_failed(found, [*prepared.cameras])
-    return _write(prepared, Path(path), format, whole=cameras is None)
+    return _write(prepared, Path(path), format, force=force)
 
 
 def _require_not_failed(result: Calibration, cameras: Sequence[str]) -> None:
@@ -123,37 +121,21 @@ def _loaded(path: Path | str) -> Calibration | Rig:
     return load_rig(file)
 
 
-def outputs_of_export(path: Path, format: str) -> list[Output]:
-    """The files of an export that its name tells, before cameras are known: none of a folder."""
-    if format == _FOLDER:
-        require_place_for_folder(path)
-        return []
-    beside = [_statement_of(path)] if format == _WITHOUT_COMMENTS else []
-    return _outputs((path, *beside))
-
-
 def _statement_of(path: Path) -> Path:
     """Beside the file of a format without comments, one with its direction."""
     return path.with_name(f"{path.stem}.direction.txt")
 
 
-def _outputs(files: Iterable[Path]) -> list[Output]:
-    return [Output(file, "export", _MARKS) for file in files]
-
-
-def _write(export: RigExport, path: Path, format: str, *, whole: bool) -> tuple[Path, ...]:
-    """Write all files or, if one may not be replaced, none; of a whole rig no others stay."""
+def _write(export: RigExport, path: Path, format: str, *, force: bool) -> tuple[Path, ...]:
+    """Write all files or, if one may not be replaced, none."""
     written = WRITERS[format](export)
     contents = {path: written} if isinstance(written, str) else {
         path / name: content for name, content in written.items()
     }  # fmt: skip
     if format == _WITHOUT_COMMENTS:
         contents[_statement_of(path)] = commented(kitti_statement(export))
-    require_writable(_outputs(contents))
-    others = path.glob("*.yaml") if format == _FOLDER and whole else ()
-    for file in [*others]:
-        if file not in contents and is_marked(file, LENS_MARK.encode()):
-            file.unlink()
+    for file in contents:
+        require_new_file(file, force=force)
     for file, content in contents.items():
         write_text(file, content)
     return tuple(contents)

@@ -26,4 +26,4 @@ IMPORT_FORMATS: Final = (
     "koide3 calib.json, KITTI and KITTI-360 (calib_cam_to_velo.txt, "
     "perspective.txt), a ROS bag, a rig file, a result or a JSON export of calibgraph"
 )
-"""What ``calibgraph import`` reads."""
+"""What ``calibgraph rig`` reads."""

@@ -305,7 +305,7 @@ def _camera(
         raise RigError(
             f"camera {name!r}: no file has its T_camera_lidar{listed}; name its "
             "frame with --camera-frame, add a URDF, a sensor kit or a rig file with a guess, or "
-            f"describe its mounting to calibgraph guess{notes}",
+            f"describe its mounting with --mount {name}=WORDS{notes}",
             camera=name,
         )
     return {**replace(lens, size_px=size).fields(), "T_camera_lidar": T_camera_lidar}

@@ -23,7 +23,6 @@ from calibgraph.model.rig import Camera
 
 DERIVED = "computed from T_cam_lidar"
 """States of a T_cn_cnm1 that it is no measurement."""
-LENS_MARK: Final = "the extrinsic is not part of a camera_info"
 """Text of exported lenses alone."""
 _MODELS: Final = {"pinhole": "plumb_bob", "fisheye": "equidistant", "omnidirectional": "mei"}
 _PLUMB_BOB = 5
@@ -159,7 +158,7 @@ def write_camera_infos(export: RigExport) -> Mapping[str, str]:
         statement = (
             export.origin,
             "K and D are of the images as recorded, R is the identity, P is K",
-            f"{LENS_MARK}: export it as tf2, ros2-launch or urdf",
+            "the extrinsic is not part of a camera_info: export it as tf2, ros2-launch or urdf",
             f"optical frame: {export.optical_frames[name]}",
         )
         files[file] = commented_yaml(statement, _of_ros(name, camera))

@@ -1,6 +1,10 @@
 """Camera-to-camera matches: co-visible features on the LiDAR's surfaces."""
 
-from calibgraph.matching.camera_pairs.find import match_cameras, match_some_frames, with_surfaces
-from calibgraph.matching.camera_pairs.overlap import overlapping_pairs
+from calibgraph.matching.camera_pairs.find import (
+    PAIR_FRAMES,
+    match_cameras,
+    overlapping_pairs,
+    with_surfaces,
+)
 
-__all__ = ["match_cameras", "match_some_frames", "overlapping_pairs", "with_surfaces"]
+__all__ = ["PAIR_FRAMES", "match_cameras", "overlapping_pairs", "with_surfaces"]

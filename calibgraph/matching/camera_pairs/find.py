@@ -16,12 +16,14 @@ from calibgraph.matching.camera_pairs.surfaces import planes_at
 from calibgraph.model.camera_matches import CameraMatches, concatenate_camera_matches
 from calibgraph.model.clock import when_taken
 from calibgraph.model.geometry import planes_in_lidar
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress, no_progress
 from factors import unproject
 
 Pair = tuple[str, str]
+_MARGIN = 0.1  # of an image's size, added on each side: extrinsics are estimates
+_POINTS = 5000  # of the cloud: a common strip of a hundredth of all it sees still has 50
 PAIR_FRAMES = 3
 """So many frames of a recording are enough: on KITTI, 2 to 10 give relative poses within 0.01 deg
 and 0.3 cm of each other, and 3 take a tenth of the time of a run."""
@@ -30,9 +32,9 @@ and 0.3 cm of each other, and 3 take a tenth of the time of a run."""
 def match_cameras(
     dataset: Dataset,
     rig: Rig,
-    *,
-    frames: Sequence[Frame] | None = None,
     pairs: Iterable[Pair] | None = None,
+    *,
+    most_frames: int | None = None,
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> CameraMatches:
@@ -44,8 +46,8 @@ def match_cameras(
     Args:
         dataset: images.
         rig: lenses.
-        frames: of the dataset; all of them if None.
         pairs: of cameras, A before B in the rig's order; all of them if None.
+        most_frames: so many, evenly spread; a calibration takes ``PAIR_FRAMES``; None: all.
         seed: of the choice of samples.
         progress: called as frames are done.
 
@@ -56,7 +58,7 @@ def match_cameras(
         FileError: if an image cannot be read.
     """
     wanted = list(combinations(rig.cameras, 2)) if pairs is None else list(pairs)
-    chosen = dataset.frames if frames is None else frames
+    chosen = dataset.frames if most_frames is None else spread_out(dataset.frames, most_frames)
     found: dict[Pair, list[tuple[int, Features, Features]]] = {pair: [] for pair in wanted}
     match = partial(_match_frame, rig=rig, pairs=wanted)
     with core_pool() as cores:
@@ -67,19 +69,6 @@ def match_cameras(
     tables = [_agreeing(rig, pair, parts, seed) for pair, parts in found.items() if parts]
     metadata = {"camera_features": "sift", "seed": seed}
     return concatenate_camera_matches([CameraMatches.empty(tuple(rig.cameras), metadata), *tables])
-
-
-def match_some_frames(
-    dataset: Dataset,
-    rig: Rig,
-    pairs: Iterable[Pair] | None = None,
-    *,
-    seed: int = 0,
-    progress: Progress = no_progress,
-) -> CameraMatches:
-    """The matches of as many frames as a calibration needs; arguments as of `match_cameras`."""
-    frames = spread_out(dataset.frames, PAIR_FRAMES)
-    return match_cameras(dataset, rig, frames=frames, pairs=pairs, seed=seed, progress=progress)
 
 
 def _match_frame(
@@ -158,3 +147,28 @@ def _agreeing(
         pixels_px=np.stack(pixels, axis=1)[fit.inlier],
         planes_lidar_per_m=np.full((n, 2, 3), np.nan),
     )
+
+
+def overlapping_pairs(rig: Rig, cloud: NDArray[np.float32]) -> list[tuple[str, str]]:
+    """The pairs of cameras that have points of a cloud in both images, or next to them.
+
+    Args:
+        rig: lenses and extrinsics.
+        cloud: (n, >= 3) x y z [m] in the LiDAR frame.
+
+    Returns:
+        A before B in the rig's order.
+    """
+    step = max(1, len(cloud) // _POINTS)
+    points = cloud[::step, :3].astype(np.float64)
+    seen = {name: _in_widened_image(camera, points) for name, camera in rig.cameras.items()}
+    return [(a, b) for a, b in combinations(rig.cameras, 2) if (seen[a] & seen[b]).any()]
+
+
+def _in_widened_image(camera: Camera, points: Array) -> NDArray[np.bool_]:
+    """(n,) the points that project into the image or its margin."""
+    T = camera.T_camera_lidar
+    pixels, valid = camera.lens.project(points @ T[:3, :3].T + T[:3, 3])
+    size = np.array([camera.width_px, camera.height_px])
+    shares = (pixels + 0.5) / size
+    return np.asarray(valid & (shares > -_MARGIN).all(axis=1) & (shares < 1 + _MARGIN).all(axis=1))

@@ -1,4 +1,4 @@
-"""Robust epipolar geometry on rays, and whether it could have come about by chance."""
+"""Robust geometry on rays: epipolar, and whether it came about by chance; the relative pose."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from scipy.special import gammaln
 
 from calibgraph.arrays import Array
 from calibgraph.model.rig import Camera
-from calibgraph.solver.pnp import magsac
+from calibgraph.solver.pnp import magsac, ransac_on_plane
 from factors import ray_spreads
 
 MAX_LOG10_FALSE_ALARMS = -3.0
@@ -21,6 +21,13 @@ _ITERATIONS = 5000
 _SAMPLE, _MODELS = 5, 10  # matches that determine an essential matrix, and at most how many of them
 MAX_ANGLE_RAD = math.radians(60.0)  # off the mean ray: a plane magnifies the errors of wider rays
 _FOCAL_PX = 1000.0
+
+MIN_INLIERS = 12
+"""Features that must agree on a pose: 4 determine one, and of those that agree on an epipolar
+geometry few others agree by chance."""
+
+_THRESHOLD_RAD = math.radians(0.3)  # depths beside silhouettes, of an estimate a degree off
+_PNP_ITERATIONS = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +142,32 @@ def _essential_matrix(
     if found is None or found.shape != (3, 3):
         return None
     return np.asarray(turns[1].T @ found @ turns[0])
+
+
+def relative_pose(points_a_m: Array, rays_b: Array, *, seed: int) -> Array | None:
+    """T_b_a from points in the frame of camera A and the rays on which camera B sees them.
+
+    MAGSAC and PnP on the plane across the mean ray, so that any field of view serves.
+
+    Args:
+        points_a_m: (n, 3).
+        rays_b: (n, 3) unit vectors.
+        seed: of the choice of samples.
+
+    Returns:
+        (4, 4); None if too few agree on a pose.
+    """
+    if len(rays_b) < MIN_INLIERS:
+        return None
+    turn = turn_to_axis(rays_b)
+    turned = rays_b @ turn.T
+    narrow = turned[:, 2] > math.cos(MAX_ANGLE_RAD)
+    if np.count_nonzero(narrow) < MIN_INLIERS:
+        return None
+    plane = turned[narrow, :2] / turned[narrow, 2:]
+    parameters = magsac(_THRESHOLD_RAD * _FOCAL_PX, iterations=_PNP_ITERATIONS, seed=seed)
+    found = ransac_on_plane(points_a_m[narrow], plane, _FOCAL_PX, parameters, turn=turn)
+    return None if found is None or found[1] < MIN_INLIERS else found[0]
 
 
 def turn_to_axis(rays: Array) -> Array:

@@ -20,7 +20,6 @@ from calibgraph.matching.cmrnext.architecture import (
 )
 from calibgraph.matching.cmrnext.network import CmrNext
 from calibgraph.matching.cmrnext.torch_file import MAX_BYTES, read_torch_file
-from calibgraph.outputs import WEIGHTS_MARK
 
 SAFETENSORS = ".safetensors"
 
@@ -90,7 +89,7 @@ class Checkpoint:
         """Write the weights and their config as a .safetensors file."""
         from safetensors.torch import save_file
 
-        metadata = {"format": WEIGHTS_MARK, "config": json.dumps(self.config)}
+        metadata = {"format": "calibgraph-cmrnext/1", "config": json.dumps(self.config)}
         # Some tensors are stored under two names; safetensors requires separate memory.
         state = {name: tensor.clone().contiguous() for name, tensor in self.state.items()}
         write_atomically(path, lambda temporary: save_file(state, temporary, metadata))

@@ -45,22 +45,6 @@ def volume_bytes(batch: int, height: int, width: int) -> int:
     return math.ceil(batch * (height // 8 * (width // 8)) ** 2 * 4 * _PYRAMID)
 
 
-def cross_entropy(windows: Tensor, targets: Tensor) -> Tensor:
-    """Mean cross-entropy of the finest level's softmax at the targets.
-
-    Args:
-        windows: (n, 81) the first channels of :meth:`Correlation.window`.
-        targets: (n, 2) x, y of the true position from the window's centre, cells; within +-4.
-    """
-    fraction, whole = torch.frac(targets + RADIUS), (targets + RADIUS).long()
-    corner = (WINDOW * whole[:, 0] + whole[:, 1])[:, None]
-    x, y = fraction[:, :1], fraction[:, 1:]
-    shares = torch.cat([(1 - x) * (1 - y), (1 - x) * y, x * (1 - y), x * y], dim=1)
-    index = corner + torch.tensor([0, 1, WINDOW, WINDOW + 1], device=windows.device)
-    found = windows.log_softmax(dim=1).gather(1, index.clamp(max=WINDOW**2 - 1))
-    return -(shares * found).sum(dim=1).mean()
-
-
 class Volume:
     """All pairs of cells, computed once."""
 

@@ -1,8 +1,14 @@
-"""Matches of one network: images and clouds in, a table of correspondences per image out."""
+"""Matches of one network: images and clouds in, a table of correspondences per image out.
 
-from collections.abc import Sequence
+And the outcome of each image, with the matcher's findings from all of them. The confidence of a
+match, 0 to 1, follows the predicted standard deviations, if there is an uncertainty head. Without
+one it is a product of three factors: convergence, correlation peak, and agreement with the frame's
+pose. It ranks matches, but is not calibrated: it is no probability.
+"""
+
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import cast
 
 import numpy as np
@@ -11,8 +17,8 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.io.frame import Frame
-from calibgraph.matching.cmrnext import confidence
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint
+from calibgraph.matching.cmrnext.correlation import WINDOW
 from calibgraph.matching.cmrnext.inputs import (
     LidarImage,
     View,
@@ -22,9 +28,10 @@ from calibgraph.matching.cmrnext.inputs import (
     lidar_tensor,
     rgb_tensor,
 )
-from calibgraph.matching.cmrnext.layers import CELL
-from calibgraph.matching.cmrnext.network import CmrNext, upscale
+from calibgraph.matching.cmrnext.network import CELL, CmrNext, upscale
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Camera
 
 Maps = NDArray[np.float32]
@@ -32,6 +39,14 @@ Maps = NDArray[np.float32]
 HALVED_FROM_PX = 1400
 """Images at least this wide are halved unless the weights or the user choose: the networks were
 trained at 1241 pixels, and on larger images halved."""
+
+STEP_PX = 1.0
+"""A last iteration that moves the match by this halves its confidence."""
+
+RESIDUAL_PX = 4.0
+"""A reprojection error of this at the frame's pose halves it."""
+
+MIN_CONFIDENCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,9 +167,73 @@ def to_table(
         frame=job.frame.index,
         pixels_px=pixels[kept].reshape(-1, 2),
         points_lidar_m=job.cloud[index, :3],
-        confidence=confidence.from_flow(step, peak)
+        confidence=_confidence_of_flow(step, peak)
         if sigma is None
-        else confidence.from_sigmas(sigma),
-        information_px=None if sigma is None else confidence.to_information(sigma),
+        else _confidence_of_sigmas(sigma),
+        information_px=None if sigma is None else _to_information(sigma),
         point_index=index,
+    )
+
+
+def _confidence_of_flow(step_px: Array, peak: Array) -> NDArray[np.float32]:
+    """Confidence without an uncertainty head, before the frame's pose is estimated.
+
+    Args:
+        step_px: (n,) length of the last iteration's change.
+        peak: (n,) softmax share of the correlation at the target among its 9 x 9 neighbours; a
+            share no better than chance halves the confidence.
+
+    Returns:
+        (n,) in (0, 1]; uncalibrated.
+    """
+    converged = 1.0 / (1.0 + (step_px / STEP_PX) ** 2)
+    distinct = peak / (peak + 1.0 / WINDOW**2)
+    return _bound(converged * distinct)
+
+
+def lower_by_residuals(confidence: NDArray[np.float32], residual_px: Array) -> NDArray[np.float32]:
+    """Confidence lowered by (n,) reprojection errors at the pose of the frame's own matches."""
+    return _bound(confidence / (1.0 + (residual_px / RESIDUAL_PX) ** 2))
+
+
+def _confidence_of_sigmas(sigma_px: Array) -> NDArray[np.float32]:
+    """Confidence from (n, 2) predicted standard deviations; 1 for the least, 1 px per axis."""
+    return _bound(2.0 / sigma_px.sum(axis=1))
+
+
+def _to_information(sigma_px: Array) -> Array:
+    """(n, 3) i_uu, i_uv, i_vv from (n, 2) predicted standard deviations."""
+    return np.column_stack(
+        [sigma_px[:, 0] ** -2.0, np.zeros(len(sigma_px)), sigma_px[:, 1] ** -2.0]
+    )
+
+
+def _bound(values: Array | NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(np.nan_to_num(values).clip(MIN_CONFIDENCE, 1.0), dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageResult:
+    """The outcome of one image.
+
+    Attributes:
+        job: with the estimate from which the last network started.
+        matches: of the last network.
+        T_camera_lidar: (4, 4) estimated from them by PnP; None if that failed.
+        failed: whether a network gave no pose, or one beyond its range of training.
+    """
+
+    job: MatchingJob
+    matches: Correspondences
+    T_camera_lidar: Array | None
+    failed: bool
+
+
+def to_findings(results: Mapping[str, Sequence[ImageResult]], last: Checkpoint) -> MatcherFindings:
+    """Failed frames, and the shared error of the last network."""
+    prior = asdict(error_components().matchers["cmrnext"])
+    stated = {key: last.config[key] for key in prior if last.config.get(key) is not None}
+    return MatcherFindings(
+        failed_share={name: float(np.mean([r.failed for r in e])) for name, e in results.items()},
+        **{**prior, **stated},
     )

@@ -1,6 +1,6 @@
 """The matcher ``cmrnext``: a schedule of networks from coarse to fine, and its findings."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -9,20 +9,19 @@ from typing import Any, Literal
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.matching.cmrnext import confidence, probe
+from calibgraph.io.dataset import Dataset
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint, load_checkpoint
-from calibgraph.matching.cmrnext.flow_matching import FlowMatcher, MatchingJob, load_job
-from calibgraph.matching.cmrnext.image_results import (
+from calibgraph.matching.cmrnext.flow_matching import (
+    FlowMatcher,
     ImageResult,
-    list_failed_frames,
+    MatchingJob,
+    load_job,
+    lower_by_residuals,
     to_findings,
-    without_failed,
 )
 from calibgraph.matching.cmrnext.inputs import View
 from calibgraph.matching.cmrnext.network import torch_device
-from calibgraph.matching.protocol import Start
-from calibgraph.model.config import Config, LensPart, Stage1Source
+from calibgraph.model.config import Config, Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Rig
@@ -30,7 +29,6 @@ from calibgraph.progress import Progress
 from calibgraph.solver.pnp import frame_pose
 
 _BATCH = {"cpu": 1, "cuda": 4}
-_PROBED_FRAMES = 5  # per camera
 _BEYOND = 2.0  # times the range of training, corner to corner: no network corrects by more
 
 
@@ -56,10 +54,6 @@ class CmrNextMatcher:
     """
 
     stage1: Stage1Source = "pnp"
-    most_frames: int | None = None
-    tracking_rounds: tuple[int, ...] = ()
-    image_checks_can_fail = False
-    knows_motion = False
 
     def __init__(
         self,
@@ -73,7 +67,7 @@ class CmrNextMatcher:
         seed: int = 0,
     ) -> None:
         if not weights:
-            raise ValueError("no weights given: --weights iter1.tar iter5.tar iter6.tar")
+            raise ValueError("no weights given: --weights iter1.tar --weights iter5.tar")
         if start_from not in ("frame", "joint"):
             raise ValueError(f"start_from {start_from!r}: known are frame, joint")
         if iterations < 1 or (batch is not None and batch < 1):
@@ -88,16 +82,6 @@ class CmrNextMatcher:
         self.networks = [loaded[str(path)] for path in weights]
         self.rounds = len(self.networks) if start_from == "joint" else 1
 
-    def with_estimate(self, parts: Sequence[LensPart]) -> "CmrNextMatcher":  # noqa: ARG002
-        """The same matcher: each of its frames has a pose of its own."""
-        return self
-
-    def locate(
-        self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
-    ) -> Start:
-        """The rounds begin at the initial guess."""
-        return Start(rig)
-
     def match(
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
     ) -> Correspondences:
@@ -105,9 +89,6 @@ class CmrNextMatcher:
         schedule = self.networks
         if self.start_from == "joint":
             schedule = schedule[round_index : round_index + 1]
-        is_last = round_index == self.rounds - 1
-        probed = spread_out(dataset.frames, _PROBED_FRAMES) if is_last else []
-        probed_frames = {frame.index for frame in probed}
         total = len(rig.cameras) * len(dataset.frames)
         results: dict[str, list[ImageResult]] = {name: [] for name in rig.cameras}
         done = 0
@@ -115,20 +96,19 @@ class CmrNextMatcher:
             what = f"round {round_index + 1} of {self.rounds}: {jobs[0].frame.name}"
             progress(what, round_index * total + done, self.rounds * total)
             for result in self._run(jobs, schedule):
-                if result.job.frame.index in probed_frames:
-                    result = self._probe(result, schedule[-1])  # noqa: PLW2901
                 results[result.job.name].append(result)
             done += len(jobs)
-        tables = [result.matches for each in results.values() for result in without_failed(each)]
+        # Of a camera whose images all failed, all are given: the solve reports the failure.
+        good = [[r for r in each if not r.failed] or each for each in results.values()]
+        tables = [result.matches for each in good for result in each]
         findings = to_findings(results, schedule[-1].checkpoint)
         metadata = {
             **self._metadata(schedule[-1].checkpoint, round_index),
-            "failed_frames": list_failed_frames(results),
+            "failed_frames": {
+                n: [r.job.frame.name for r in e if r.failed] for n, e in results.items()
+            },
         }
         return concatenate(tables).with_metadata(metadata).with_findings(findings)
-
-    def release(self) -> None:
-        """Nothing is kept of frames."""
 
     def _load(self, path: str) -> FlowMatcher:
         checkpoint = load_checkpoint(path)
@@ -165,7 +145,12 @@ class CmrNextMatcher:
                 for job, table, before in zip(jobs, tables, failed, strict=True)
             ]
             failed = [result.failed for result in results]
-            jobs = [result.next_job() for result in results]
+            jobs = [  # of the next network: from the new estimate, unless it failed
+                r.job
+                if r.failed or r.T_camera_lidar is None
+                else replace(r.job, T_camera_lidar=r.T_camera_lidar)
+                for r in results
+            ]
         return results
 
     def _estimate(
@@ -177,23 +162,6 @@ class CmrNextMatcher:
             return ImageResult(job, table, None, failed=True)
         failed = failed or not _is_within_range(checkpoint, job, T_camera_lidar)
         return ImageResult(job, _weigh(job, table, T_camera_lidar), T_camera_lidar, failed)
-
-    def _probe(self, result: ImageResult, network: FlowMatcher) -> ImageResult:
-        """Match again from a displaced start: with the image, and with a blank one."""
-        job = result.job
-        base = job.T_camera_lidar if result.T_camera_lidar is None else result.T_camera_lidar
-        rng = np.random.default_rng([self.seed, job.frame.index])
-        start = probe.displace(base, network.checkpoint.range_deg_m, rng)
-        blank = np.full_like(job.image, probe.BLANK)
-        with_image, without_image = (
-            network.match([replace(job, T_camera_lidar=start, image=image)])[0]
-            for image in (job.image, blank)
-        )
-        dependence, kept = (
-            probe.remaining_share(job.camera, base, start, table)
-            for table in (with_image, without_image)
-        )
-        return replace(result, start_dependence=dependence, memorization=1.0 - kept)
 
     def _metadata(self, last: Checkpoint, round_index: int) -> dict[str, Any]:
         return {
@@ -232,4 +200,4 @@ def _weigh(job: MatchingJob, table: Correspondences, T_camera_lidar: Array) -> C
     projected, valid = job.camera.lens.project(points)
     residuals = np.linalg.norm(projected - table.pixels_px, axis=1)
     residuals = np.where(valid, residuals, np.inf)
-    return replace(table, confidence=confidence.lower_by_residuals(table.confidence, residuals))
+    return replace(table, confidence=lower_by_residuals(table.confidence, residuals))

@@ -8,8 +8,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
-from calibgraph.matching.camera_pairs.geometry import agree_on_epipolar_geometry
-from calibgraph.matching.camera_pairs.relative_pose import relative_pose
+from calibgraph.matching.camera_pairs.geometry import agree_on_epipolar_geometry, relative_pose
 from calibgraph.matching.camera_pairs.surfaces import planes_at
 from calibgraph.matching.structure.pose_refinement import CameraFrames
 from calibgraph.model.rig import Rig

@@ -21,7 +21,7 @@ from calibgraph.matching.structure.correlation_kernels import find_best_shifts, 
 from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.prepared_image import PreparedImage
-from calibgraph.matching.structure.score_kernel import score_windows
+from calibgraph.matching.structure.score_kernel import pad, score_windows
 from calibgraph.matching.structure.shift_scores import name_cells
 from calibgraph.matching.structure.visibility import find_visible
 from calibgraph.matching.structure.windows import Windows
@@ -143,13 +143,14 @@ def correlate(
 
     The windows of a frame are at most so many, drawn by the seed; if dense, twice as close.
     """
-    cells = _to_angular_image(grays[0], camera).log_gray.size
+    images = [_to_angular_image(gray, camera) for gray in grays]
+    cells = images[0].log_gray.size
     max_windows = max(1, min(max_windows, MAX_CELLS // (cells * len(grays))))
     stride = DENSE_SPACINGS if dense else STRIDE_SPACINGS
     draw = max_windows, seed
     cut = partial(_cut_windows_in_reach, range_rad=range_rad, stride=stride, draw=draw)
     one = partial(_correlate_frame, camera=camera, cut=cut)
-    frames = list(cores.map(one, grays, clouds))
+    frames = list(cores.map(one, images, clouds))
     return CorrelationMaps(
         np.concatenate([frame.maps for frame in frames]),
         np.concatenate([frame.points_lidar_m for frame in frames]),
@@ -159,14 +160,13 @@ def correlate(
 
 
 def _correlate_frame(
-    gray: PreparedImage,
+    image: _AngularImage,
     cloud: PreparedCloud,
     *,
     camera: Camera,
     cut: Callable[[_AngularImage, PreparedCloud, Camera], Windows],
 ) -> CorrelationMaps:
     """The maps of one frame, of windows that are cut so."""
-    image = _to_angular_image(gray, camera)
     windows = cut(image, cloud, camera)
     if not len(windows.counts):
         nothing = np.zeros((0, *image.inside.shape), np.float32)
@@ -222,7 +222,7 @@ def _score_maps(
     maps = np.zeros((groups, *inside.shape), np.float32)
     first = np.zeros(2, np.int64)
     score_windows(
-        image.log_gray, places, windows.counts, windows.basis, group, first, False, maps,
+        pad(image.log_gray), places, windows.counts, windows.basis, group, first, False, maps,
         CHANCE,
     )  # fmt: skip
     maps *= inside

@@ -53,25 +53,40 @@ def thin(angles: Array, cell_rad: float) -> Rows:
     """
     if not len(angles):
         return np.empty(0, np.intp)
-    azimuth, elevation = angles.T
-    up = elevation / cell_rad
-    floor = np.floor(up)
-    row = (floor - floor.min()).astype(np.intp)
-    cosine = np.cos((np.arange(row.max() + 1) + floor.min() + 0.5) * cell_rad)
-    along = (azimuth + math.pi) * cosine[row] / cell_rad
-    column = np.floor(along)
-    off = (along - column - 0.5) ** 2 + (up - floor - 0.5) ** 2
-    column -= column.min()
-    cell = row * (int(column.max()) + 1) + column.astype(np.intp)
-    nearest = np.full(cell.max() + 1, -1, np.intp)
-    _find_nearest(cell, off, nearest)
+    lowest, highest = (math.floor(f(angles[:, 1]) / cell_rad) for f in (np.min, np.max))
+    cosine = np.cos((np.arange(highest - lowest + 1) + float(lowest) + 0.5) * cell_rad)
+    cells, off = np.empty((len(angles), 2), np.intp), np.empty(len(angles))
+    first, last = _find_cells(np.ascontiguousarray(angles), cell_rad, lowest, cosine, cells, off)
+    nearest = np.full((len(cosine), last - first + 1), -1, np.intp)
+    _find_nearest(cells, off, first, nearest)
     return nearest[nearest >= 0]
 
 
 @compiled()
-def _find_nearest(cell, off, nearest):  # type: ignore[no-untyped-def]
+def _find_cells(angles, cell, lowest, cosine, cells, off):  # type: ignore[no-untyped-def]
+    """Fill each direction's cell (row, column), and its squared distance from the centre.
+
+    Returns:
+        The first and the last column.
+    """
+    first, last = 1 << 62, -1
+    for i in range(len(angles)):
+        up = angles[i, 1] / cell
+        floor = math.floor(up)
+        row = floor - lowest
+        along = (angles[i, 0] + math.pi) * cosine[row] / cell
+        column = math.floor(along)
+        x, y = along - column - 0.5, up - floor - 0.5
+        cells[i, 0], cells[i, 1], off[i] = row, column, x * x + y * y
+        first, last = min(first, column), max(last, column)
+    return first, last
+
+
+@compiled()
+def _find_nearest(cells, off, first, nearest):  # type: ignore[no-untyped-def]
     """Fill the number of each cell's nearest direction; of equally near ones, the first."""
-    for i in range(len(cell)):
-        before = nearest[cell[i]]
+    for i in range(len(cells)):
+        row, column = cells[i, 0], cells[i, 1] - first
+        before = nearest[row, column]
         if before < 0 or off[i] < off[before]:
-            nearest[cell[i]] = i
+            nearest[row, column] = i

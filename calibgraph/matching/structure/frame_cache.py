@@ -20,7 +20,7 @@ FileVersion = tuple[Path, int, int]
 """Path, time of the last change [ns] and size [bytes]: a file that has changed is decoded again."""
 
 
-MAX_IMAGE_BYTES, MAX_CLOUD_BYTES = 1_500_000_000, 500_000_000
+MAX_IMAGE_BYTES, MAX_CLOUD_BYTES, MAX_SMALL_BYTES = 1_500_000_000, 500_000_000, 600_000_000
 
 
 class FrameCache:
@@ -30,11 +30,13 @@ class FrameCache:
     """
 
     def __init__(self) -> None:
-        self._clouds: KeyedCache[tuple[FileVersion, ScanMotion | None], PreparedCloud] = (
-            KeyedCache()
+        self._clouds: KeyedCache[tuple[FileVersion, ScanMotion | None], PreparedCloud] = KeyedCache(
+            MAX_CLOUD_BYTES
         )
-        self._images: KeyedCache[tuple[FileVersion, int, int], PreparedImage] = KeyedCache()
-        self._tables, self._smaller = WindowTables(), SmallImages()
+        self._images: KeyedCache[tuple[FileVersion, int, int], PreparedImage] = KeyedCache(
+            MAX_IMAGE_BYTES
+        )
+        self._tables, self._smaller = WindowTables(), SmallImages(MAX_SMALL_BYTES)
 
     def keep_only(self, frames: Iterable[Frame]) -> None:
         """Drop all other frames: memory stays bounded along a drive."""
@@ -47,12 +49,10 @@ class FrameCache:
 
     def cloud(self, frame: Frame) -> PreparedCloud:
         """The frame's cloud."""
-        cloud = self._clouds.get(
+        return self._clouds.get(
             (_file_version(frame.cloud_path), frame.motion),
             lambda: PreparedCloud.from_points(frame.load_cloud(), self._tables),
         )
-        self._clouds.keep_last(MAX_CLOUD_BYTES, lambda cloud: cloud.nbytes)
-        return cloud
 
     def image(self, frame: Frame, name: str, camera: Camera) -> PreparedImage:
         """The camera's image; its size is checked against the camera's."""
@@ -63,9 +63,7 @@ class FrameCache:
             kept = gray if isinstance(frame, KeptFrame) else mmap_copy(gray)
             return PreparedImage.from_gray(kept, camera, self._smaller)
 
-        image = self._images.get(key, load)
-        self._images.keep_last(MAX_IMAGE_BYTES, lambda image: image.nbytes)
-        return image
+        return self._images.get(key, load)
 
 
 def cache_of(frames: Sequence[Frame], otherwise: FrameCache) -> FrameCache:

@@ -78,8 +78,7 @@ class StructureMatcher:
     """
 
     stage1: Stage1Source = "rig"
-    image_checks_can_fail: bool = True
-    knows_motion: bool = False
+    image_checks_can_fail = True
 
     def __init__(
         self,

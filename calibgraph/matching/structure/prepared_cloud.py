@@ -104,6 +104,7 @@ class PreparedCloud:
                 spacing_rad=spacing_rad,
                 stride_spacings=stride_spacings,
                 keep_linear=fine,
+                is_kept=self.seen_from_origin,
             )
 
         if not self.seen_from_origin:

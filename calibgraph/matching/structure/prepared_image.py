@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.memory import mmap_copy
+from calibgraph.matching.structure.score_kernel import pad
+from calibgraph.memory import mmap_copy, mmap_zeros
 from calibgraph.model.rig import Camera
 from calibgraph.parallel import KeyedCache
 
 Gray = NDArray[np.uint8]
 SmallImages = KeyedCache[tuple[Hashable, ...], NDArray[np.float32]]
 
-MAX_BYTES = 400_000_000  # of all scaled images of a cache
 FINEST_RAD = np.radians(0.03)
 """Of a pixel; half the finest step. Images of 20 megapixels keep a quarter of their pixels."""
 LOG_GRAY = np.log1p(np.arange(256, dtype=np.float32))
@@ -53,18 +53,22 @@ class PreparedImage:
 
         A pixel p of the image lies at (p + 0.5) scale - 0.5.
         """
-        factor = min(1.0, 1.0 / (camera.lens.pixels_per_rad * step_rad))
-        height, width = camera.height_px, camera.width_px
-        size = (max(8, round(width * factor)), max(8, round(height * factor)))
+        width, height = size = _scaled_size(camera, step_rad)
+        small = cv2.resize(cv2.LUT(self.gray, LOG_GRAY), size, interpolation=cv2.INTER_AREA)
+        small = cv2.GaussianBlur(small, (0, 0), blur_steps)
+        scale = np.array([width / camera.width_px, height / camera.height_px])
+        return np.asarray(small, dtype=np.float32), scale
 
-        def make() -> NDArray[np.float32]:
-            small = cv2.resize(cv2.LUT(self.gray, LOG_GRAY), size, interpolation=cv2.INTER_AREA)
-            small = cv2.GaussianBlur(small, (0, 0), blur_steps)
-            return mmap_copy(np.asarray(small, dtype=np.float32))
-
-        image = self.smaller.get((self.identity, size, blur_steps), make)
-        self.smaller.keep_last(MAX_BYTES, lambda each: each.nbytes)
-        return image, np.array([size[0] / width, size[1] / height])
+    def padded_log_gray(
+        self, camera: Camera, step_rad: float, blur_steps: float
+    ) -> tuple[NDArray[np.float32], Array]:
+        """The same, padded for :func:`.score_kernel.score_windows`, and kept."""
+        width, height = _scaled_size(camera, step_rad)
+        image = self.smaller.get(
+            (self.identity, width, height, blur_steps),
+            lambda: pad(self.log_gray(camera, step_rad, blur_steps)[0], mmap_zeros),
+        )
+        return image, np.array([width / camera.width_px, height / camera.height_px])
 
     def mirrored(self) -> PreparedImage:
         """The image with its left and right swapped."""
@@ -74,3 +78,9 @@ class PreparedImage:
     def nbytes(self) -> int:
         """Size in memory, without what is scaled of it."""
         return self.gray.nbytes
+
+
+def _scaled_size(camera: Camera, step_rad: float) -> tuple[int, int]:
+    """Width and height of an image whose pixels are a step, or its own."""
+    factor = min(1.0, 1.0 / (camera.lens.pixels_per_rad * step_rad))
+    return max(8, round(camera.width_px * factor)), max(8, round(camera.height_px * factor))

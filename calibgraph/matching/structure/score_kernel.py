@@ -11,6 +11,8 @@ remainders, and only as long as their values fit the 32 registers: hence the num
 """
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +36,21 @@ _TO_FACTOR = np.float32(1 / (1 + MIN_RESIDUAL_SHARE))
 _index = np.uint64  # numba tests other integers for negative ones
 
 
+def pad(
+    image: NDArray[np.float32], make: Callable[..., NDArray[Any]] = np.zeros
+) -> NDArray[np.float32]:
+    """(h + LINES, w + LANES) an image with zero mean, and zeros: strips may begin anywhere.
+
+    In an array of zeros that is made from its shape and dtype.
+    """
+    height, width = image.shape
+    padded = make((height + LINES, width + LANES), np.float32)
+    np.subtract(image, image.mean(), out=padded[:height, :width])
+    return padded
+
+
 def score_windows(
-    image: NDArray[np.float32],
+    padded: NDArray[np.float32],
     places: NDArray[np.int32],
     counts: NDArray[np.int32],
     basis: NDArray[np.float32],
@@ -54,7 +69,7 @@ def score_windows(
     leaves the image count 0.
 
     Args:
-        image: (h, w).
+        padded: (h + LINES, w + LANES) an image, see :func:`pad`.
         places: (n, l, 2) nearest pixels (u, v) at shift 0.
         counts: (n,) how many of them are in use: the first ones.
         basis: (n, l, 4), of which the last two columns are zero where ``likelihood``.
@@ -64,14 +79,11 @@ def score_windows(
         grids: (g, s, s).
         chance: how much of an unrelated window's share to subtract.
     """
-    height, width = image.shape
+    height, width = padded.shape[0] - LINES, padded.shape[1] - LANES
     rows, columns = grids.shape[1:]
-    padded = math.ceil(columns / LANES) * LANES
-    pixels = np.zeros((height + LINES, width + LANES), np.float32)  # strips may begin anywhere
-    pixels[:height, :width] = image - image.mean()
     ones = _aligned(2 * LANES)
     ones[:LANES] = 1
-    totals = _aligned(rows * padded + LANES)
+    totals = _aligned(rows * math.ceil(columns / LANES) * LANES + LANES)
     totals[:] = likelihood
     room = (
         np.empty(places.shape[1] + POINTS, np.int64),
@@ -80,7 +92,7 @@ def score_windows(
         totals,
     )
     _score_windows(
-        pixels.ravel(), (height, width), (places, counts, basis, group), origin, likelihood, room,
+        padded.ravel(), (height, width), (places, counts, basis, group), origin, likelihood, room,
         grids, (np.float32(chance * CHANCE_DEPTH), np.float32(chance * CHANCE_INTENSITY)),
     )  # fmt: skip
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,7 @@ class ViewedWindows:
         camera: where it is when it takes the middle row, see :func:`when_taken`.
         windows: w of them, by group.
         group: (w,) the group of each.
-        image: logarithm of gray, a pixel per step.
+        image: logarithm of gray, a pixel per step, padded.
         steps_per_px: (2,) of u and v.
         places: (w, l, 2) where the image shows their members [steps].
         points_lidar_m: (g, 3) each group's mean point, in the LiDAR frame of the cloud.
@@ -141,7 +141,7 @@ def view_windows(  # noqa: PLR0913 - what is seen, and how
     With the twist of the LiDAR, (6,), when the camera takes it.
     """
     camera = when_taken(camera, twist_per_s)
-    image, scale = gray.log_gray(camera, level.step_rad, level.blur_steps)
+    image, scale = gray.padded_log_gray(camera, level.step_rad, level.blur_steps)
     windows = select_windows(cloud, camera, level, max_windows=max_windows)
     T, viewpoint_m = camera.T_camera_lidar, cloud.viewpoint_lidar_m(camera)
     centres_lidar_m = windows.rays_m[:, 0] + viewpoint_m
@@ -167,7 +167,22 @@ def view_windows(  # noqa: PLR0913 - what is seen, and how
 def select_windows(
     cloud: PreparedCloud, camera: Camera, level: Level, *, max_windows: int
 ) -> Windows:
-    """Select the windows of a cloud that a camera sees from its estimated pose."""
+    """The windows of a cloud that a camera sees from its estimated pose.
+
+    Those of coarse levels are kept a while: the images of neighbouring frames are compared with it.
+    """
+    select = partial(_select_windows, cloud, camera, level, max_windows=max_windows)
+    if level.fine:
+        return select()
+    lens = camera.lens.kind, camera.lens.packed.tobytes(), camera.width_px, camera.height_px
+    cut = level.spacing_rad, level.stride_spacings, level.weighed
+    key = cloud.identity, camera.T_camera_lidar.tobytes(), lens, cut, max_windows
+    return cloud.tables.select(key, select)
+
+
+def _select_windows(
+    cloud: PreparedCloud, camera: Camera, level: Level, *, max_windows: int
+) -> Windows:
     index, angles, distance_m = find_in_view(cloud.points_lidar_m, camera)
     visible = find_visible(angles, distance_m, OCCLUSION_SPACINGS * level.spacing_rad)
     in_view, clear = np.zeros((2, len(cloud.points_lidar_m)), np.bool_)

@@ -16,7 +16,7 @@ from calibgraph.parallel import KeyedCache
 Rows = NDArray[np.intp]
 
 MIN_RELIABILITY = 0.3  # of a window's variation (0 flat, 1 strong)
-MAX_BYTES = 500_000_000  # of all tables of a cache
+MAX_BYTES, MAX_SELECTED_BYTES = 500_000_000, 100_000_000  # of all tables, and all selections
 _UNCUT, _USELESS = -1, -2
 
 
@@ -34,6 +34,7 @@ class WindowTable:
         spacing_rad: of the points in a window.
         stride_spacings: of the windows, in spacings of the points.
         keep_linear: keep the linear parts of the variation.
+        is_kept: keep the windows that are cut, for later poses and cameras.
     """
 
     def __init__(
@@ -46,19 +47,18 @@ class WindowTable:
         spacing_rad: float,
         stride_spacings: float,
         keep_linear: bool,
+        is_kept: bool = True,
     ) -> None:
         kept = thin(angles, spacing_rad)
         centres = thin(angles[kept], stride_spacings * spacing_rad)
+        own_pages = mmap_copy if is_kept else np.asarray
         self._cloud = rays_m, intensity_rank
-        self._rows = mmap_copy(rows[kept].astype(np.int32))
-        self._centres = mmap_copy(np.random.default_rng(0).permutation(centres).astype(np.int32))
-        self._centre_rows = mmap_copy(self._rows[self._centres])
-        self._slots = mmap_copy(np.full(len(centres), _UNCUT, np.int32))
-        self._windows, self._count = Windows.empty(len(centres), mmap_zeros), 0
-        self._windows_nbytes = self._windows.nbytes
+        self._rows = own_pages(rows[kept].astype(np.int32))
+        self._centres = own_pages(np.random.default_rng(0).permutation(centres).astype(np.int32))
+        self._centre_rows = own_pages(self._rows[self._centres])
         self._neighbours = NearestRays(rays_m, self._rows, angles[kept], spacing_rad)
         self._spacing_rad, self._keep_linear = spacing_rad, keep_linear
-        self._lock = Lock()
+        self._buffer = _Buffer(len(centres)) if is_kept else None
 
     def cut(
         self, in_view: Mask, clear: Mask, *, max_covered: float, max_windows: int, seed: int = 0
@@ -80,47 +80,73 @@ class WindowTable:
         covered = (windows.front.take(slots, axis=0) & ~clear.take(rows)).mean(axis=1)
         return windows.select(slots[in_view.take(rows).all(axis=1) & (covered <= max_covered)])
 
-    def _take(self, chosen: Rows) -> tuple[Windows, NDArray[np.int32]]:
-        """The window buffer and the rows of the chosen centres; missing windows are extracted."""
-        with self._lock:
-            missing = chosen[self._slots[chosen] == _UNCUT]
-            if len(missing):
-                self._cut_missing(missing)
-            slots = self._slots[chosen]
-            return self._windows, slots[slots >= 0]
+    def _take(self, chosen: Rows) -> tuple[Windows, Rows]:
+        """Windows, and the rows of the chosen centres that are useful."""
+        if self._buffer is not None:
+            return self._buffer.take(chosen, self._cut)
+        windows, useful = self._cut(chosen)
+        return windows, np.flatnonzero(useful)
 
-    def _cut_missing(self, missing: Rows) -> None:
+    def _cut(self, chosen: Rows) -> tuple[Windows, Mask]:
         windows, reliability = cut_windows(
-            self._cloud, self._centres[missing], self._neighbours,
+            self._cloud, self._centres[chosen], self._neighbours,
             spacing_rad=self._spacing_rad, keep_linear=self._keep_linear,
         )  # fmt: skip
-        useful = reliability > MIN_RELIABILITY
-        first, self._count = self._count, self._count + int(np.count_nonzero(useful))
-        self._windows.put(first, windows.select(useful))
-        self._slots[missing] = _USELESS
-        self._slots[missing[useful]] = np.arange(first, self._count)
+        return windows, reliability > MIN_RELIABILITY
 
     @property
     def nbytes(self) -> int:
         """Size in memory, without the cloud."""
-        cut = self._count * self._windows_nbytes // max(1, len(self._centres))
-        kept = self._rows.nbytes + 3 * self._centres.nbytes
-        return cut + kept + self._neighbours.nbytes
+        kept = self._rows.nbytes + 2 * self._centres.nbytes + self._neighbours.nbytes
+        return kept + (self._buffer.nbytes if self._buffer else 0)
+
+
+class _Buffer:
+    """Room for the windows of all centres; those of some are cut."""
+
+    def __init__(self, centres: int) -> None:
+        self._slots = mmap_copy(np.full(centres, _UNCUT, np.int32))
+        self._windows, self._count = Windows.empty(centres, mmap_zeros), 0
+        self._lock = Lock()
+
+    def take(
+        self, chosen: Rows, cut: Callable[[Rows], tuple[Windows, Mask]]
+    ) -> tuple[Windows, Rows]:
+        """The windows, and the rows of the chosen centres; missing windows are cut."""
+        with self._lock:
+            missing = chosen[self._slots[chosen] == _UNCUT]
+            if len(missing):
+                windows, useful = cut(missing)
+                first, self._count = self._count, self._count + int(np.count_nonzero(useful))
+                self._windows.put(first, windows.select(useful))
+                self._slots[missing] = _USELESS
+                self._slots[missing[useful]] = np.arange(first, self._count)
+            slots = self._slots[chosen].astype(np.intp)
+            return self._windows, slots[slots >= 0]
+
+    @property
+    def nbytes(self) -> int:
+        cut = self._count * self._windows.nbytes // max(1, len(self._slots))
+        return cut + self._slots.nbytes
 
 
 class WindowTables:
-    """The tables of several clouds: those used last, up to ``MAX_BYTES``."""
+    """The tables of several clouds, and what was selected of them: those used last."""
 
     def __init__(self) -> None:
-        self._tables: KeyedCache[tuple[Hashable, ...], WindowTable] = KeyedCache()
+        self._tables: KeyedCache[tuple[Hashable, ...], WindowTable] = KeyedCache(MAX_BYTES)
+        self._selected: KeyedCache[tuple[Hashable, ...], Windows] = KeyedCache(MAX_SELECTED_BYTES)
 
     def get(self, key: tuple[Hashable, ...], make: Callable[[], WindowTable]) -> WindowTable:
         """The table of a key whose first entry is the cloud; made if it is missing."""
-        table = self._tables.get(key, make)
-        self._tables.keep_last(MAX_BYTES, lambda table: table.nbytes)
-        return table
+        return self._tables.get(key, make)
+
+    def select(self, key: tuple[Hashable, ...], make: Callable[[], Windows]) -> Windows:
+        """The windows that a camera sees, of a key whose first entry is the cloud."""
+        return self._selected.get(key, make)
 
     def keep_only(self, clouds: Iterable[Hashable]) -> None:
-        """Drop the tables of all other clouds."""
+        """Drop what is of all other clouds."""
         kept = set(clouds)
         self._tables.keep_only(lambda key: key[0] in kept)
+        self._selected.keep_only(lambda key: key[0] in kept)

@@ -130,7 +130,7 @@ def test_images_pair_with_the_cloud_of_the_nearest_stamp(tmp_path: Path) -> None
 
     bag = recording(tmp_path, delay)
     assert numbers(load_dataset(bag)) == [0, 1, 2, 3, 4, 5]
-    near = load_dataset(bag, bag=BagOptions(tolerance_s=0.012))  # 3 ms, and 0, 4, 8, ...
+    near = load_dataset(bag, bag=BagOptions(sync_tolerance_s=0.012))  # 3 ms, and 0, 4, 8, ...
     assert numbers(near) == [0, 1, 2]
     assert "6 clouds, 3 with all images within 0.012 s" in near.notes[-1]
     assert "left +7 ms (median), at most 11; 3 without an image of left" in near.notes[-1]
@@ -182,7 +182,7 @@ def test_clocks_that_differ_are_named_and_the_time_of_recording_serves(tmp_path:
         return restamped(each, stamp_of(each) - START_NS) if each.topic == LEFT else each
 
     bag = recording(tmp_path, since_start)
-    with pytest.raises(DatasetError, match=r"/left.* 0.003 to 0.503 s do not meet; give --stamps"):
+    with pytest.raises(DatasetError, match=r"/left.* 0.003 to 0.503 s do not meet; set stamps"):
         load_dataset(bag)
     assert numbers(load_dataset(bag, bag=BagOptions(stamps="record"))) == [0, 1, 2, 3, 4, 5]
 

@@ -189,7 +189,7 @@ def test_the_verdict_is_that_of_the_cameras_that_are_written(
         export_calibration(mixed, tmp_path / "a.json", "json")
     export_calibration(mixed, tmp_path / "a.json", "json", cameras=["left"])
     assert json.loads((tmp_path / "a.json").read_text())["verdict"] != "FAIL"
-    export_calibration(mixed, tmp_path / "a.json", "json", even_if_failed=True)
+    export_calibration(mixed, tmp_path / "a.json", "json", even_if_failed=True, force=True)
     cameras = json.loads((tmp_path / "a.json").read_text())["cameras"]
     assert cameras["left"]["covariance"] is not None
     assert cameras["right"]["covariance"] is None
@@ -224,18 +224,18 @@ def test_files_hold_the_covariance_in_the_order_of_ros(solved: Calibration, tmp_
             np.testing.assert_allclose(np.reshape(found, (6, 6)), expected, rtol=1e-9)
 
 
-def test_only_files_that_were_exported_before_are_replaced(tmp_path: Path) -> None:
+def test_files_that_are_there_are_replaced_only_with_force(tmp_path: Path) -> None:
     rig, path = make_pair(), tmp_path / "mine.yaml"
     rig.save(path)
     before = path.read_text()
-    with pytest.raises(FileError, match="would be replaced"):
+    with pytest.raises(FileError, match="is there already"):
         export_calibration(path, path, "kalibr")
     assert path.read_text() == before
-    for format in READERS.keys() - {"kitti"}:
-        for _ in range(2):
-            export_calibration(rig, tmp_path / f"again.{format}", format)
+    export_calibration(path, path, "kalibr", force=True)
+    assert path.read_text() != before
     export_calibration(rig, tmp_path / "calib.txt", "kitti")
-    with pytest.raises(FileError, match="would be replaced"):
+    (tmp_path / "calib.txt").unlink()
+    with pytest.raises(FileError, match="calib.direction.txt: is there already"):
         export_calibration(rig, tmp_path / "calib.txt", "kitti")
 
 
@@ -310,15 +310,13 @@ def test_a_file_has_what_the_parser_of_ros_requires(tmp_path: Path) -> None:
     assert "export it as tf2" in text
 
 
-def test_only_lenses_that_were_exported_are_replaced(tmp_path: Path) -> None:
+def test_lenses_that_are_there_stay(tmp_path: Path) -> None:
     rig = make_pair()
-    for _ in range(2):
-        export_calibration(rig, tmp_path, "camera_info")
     (tmp_path / "right.yaml").write_text("mine")
-    before = (tmp_path / "left.yaml").stat().st_mtime_ns
-    with pytest.raises(FileError, match="would be replaced"):
+    with pytest.raises(FileError, match="right.yaml: is there already"):
         export_calibration(rig, tmp_path, "camera_info")
-    assert (tmp_path / "left.yaml").stat().st_mtime_ns == before
+    assert not (tmp_path / "left.yaml").exists()
+    assert len(export_calibration(rig, tmp_path, "camera_info", force=True)) == 2
 
 
 def test_what_has_no_place_in_files_of_ros_is_refused(tmp_path: Path) -> None:
@@ -337,19 +335,6 @@ def test_the_name_in_a_file_is_the_files(tmp_path: Path) -> None:
     rig = Rig(cameras={"front left": make_pair().cameras["left"]})
     (file,) = export_calibration(rig, tmp_path, "camera_info")
     assert yaml.safe_load(file.read_text())["camera_name"] == file.stem == "front_left"
-
-
-def test_lenses_of_cameras_that_the_rig_has_no_more_are_removed(tmp_path: Path) -> None:
-    """Unless single cameras are exported; files of other kinds stay."""
-    rig = make_pair()
-    export_calibration(rig, tmp_path, "camera_info")
-    export_calibration(rig, tmp_path / "tree.yaml", "tf2")
-    (tmp_path / "mine.yaml").write_text("mine")
-    export_calibration(rig, tmp_path, "camera_info", cameras=["left"])
-    names = {"left.yaml", "mine.yaml", "tree.yaml"}
-    assert {file.name for file in tmp_path.iterdir()} == names | {"right.yaml"}
-    export_calibration(Rig(cameras={"left": rig.cameras["left"]}), tmp_path, "camera_info")
-    assert {file.name for file in tmp_path.iterdir()} == names
 
 
 POINT = np.array([2.0, -0.7, -0.4])  # behind the lens

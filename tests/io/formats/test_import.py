@@ -214,7 +214,7 @@ def test_distorted_lenses_survive_the_way_there_and_back(mixed_rig: Rig, tmp_pat
 
 def test_a_json_export_is_a_rig(mixed_rig: Rig, tmp_path: Path) -> None:
     for rig in (mixed_rig, rig_for("json")):
-        export_calibration(rig, tmp_path / "rig.json", "json")
+        export_calibration(rig, tmp_path / "rig.json", "json", force=True)
         for read in (load_rig(tmp_path / "rig.json"), import_rig([tmp_path / "rig.json"])):
             assert list(read.cameras) == list(rig.cameras)
             for name, camera in rig.cameras.items():

@@ -1,4 +1,4 @@
-"""The matcher `structure` on the sample; from its own guess, as a user calls it: test_readme.py."""
+"""The matcher `structure` on the sample; from its own guess, as a user calls it: test_docs.py."""
 
 from __future__ import annotations
 
@@ -191,19 +191,3 @@ class TestArguments:
     def test_ranges_are_checked(self, ranges: dict[str, float | None], words: str) -> None:
         with pytest.raises(ValueError, match=words):
             StructureMatcher(**ranges)  # type: ignore[arg-type]
-
-    @pytest.mark.parametrize(
-        ("arguments", "line"),
-        [
-            (("--search-deg", "far"), "--search-deg far: give a number, or none"),
-            (("--search-deg", "100"), "the search reaches up to 45 deg and 5 m per axis"),
-            (("--matcher", "m.csv", "--search-m", "1"), "--search-m is for --matcher structure"),
-            (("--time-limit-s", "-1"), "--time-limit-s"),
-        ],
-    )
-    def test_errors_are_one_line_on_the_command_line(
-        self, call: Call, tmp_path: Path, arguments: tuple[str, ...], line: str
-    ) -> None:
-        code, _, err = call("calibrate", SAMPLE, "--out", tmp_path / "out", *arguments)
-        assert code == 2
-        assert line in err and len(err.strip().splitlines()) == 1

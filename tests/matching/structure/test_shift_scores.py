@@ -1,3 +1,5 @@
+"""Prepared images, and the scores of windows in them."""
+
 from __future__ import annotations
 
 import cv2
@@ -6,7 +8,9 @@ import pytest
 
 import calibgraph
 from calibgraph import Rig
+from calibgraph.matching.structure import frame_cache
 from calibgraph.matching.structure.consensus import z_score
+from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import LEVELS
@@ -16,10 +20,55 @@ from calibgraph.matching.structure.score_kernel import (
     GRAY_NOISE,
     MIN_RESIDUAL_SHARE,
     OPPOSITE,
+    pad,
     score_windows,
 )
 from calibgraph.matching.structure.shift_scores import score_frame
+from calibgraph.model.rig import Camera
 from tests.conftest import SAMPLE
+
+
+def test_an_image_is_scaled_once_for_each_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, cache = calibgraph.load_dataset(SAMPLE), FrameCache()
+    camera = data.rig.cameras["left"]
+    image, other = (cache.image(frame, "left", camera) for frame in data.frames[:2])
+    small, scale = image.log_gray(camera, 0.02, 1.0)
+    assert small.shape == (round(scale[1] * camera.height_px), round(scale[0] * camera.width_px))
+    padded, same = image.padded_log_gray(camera, 0.02, 1.0)
+    np.testing.assert_array_equal(padded, pad(small))
+    np.testing.assert_array_equal(scale, same)
+    assert image.padded_log_gray(camera, 0.02, 1.0)[0] is padded
+    assert image.padded_log_gray(camera, 0.01, 1.0)[0].shape > padded.shape
+    assert (other.padded_log_gray(camera, 0.02, 1.0)[0] != padded).any()
+    np.testing.assert_array_equal(image.mirrored().gray, image.gray[:, ::-1])
+    cache.keep_only(data.frames[2:])
+    assert not image.smaller.values()
+    monkeypatch.setattr(frame_cache, "MAX_SMALL_BYTES", padded.nbytes)
+    cache = FrameCache()
+    image, other = (cache.image(frame, "left", camera) for frame in data.frames[:2])
+    kept = image.padded_log_gray(camera, 0.02, 1.0)[0]
+    other.padded_log_gray(camera, 0.02, 1.0)
+    assert image.padded_log_gray(camera, 0.02, 1.0)[0] is not kept
+
+
+def test_images_finer_than_the_finest_level_needs_are_reduced() -> None:
+    """By whole pixels, which moves nothing; their logarithm changes by the rounding of gray."""
+    camera = calibgraph.load_dataset(SAMPLE).rig.cameras["left"]
+    stated = camera.model_dump()
+    stated["intrinsics_px"] = {key: 10 * each for key, each in camera.intrinsics_px if each}
+    stated |= {"width_px": 10 * camera.width_px, "height_px": 10 * camera.height_px}
+    fine = Camera(**stated)
+    rows, columns = np.indices((fine.height_px, fine.width_px))
+    gray = (150 + 50 * np.sin(rows / 300) * np.cos(columns / 200)).astype(np.uint8)
+    whole, reduced = PreparedImage(gray), PreparedImage.from_gray(gray, fine)
+    assert reduced.nbytes * 4 == whole.nbytes
+    (one, scale), (other, same) = (
+        each.log_gray(fine, LEVELS[-1].step_rad, 1.0) for each in (whole, reduced)
+    )
+    np.testing.assert_array_equal(scale, same)
+    assert np.abs(one - other).max() < 0.5 / gray.min()
+    kept = PreparedImage.from_gray(gray[::10, ::10], camera)
+    np.testing.assert_array_equal(kept.gray, gray[::10, ::10])
 
 
 def orthonormal(points: int, columns: int, rng: np.random.Generator) -> np.ndarray:
@@ -40,7 +89,7 @@ def test_the_score_of_a_window_is_its_share_of_the_images_variance(
     basis[:, 2:] *= not likelihood
     grids = np.zeros((1, 5, 5), np.float32)
     score_windows(
-        image, places[None], np.array([12], np.int32), basis[None], np.zeros(1, np.int32),
+        pad(image), places[None], np.array([12], np.int32), basis[None], np.zeros(1, np.int32),
         np.array([-2, -2]), likelihood, grids,
     )  # fmt: skip
     seen = image[places[:, 1] - 1, places[:, 0] + 2]  # at the shift (2, -1)
@@ -70,7 +119,7 @@ def test_scores_are_those_of_the_formula_wherever_a_window_is_in_the_image(
     origin = -np.array(size[::-1]) // 2
     grids, expected = np.zeros((4, *size), np.float32), np.zeros((4, *size))
     score_windows(
-        image, places.astype(np.int32), counts.astype(np.int32), basis, group.astype(np.int32),
+        pad(image), places.astype(np.int32), counts.astype(np.int32), basis, group.astype(np.int32),
         origin, likelihood, grids,
     )  # fmt: skip
     for window, n, columns, g in zip(places, counts, basis, group, strict=True):
@@ -106,7 +155,7 @@ def test_unrelated_windows_score_no_higher_on_structure_than_on_a_flat_image() -
         basis = np.zeros((1, 25, 4), np.float32)
         basis[0, :, 0] = (near - near.mean()) / np.linalg.norm(near - near.mean())
         score_windows(
-            image, places.astype(np.int32), np.array([25], np.int32), basis,
+            pad(image), places.astype(np.int32), np.array([25], np.int32), basis,
             np.zeros(1, np.int32), np.zeros(2, np.int64), False, grids,
         )  # fmt: skip
     flat, structured = grids[0, 5:55, 5:25].mean() / 400, grids[0, 5:55, 35:55].mean() / 400

@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import calibgraph
-from calibgraph import Rig
-from calibgraph.matching.structure.consensus import z_score
-from calibgraph.matching.structure.prepared_cloud import PreparedCloud
-from calibgraph.matching.structure.prepared_image import PreparedImage
-from calibgraph.matching.structure.schedule import LEVELS
-from calibgraph.matching.structure.score_kernel import score_windows
-from calibgraph.matching.structure.shift_scores import score_frame
+from calibgraph.matching.structure.score_kernel import pad, score_windows
 from calibgraph.matching.structure.window_kernels import FEATURES, ROOM, fill_features
 from calibgraph.matching.structure.window_weights import WindowNetwork, window_network
 from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows
-from tests.conftest import make_camera
-from tools.scenes.surroundings import build_meadow
 
 Array = NDArray[np.float64]
 
@@ -93,7 +82,7 @@ def test_a_weight_lessens_the_share_that_a_window_explains() -> None:
         grids = np.zeros((1, 9, 9), np.float32)
         group, first = np.zeros(1, np.int32), np.array([-4, -4])
         at = places.reshape(1, WINDOW_POINTS, 2).astype(np.int32)
-        score_windows(image, at, of.counts, of.basis, group, first, True, grids)
+        score_windows(pad(image), at, of.counts, of.basis, group, first, True, grids)
         return grids[0].astype(float)
 
     always = np.zeros((len(FEATURES), 1)), np.array([np.log(0.3 / 0.7)])
@@ -118,20 +107,3 @@ def test_the_network_is_two_hidden_layers_as_torch_computes_them() -> None:
     # Weights are kept in single precision.
     np.testing.assert_allclose(network.weights(raw), expected.detach().numpy(), atol=1e-6)
     assert sum(matrix.size + bias.size for matrix, bias in network.layers) == 529
-
-
-@pytest.mark.usefixtures("open3d")
-def test_weights_make_the_truth_stand_out_more_among_leaves(tmp_path: Path) -> None:
-    """On a rendered meadow that took no part in the training."""
-    rig = Rig(cameras={"left": make_camera()})
-    calibgraph.simulate_street(
-        tmp_path / "meadow", rig, frames=1, seed=5, vary_layout=True, build_scene=build_meadow
-    )
-    frame, camera = calibgraph.load_dataset(tmp_path / "meadow", rig).frames[0], rig.cameras["left"]
-    gray = PreparedImage(frame.load_gray("left", camera))
-    cloud = PreparedCloud.from_points(frame.load_cloud())
-    plain, weighed = (
-        z_score(score_frame(gray, cloud, camera, level, frame=0, max_windows=2000), np.zeros(6))
-        for level in (replace(LEVELS[3], weighed=False), LEVELS[3])
-    )
-    assert weighed > 1.05 * plain > 5.0

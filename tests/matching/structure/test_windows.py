@@ -1,17 +1,118 @@
+"""Which points a camera sees, the nearest rays of a ray, and the windows made of them."""
+
 from __future__ import annotations
 
 import itertools
 
 import numpy as np
+import pytest
+from scipy.spatial import cKDTree
 
 import calibgraph
 from calibgraph import Camera, Intrinsics, Rig
-from calibgraph.matching.structure.directions import sphere_angles
+from calibgraph.arrays import Array
+from calibgraph.matching.structure.directions import sphere_angles, thin, view_angles
+from calibgraph.matching.structure.nearest_rays import NearestRays
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.shift_scores import select_windows
+from calibgraph.matching.structure.visibility import (
+    find_in_view,
+    find_visible,
+)
 from calibgraph.matching.structure.window_table import WindowTable
 from tests.conftest import KANNALA, SAMPLE, make_camera
+
+T = np.array([[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, -0.2], [1.0, 0.0, 0.0, 0.3], [0, 0, 0, 1]])
+
+
+def camera(model: str, distortion: list[float], cx: float = 320.0, cy: float = 200.0) -> Camera:
+    return Camera(
+        model=model,
+        width_px=640,
+        height_px=400,
+        intrinsics_px=Intrinsics(fx=400.0, fy=390.0, cx=cx, cy=cy),
+        distortion=distortion,
+        T_camera_lidar=T,
+    )
+
+
+@pytest.mark.parametrize(
+    "seen_by",
+    [
+        camera("pinhole", []),
+        camera("pinhole", [], cx=20.0, cy=390.0),
+        camera("pinhole", [], cx=-60.0),  # its axis lies outside of the image
+        camera("pinhole", [-0.3, 0.1, 0.002, -0.003, 0.0], cx=200.0),
+        camera("pinhole", [0.2, 0.05, 0.0, 0.0, 0.0]),
+        camera("fisheye", [0.05, -0.01, 0.0, 0.0]),
+    ],
+)
+def test_all_points_that_project_into_the_image_are_in_view(seen_by: Camera) -> None:
+    points = np.random.default_rng(0).normal(size=(200_000, 3)) * [20.0, 20.0, 8.0]
+    rows, angles, distance_m = find_in_view(points, seen_by)
+    in_camera = points @ T[:3, :3].T + T[:3, 3]
+    pixels, valid = seen_by.lens.project(in_camera)
+    inside = ((pixels >= -0.5) & (pixels < [639.5, 399.5])).all(axis=1)
+    np.testing.assert_array_equal(rows, np.flatnonzero(valid & inside))
+    np.testing.assert_allclose(angles, view_angles(in_camera[rows]), atol=1e-12)
+    np.testing.assert_allclose(distance_m, np.linalg.norm(in_camera[rows], axis=1), rtol=1e-12)
+
+
+def test_background_behind_a_near_object_is_hidden() -> None:
+    wall = np.column_stack(
+        [*(a.ravel() for a in np.mgrid[-2:2:0.05, -2:2:0.05]), np.full(6400, 20.0)]
+    )
+    post = np.column_stack([np.zeros(100), np.linspace(-0.4, 0.4, 100), np.full(100, 4.0)])
+    points = np.vstack([wall, post])
+    visible = find_visible(view_angles(points), np.linalg.norm(points, axis=1), np.radians(0.5))
+    assert visible[-100:].all()
+    behind = (np.abs(wall[:, 0]) < 0.04) & (np.abs(wall[:, 1]) < 1.5)
+    assert not visible[:-100][behind].any()
+    assert visible[:-100][np.abs(wall[:, 0]) > 0.5].all()
+
+
+def test_thinned_directions_are_as_dense_everywhere() -> None:
+    rng = np.random.default_rng(0)
+    rays = rng.standard_normal((400_000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    kept = rays[thin(sphere_angles(rays), 0.02)]
+    cells = 2 * np.pi * (1 - np.cos(0.5)) / 0.02**2  # of a cone of 0.5 rad
+    for axis in np.vstack([np.eye(3), -np.eye(3)]):
+        assert np.count_nonzero(kept @ axis > np.cos(0.5)) == pytest.approx(cells, rel=0.1)
+
+
+MOST = 9
+
+
+def on_the_sphere(rng: np.random.Generator) -> Array:
+    return rng.standard_normal((4000, 3)) * rng.uniform(2, 30, (4000, 1))
+
+
+def on_scan_lines(rng: np.random.Generator) -> Array:
+    """Of a LiDAR with 16 lines, all around."""
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, 4000), rng.integers(-8, 8, 4000) * 0.035
+    level = np.cos(elevation)
+    rays = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]
+    return np.column_stack(rays) * rng.uniform(2, 30, (4000, 1))
+
+
+@pytest.mark.parametrize("draw", [on_the_sphere, on_scan_lines])
+@pytest.mark.parametrize("reach", [0.05, 2.0])
+def test_finds_the_rays_that_a_tree_finds(draw: object, reach: float) -> None:
+    rays = draw(np.random.default_rng(0))  # type: ignore[operator]
+    angles = sphere_angles(rays)
+    kept = thin(angles, 0.02)
+    nearest = NearestRays(rays, kept.astype(np.int32), angles[kept], 0.02)
+    members, counts = nearest.of(np.arange(len(kept), dtype=np.int32), MOST, reach)
+
+    directions = rays[kept] / np.linalg.norm(rays[kept], axis=1, keepdims=True)
+    _, found = cKDTree(directions).query(directions, MOST, distance_upper_bound=reach)
+    inside = found < len(kept)
+    expected = np.where(inside, found, np.arange(len(kept))[:, None])
+    np.testing.assert_array_equal(counts, inside.sum(axis=1))
+    np.testing.assert_array_equal(members, kept[expected])
+    assert 0.2 < inside.mean() <= 1
 
 
 def test_windows_come_from_clouds_with_and_without_intensity(truth: Rig) -> None:

@@ -1,1 +1,0 @@
-"""Many vehicles: what a fleet's model finds, and solves of tables in shards."""

@@ -1,0 +1,301 @@
+"""The command for a rig to begin with: from a bag, a folder, words, files of others, a search."""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+from typer import Argument, Option
+
+from calibgraph.cli import options
+from calibgraph.cli.arguments import bag_options_from, checked_arguments, parse_names
+from calibgraph.cli.terminal import print_json, print_line, progress_bar
+from calibgraph.errors import CalibrationError
+from calibgraph.io.formats.names import IMPORT_FORMATS
+
+if TYPE_CHECKING:
+    from calibgraph.guessing.guess import RigGuess
+    from calibgraph.io.formats.rig_import import RigParts
+    from calibgraph.model.rig import Rig
+
+_SEARCH = "search"
+
+
+_TAKEN = {
+    "a folder of images and clouds": {"mount", "lens"},
+    "a bag alone": {"topic", "tie_deg", "tie_m", "correct", "json"},
+    "files": {"mount", "dataset", "rename", "lidar_frame", "camera_frame", "size", "tie_deg",
+              "tie_m", "correct", "json"},
+}  # fmt: skip
+"""The options that change something, by the kind of source."""
+
+
+def rig(
+    source: list[str] = Argument(
+        ...,
+        metavar="SOURCE...",
+        help="A ROS bag; a folder with lidar/ and cameras/NAME/; or files: "
+        f"{IMPORT_FORMATS}. NAME=FILE names the camera of a file of one camera.",
+    ),
+    out: Path | None = Option(
+        None, metavar="FILE.yaml", help="Rig to write. (default: in a folder rig.yaml, else none)"
+    ),
+    mount: list[str] | None = Option(
+        None,
+        metavar="NAME=WORDS",
+        help="How a camera is mounted: front, front-left, left, rear-left, rear, ...; then "
+        "NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, "
+        "NUMBER m|cm ahead|behind|left|right|above|below of the LiDAR; or search, in the "
+        "images of --dataset, although a file has an extrinsic. May be repeated.",
+    ),
+    lens: list[str] | None = Option(
+        None,
+        metavar="[NAME=]HOW",
+        help="Of a folder: how the lens of a camera, or of all, is known: calibration; a "
+        "horizontal field of view, as '90 deg'; or focal length and size of a pixel, as "
+        "'4 mm 3 um'. May be repeated. (default: asked in a terminal, else calibration)",
+    ),
+    dataset: list[Path] | None = Option(
+        None,
+        metavar="DATASET",
+        help="Images and clouds, in which cameras without words or an extrinsic in a file are "
+        "searched for, over all headings. May be repeated.",
+    ),
+    forward: str = Option("+x", metavar="+x|-x|+y|-y", help="The LiDAR's axis ahead; z is up."),
+    topic: options.Topic = None,
+    rename: list[str] | None = Option(
+        None, metavar="OLD=NEW", help="Another name of a camera; may be repeated."
+    ),
+    lidar_frame: str | None = Option(
+        None, metavar="FRAME", help="The LiDAR's frame. (default: the one named so)"
+    ),
+    camera_frame: list[str] | None = Option(
+        None,
+        metavar="NAME=FRAME",
+        help="Frame of a camera, where the names differ; may be repeated. A frame with "
+        "'optical' in its name is x right, y down, z forward, others are x forward, z up.",
+    ),
+    size: str | None = Option(None, metavar="WIDTHxHEIGHT", help="Image size, if files have none."),
+    tie_deg: float | None = Option(
+        None,
+        metavar="DEG",
+        min=0.001,
+        help="Relative poses are measured, with this sigma per axis; with --tie-m. (default: "
+        "0.1 of files as Kalibr's; those of a bag are only a guess)",
+    ),
+    tie_m: float | None = Option(
+        None, metavar="M", min=1e-5, help="The sigma in translation, per axis. (default: 0.005)"
+    ),
+    correct: list[str] | None = Option(
+        None,
+        metavar="[CAMERA=]MISTAKE",
+        help="Undo a mistake of the guess, by the name that doctor gives it, as inverse or "
+        "camera-flu; of all cameras or of one. May be repeated.",
+    ),
+    as_json: options.JsonOption = False,
+    force: options.Force = False,
+) -> None:
+    """Write a rig to begin a calibration with, and print where each camera looks and sits.
+
+    Of a ROS bag: its topics, lenses and /tf_static. Of a folder: its cameras, and each key that is
+    left to fill in explained. Of files of other programs: what they hold together, and how good a
+    guess it is if cameras are described or searched for.
+    """
+    from calibgraph.files import require_new_file
+    from calibgraph.io.bags.storage import is_bag
+    from calibgraph.io.formats.describe import describe_rig
+    from calibgraph.io.formats.rig_import import read_rig_parts
+    from calibgraph.model.lens_knowledge import state_calibrated
+    from calibgraph.model.plausibility import find_implausible
+    from calibgraph.trust.conventions import correct_guess
+
+    given = {
+        "mount": mount, "lens": lens, "dataset": dataset, "topic": topic, "rename": rename,
+        "lidar_frame": lidar_frame, "camera_frame": camera_frame, "size": size, "tie_deg": tie_deg,
+        "tie_m": tie_m, "correct": correct, "json": as_json or None,
+    }  # fmt: skip
+    path = Path(source[0])
+    if len(source) == 1 and not correct and _is_to_fill_in(path):
+        _refuse_others("a folder of images and clouds", given)
+        _write_template(path, out, mount, lens, forward=forward, force=force)
+        return
+    if out is not None:
+        require_new_file(out, ".yaml", ".yml", force=force)
+    is_of_bag = len(source) == 1 and is_bag(path) and not (mount or dataset)
+    _refuse_others("a bag alone" if is_of_bag else "files", given)
+    with checked_arguments(), progress_bar("reading") as progress:
+        sigmas = _sigmas(tie_deg, tie_m)
+        if is_of_bag:
+            made, notes, topics = _rig_of_bag(path, topic, sigmas)
+            guess = None
+        else:
+            named = [_parse_file(text) for text in source]
+            parts = read_rig_parts(
+                [file for _, file in named], names={file: name for name, file in named if name},
+                rename=parse_names("--rename", rename), lidar_frame=lidar_frame,
+                camera_frames=parse_names("--camera-frame", camera_frame),
+            )  # fmt: skip
+            notes, topics = [f"note: {note}" for note in parts.notes], []
+            made, guess = _rig_of_files(
+                parts, parse_names("--mount", mount), dataset, forward=forward,
+                size_px=_size_px(size), sigmas=sigmas, progress=progress
+            )  # fmt: skip
+        made = state_calibrated(correct_guess(made, correct or ()))
+        guess = guess and replace(guess, rig=made)
+    if out is not None:
+        (guess or made).save(out)
+    notes += [f"warning: {line}" for line in find_implausible(made)]
+    if as_json:
+        found = {"topics": topics, "rig": made.model_dump(mode="json"), "notes": notes}
+        written = {"out": None if out is None else str(out)}
+        print_json(found | written | (guess.to_mapping() if guess else {}))
+        return
+    lines = [f"{each['topic']}  {each['type']}  {each['messages']}" for each in topics]
+    for line in [*lines, *(guess.lines if guess else describe_rig(made)), *notes]:
+        print_line(line)
+    end = f"{out}: written" if out is not None else "nothing was written; --out writes the rig"
+    print_line(f"{end}; check the sentences above against the vehicle")
+
+
+def _is_to_fill_in(path: Path) -> bool:
+    """Whether a source is a folder without a rig, or with one such as this command writes."""
+    from calibgraph.io.bags.storage import is_bag
+    from calibgraph.io.rigs import RIG_FILE, find_rig_file
+
+    return path.is_dir() and not is_bag(path) and find_rig_file(path) in (None, path / RIG_FILE)
+
+
+def _refuse_others(kind: str, given: dict[str, Any]) -> None:
+    """Refuse options that would change nothing."""
+    for name, value in given.items():
+        if value is not None and name not in _TAKEN[kind]:
+            kinds = " or ".join(each for each, names in _TAKEN.items() if name in names)
+            raise CalibrationError(f"--{name.replace('_', '-')} is for {kinds} only; leave it out")
+
+
+def _parse_file(text: str) -> tuple[str, Path]:
+    """The camera's name, if there is one before ``=``, and the file."""
+    name, equals, file = text.partition("=")
+    return (name, Path(file)) if equals and not Path(text).exists() else ("", Path(text))
+
+
+def _size_px(size: str | None) -> tuple[int, int] | None:
+    """Width and height of images whose file has none."""
+    if size is None:
+        return None
+    match = re.fullmatch(r"(\d+)x(\d+)", size)
+    if match is None:
+        raise ValueError(f"--size {size!r}: give WIDTHxHEIGHT, as 1920x1200")
+    return int(match[1]), int(match[2])
+
+
+def _sigmas(tie_deg: float | None, tie_m: float | None) -> tuple[float, float] | None:
+    """The sigmas of relative poses, [deg] and [m]."""
+    if tie_deg is None and tie_m is None:
+        return None
+    if tie_deg is None or tie_m is None:
+        raise ValueError("--tie-deg and --tie-m: give both")
+    return tie_deg, tie_m
+
+
+def _rig_of_files(
+    parts: RigParts,
+    mountings: dict[str, str],
+    dataset: list[Path] | None,
+    *,
+    forward: str,
+    size_px: tuple[int, int] | None,
+    sigmas: tuple[float, float] | None,
+    progress: Any,
+) -> tuple[Rig, RigGuess | None]:
+    """The rig, and how good its guess is, where cameras are described or searched for."""
+    from calibgraph.guessing.guess import guess_rig
+    from calibgraph.io.formats.rig_import import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
+
+    tie_deg, tie_m = sigmas or (RELATIVE_SIGMA_DEG, RELATIVE_SIGMA_CM / 100.0)
+    if not mountings and not dataset:
+        made = parts.to_rig(
+            size_px=size_px, relative_sigma_deg=tie_deg, relative_sigma_cm=100.0 * tie_m
+        )
+        return made, None
+    if sigmas is not None:
+        raise ValueError("--tie-deg is for files alone; leave --mount and --dataset out")
+    guess = guess_rig(
+        parts,
+        mountings={name: text for name, text in mountings.items() if text != _SEARCH},
+        data=dataset or None,
+        search=[name for name, text in mountings.items() if text == _SEARCH],
+        forward=forward,
+        size_px=size_px,
+        progress=progress,
+    )
+    return guess.rig, guess
+
+
+def _rig_of_bag(
+    path: Path, topic: list[str] | None, sigmas: tuple[float, float] | None
+) -> tuple[Rig, list[str], list[dict[str, Any]]]:
+    """The rig of a bag, what is to be said of it, and its topics."""
+    from math import radians
+
+    from calibgraph.io.bags.messages import Bag
+    from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
+
+    topics = sorted(Bag(path).topics.values(), key=lambda each: each.name)
+    read = read_bag_rig(path, bag_options_from(topic))
+    made = read.to_rig(None if sigmas is None else (radians(sigmas[0]), sigmas[1]))
+    listed = [{"topic": each.name, "type": each.type, "messages": each.count} for each in topics]
+    return made, [*doubtful_axes(made), *read.notes], listed
+
+
+def _write_template(
+    folder: Path,
+    out: Path | None,
+    mount: list[str] | None,
+    lens: list[str] | None,
+    *,
+    forward: str,
+    force: bool,
+) -> None:
+    """Write the rig of a folder, with what is left to fill in, and say what comes next."""
+    from calibgraph.guessing.lens_words import CALIBRATION
+    from calibgraph.guessing.template import cameras_of_folder, write_rig_template
+    from calibgraph.io.dataset_folders import describe_pairing
+
+    with checked_arguments():
+        words = parse_names("--mount", mount)
+        known = _lenses(lens, [*cameras_of_folder(folder)])
+        path = write_rig_template(
+            folder, out, mountings=words, lenses=known, forward=forward, replace=force
+        )
+        pairing = describe_pairing(folder)
+    if pairing:
+        print_line(pairing)
+    left = "FILL_IN" in path.read_text(encoding="utf-8").partition("\nformat:")[2]
+    where = f"{folder}" if out is None else f"{folder} --rig {out}"
+    first = "replace every FILL_IN; then" if left else "next"
+    print_line(f"{path}: written; {first}: calibgraph doctor {where}")
+    if any(how != CALIBRATION for how in known.values()):
+        print_line(
+            "a lens from a spec sheet or a field of view is known to 2 %, so estimate it: "
+            f"calibgraph calibrate {where} --estimate lens",
+        )
+
+
+def _lenses(given: list[str] | None, cameras: list[str]) -> dict[str, str]:
+    """How the lens of each camera is known, as given for all or one, or asked for."""
+    from calibgraph.guessing.lens_words import CALIBRATION, LENS_GRAMMAR
+
+    for_all = [how for how in given or () if "=" not in how]
+    if not given and sys.stdin.isatty() and sys.stderr.isatty():
+        answers = [CALIBRATION]
+        for name in cameras:
+            question = f"{name}: how is its lens known? {LENS_GRAMMAR}"
+            answers.append(typer.prompt(question, default=answers[-1], err=True))
+        return dict(zip(cameras, answers[1:], strict=True))
+    named = parse_names("--lens", [how for how in given or () if "=" in how])
+    return dict.fromkeys(cameras, for_all[-1] if for_all else CALIBRATION) | named

@@ -1,0 +1,53 @@
+"""export: its options, and results that FAILed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from calibgraph import MatcherErrors, load_rig, simulate_correspondences, solve
+from calibgraph.io.formats.names import EXPORT_FORMATS
+from tests.cli.conftest import error_line
+from tests.conftest import SAMPLE, Call, make_pair
+from tests.io.formats.readers import READERS
+
+
+def test_a_rig_is_exported_and_the_file_named(call: Call, tmp_path: Path) -> None:
+    out = tmp_path / "robot.urdf"
+    code, stdout, err = call("export", SAMPLE, "--format", "urdf", "--out", out)
+    assert (code, stdout, err) == (0, "", f"{out}: written (urdf)\n")
+    truth = load_rig(SAMPLE).T_camera_lidar
+    for name, T in READERS["urdf"](out).items():
+        np.testing.assert_allclose(T, truth[name], atol=1e-9)
+
+
+def test_the_formats_are_listed_without_other_arguments(call: Call) -> None:
+    code, stdout, err = call("export", "--format", "list")
+    assert (code, err) == (0, "")
+    assert [line.split()[0] for line in stdout.splitlines()] == list(EXPORT_FORMATS)
+
+
+def test_options_of_export_reach_the_file(call: Call, tmp_path: Path) -> None:
+    out = tmp_path / "kit.yaml"
+    code, _, _ = call(
+        "export", SAMPLE, "--format", "autoware", "--out", out, "--camera", "left",
+        "--lidar-frame", "velodyne_top", "--lidar-pose", "1 2 3 0 0 0.5",
+    )  # fmt: skip
+    assert code == 0
+    kit = yaml.safe_load(out.read_text())["sensor_kit_base_link"]
+    assert list(kit) == ["velodyne_top", "left/camera_link"]
+    assert [kit["velodyne_top"][key] for key in ("x", "y", "z")] == [1, 2, 3]
+
+
+def test_a_failed_result_needs_the_flag(call: Call, tmp_path: Path) -> None:
+    nonsense = MatcherErrors(outlier_share=1.0)
+    solve(make_pair(), simulate_correspondences(make_pair(), errors=nonsense)).save(tmp_path)
+    arguments = ("export", tmp_path, "--format", "json", "--out", tmp_path / "a.json")
+    assert "is FAIL, nothing was written" in error_line(*call(*arguments))
+    assert not (tmp_path / "a.json").exists()
+    code, _, _ = call(*arguments, "--even-if-failed")
+    assert code == 0
+    assert json.loads((tmp_path / "a.json").read_text())["verdict"] == "FAIL"

@@ -1,0 +1,263 @@
+"""rig: from a folder to fill in, a bag, or files of other programs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from calibgraph import export_calibration, load_rig, write_rig_template
+from calibgraph.guessing.mounting import parse_mounting
+from tests.cli.conftest import error_line
+from tests.conftest import SAMPLE, Call, make_pair
+from tests.io.bags.writing import (
+    START_NS,
+    Messages,
+    Stamped,
+    sample_bag,
+    sample_messages,
+    write_bag,
+)
+from tests.io.formats.calibration_files import CAMERA_INFO, KALIBR, KOIDE, SENTENCE, URDF, write
+
+LENS = {"fx": 500.0, "fy": 500.0, "cx": 319.5, "cy": 179.5}
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """The sample without a rig."""
+    folder = tmp_path / "drive"
+    for name in ("lidar", "cameras"):
+        shutil.copytree(SAMPLE / name, folder / name)
+    return folder
+
+
+def test_the_file_has_the_cameras_and_image_sizes_of_the_folder(
+    recording: Path, call: Call
+) -> None:
+    code, out, err = call("rig", recording)
+    assert (code, out) == (0, "") and f"{recording / 'rig.yaml'}: written" in err
+    cameras = yaml.safe_load((recording / "rig.yaml").read_text())["cameras"]
+    assert list(cameras) == ["front_left", "front_right", "left"]
+    assert {(c["width_px"], c["height_px"]) for c in cameras.values()} == {(640, 360)}
+
+
+@pytest.mark.parametrize("command", ["calibrate", "match", "track"])
+def test_an_unfilled_file_is_refused_with_the_key_that_is_left(
+    recording: Path, call: Call, command: str
+) -> None:
+    write_rig_template(recording)
+    rig = [recording / "rig.yaml"] if command == "track" else []
+    line = error_line(*call(command, *rig, recording, "--out", recording.parent / "out.parquet"))
+    assert "cameras.front_left.intrinsics_px.fx is still FILL_IN, and 17 more keys" in line
+
+
+def test_doctor_names_the_key_that_is_left(recording: Path, call: Call) -> None:
+    fill(write_rig_template(recording), leave="T_camera_lidar")
+    code, _, err = call("doctor", recording)
+    assert code == 1
+    assert "cameras.front_left.T_camera_lidar is still FILL_IN, and 2 more keys" in err
+
+
+def test_a_filled_file_is_a_rig_with_the_guess_of_the_words(recording: Path) -> None:
+    words = {name: "front-left, 0.4 m ahead" for name in ("front_left", "front_right", "left")}
+    path = write_rig_template(recording, mountings=words)
+    fill(path, leave="")
+    rig = load_rig(recording)
+    assert rig.cameras["left"].matrix_px[0, 0] == LENS["fx"]
+    wanted = parse_mounting("front-left, 0.4 m ahead", "left").T_camera_lidar()
+    np.testing.assert_allclose(rig.T_camera_lidar["left"], wanted, atol=1e-6)  # as rounded
+
+
+def test_matrices_in_the_comments_are_those_of_the_words(recording: Path) -> None:
+    text = write_rig_template(recording).read_text()
+    for words in ("front", "left", "right", "rear"):
+        (line,) = (line for line in text.splitlines() if f"{words} " in line and "[[" in line)
+        shown = yaml.safe_load(line[line.index("[[") :])
+        wanted = parse_mounting(words, words).T_camera_lidar()
+        np.testing.assert_allclose(shown, wanted, atol=1e-12)
+
+
+def fill(path: Path, leave: str) -> None:
+    """Fill in what a user would, but for a key."""
+    content = yaml.safe_load(path.read_text())
+    for camera in content["cameras"].values():
+        camera |= {"intrinsics_px": LENS, "distortion": []}
+        if leave != "T_camera_lidar" and camera["T_camera_lidar"] == "FILL_IN":
+            camera["T_camera_lidar"] = np.eye(4).tolist()
+    path.write_text(yaml.safe_dump(content))
+
+
+def test_a_file_that_is_there_is_replaced_only_with_force(recording: Path, call: Call) -> None:
+    mine = recording / "rig.yaml"
+    mine.write_text("mine: 1\n")
+    assert "is there already" in error_line(*call("rig", recording))
+    assert mine.read_text() == "mine: 1\n"
+    assert call("rig", recording, "--force")[0] == 0
+    assert mine.read_text().startswith("# Replace every FILL_IN")
+
+
+@pytest.mark.parametrize(
+    ("how", "focal_px"), [("90 deg", 320.0), ("53.13°", 640.0), ("4 mm 8 um", 500.0)]
+)
+def test_a_lens_in_words_is_computed_with_what_is_uncertain_of_it(
+    recording: Path, call: Call, how: str, focal_px: float
+) -> None:
+    code, _, err = call("rig", recording, "--lens", how, "--mount", "left=left",
+                        "--mount", "front_left=front", "--mount", "front_right=front")  # fmt: skip
+    assert code == 0
+    assert f"next: calibgraph doctor {recording}" in err
+    assert f"calibgraph calibrate {recording} --estimate lens" in err
+    for camera in load_rig(recording).cameras.values():
+        k, sigma = camera.intrinsics_px, camera.intrinsics_sigma_px
+        assert k.fx == k.fy == pytest.approx(focal_px, abs=0.01)
+        assert (k.cx, k.cy, camera.distortion) == (319.5, 179.5, ())
+        assert sigma is not None and sigma.centre == 5.0
+        assert sigma.focal == pytest.approx(0.02 * focal_px, abs=0.01)
+        assert camera.distortion_sigma == 0.05
+
+
+def test_a_lens_of_one_camera_is_named_and_the_others_are_filled_in(
+    recording: Path, call: Call
+) -> None:
+    assert call("rig", recording, "--lens", "left=90 deg")[0] == 0
+    cameras = yaml.safe_load((recording / "rig.yaml").read_text())["cameras"]
+    assert {n for n, c in cameras.items() if c["intrinsics_px"]["fx"] == "FILL_IN"} == {
+        "front_left",
+        "front_right",
+    }
+
+
+def test_in_a_terminal_it_asks_for_the_lens_of_each_camera(
+    recording: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The answer of one camera is proposed for the next."""
+    asked, answers = [], iter(("90 deg", "90 deg", "calibration"))
+
+    def prompt(question: str, *, default: str, err: bool) -> str:
+        assert err
+        asked.append((question.partition(":")[0], default))
+        return next(answers)
+
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    monkeypatch.setattr("typer.prompt", prompt)
+    assert call("rig", recording)[0] == 0
+    assert asked == [
+        ("front_left", "calibration"), ("front_right", "90 deg"), ("left", "90 deg")
+    ]  # fmt: skip
+    cameras = yaml.safe_load((recording / "rig.yaml").read_text())["cameras"]
+    assert [c["intrinsics_px"]["fx"] for c in cameras.values()] == [320.0, 320.0, "FILL_IN"]
+
+
+def test_a_bag_is_listed_and_its_rig_is_written(call: Call, tmp_path: Path) -> None:
+    bag, out = sample_bag(tmp_path, "sqlite3"), tmp_path / "rig.yaml"
+    code, _, err = call("rig", bag, "--out", out)
+    assert code == 0
+    assert "/points  sensor_msgs/msg/PointCloud2  6\n" in err
+    assert "left looks along LiDAR +y, 14 deg to the right" in err
+    for name, camera in load_rig(SAMPLE).cameras.items():
+        T = load_rig(out).cameras[name].T_camera_lidar
+        np.testing.assert_allclose(T, camera.T_camera_lidar, atol=1e-12)
+    code, stdout, err = call("rig", bag, "--json", "--tie-deg", 0.1, "--tie-m", 0.01)
+    assert (code, err) == (0, "")
+    found = json.loads(stdout)
+    assert len(found["rig"]["relative_poses"]) == 2
+    assert found["topics"][0] == {
+        "topic": "/front_left/camera_info", "type": "sensor_msgs/msg/CameraInfo", "messages": 1
+    }  # fmt: skip
+
+
+def test_the_notes_about_a_bag_are_printed_and_in_the_json(call: Call, tmp_path: Path) -> None:
+    make = Messages("mcap")
+    written = sample_messages(make)
+    for each in written:
+        if each.topic == "/left/camera_info":  # of an image twice as large
+            each.content.k[[0, 2, 4, 5]] *= 2
+    lost = make.transforms([("base", "gps", np.eye(4))])
+    lost.transforms[0].transform.rotation.w = 0.0
+    written.append(Stamped("/tf_static", "tf2_msgs/msg/TFMessage", START_NS, lost))
+    bag = write_bag(tmp_path, "mcap", written)
+    code, _, err = call("rig", bag)
+    assert code == 0
+    assert "the transform of frame 'gps' on /tf_static" in err
+    assert "warning: left: principal point" in err
+    code, stdout, err = call("rig", bag, "--json")
+    assert (code, err) == (0, "")
+    gps, left = json.loads(stdout)["notes"]
+    assert "'gps'" in gps
+    assert left.startswith("warning: left: principal point")
+
+
+def test_files_of_others_print_a_sentence_per_camera_and_make_a_rig(
+    call: Call, tmp_path: Path
+) -> None:
+    info, car = write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=URDF)
+    code, stdout, err = call("rig", info, car, "--out", tmp_path / "rig.yaml")
+    assert (code, stdout) == (0, "")
+    assert err.splitlines()[0] == SENTENCE
+    assert err.splitlines()[-1].startswith(f"{tmp_path / 'rig.yaml'}: written; check")
+    assert list(load_rig(tmp_path / "rig.yaml").cameras) == ["front"]
+
+
+def test_options_of_rig_reach_the_rig(call: Call, tmp_path: Path) -> None:
+    info, car = write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=URDF)
+    code, _, err = call(
+        "rig", f"nose={info}", car, "--camera-frame", "nose=front_link", "--lidar-frame",
+        "base_link", "--out", tmp_path / "rig.yaml",
+    )  # fmt: skip
+    assert code == 0, err
+    assert err.startswith("nose looks along LiDAR +x, sits 1.40 m ahead, 0.10 m left and 1.80 m")
+    (tmp_path / "calib.json").write_text(json.dumps(KOIDE))
+    code, _, err = call(
+        "rig", f"front={tmp_path / 'calib.json'}", "--size", "1646x1240", "--out",
+        tmp_path / "koide.yaml",
+    )  # fmt: skip
+    assert code == 0, err
+    assert load_rig(tmp_path / "koide.yaml").cameras["front"].width_px == 1646
+
+
+def test_cameras_of_a_camchain_are_renamed_everywhere(call: Call, tmp_path: Path) -> None:
+    (chain,) = write(tmp_path, chain__yaml=KALIBR)
+    code, _, err = call(
+        "rig", chain, "--rename", "cam0=left", "--rename", "cam1=right", "--out",
+        tmp_path / "rig.yaml",
+    )  # fmt: skip
+    assert code == 0, err
+    rig = load_rig(tmp_path / "rig.yaml")
+    assert list(rig.cameras) == ["left", "right"]
+    assert [(pair.a, pair.b) for pair in rig.relative_poses] == [("right", "left")]
+
+
+def test_a_camchain_becomes_a_rig_that_evaluate_takes(call: Call, tmp_path: Path) -> None:
+    export_calibration(make_pair(), tmp_path / "chain.yaml", "kalibr")
+    make_pair().save(tmp_path / "truth.yaml")
+    code, _, _ = call("rig", tmp_path / "chain.yaml", "--out", tmp_path / "rig.yaml")
+    assert code == 0
+    code, stdout, _ = call("evaluate", tmp_path / "rig.yaml", tmp_path / "truth.yaml", "--json")
+    assert code == 0
+    for error in json.loads(stdout)["cameras"].values():
+        assert error["rotation_error_deg"] < 1e-7 and error["translation_error_cm"] < 1e-7
+
+
+def test_angles_of_a_turn_are_radians(call: Call, tmp_path: Path) -> None:
+    turned = URDF.replace('rpy="0 0 0"', 'rpy="0 0 6.2832"')
+    info, car = write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=turned)
+    assert call("rig", info, car, "--out", tmp_path / "rig.yaml")[0] == 0
+
+
+def test_millimetres_are_warned_of_by_rig_and_export(call: Call, tmp_path: Path) -> None:
+    far = URDF.replace('xyz="1.4 0.1 1.8"', 'xyz="400 100 -200"')
+    info, car = write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=far)
+    said = "warning: front: the camera is 458 m from the LiDAR: lengths in millimetres"
+    code, _, err = call("rig", info, car, "--out", tmp_path / "rig.yaml")
+    assert (code, err.count(said)) == (0, 1)
+    pose = ("--lidar-pose", "0 0 1800 0 0 0")
+    code, _, err = call("export", tmp_path / "rig.yaml", "--format", "autoware", "--out",
+                        tmp_path / "kit.yaml", *pose)  # fmt: skip
+    assert (code, err.count(said)) == (0, 1)
+    assert "warning: --lidar-pose '0 0 1800 0 0 0': lengths in millimetres?" in err

@@ -1,0 +1,158 @@
+"""Factors of one match, and of poses: GTSAM's stock factors, and the formulas of the paper."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam import Pose3
+
+from factors import (
+    camera_prior_factor,
+    pose_sigmas,
+    projection_factor,
+    projection_residual,
+    relative_pose_factor,
+    relative_prior_factor,
+    smallest_scaled_eigenvalue,
+    unit_diagonal,
+)
+from tests.factors.blocks import KEY, LENSES, at, poses, world
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_projection_jacobian_agrees_with_finite_differences(name: str) -> None:
+    """By the pose, in GTSAM's tangent: near, off, far, and 1e-7 from the identity."""
+    lens = LENSES[name]
+    block = world(lens, 5)
+    identity = gtsam.Pose3.Expmap(1e-7 * np.array([1, -2, 3, 2, 1, -1.0]))
+    ahead = np.array([[0.5, -0.3, 5.0]])  # what a camera at the identity sees
+    for pose in [*poses()[:4], identity]:
+        points = ahead if pose is identity else block.points_lidar_m
+        for point in points:
+            residual, jacobian = projection_residual(lens, pose, point, np.zeros(2))
+            numeric = np.empty((2, 6))
+            for axis in range(6):
+                d = 1e-6 * np.eye(6)[axis]
+                plus, _ = projection_residual(lens, pose.retract(d), point, np.zeros(2))
+                minus, _ = projection_residual(lens, pose.retract(-d), point, np.zeros(2))
+                numeric[:, axis] = (plus - minus) / 2e-6
+            # Rounding: eps |residual| / step; truncation is smaller.
+            tolerance = 1e-9 * max(1e3, np.abs(residual).max()) + 1e-7 * np.abs(jacobian).max()
+            np.testing.assert_allclose(jacobian, numeric, rtol=0, atol=tolerance)
+
+
+def test_projection_factor_equals_gtsams_stock_factor() -> None:
+    calibration = gtsam.Cal3_S2(718.0, 710.0, 0.0, 607.0, 185.0)
+    cauchy = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Cauchy.Create(4.0), gtsam.noiseModel.Unit.Create(2)
+    )
+    block = world(LENSES["pinhole"], 20)
+    landmark = 99
+    for k in range(20):
+        point, pixel = block.points_lidar_m[k], block.pixels_px[k]
+        values = at(poses()[2])
+        values.insert(landmark, point)
+        stock = gtsam.GenericProjectionFactorCal3_S2(pixel, cauchy, KEY, landmark, calibration)
+        ours = projection_factor(KEY, LENSES["pinhole"], point, pixel, scale=4.0)
+        np.testing.assert_allclose(ours.error(values), stock.error(values), rtol=1e-12)
+        expected, right = stock.linearize(values).jacobian()
+        A, b = ours.linearize(values).jacobian()
+        np.testing.assert_allclose(A, expected[:, :6], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(b, right, rtol=1e-9, atol=1e-9)
+
+
+SIZES = [1e-7, 0.01, 0.5, 1.0]
+
+
+def random_pose(rng: np.random.Generator, size: float = 1.0) -> Pose3:
+    return Pose3.Expmap(np.concatenate([rng.standard_normal(3), 3 * rng.standard_normal(3)]) * size)
+
+
+def values_of(*transforms: Pose3) -> gtsam.Values:
+    """Values 0, 1, ...: the inverses of the given T_camera_lidar."""
+    result = gtsam.Values()
+    for key, T in enumerate(transforms):
+        result.insert(key, T.inverse())
+    return result
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_camera_prior_is_the_papers_formula(size: float) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        T_hat = random_pose(rng)
+        T = T_hat.compose(random_pose(rng, 0.3 * size))
+        weight = rng.uniform(0.5, 10)
+        paper = weight * np.sum(Pose3.Logmap(T_hat.inverse().compose(T)) ** 2)
+        factor = camera_prior_factor(0, T_hat.matrix(), weight=weight)
+        assert 2 * factor.error(values_of(T)) == pytest.approx(paper, rel=1e-7)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_relative_prior_is_the_papers_formula(size: float) -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        T_hat_1, T_hat_2 = random_pose(rng), random_pose(rng)
+        T_1 = T_hat_1.compose(random_pose(rng, 0.2 * size))
+        T_2 = T_hat_2.compose(random_pose(rng, 0.2 * size))
+        weight = rng.uniform(0.5, 10)
+        T_hat_12 = T_hat_2.compose(T_hat_1.inverse())
+        difference = T_hat_12.inverse().compose(T_2).compose(T_1.inverse())
+        paper = weight * np.sum(Pose3.Logmap(difference) ** 2)
+        factor = relative_prior_factor(0, 1, T_hat_12.matrix(), weight=weight)
+        assert 2 * factor.error(values_of(T_1, T_2)) == pytest.approx(paper, rel=1e-7)
+
+
+def test_relative_pose_is_exact_at_the_truth_and_costs_one_at_one_sigma() -> None:
+    rng = np.random.default_rng(3)
+    T_a, T_b = random_pose(rng), random_pose(rng)
+    T_a_b = T_a.compose(T_b.inverse())
+    for axis, sigma in enumerate([0.01] * 3 + [0.002] * 3):
+        off = T_a_b.compose(Pose3.Expmap(sigma * np.eye(6)[axis]))
+        factor = relative_pose_factor(
+            0, 1, off.matrix(), rotation_sigma_rad=0.01, translation_sigma_m=0.002
+        )
+        assert 2 * factor.error(values_of(T_a, T_b)) == pytest.approx(1.0, rel=1e-6)
+    exact = relative_pose_factor(
+        0, 1, T_a_b.matrix(), rotation_sigma_rad=0.01, translation_sigma_m=0.002
+    )
+    assert exact.error(values_of(T_a, T_b)) < 1e-20
+
+
+def test_sigmas_are_rotation_first() -> None:
+    assert pose_sigmas(rotation_rad=1.0, translation_m=2.0).tolist() == [1, 1, 1, 2, 2, 2]
+
+
+def random_hessian(seed: int = 0) -> np.ndarray:
+    root = np.random.default_rng(seed).standard_normal((9, 6))
+    return root.T @ root
+
+
+def test_the_diagonal_becomes_one_and_the_units_undo_it() -> None:
+    hessian = random_hessian()
+    scaled, units = unit_diagonal(hessian)
+    np.testing.assert_allclose(np.diag(scaled), 1.0, rtol=1e-15)
+    np.testing.assert_allclose(scaled * np.outer(units, units), hessian, rtol=1e-14)
+
+
+def test_the_smallest_eigenvalue_does_not_depend_on_units() -> None:
+    hessian = random_hessian()
+    units = np.repeat([1e-3, 1e4], 3)
+    expected = smallest_scaled_eigenvalue(hessian)
+    assert 0 < expected < 1
+    # Rounding of a 6x6 eigenvalue problem with eigenvalues up to 6.
+    found = smallest_scaled_eigenvalue(hessian * np.outer(units, units))
+    assert found == pytest.approx(expected, abs=1e-14)
+    assert smallest_scaled_eigenvalue(np.diag([1e-9, 1.0, 1e9])) == pytest.approx(1.0)
+
+
+def test_a_free_unknown_or_direction_gives_zero() -> None:
+    hessian = random_hessian()
+    free = hessian.copy()
+    free[2], free[:, 2] = 0.0, 0.0
+    assert smallest_scaled_eigenvalue(free) == 0.0
+    assert unit_diagonal(free)[1][2] == 1.0
+    direction = np.ones(6) / np.sqrt(6)
+    projected = np.eye(6) - np.outer(direction, direction)
+    assert abs(smallest_scaled_eigenvalue(projected @ hessian @ projected)) < 1e-14

@@ -1,0 +1,185 @@
+"""The parts of the search: bodies, common features, correlation maps, the box about a guess."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+
+import calibgraph
+from calibgraph import RelativePose, Rig
+from calibgraph.matching.structure.bodies import adjoint, lead, place, place_member, rigid_bodies
+from calibgraph.matching.structure.box_search import BodyMaps, Box, search_box
+from calibgraph.matching.structure.common_features import CommonFeatures
+from calibgraph.matching.structure.correlation_maps import CorrelationMaps, correlate
+from calibgraph.matching.structure.directions import view_angles
+from calibgraph.matching.structure.frame_cache import FrameCache, load_camera_frames
+from calibgraph.model.geometry import pose_difference
+from calibgraph.parallel import core_pool
+from calibgraph.solver.camera_twist import apply_twist
+from tests.conftest import SAMPLE, make_camera
+
+
+def relative(rig: Rig, a: str, b: str, sigma_rad: float = 0.001) -> RelativePose:
+    T = rig.T_camera_lidar
+    return RelativePose(
+        a=a,
+        b=b,
+        T_a_b=T[a] @ np.linalg.inv(T[b]),
+        rotation_sigma_rad=sigma_rad,
+        translation_sigma_m=0.01,
+    )
+
+
+@pytest.fixture
+def names(truth: Rig) -> list[str]:
+    return list(truth.cameras)
+
+
+def test_tight_relative_poses_join_cameras_whatever_their_direction(
+    truth: Rig, names: list[str]
+) -> None:
+    a, b, c = names
+    rig = truth.model_copy(
+        update={"relative_poses": (relative(truth, c, b), relative(truth, b, a))}
+    )
+    (body,) = rigid_bodies(rig.moved_to({b: np.eye(4), c: np.eye(4)}))
+    assert list(body)[0] == a
+    for name in names:
+        np.testing.assert_allclose(body[name].T_camera_lidar, truth.T_camera_lidar[name], atol=1e-9)
+
+
+def test_a_moved_body_keeps_its_relative_poses(truth: Rig, names: list[str]) -> None:
+    pairs = tuple(relative(truth, names[0], name) for name in names[1:])
+    (body,) = rigid_bodies(truth.model_copy(update={"relative_poses": pairs}))
+    twist = np.array([1e-4, -2e-4, 1e-4, 2e-3, 1e-3, -1e-3])
+    moved = place(body, apply_twist(lead(body), twist).T_camera_lidar)
+    for name in names:
+        own = apply_twist(body[name], adjoint(body, name) @ twist).T_camera_lidar
+        np.testing.assert_allclose(moved[name].T_camera_lidar, own, atol=2e-6)
+        again = place_member(body, name, moved[name].T_camera_lidar)
+        for other in names:
+            np.testing.assert_allclose(
+                again[other].T_camera_lidar, moved[other].T_camera_lidar, atol=1e-9
+            )
+
+
+OVERLAP, APART = ("front_left", "front_right"), ("front_right", "left")
+
+
+@pytest.fixture(scope="module")
+def common(truth: Rig) -> CommonFeatures:
+    """Of the sample's cameras, without their extrinsics."""
+    lenses = truth.moved_to(dict.fromkeys(truth.cameras, np.eye(4)))
+    frames = calibgraph.load_dataset(SAMPLE).select("0:3").frames
+    with core_pool() as cores:
+        loaded = load_camera_frames(FrameCache(), frames, lenses, cores)
+        found = CommonFeatures(lenses, loaded, seed=0)
+    return found
+
+
+@pytest.mark.parametrize("names", [OVERLAP, OVERLAP[::-1]])
+def test_a_camera_is_placed_where_another_one_sees_it(
+    common: CommonFeatures, truth: Rig, names: tuple[str, str]
+) -> None:
+    T = truth.T_camera_lidar
+    placed = common.place(names[0], names[1], T[names[1]])
+    assert placed is not None
+    degrees, centimetres = pose_difference(placed, T[names[0]])
+    assert degrees < 0.5 and centimetres < 15.0  # the reach of a refinement is far more
+
+
+@pytest.mark.parametrize("names", [APART, APART[::-1]])
+def test_cameras_that_see_nothing_in_common_place_nothing(
+    common: CommonFeatures, truth: Rig, names: tuple[str, str]
+) -> None:
+    assert common.place(names[0], names[1], truth.T_camera_lidar[names[1]]) is None
+
+
+def make_maps(rng: np.random.Generator) -> CorrelationMaps:
+    smooth = rng.standard_normal((40, 30, 50)).cumsum(axis=1).cumsum(axis=2).astype(np.float32)
+    points = rng.uniform([-8, -4, 5], [8, 4, 30], (40, 3))
+    return CorrelationMaps(smooth, points, np.array([-0.5, -0.3]), 0.02)
+
+
+def make_transforms(rng: np.random.Generator, count: int) -> np.ndarray:
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(rng.uniform(-0.3, 0.3, (count, 3))).as_matrix()
+    T[:, :3, 3] = rng.uniform(-1, 1, (count, 3))
+    return T
+
+
+def literal_z_score(maps: CorrelationMaps, T: np.ndarray) -> float:
+    """The sum of interpolated scores over its standard deviation, group by group."""
+    total, variance = 0.0, maps._variance_floor
+    height, width = maps.maps.shape[1:]
+    for scores, point, of_group in zip(maps.maps, maps.points_lidar_m, maps.variances, strict=True):
+        angles = view_angles((T[:3, :3] @ point + T[:3, 3])[None])[0]
+        u, v = (angles - maps.origin_rad) / maps.step_rad
+        if 0 <= u < width - 1 and 0 <= v < height - 1:
+            total += map_coordinates(scores.astype(float), [[v], [u]], order=1)[0]
+            variance += of_group
+    return float(total / np.sqrt(variance))
+
+
+def test_z_scores_are_those_of_the_literal_formula() -> None:
+    rng = np.random.default_rng(0)
+    maps, transforms = make_maps(rng), make_transforms(rng, 50)
+    expected = [literal_z_score(maps, T) for T in transforms]
+    np.testing.assert_allclose(maps.z_scores(transforms), expected, rtol=2e-3, atol=2e-3)
+
+
+def test_with_dense_windows_the_right_pose_stands_out_more() -> None:
+    data, rig = calibgraph.load_dataset(SAMPLE), calibgraph.load_rig(SAMPLE / "reference.yaml")
+    frame, (name, camera) = data.frames[0], next(iter(rig.cameras.items()))
+    cache = FrameCache()
+    gray, cloud = cache.image(frame, name, camera), cache.cloud(frame)
+    z_scores = {}
+    with core_pool() as cores:
+        for dense in (False, True):
+            maps = correlate(
+                [gray], [cloud], camera, cores,
+                range_rad=0.3, max_windows=9000, dense=dense, seed=0,
+            )  # fmt: skip
+            z_scores[dense] = maps.blur(1.0).z_scores(camera.T_camera_lidar[None])[0]
+    assert z_scores[True] > 1.2 * z_scores[False] > 0
+
+
+def test_displacement_inverts_transforms() -> None:
+    box = Box(make_camera((0.3, 0.1, -0.1)).T_camera_lidar, 0.3, 1.5)
+    displacements = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 6))
+    found = box.displacements(box.transforms(displacements))
+    np.testing.assert_allclose(found, displacements, atol=1e-12)
+    np.testing.assert_array_equal(box.excess(displacements), np.zeros(5))
+    assert box.excess(np.full((1, 6), 0.6)) == pytest.approx(3.0)  # three angles, twice as far
+
+
+@pytest.mark.slow
+def test_the_search_finds_where_the_maps_agree() -> None:
+    """Groups whose maps have one peak each: half where the true pose puts them, half anywhere."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform([5, -15, -2], [40, 15, 4], (600, 3))
+    true = make_camera((0.3, 0.1, -0.1)).T_camera_lidar
+    step, origin, shape = np.radians(0.6), np.radians([-41.0, -15.0]), (50, 137)
+    place = (view_angles(points @ true[:3, :3].T + true[:3, 3]) - origin) / step
+    outlier = rng.random(600) < 0.5
+    place[outlier] = rng.uniform(0, shape[::-1], (np.count_nonzero(outlier), 2))
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    squares = (u - place[:, 0, None, None]) ** 2 + (v - place[:, 1, None, None]) ** 2
+    maps = np.exp(-0.5 * squares / 2.0**2).astype(np.float32)
+    maps -= maps.mean(axis=(1, 2), keepdims=True)
+    correlation = CorrelationMaps(maps, points, origin, step)
+    body = BodyMaps([correlation], [np.eye(4)])
+    guess = Box(true, np.radians(20), 1.5).transforms(rng.uniform(-1, 1, (1, 6)) * 0.3)[0]
+    box = Box(guess, np.radians(20), 1.5)
+    with core_pool() as cores:
+        found = search_box(body, box, cores, seed=0)
+    off = Box(true, 1.0, 1.0).displacements(found[0][None])[0]
+    assert np.abs(off[:3]).max() < np.radians(0.6)  # a step of the maps
+    assert np.abs(off[3:]).max() < 0.15  # a step at 15 m
+    with ThreadPoolExecutor(1) as alone:
+        again = search_box(body, box, alone, seed=0)
+    np.testing.assert_array_equal(again, found)  # whatever the number of threads

@@ -1,0 +1,222 @@
+"""What is burnt into images is filled, and copies of a camera's images are named."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import calibgraph
+from calibgraph import Dataset, DatasetError, dataset_from_arrays
+from calibgraph.matching.burnt_in import describe_burnt_in, find_burnt_in, hide_burnt_in
+from calibgraph.matching.camera_pairs.features import features_of, match_features
+from calibgraph.matching.same_images import find_same_images, require_different_images
+from calibgraph.progress import no_progress
+from calibgraph.rounds import match_in_rounds
+from tests.conftest import SAMPLE, Call
+
+Image = np.ndarray
+PAIR = ("front_left", "left")  # which look 70 degrees apart
+
+
+def text(image: Image, number: int) -> None:
+    """A date, a time that changes, and a place."""
+    line = f"2024-05-01 12:30:{11 + 7 * number} N47.{3771 + 13 * number}"
+    cv2.putText(image, line, (8, 350), 0, 0.6, (255, 255, 255), 2)
+
+
+def logo(image: Image, _: int) -> None:
+    cv2.rectangle(image, (500, 300), (632, 352), (255, 255, 255), -1)
+    cv2.putText(image, "LOGO", (508, 340), 0, 1.2, (0, 0, 0), 3)
+
+
+def crosshair(image: Image, _: int) -> None:
+    cv2.line(image, (280, 180), (360, 180), (0, 255, 0), 2)
+    cv2.line(image, (320, 140), (320, 220), (0, 255, 0), 2)
+
+
+def circle(image: Image, _: int) -> None:
+    outside = np.ones(image.shape[:2], np.uint8)
+    cv2.circle(outside, (320, 180), 300, 0, -1)
+    image[outside > 0] = 0
+
+
+def nothing(_: Image, __: int) -> None:
+    """The images as they are."""
+
+
+def drawn(draw: Callable[[Image, int], None], frames: slice = slice(None)) -> Dataset:
+    """The sample with something drawn into the images of two cameras, which are compressed."""
+    data = calibgraph.load_dataset(SAMPLE)
+    rig = data.rig.model_copy(update={"cameras": {n: data.rig.cameras[n] for n in PAIR}})
+    images: dict[str, list[Image]] = {name: [] for name in PAIR}
+    for frame in data.frames[frames]:
+        for name in PAIR:
+            image = frame.load_image(name, rig.cameras[name]).copy()
+            draw(image, frame.index)
+            coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 50])[1]
+            images[name].append(np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)))
+    return dataset_from_arrays(rig, [np.ones((5, 4))] * len(images["left"]), images)
+
+
+@pytest.mark.parametrize(
+    ("draw", "inside"),
+    [
+        (text, ((8, 334), (215, 350))),
+        (logo, ((500, 300), (632, 352))),
+        (crosshair, ((300, 178), (340, 182))),
+        (circle, ((20, 178), (22, 182))),
+    ],
+)
+def test_what_is_drawn_into_images_is_found_with_its_rectangle(
+    draw: Callable[[Image, int], None], inside: tuple[tuple[int, int], tuple[int, int]]
+) -> None:
+    data = drawn(draw)
+    found = find_burnt_in(data, data.rig)
+    assert found.keys() == {*PAIR}
+    (left, top), (right, bottom) = inside
+    for each in found.values():
+        assert each.mask[top : bottom + 1, left : right + 1].mean() > 0.9
+        assert each.mask.mean() < 0.1
+        assert any(
+            a <= left and b <= top and right < c and bottom < d for a, b, c, d in each.rectangles
+        )
+
+
+def test_the_scene_is_not_burnt_in_however_often_it_is_seen() -> None:
+    drive = drawn(nothing)
+    stands = replace(drive, frames=tuple(drive.frames[i] for i in (0, 0, 1, 1, 1, 0)))
+    for data in (drive, stands, drawn(nothing, slice(1))):
+        assert hide_burnt_in(data, data.rig) is data
+
+
+def test_in_few_frames_what_cameras_that_look_elsewhere_have_in_common_is_burnt_in() -> None:
+    two, one = drawn(logo, slice(2)), drawn(logo, slice(1))
+    assert find_burnt_in(two, two.rig).keys() == {*PAIR}
+    assert not find_burnt_in(one, one.rig)  # two views can be alike by chance
+    R = two.rig.T_camera_lidar
+    beside = two.rig.moved_to({"left": R["front_left"]})
+    assert not find_burnt_in(two, beside)  # where what is far is at the same pixels
+
+
+def test_its_features_match_no_more() -> None:
+    data = drawn(text)
+    hidden = hide_burnt_in(data, data.rig)
+    assert len(describe_burnt_in(hidden)) == len(PAIR)
+    counts = []
+    for each in (data, hidden):
+        one, two = (features_of(each.frames[0], n, data.rig.cameras[n]) for n in PAIR)
+        rows = match_features(one, two)
+        apart = np.linalg.norm(one.pixels_px[rows[:, 0]] - two.pixels_px[rows[:, 1]], axis=1)
+        counts.append(int(np.sum(apart < 1.0)))
+    assert counts[0] > 20 and counts[1] == 0
+
+
+SIZE = (640, 360)
+
+
+def compressed(image: Image) -> Image:
+    return np.asarray(cv2.imdecode(cv2.imencode(".jpg", image, [1, 20])[1], cv2.IMREAD_COLOR))
+
+
+def brighter(image: Image) -> Image:
+    return np.asarray(255 * (image / 255) ** 0.6, np.uint8)
+
+
+def cropped(image: Image) -> Image:
+    return cv2.resize(image[36:324, 64:576], SIZE)
+
+
+def scaled(image: Image) -> Image:
+    return cv2.resize(cv2.resize(image, (320, 180)), SIZE)
+
+
+def turned(image: Image) -> Image:
+    return image[::-1, ::-1]
+
+
+def noisy(image: Image) -> Image:
+    noise = np.random.default_rng(0).normal(0, 10, image.shape)
+    return np.clip(image + noise, 0, 255).astype(np.uint8)
+
+
+def as_it_is(image: Image) -> Image:
+    return image
+
+
+def copied(change: Callable[[Image], Image], delay: int = 0) -> Dataset:
+    """The sample, whose front_right has changed images of front_left, some frames later."""
+    data = calibgraph.load_dataset(SAMPLE)
+    images = {
+        name: [frame.load_image(name, camera) for frame in data.frames]
+        for name, camera in data.rig.cameras.items()
+    }
+    own = images["front_left"]
+    shown = [change(own[max(0, number - delay)]) for number in range(len(own))]
+    return dataset_from_arrays(
+        data.rig, [frame.load_cloud() for frame in data.frames], images | {"front_right": shown}
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "delay"),
+    [
+        (as_it_is, 0), (compressed, 0), (brighter, 0), (cropped, 0), (scaled, 0), (turned, 0),
+        (noisy, 0), (compressed, 1),
+    ],
+)  # fmt: skip
+def test_copies_are_named_also_changed_or_a_frame_apart(
+    change: Callable[[Image], Image], delay: int
+) -> None:
+    data = copied(change, delay)
+    (line,) = find_same_images(data, data.rig)
+    assert {"front_left", "front_right"} <= {*line.replace(",", " ").split()}
+    assert ("a frame apart" in line) == (delay != 0)
+
+
+def test_cameras_that_see_the_same_are_not_accused() -> None:
+    data = calibgraph.load_dataset(SAMPLE)
+    assert not find_same_images(data, data.rig)
+    require_different_images(data, data.rig)
+
+
+def test_what_cannot_be_compared_is_not_accused() -> None:
+    blank = copied(np.zeros_like)
+    assert not find_same_images(blank, blank.rig)
+
+
+def test_nothing_is_searched_for_in_the_same_images() -> None:
+    with pytest.raises(DatasetError, match="front_left and front_right have the same images"):
+        match_in_rounds(copied(as_it_is), progress=no_progress)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("doctor", "DATA"),
+        ("calibrate", "DATA", "--out", "OUT"),
+        ("match", "DATA", "--out", "TABLE"),
+        ("check", "RIG", "DATA"),
+        ("track", "RIG", "DATA", "--matcher", "structure", "--out", "OUT"),
+    ],
+)
+def test_every_command_names_them(command: tuple[str, ...], tmp_path: Path, call: Call) -> None:
+    data = tmp_path / "data"
+    shutil.copytree(SAMPLE, data)
+    for path in (data / "cameras/front_left").iterdir():
+        shutil.copy(path, data / "cameras/front_right")
+    names = {
+        "DATA": data,
+        "RIG": data / "rig.yaml",
+        "OUT": tmp_path / "out",
+        "TABLE": tmp_path / "t.parquet",
+    }
+    code, printed, errors = call(*(str(names.get(word, word)) for word in command))
+    assert code == (1 if command[0] == "doctor" else 2)
+    words = " ".join((printed + errors).split())
+    assert "front_left and front_right have the same images: one device under two names" in words

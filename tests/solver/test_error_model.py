@@ -1,0 +1,365 @@
+"""What errors are made of: what is stated, what is learnt, and the shares of an error bar."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from calibgraph import (
+    Correspondences,
+    MatcherErrors,
+    Rig,
+    concatenate,
+    simulate_correspondences,
+    solve,
+)
+from calibgraph.graph.latent_poses import to_ordering
+from calibgraph.graph.variables import DISTORTION
+from calibgraph.model.config import Config, preset
+from calibgraph.model.error_components import error_components
+from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES
+from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.geometry import relative_covariance, relative_transform
+from calibgraph.model.verdict import COMMON_ERROR
+from calibgraph.simulation.correspondences import PoseSpread
+from calibgraph.solver.camera_pairs import pair_terms
+from calibgraph.solver.covariance import with_pseudo_frames
+from calibgraph.solver.curvature import Curvature
+from calibgraph.solver.elimination import join_linear
+from calibgraph.solver.error_model import ErrorFit, fit_errors
+from calibgraph.solver.error_shares import variances_by_source
+from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.pair_refinement import PairFit, fit_pairs, pair_sigmas
+from calibgraph.solver.shared_error import error_between, shared_scatter, shared_variance_ratio
+from calibgraph.solver.variance_components import VarianceRatios
+from calibgraph.trust.evidence import Evidence
+from factors import pose_sigmas
+from tests.draws.places import displaced
+from tests.solver.test_camera_pairs import simulated_pairs
+
+ZERO = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
+
+
+def stating(rig: Rig, metadata: dict[str, Any]) -> Correspondences:
+    return replace(simulate_correspondences(rig, frames=8, matches=200), metadata=metadata)
+
+
+def common_checks(rig: Rig, found: Correspondences, config: Config | None = None) -> list[str]:
+    result = solve(rig, found, config)
+    return [c.text for c in result.camera_verdicts["left"].checks if c.kind == COMMON_ERROR]
+
+
+@pytest.mark.parametrize("metadata", [{}, {"matcher": "mine"}, {"name": "picked by hand"}])
+def test_a_table_that_states_none_is_no_pass(pair: Rig, metadata: dict[str, Any]) -> None:
+    result = solve(pair, stating(pair, metadata))
+    assert result.verdict.status == "WARN" and result.verdict.cannot_tell
+    (reason,) = result.summary.reasons
+    assert reason.text.startswith("cannot tell: scatter only: ")
+    assert reason.cameras == ("left", "right")
+    assert any("common_deg and common_cm" in action for action in result.summary.actions)
+
+
+@pytest.mark.parametrize("matcher", ["structure", "cmrnext"])
+def test_a_known_matcher_has_its_usual_one(pair: Rig, matcher: str) -> None:
+    usual = error_components().matchers[matcher]
+    found = MatcherFindings.from_metadata({"matcher": matcher})
+    assert found.systematic_rotation_rad == usual.systematic_rotation_rad
+    assert found.place_variance == usual.place_variance
+    assert not common_checks(pair, stating(pair, {"matcher": matcher}))
+    silent, known = (
+        solve(pair, stating(pair, metadata)).sigmas("left")
+        for metadata in ({}, {"matcher": matcher})
+    )
+    assert known[0].max() > 3 * silent[0].max() and known[1].max() > 3 * silent[1].max()
+    own = MatcherFindings.from_metadata({"matcher": matcher, **ZERO})
+    assert own.systematic_sigmas == (0.0, 0.0) and own.place_variance == 0.0
+
+
+def test_the_settings_state_it_for_a_table_that_does_not(pair: Rig) -> None:
+    config = Config(common_deg=0.1, common_cm=2.0)
+    sigmas = solve(pair, stating(pair, {}), config).sigmas("left")
+    assert sigmas is not None and sigmas[0].max() > 0.1 and sigmas[1].max() > 2.0
+    assert not common_checks(pair, stating(pair, {}), config)
+    assert not common_checks(pair, stating(pair, {}), Config(common_deg=0.0))
+
+
+def test_simulated_matchers_state_it_where_they_have_none(pair: Rig) -> None:
+    biased = MatcherErrors(bias_pose=PoseSpread(rotation_deg=(0.1, 0.1, 0.1)))
+    for errors, states in ((MatcherErrors(), True), (biased, False)):
+        found = simulate_correspondences(pair, frames=1, matches=50, errors=errors)
+        assert found.findings.states_common_error == states
+        kept = MatcherFindings.from_metadata(found.findings.to_metadata())
+        assert kept.states_common_error == states
+
+
+def test_few_frames_add_what_is_usual_and_many_keep_their_own_scatter() -> None:
+    """The gradient of one frame is zero at the solution; of ten, pseudo frames add a diagonal."""
+    rng, hessian = np.random.default_rng(0), np.diag([4.0, 3.0, 2.0, 1.0])
+    usual = np.diag([9.0, 8.0, 7.0, 6.0])
+    found = with_pseudo_frames(np.zeros((4, 4)), hessian, np.ones(4), usual)
+    np.testing.assert_allclose(found, usual)
+    few, many = (rng.standard_normal((frames, 4)) for frames in (10, 4000))
+    scatter = few.T @ few
+    found = with_pseudo_frames(scatter, hessian, np.full(4, 10.0))
+    np.testing.assert_allclose(found, scatter + 6 / 9 * np.diag(np.diag(scatter)))
+    scatter = many.T @ many
+    found = with_pseudo_frames(scatter, hessian, np.full(4, 4000.0), 100 * scatter)
+    np.testing.assert_allclose(found, scatter, rtol=0.02, atol=0.02 * scatter[0, 0])
+
+
+SHARED_RAD, SHARED_M = np.radians(0.09), 0.02
+STATED: dict[str, Any] = {
+    "systematic_rotation_rad": float(SHARED_RAD),
+    "systematic_translation_m": SHARED_M,
+    "camera_share": 0.4,
+}
+OF_A_SENSOR = STATED | {
+    "systematic_rotation_rad": float(np.radians(0.15)),
+    "elevation_rad": float(np.radians(0.12)),
+    "place_variance": 6.0,
+    "place_rotation_rad": 3e-4,
+    "place_translation_m": 0.006,
+}
+A_PLACE = 3  # frames
+
+
+def table_of_places(rig: Rig, places: int, stated: dict[str, Any]) -> Correspondences:
+    """Matches of a pixel of noise, of several places."""
+    frames = A_PLACE * places
+    found = simulate_correspondences(rig, frames=frames, errors=MatcherErrors(), seed=3)
+    lists = np.arange(frames).reshape(places, -1).tolist()
+    return replace(found, metadata={**stated, "places": lists})
+
+
+def evidence(rig: Rig, found: Correspondences, config: Config | None = None) -> Evidence:
+    return Evidence(solve_joint(rig, found, config or Config()), rig)
+
+
+@pytest.mark.parametrize("config", [Config(), preset("kitti")])
+def test_what_all_frames_share_is_the_share_that_its_size_has(pair: Rig, config: Config) -> None:
+    found = evidence(pair, table_of_places(pair, 2, STATED), config).error_sources["left"]
+    assert sum(found.rotation.values()) == pytest.approx(1.0)
+    # The cloud turns about the LiDAR, as far as the camera.
+    expected = (np.degrees(SHARED_RAD) / found.rotation_deg) ** 2
+    assert found.rotation[COMMON] == pytest.approx(expected, rel=0.01)
+    assert found.rotation[COMMON] > 0.5 > found.rotation[MATCHES] > 0
+
+
+def test_the_shares_are_those_of_independent_errors_and_add_up(pair: Rig) -> None:
+    """The part that is left to the matches is the one that their own equations give."""
+    errors = evidence(pair, table_of_places(pair, 3, OF_A_SENSOR)).solution.marginals.errors
+    parts = variances_by_source(errors)
+    matches = np.diag(errors.fit.covariance) - sum(parts.values())
+    assert matches == pytest.approx(of_matches(errors), rel=1e-6)
+
+
+def of_matches(errors: ErrorFit) -> np.ndarray:
+    """(6 N,) variances by the data, by the residuals of the distortion, and by the scatter.
+
+    From the dense covariance C: C G C, with G the information of each of these.
+    """
+    linear, weight = (
+        errors.fit.linear,
+        errors.fit.place_weights(errors.model.components.robust_scale),
+    )
+    parts = errors.model.components.with_fixed_weights(weight)
+    model = replace(errors.model, components=parts)
+    order = to_ordering([*model.reported_keys, *model.shared_keys[: -len(model.cameras)],
+                         *model.place_keys])  # fmt: skip
+    starts, end = {}, 0
+    for number in range(order.size()):
+        starts[order.at(number)] = end
+        end += 3 if order.at(number) == DISTORTION else 6
+    graph = join_linear(linear.shared, linear.placed)
+    moved = np.linalg.inv(graph.hessian(order)[0])[: 6 * len(model.cameras)]
+    information = np.zeros((end, end))
+    for number in range(linear.data.graph.size()):
+        factor = linear.data.graph.at(number)
+        rows = np.concatenate([starts[key] + np.arange(6) for key in list(factor.keys())])
+        information[np.ix_(rows, rows)] += factor.information()
+    shown = np.einsum("pn,pnij->ij", parts.distortion_weight, parts.distortion_information)
+    rows = starts[DISTORTION] + np.arange(3)
+    information[np.ix_(rows, rows)] += shown
+    for number, (place, camera) in enumerate(model.matched_places):
+        edge = model.place_graph.at(model.places + number)
+        root = edge.noiseModel().R()
+        whitened, _ = edge.linearize(linear.values).jacobian()
+        rows = np.concatenate([starts[key] + np.arange(6) for key in list(edge.keys())])
+        scatter = root @ parts.scatter_at_place[place, camera] @ root.T
+        information[np.ix_(rows, rows)] += whitened.T @ scatter @ whitened
+    return np.diag(moved @ information @ moved.T)
+
+
+def test_the_error_bar_of_more_frames_is_as_predicted(pair: Rig) -> None:
+    few = evidence(pair, table_of_places(pair, 5, OF_A_SENSOR)).error_sources
+    many = evidence(pair, table_of_places(pair, 25, OF_A_SENSOR)).error_sources
+    for name, before in few.items():
+        after = many[name].rotation_deg, many[name].translation_cm
+        assert before.rotation_deg > after[0] and before.translation_cm > after[1]
+        # Scatter of 15 frames, so of 12 degrees of freedom: sigmas to 20 %, of a part.
+        assert before.forecast[5] == pytest.approx(after, rel=0.2)
+
+
+def test_recording_is_advised_only_where_it_shrinks_the_error_bar_enough(pair: Rig) -> None:
+    found = evidence(pair, table_of_places(pair, 2, OF_A_SENSOR)).error_sources["left"]
+    assert found.describe((0.5, 100.0)).startswith(f"{found.rotation_deg:.2g} deg (1 sigma)")
+    best_deg = found.forecast[MOST_TIMES][0]
+    wide = found.rotation_deg / 0.3
+    assert found.action((1.01 * wide, 100.0)) == ""
+    twice = 1.001 * found.forecast[2][0] / 0.3
+    assert found.action((twice, 100.0)).startswith("Record 2 times as many frames")
+    limited = found.action((0.9 * best_deg / 0.3, 100.0))
+    assert "Record" not in limited and limited.startswith("Tolerate more")
+    assert f"{best_deg:.2g} deg" in limited
+
+
+FINDINGS = MatcherFindings(systematic_rotation_rad=2e-3, systematic_translation_m=0.03)
+EACH = pose_sigmas(rotation_rad=2e-3, translation_m=0.03) ** 2
+
+
+def alone(rig: Rig) -> Curvature:
+    """Of correspondences that tie each camera by itself."""
+    own = np.diag(np.tile([4e6, 3e6, 2e6, 9e4, 8e4, 7e4], len(rig.cameras)))
+    return Curvature(own, np.zeros_like(own), own)
+
+
+def test_every_camera_has_it_and_half_of_its_variance_is_that_of_the_whole_cloud(
+    pair: Rig,
+) -> None:
+    bent = alone(pair)
+    joint = bent.sandwich(shared_scatter(FINDINGS, pair.T_camera_lidar, bent, {}))
+    assert np.diag(joint)[:3] == pytest.approx(EACH[:3], rel=1e-9)
+    lever_m2 = 2e-3**2 / 2  # the cloud turns about the LiDAR, under a metre from the cameras
+    for rows in (slice(3, 6), slice(9, 12)):
+        assert (np.diag(joint)[rows] >= 0.999 * EACH[3:]).all()
+        assert (np.diag(joint)[rows] <= EACH[3:] + lever_m2).all()
+    relative = relative_covariance(
+        joint, 0, 1, relative_transform(*(pair.T_camera_lidar[n] for n in ("right", "left")))
+    )
+    # What both share is not between them: two halves are left of two whole ones.
+    assert np.diag(relative)[:3] == pytest.approx(EACH[:3], rel=1e-9)
+
+
+def test_the_part_of_a_place_does_not_fall_with_the_number_of_its_frames(pair: Rig) -> None:
+    findings = MatcherFindings(place_variance=4.0)
+    found = []
+    for count in (1, 10):
+        own = count * alone(pair).of_correspondences
+        bent = Curvature(own, np.zeros_like(own), own)
+        frames = dict.fromkeys(pair.cameras, float(count))
+        found.append(bent.sandwich(shared_scatter(findings, pair.T_camera_lidar, bent, frames)))
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-12, atol=1e-20)
+    np.testing.assert_allclose(
+        found[0], 4 * np.linalg.inv(alone(pair).of_correspondences), rtol=1e-9, atol=1e-20
+    )
+
+
+def test_the_error_of_images_is_between_cameras_that_share_features_alone(pair: Rig) -> None:
+    terms, T = pair_terms(pair, simulated_pairs(pair), Config()), pair.T_camera_lidar
+    assert not error_between(T, ()).any()
+    relative = relative_covariance(
+        error_between(T, terms), 0, 1, relative_transform(T["right"], T["left"])
+    )
+    # Half of the pair's variance is in the left camera, half a metre away, which adds to it.
+    own = pair_sigmas()
+    assert np.sqrt(np.diag(relative)) == pytest.approx(own, abs=0.5 * own[0])
+
+
+@pytest.mark.parametrize("size", [2.0, 4.0])
+def test_its_size_is_found_from_what_cameras_see_in_common(mixed_rig: Rig, size: float) -> None:
+    """Cameras displaced at random by so many times their covariance, images that are exact."""
+    rng = np.random.default_rng(0)
+    covariance = np.diag(np.tile(EACH, 3))
+    fits, found = fits_of(mixed_rig), []
+    for _ in range(200):
+        own = {
+            name: gtsam.Pose3.Expmap(size * np.sqrt(EACH) * rng.standard_normal(6)).matrix() @ T
+            for name, T in mixed_rig.T_camera_lidar.items()
+        }
+        found.append(shared_variance_ratio(own, covariance, fits))
+    # Two of the three cameras are tied: six degrees of freedom, and six of what is usual.
+    expected = (6 + 6 * size**2) / 12
+    spread = 6 * size**2 * np.sqrt(2 / 6) / 12 / np.sqrt(200)
+    assert np.mean(found) == pytest.approx(expected, rel=0.05, abs=4 * spread)
+
+
+def fits_of(rig: Rig) -> list[PairFit]:
+    """Where exact images place the cameras."""
+    held = np.array([np.diag(EACH)] * len(rig.cameras))
+    return fit_pairs(rig, simulated_pairs(rig), Config(), held)
+
+
+def test_it_is_never_taken_for_less_than_usual_and_as_usual_without_tied_cameras(pair: Rig) -> None:
+    covariance = np.diag(np.tile(EACH, 2))
+    for fits in (fits_of(pair), ()):
+        assert shared_variance_ratio(pair.T_camera_lidar, covariance, fits) == 1.0
+
+
+def test_a_displaced_camera_widens_the_error_bars(pair: Rig) -> None:
+    """The matches of one camera are displaced by 12 cm, which images of both show."""
+    table = simulate_correspondences(
+        pair, frames=6, errors=MatcherErrors(outlier_share=0.1), seed=0
+    )
+    metadata = {"systematic_rotation_rad": 1e-3, "systematic_translation_m": 0.01}
+    moved = table.points_lidar_m.copy()
+    moved[table.camera_index == table.cameras.index("right")] += [0.0, 0.12, 0.0]
+    widths = []
+    for points in (table.points_lidar_m, moved):
+        given = replace(table, points_lidar_m=points, metadata=metadata)
+        solution = solve_joint(pair, given, camera_matches=simulated_pairs(pair))
+        evidence = Evidence(solution, guess=pair)
+        covariance = evidence.covariance_of("right")
+        widths.append(float(np.sqrt(covariance[3, 3])))
+        errors = [
+            np.linalg.norm(solution.T_camera_lidar[n][:3, 3] - pair.T_camera_lidar[n][:3, 3])
+            for n in pair.cameras
+        ]
+    assert max(errors) > 0.02
+    assert widths[1] > 2 * widths[0]
+
+
+EXACT = MatcherErrors(noise_px=0.3, outlier_share=0.0)
+OF_PLACES = {"place_rotation_rad": 1e-3, "place_translation_m": 0.01, "camera_share": 0.0}
+SIGMAS = np.repeat([1e-3, 0.01], 3)
+
+
+def table_of(rig: Rig, places: int, size: float, seed: int) -> Correspondences:
+    """The cloud is displaced at each place, by ``size`` times the variance that is stated."""
+    rng, tables = np.random.default_rng(seed), []
+    for place in range(places):
+        cloud = np.sqrt(size) * SIGMAS * rng.standard_normal(6)
+        there = displaced(rig, cloud, np.zeros((len(rig.cameras), 6)))
+        table = simulate_correspondences(
+            there, frames=2, matches=200, errors=EXACT, seed=int(rng.integers(2**31))
+        )
+        tables.append(replace(table, frame=table.frame + 2 * place))
+    joined = concatenate(tables)
+    names = [[2 * place, 2 * place + 1] for place in range(places)]
+    return replace(joined, metadata={**joined.metadata, **OF_PLACES, "places": names})
+
+
+def errors_of(rig: Rig, table: Correspondences) -> ErrorFit:
+    solution = solve_joint(rig, table, Config(learnt_weights=False))
+    found = solution.errors or fit_errors(solution.fitted, table.findings, table.places)
+    return found
+
+
+@pytest.mark.parametrize("size", [0.25, 2.0])
+def test_the_size_of_places_is_found_from_many_of_them(pair: Rig, size: float) -> None:
+    places = 20
+    found = [errors_of(pair, table_of(pair, places, size, seed)).ratios.cloud for seed in range(4)]
+    # 6 (places - 1) degrees of freedom a table; what is usual counts as 12 of size 1.
+    free = 6 * (places - 1)
+    expected = (12 + free * size) / (12 + free)
+    spread = size * np.sqrt(2 / free / len(found))
+    assert np.mean(found) == pytest.approx(expected, rel=0.15, abs=4 * spread)
+
+
+def test_few_places_are_never_taken_for_better_than_usual_and_one_says_nothing(pair: Rig) -> None:
+    """At one place nothing is measured twice, so nothing is learnt, whatever the error."""
+    for places, size in ((4, 0.0), (1, 25.0)):
+        assert errors_of(pair, table_of(pair, places, size, 0)).ratios == VarianceRatios()
