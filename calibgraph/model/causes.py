@@ -22,6 +22,7 @@ _FROM_RESULT = "Calibrate again with this result as the guess: the matcher then 
 _STRUCTURE = "Record where image and cloud both have structure: edges, poles, facades at 5 to 40 m."
 _FRAMES = "Look at the frames that disagree: leave out those in which a sensor moved or lagged."
 _SPREAD = "Give more matches, spread over the image and over distances."
+_LEARNED = "Use the matcher structure."
 
 _ESTIMATED_AS = {
     "focal_length": "focal",
@@ -118,7 +119,8 @@ CAUSES: dict[str, Cause] = {
         "wrong correspondences",
         "Look at the residuals of the matches in the report: too many are wrong.",
         {"competing_solution": "", "failed_frames": "",
-         "assumed_spread": "Leave loss_scale_px out of the config, or raise it."},
+         "assumed_spread": "Leave loss_scale_px out of the config, or raise it.",
+         "start_dependence": _LEARNED, "memorization": _LEARNED},
     ),
     "frames": Cause(
         "frames or places that contradict each other", _FRAMES,

@@ -16,8 +16,10 @@ from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.yaml_text import describe_value
 
 _OF_ONE_SEARCH = ("found", "missed", "chance")
-_PER_CAMERA = "z_score", *_OF_ONE_SEARCH, "contradicted", "failed_share"
-_FORMER_KEYS = {"contrast": "z_score"}
+_PER_CAMERA = (
+    "z_score", *_OF_ONE_SEARCH, "contradicted", "start_dependence", "memorization", "failed_share"
+)  # fmt: skip
+_FORMER_KEYS = {"contrast": "z_score", "recall": "memorization"}
 IMAGES = "calibgraph_images"
 """Key of what the images said of a result; its content is of ``calibgraph.trust.image_record``."""
 STAGE1 = "stage1"
@@ -52,6 +54,8 @@ class MatcherFindings:
 
     Attributes:
         z_score: agreement of image and cloud, in standard deviations of chance agreement.
+        start_dependence: share of a displaced start that remains in the matches (0 to 1).
+        memorization: share of the displacement that is undone with a blank image (0 to 1).
         failed_share: share of the frames without matches (0 to 1).
         found: z-score at the pose where the search found the camera.
         missed: best z-score of the search where it did not find the camera: the camera fails.
@@ -75,6 +79,8 @@ class MatcherFindings:
     """
 
     z_score: Mapping[str, _Finite] = field(default_factory=dict)
+    start_dependence: Mapping[str, _Number] = field(default_factory=dict)
+    memorization: Mapping[str, _Number] = field(default_factory=dict)
     failed_share: Mapping[str, _Number] = field(default_factory=dict)
     found: Mapping[str, _Finite] = field(default_factory=dict)
     missed: Mapping[str, _Finite] = field(default_factory=dict)

@@ -10,6 +10,7 @@ import numpy as np
 from calibgraph.matching.structure.acceptance import FEW_FRAMES, SEARCH, probability_by_chance
 from calibgraph.matching.structure.global_search import ALONE
 from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.threshold import Threshold
 from calibgraph.model.verdict import FAIL_ABOVE, TOLERANCE, Check
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.solution_checks import check_sigmas
@@ -61,7 +62,7 @@ def check_findings(
     shared = None if shared_sigmas is None else np.repeat(shared_sigmas, 3)
     return [
         *_search_checks(findings, camera),
-        _failed_frames_check(findings, camera),
+        *_share_checks(findings, camera),
         *check_sigmas("error that the matcher's frames share", shared, tolerance),
         *_agreement_checks(findings, camera),
     ]
@@ -122,9 +123,21 @@ def _contradiction(findings: MatcherFindings, camera: str) -> list[Check]:
     return [Check(f"features in common with {other}", "WARN", text, kind="contradiction")]
 
 
-def _failed_frames_check(findings: MatcherFindings, camera: str) -> Check:
-    """How many frames failed to be matched."""
-    row, share = threshold("failed_frames"), findings.failed_share.get(camera, 0.0)
+def _share_checks(findings: MatcherFindings, camera: str) -> list[Check]:
+    """Checks of a learned matcher: dependence on its start, memorization, failed frames."""
+    shares = (
+        (threshold("start_dependence"), findings.start_dependence.get(camera),
+         "of a displaced start remains in the matches"),
+        (threshold("memorization"), findings.memorization.get(camera),
+         "of a displaced start is undone even without the image"),
+        (threshold("failed_frames"), findings.failed_share.get(camera, 0.0),
+         "of the frames failed to be matched"),
+    )  # fmt: skip
+    return [_check_share(row, share, text) for row, share, text in shares if share is not None]
+
+
+def _check_share(row: Threshold, share: float, text: str) -> Check:
     found = "an unknown share" if math.isnan(share) else f"{share:.0%}"
-    text = f"{found} of the frames failed to be matched"
-    return row.describe(share, row.grade(share), text)
+    status = row.grade(share)
+    advice = f": {row.advice}" if row.advice and status != "PASS" else ""
+    return row.describe(share, status, f"{found} {text}{advice}")

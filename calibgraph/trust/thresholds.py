@@ -75,6 +75,12 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "With fewer, the error bar is mostly a prior.",
               "the error bar is mostly a default, not measured"),
     # the matcher
+    Threshold("start_dependence", "start dependence", "at most", 0.25, 0.5, "share",
+              "How much of a displaced start does a learned matcher leave?", _CHOSEN,
+              "the network does not measure here"),
+    Threshold("memorization", "memorization", "at most", 0.3, 0.6, "share",
+              "How much of a displaced start does a learned matcher undo without the image?",
+              _CHOSEN, "the network reproduces the rig it was trained on, and pulls towards it"),
     Threshold("failed_frames", "failed frames", "at most", 0.3, 0.7, "share",
               "How many frames gave no matches?", _CHOSEN),
     Threshold("z_score", "z-score of image and cloud", "at least", 15.0, 8.0, "",

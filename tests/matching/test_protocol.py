@@ -162,6 +162,8 @@ def test_findings_of_the_start_and_of_the_last_round_are_in_the_table(
 
 FINDINGS = MatcherFindings(
     z_score={"left": 17.5},
+    start_dependence={"left": 0.1},
+    memorization={"left": 0.9},
     failed_share={"left": 0.25},
     found={"left": 18.0},
     missed={"right": 3.0},

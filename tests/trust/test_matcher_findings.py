@@ -25,9 +25,14 @@ def table(pair: Rig) -> Correspondences:
     ("findings", "status"),
     [
         ({}, "PASS"),
-        ({"failed_share": 0.1}, "PASS"),
+        ({"start_dependence": 0.1, "memorization": 0.1, "failed_share": 0.1}, "PASS"),
+        ({"start_dependence": 0.3}, "WARN"),
+        ({"start_dependence": 0.9}, "FAIL"),
+        ({"start_dependence": float("nan")}, "FAIL"),
+        ({"memorization": 0.4}, "WARN"),
+        ({"memorization": 1.0}, "FAIL"),
+        ({"memorization": -0.5}, "PASS"),
         ({"failed_share": 0.5}, "WARN"),
-        ({"failed_share": float("nan")}, "FAIL"),
         ({"failed_share": 1.0}, "FAIL"),
     ],
 )
@@ -58,8 +63,8 @@ def test_a_camera_that_features_place_elsewhere_is_no_pass_with_both_statements(
 def test_malformed_findings_are_refused(
     pair: Rig, table: Correspondences, nonsense: object
 ) -> None:
-    with pytest.raises(calibgraph.CorrespondenceError, match="failed_share"):
-        calibgraph.solve(pair, replace(table, metadata={"failed_share": nonsense}))
+    with pytest.raises(calibgraph.CorrespondenceError, match="memorization"):
+        calibgraph.solve(pair, replace(table, metadata={"memorization": nonsense}))
 
 
 def test_a_matchers_own_error_is_reported_once(pair: Rig) -> None:

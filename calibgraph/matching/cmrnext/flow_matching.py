@@ -221,19 +221,38 @@ class ImageResult:
         matches: of the last network.
         T_camera_lidar: (4, 4) estimated from them by PnP; None if that failed.
         failed: whether a network gave no pose, or one beyond its range of training.
+        start_dependence: see :mod:`calibgraph.matching.cmrnext.probe`; None if not measured.
+        memorization: see the same module; None if not measured.
     """
 
     job: MatchingJob
     matches: Correspondences
     T_camera_lidar: Array | None
     failed: bool
+    start_dependence: float | None = None
+    memorization: float | None = None
 
 
 def to_findings(results: Mapping[str, Sequence[ImageResult]], last: Checkpoint) -> MatcherFindings:
-    """Failed frames, and the shared error of the last network."""
+    """Failed frames, in the last round the probes, and the shared error of the last network."""
     prior = asdict(error_components().matchers["cmrnext"])
     stated = {key: last.config[key] for key in prior if last.config.get(key) is not None}
     return MatcherFindings(
         failed_share={name: float(np.mean([r.failed for r in e])) for name, e in results.items()},
+        start_dependence=_medians(results, "start_dependence"),
+        memorization=_medians(results, "memorization"),
         **{**prior, **stated},
     )
+
+
+def _medians(results: Mapping[str, Sequence[ImageResult]], attribute: str) -> dict[str, float]:
+    """Median of a probe over the frames of each probed camera; NaN if none could be measured."""
+    values = {name: [getattr(result, attribute) for result in each]
+              for name, each in results.items()}  # fmt: skip
+    probed = {name: [v for v in each if v is not None] for name, each in values.items()}
+    return {name: _finite_median(each) for name, each in probed.items() if each}
+
+
+def _finite_median(values: Sequence[float]) -> float:
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.median(finite)) if finite else float("nan")

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.io.dataset import Dataset
+from calibgraph.io.dataset import Dataset, spread_out
+from calibgraph.matching.cmrnext import probe
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint, load_checkpoint
 from calibgraph.matching.cmrnext.flow_matching import (
     FlowMatcher,
@@ -29,6 +30,7 @@ from calibgraph.progress import Progress
 from calibgraph.solver.pnp import frame_pose
 
 _BATCH = {"cpu": 1, "cuda": 4}
+_PROBED_FRAMES = 5  # per camera
 _BEYOND = 2.0  # times the range of training, corner to corner: no network corrects by more
 
 
@@ -89,6 +91,9 @@ class CmrNextMatcher:
         schedule = self.networks
         if self.start_from == "joint":
             schedule = schedule[round_index : round_index + 1]
+        is_last = round_index == self.rounds - 1
+        probed = spread_out(dataset.frames, _PROBED_FRAMES) if is_last else []
+        probed_frames = {frame.index for frame in probed}
         total = len(rig.cameras) * len(dataset.frames)
         results: dict[str, list[ImageResult]] = {name: [] for name in rig.cameras}
         done = 0
@@ -96,6 +101,8 @@ class CmrNextMatcher:
             what = f"round {round_index + 1} of {self.rounds}: {jobs[0].frame.name}"
             progress(what, round_index * total + done, self.rounds * total)
             for result in self._run(jobs, schedule):
+                if result.job.frame.index in probed_frames:
+                    result = self._probe(result, schedule[-1])  # noqa: PLW2901
                 results[result.job.name].append(result)
             done += len(jobs)
         # Of a camera whose images all failed, all are given: the solve reports the failure.
@@ -162,6 +169,23 @@ class CmrNextMatcher:
             return ImageResult(job, table, None, failed=True)
         failed = failed or not _is_within_range(checkpoint, job, T_camera_lidar)
         return ImageResult(job, _weigh(job, table, T_camera_lidar), T_camera_lidar, failed)
+
+    def _probe(self, result: ImageResult, network: FlowMatcher) -> ImageResult:
+        """Match again from a displaced start: with the image, and with a blank one."""
+        job = result.job
+        base = job.T_camera_lidar if result.T_camera_lidar is None else result.T_camera_lidar
+        rng = np.random.default_rng([self.seed, job.frame.index])
+        start = probe.displace(base, network.checkpoint.range_deg_m, rng)
+        blank = np.full_like(job.image, probe.BLANK)
+        with_image, without_image = (
+            network.match([replace(job, T_camera_lidar=start, image=image)])[0]
+            for image in (job.image, blank)
+        )
+        dependence, kept = (
+            probe.remaining_share(job.camera, base, start, table)
+            for table in (with_image, without_image)
+        )
+        return replace(result, start_dependence=dependence, memorization=1.0 - kept)
 
     def _metadata(self, last: Checkpoint, round_index: int) -> dict[str, Any]:
         return {
