@@ -61,7 +61,7 @@ from .model.correspondences import concatenate as concatenate
 from .model.metrics import Evaluation as Evaluation
 from .model.metrics import PoseError as PoseError
 from .model.metrics import evaluate as evaluate
-from .model.perturbation import perturb as perturb
+from .model.metrics import perturb as perturb
 from .model.rig import Camera as Camera
 from .model.rig import Intrinsics as Intrinsics
 from .model.rig import RelativePose as RelativePose

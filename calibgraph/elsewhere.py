@@ -24,8 +24,7 @@ from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.rematch import LastRound, rounds_from, with_cameras_of
 from calibgraph.rounds import assign_places
 from calibgraph.solver.joint import solve_without_failing
-from calibgraph.trust.evidence import Evidence
-from calibgraph.trust.run_evidence import RunEvidence
+from calibgraph.trust.evidence import Evidence, RunEvidence
 
 _TIMES = 3  # at most: a posterior that its prior cuts off shows the way, not the end
 _log = logging.getLogger(__name__)

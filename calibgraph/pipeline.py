@@ -16,14 +16,13 @@ from pathlib import Path
 from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset
-from calibgraph.model.calibration import Calibration
+from calibgraph.model.calibration import Calibration, Later
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pair_covariances
-from calibgraph.model.later import Later
-from calibgraph.model.lens_estimate import with_sigmas
+from calibgraph.model.lens import with_sigmas
 from calibgraph.model.rig import Rig
 from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.parallel import Threads, with_own_threads
@@ -31,13 +30,12 @@ from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess, assess_run, in_order
-from calibgraph.trust.clock_checks import asks_offset
-from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.evidence import Evidence, RunEvidence
 from calibgraph.trust.image_record import ImageRecord, RunChecks, to_metadata
-from calibgraph.trust.motion_checks import registered_twists
+from calibgraph.trust.inputs import registered_twists
+from calibgraph.trust.lens_checks import asks_offset
 from calibgraph.trust.observability import weaknesses
 from calibgraph.trust.probability import TABLES, judge, model_of
-from calibgraph.trust.run_evidence import RunEvidence
 
 _log = logging.getLogger(__name__)
 

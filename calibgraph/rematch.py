@@ -14,12 +14,12 @@ from calibgraph.matching.run import (
     with_motion,
 )
 from calibgraph.model.correspondences import Correspondences, concatenate
-from calibgraph.model.perturbation import perturb
+from calibgraph.model.metrics import perturb
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.solution import Solution
-from calibgraph.trust.rematch_checks import REMATCH_DEG, REMATCH_M, compare_ends
+from calibgraph.trust.matcher_checks import REMATCH_DEG, REMATCH_M, compare_ends
 
 _BETTER = 1.03
 """Ratio of z-scores from which the end of a displaced start replaces the first end. On KITTI, ends

@@ -34,7 +34,7 @@ from calibgraph.matching.same_images import require_different_images
 from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.lens_estimate import LensEstimate, change_of_lens, unsettled
+from calibgraph.model.lens import LensEstimate, change_of_lens, unsettled
 from calibgraph.model.places import Places, as_groups
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, Stopwatch, with_note

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from calibgraph.model.threshold import Threshold, in_unit, is_reachable
-from calibgraph.model.verdict import TOLERANCE
+from calibgraph.model.verdict import TOLERANCE, Threshold, in_unit, is_reachable
 from calibgraph.trust.thresholds import THRESHOLDS
 
 

@@ -20,9 +20,9 @@ from calibgraph.matching.named import find_matcher
 from calibgraph.matching.run import require_known_motion
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import Verdict
-from calibgraph.trust import clock_checks
-from calibgraph.trust.clock_checks import _motion_options
+from calibgraph.trust import lens_checks
 from calibgraph.trust.conventions import _sentence, undo_convention_errors
+from calibgraph.trust.lens_checks import _motion_options
 from calibgraph.trust.lens_parameter import IMAGES, TIME, LensParameter, check_parameter
 from tests.conftest import ROOT, SAMPLE, Call
 
@@ -100,7 +100,7 @@ def test_the_offset_that_scans_show_is_estimated_with_the_interval_of_clouds(
     words = action.rstrip(".").partition(": ")[2].split()
     context: click.Context = COMMANDS["calibrate"].make_context("calibrate", [str(SAMPLE), *words])
     assert context.params["dataset"] == [SAMPLE]
-    monkeypatch.setattr(clock_checks, "is_bag", lambda _: True)
+    monkeypatch.setattr(lens_checks, "is_bag", lambda _: True)
     assert _motion_options(sample) == " --motion scans"
 
 

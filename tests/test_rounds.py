@@ -37,10 +37,10 @@ from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
 from calibgraph.solver.joint import solve_joint, solve_without_failing
+from calibgraph.trust.evidence import RunEvidence
+from calibgraph.trust.matcher_checks import going_on_checks
 from calibgraph.trust.pose_posterior import PosePosterior
 from calibgraph.trust.probability import STRUCTURE, judge
-from calibgraph.trust.rematch_checks import going_on_checks
-from calibgraph.trust.run_evidence import RunEvidence
 from factors import Clock, displace
 from tests.conftest import SAMPLE
 from tests.draws.clocks import draw_twists

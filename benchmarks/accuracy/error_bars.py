@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -44,7 +44,7 @@ from calibgraph import (
 )
 from calibgraph.model.camera_matches import CameraMatches, concatenate_camera_matches
 from calibgraph.model.correspondences import concatenate
-from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
 from calibgraph.pipeline import to_calibration
 from calibgraph.simulation.scan_errors import draw_scan_errors
@@ -175,7 +175,7 @@ def load_streets(folders: Sequence[Path]) -> Streets:
             matches = load_camera_matches(folder / "camera_matches.parquet")
             pairs.append(replace(matches, frame=matches.frame + add))
     joined = concatenate(tables)
-    stated = asdict(error_components().matchers["structure"])  # also where tables are older
+    stated = error_components().matchers["structure"]  # also where tables are older
     joined = replace(joined, metadata={**joined.metadata, **stated, "places": places})
     matches = concatenate_camera_matches(pairs) if pairs else None
     aligned = mean_poses([load_rig(folder / ALIGNMENT).T_camera_lidar for folder in folders])

@@ -22,7 +22,7 @@ from calibgraph.matching.structure import StructureMatcher
 from calibgraph.model.config import Config, PresetName, Terms, preset
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import relative_transform
-from calibgraph.model.perturbation import perturb
+from calibgraph.model.metrics import perturb
 from calibgraph.model.rig import RelativePose, Rig
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds

@@ -27,25 +27,22 @@ from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.same_images import require_different_images
+from calibgraph.model.calibration import package_versions
 from calibgraph.model.config import Config, Reported
 from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Status
-from calibgraph.model.versions import package_versions
 from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.parallel import with_own_threads
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, assign_places
-from calibgraph.trust.competing_solution import competing_solution_checks
-from calibgraph.trust.evidence import Checks, Evidence, concatenate
+from calibgraph.trust.agreement import competing_solution_checks, pair_agreement_checks
+from calibgraph.trust.evidence import Checks, Evidence, RunEvidence, concatenate
 from calibgraph.trust.guess import point_distance_checks
 from calibgraph.trust.image_evidence import measure_image_evidence
 from calibgraph.trust.inputs import describe_copies
-from calibgraph.trust.intrinsics import intrinsics_checks
-from calibgraph.trust.matcher_checks import matcher_checks
-from calibgraph.trust.pair_agreement import pair_agreement_checks
-from calibgraph.trust.rematch_checks import last_round_checks
-from calibgraph.trust.run_evidence import RunEvidence
+from calibgraph.trust.lens_checks import intrinsics_checks
+from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
 from calibgraph.trust.thresholds import threshold
 

@@ -27,8 +27,8 @@ from calibgraph.audit.significance import (
     detectable,
     tail_of_axis,
 )
-from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.model.error_sources import MOST_TIMES
+from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
 from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
 from calibgraph.tracking.cause import Steps, find_cause
@@ -68,8 +68,7 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
     if has_too_few_frames(evidence, name):
         return CameraAudit("CANNOT TELL", _TOO_FEW_FRAMES, deviation, z_score=z_score)
     if not evidence.findings.states_common_error:  # the prior, for a matcher that states none
-        prior = error_components().matchers[UNKNOWN]
-        rad, metres = prior.systematic_rotation_rad, prior.systematic_translation_m
+        rad, metres = MatcherFindings(**error_components().matchers[UNKNOWN]).systematic_sigmas
         covariance = covariance + np.diag(pose_sigmas(rotation_rad=rad, translation_m=metres) ** 2)
     sigma = np.sqrt(np.diag(covariance))
     quantiles = _quantiles(evidence, name, covariance)

@@ -11,8 +11,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.io.frame import Frame
 from calibgraph.model.rig import Rig
-from calibgraph.model.threshold import fixed
-from calibgraph.model.verdict import Status
+from calibgraph.model.verdict import Status, fixed
 
 ORDER = ("OK", "CANNOT TELL", "CHANGED", "WRONG")
 

@@ -96,7 +96,7 @@ def perturb(
     """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses."""
     from calibgraph.files import require_new_file
     from calibgraph.io.rigs import load_rig
-    from calibgraph.model.perturbation import perturb
+    from calibgraph.model.metrics import perturb
 
     require_new_file(out, ".yaml", ".yml", force=force)
     given = load_rig(rig)

@@ -109,7 +109,7 @@ def rig(
     from calibgraph.io.bags.storage import is_bag
     from calibgraph.io.formats.describe import describe_rig
     from calibgraph.io.formats.rig_import import read_rig_parts
-    from calibgraph.model.lens_knowledge import state_calibrated
+    from calibgraph.model.lens import state_calibrated
     from calibgraph.model.plausibility import find_implausible
     from calibgraph.trust.conventions import correct_guess
 

@@ -19,7 +19,7 @@ from calibgraph.fleet.job import end_children, interrupt_jobs, run_job
 from calibgraph.fleet.manifest import Job, Key, load_manifest
 from calibgraph.fleet.rows import ROWS, SCHEMA, Store, read_rows
 from calibgraph.fleet.task import Limits, Outcome, Task, release
-from calibgraph.model.versions import package_versions
+from calibgraph.model.calibration import package_versions
 from calibgraph.parallel import count_cores
 from calibgraph.progress import Progress, no_progress
 

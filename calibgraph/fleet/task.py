@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from calibgraph.errors import CalibrationError
 from calibgraph.fleet.manifest import Job
-from calibgraph.model.versions import version_of
+from calibgraph.model.calibration import version_of
 
 ErrorKind = Literal["bad input", "io", "out of memory", "timeout", "worker died", "internal error"]
 

@@ -24,7 +24,7 @@ from calibgraph.graph.clock import clock_sigmas, put_clock_into
 from calibgraph.graph.variables import DISTORTION, lens_key, seen_lens_key
 from calibgraph.model.clock import clock_of
 from calibgraph.model.config import LensPart
-from calibgraph.model.lens_knowledge import IN_DOUBT, LensSigmas
+from calibgraph.model.lens import IN_DOUBT, LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from factors import (
     BlockSums,

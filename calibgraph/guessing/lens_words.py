@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from calibgraph.errors import RigError
-from calibgraph.model.lens_knowledge import IN_DOUBT
+from calibgraph.model.lens import IN_DOUBT
 from calibgraph.model.rig import Camera, Intrinsics
 
 CALIBRATION = "calibration"

@@ -16,7 +16,7 @@ from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.error_sources import ErrorSources
-from calibgraph.model.lens_estimate import LensEstimate, joint_parameters
+from calibgraph.model.lens import LensEstimate, joint_parameters
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
     CALIBRATION_FORMAT,

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file, wide_encoding
-from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.places import Places
-from calibgraph.model.table_columns import (
+from calibgraph.model.correspondences import (
     COORDINATES,
     INFORMATION,
     OPTIONAL_WHOLE,
     TWIST,
+    Correspondences,
     as_confidence,
     check_schema,
 )
+from calibgraph.model.places import Places
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -10,10 +10,9 @@ from calibgraph.io.dataset import Dataset
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.model.clock import OF_IMAGES, require_motion
 from calibgraph.model.config import LensPart
-from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.correspondences import TWIST_RULE, Correspondences, beyond_vehicles
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Rig
-from calibgraph.model.table_columns import TWIST_RULE, beyond_vehicles
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.solution import Solution

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import platform
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import cache, cached_property
+from importlib.metadata import PackageNotFoundError, version
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
@@ -20,13 +23,11 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.error_sources import ErrorSources, left_out
-from calibgraph.model.lens_estimate import LensEstimate, joint_parameters
-from calibgraph.model.lens_knowledge import describe_unstated
+from calibgraph.model.lens import LensEstimate, describe_unstated, joint_parameters
 from calibgraph.model.places import Groups
 from calibgraph.model.rig import Rig
 from calibgraph.model.summary import Summary, summarize
 from calibgraph.model.verdict import Verdict, rig_verdict
-from calibgraph.model.versions import package_versions
 
 FRAMES_SENTENCE = "p_camera = T_camera_lidar * p_lidar"
 TANGENT_SENTENCE = (
@@ -36,6 +37,52 @@ TANGENT_SENTENCE = (
 PAIR_TANGENT_SENTENCE = (
     "A->B: T_B_A = exp(xi) * estimate, xi = (rotation [rad], translation [m]) in the axes of B"
 )
+
+
+Value = TypeVar("Value")
+
+
+class Later(Mapping[str, Value]):
+    """Values by name, computed when they are first read; another process gets a dict."""
+
+    def __init__(self, compute: Callable[[], Mapping[str, Value]]) -> None:
+        self._compute = compute
+
+    @cached_property
+    def _values(self) -> dict[str, Value]:
+        return dict(self._compute())
+
+    def __getitem__(self, name: str) -> Value:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        return repr(self._values)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (self._values,)
+
+
+_PACKAGES = ("calibgraph", "gtsam", "numpy", "numba", "opencv-python-headless", "scipy")
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of this package and of the libraries that results depend on."""
+    return {"python": platform.python_version()} | {name: version_of(name) for name in _PACKAGES}
+
+
+@cache  # reading the metadata of a package takes a millisecond
+def version_of(package: str) -> str:
+    """The version of an installed package."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed as a package"
 
 
 @dataclass(frozen=True)
@@ -272,8 +319,7 @@ class Calibration:
             "T_camera_lidar": self.T_camera_lidar,
             "sigmas": {name: _sigma_mapping(self.covariance[name]) for name in self.rig.cameras},
             "error_bar_holds": {
-                name: self.error_bar_holds(name)
-                for name in (*self.rig.cameras, *self.pair_covariance)
+                n: self.error_bar_holds(n) for n in (*self.rig.cameras, *self.pair_covariance)
             },
             "rig": self.rig.model_dump(),
             "covariance_of": TANGENT_SENTENCE,

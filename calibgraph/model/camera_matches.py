@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
-from calibgraph.model.correspondences import MAX_COORDINATE
-from calibgraph.model.table_columns import write_table
+from calibgraph.model.correspondences import MAX_COORDINATE, write_table
 
 if TYPE_CHECKING:
     import pyarrow as pa

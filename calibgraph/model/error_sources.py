@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
-from calibgraph.model.threshold import in_unit
+from calibgraph.model.verdict import in_unit
 
 MATCHES = "scatter of the matches"
 PLACES = "errors that a place shares"

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import cache
+from importlib.resources import files
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import describe
-from calibgraph.model.error_components import UNKNOWN, error_components
 from calibgraph.yaml_text import describe_value
 
 _OF_ONE_SEARCH = ("found", "missed", "chance")
@@ -213,4 +216,69 @@ def _prior_of(matcher: object) -> dict[str, float]:
     """The error sizes of a known matcher; empty for others, whose tables have to state them."""
     known = error_components().matchers
     named = isinstance(matcher, str) and matcher in known and matcher != UNKNOWN
-    return vars(known[str(matcher)]) if named else {}
+    return known[str(matcher)] if named else {}
+
+
+UNKNOWN = "unknown"
+"""Stands for the matcher of a table that states nothing."""
+
+
+@dataclass(frozen=True)
+class ErrorComponents:
+    """All parts of the file.
+
+    Attributes:
+        matchers: by name, the sizes of its errors, named as in ``MatcherFindings``.
+        pair_rotation_rad, pair_translation_m: standard deviation per axis of a relative pose from
+            images, which all frames share.
+        pair_correlation: of the errors of two features of a pair in one frame.
+        frame_correlation: of the errors of two matches of one frame, where frames are few.
+        prior_frames: weight of that prior in frames.
+        pseudo_frames: frames that are added with the scatter along each principal direction.
+        shared_dof, place_dof: degrees of freedom of the priors.
+        least_places: number of places from which their variance may fall below its prior.
+        robust_sigmas: distance at which the loss of a place bends.
+        robust_places: number of places from which there is one.
+        contradiction_sigmas: from so far on a measured relative pose takes no part.
+    """
+
+    matchers: dict[str, dict[str, Any]]
+    pair_rotation_rad: float
+    pair_translation_m: float
+    pair_correlation: float
+    frame_correlation: float
+    prior_frames: float
+    pseudo_frames: float
+    shared_dof: float
+    place_dof: float
+    least_places: int
+    robust_sigmas: float
+    robust_places: int
+    contradiction_sigmas: float
+
+
+@cache
+def error_components() -> ErrorComponents:
+    """The sizes that the error model begins with; ``error_components.json`` states their origin.
+
+    A matcher's part goes into the metadata of its tables, so that a table remains what it was when
+    the file changes.
+    """
+    text = (files("calibgraph.model") / "error_components.json").read_text(encoding="utf-8")
+    content = json.loads(text)
+    frames = _sizes(content["frames"])
+    return ErrorComponents(
+        matchers={name: _sizes(one) for name, one in content["matchers"].items()},
+        **{f"pair_{name}": size for name, size in _sizes(content["pairs"]).items()},
+        frame_correlation=frames.pop("correlation"),
+        **frames,
+        **_sizes(content["sizes"]),
+    )
+
+
+def _sizes(part: Mapping[str, Any]) -> dict[str, Any]:
+    """The numbers of a part of the file, by the names of their fields: angles in radians."""
+    sizes = {name: value for name, value in part.items() if isinstance(value, (int, float))}
+    for name in [name for name in sizes if name.endswith("_deg")]:
+        sizes[f"{name.removesuffix('_deg')}_rad"] = float(np.radians(sizes.pop(name)))
+    return sizes

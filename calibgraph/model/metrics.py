@@ -1,5 +1,6 @@
-"""The paper's metrics: an estimate against a reference, per camera and between cameras."""
+"""The paper's protocol: perturbed guesses, T_init = T_delta T_GT; and its metrics of estimates."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
@@ -11,8 +12,8 @@ from scipy.special import chdtrc
 
 from calibgraph.arrays import Array
 from calibgraph.errors import RigError
-from calibgraph.model.geometry import angle_deg, relative_transform, twist_between
-from calibgraph.model.lens_difference import corner_distance_px, has_other_lens
+from calibgraph.model.geometry import angle_deg, relative_transform, transform, twist_between
+from calibgraph.model.lens import corner_distance_px, has_other_lens
 from calibgraph.model.rig import Camera, Rig
 
 
@@ -147,12 +148,9 @@ def _later_ms(estimate: Rig, reference: Rig, key: str) -> dict[str, float]:
 
 
 def deviation(estimate: Array, reference: Camera, covariance: Array | None) -> Deviation:
-    """Difference of a (4, 4) transform from a reference, in standard deviations.
+    """Difference of a (4, 4) T_camera_lidar from a reference, in standard deviations.
 
-    Args:
-        estimate: T_camera_lidar.
-        reference: with a covariance.
-        covariance: (6, 6) of the estimate, None if unknown.
+    Of the reference's covariance, and of that of the estimate, (6, 6), if it is known.
     """
     xi = twist_between(estimate, reference.T_camera_lidar)
     total = np.array(reference.covariance)
@@ -170,13 +168,46 @@ def pose_error(estimate: Array, reference: Array) -> PoseError:
     rotation = estimate[:3, :3] @ reference[:3, :3].T
     shift = 100.0 * (estimate[:3, 3] - reference[:3, 3])
     about_x, about_y, about_z = np.degrees(Rotation.from_matrix(rotation).as_rotvec())
-    return PoseError(
-        rotation_error_deg=angle_deg(rotation),
-        translation_error_cm=float(np.linalg.norm(shift)),
-        x_cm=float(shift[0]),
-        y_cm=float(shift[1]),
-        z_cm=float(shift[2]),
-        roll_deg=float(about_z),
-        pitch_deg=float(about_x),
-        yaw_deg=float(about_y),
-    )
+    x, y, z = shift.tolist()
+    length, turns = float(np.linalg.norm(shift)), (float(about_z), float(about_x), float(about_y))
+    return PoseError(angle_deg(rotation), length, x, y, z, *turns)
+
+
+def perturb(
+    rig: Rig, *, rotation_deg: float, translation_m: float, seed: int = 0, uniform: bool = False
+) -> Rig:
+    """Displace every camera independently: T_camera_lidar becomes T_delta T_camera_lidar.
+
+    Args:
+        rig: its extrinsics are displaced.
+        rotation_deg: the angle, about a random axis.
+        translation_m: the length, in a random direction.
+        seed: of the draws; cameras are drawn in the rig's order.
+        uniform: draw each of the six components uniformly within +- the value instead, the
+            rotation as Euler angles about the camera's x, y, z axes.
+
+    Raises:
+        ValueError: if an angle or length is out of range.
+    """
+    if not (0 <= rotation_deg <= 180 and 0 <= translation_m < math.inf):  # noqa: PLR2004
+        raise ValueError(
+            f"expected an angle within 0 to 180 deg and a length >= 0 m, found {rotation_deg} deg "
+            f"and {translation_m} m"
+        )
+    rng, draw = np.random.default_rng(seed), _draw_uniform if uniform else _draw_exact
+    extrinsics = rig.T_camera_lidar.items()
+    return rig.moved_to({n: draw(rng, rotation_deg, translation_m) @ T for n, T in extrinsics})
+
+
+def _draw_exact(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
+    """(4, 4) T_delta of exactly this angle and length, about and along random directions."""
+    axis, direction = rng.standard_normal((2, 3))
+    turn = Rotation.from_rotvec(np.radians(rotation_deg) * axis / np.linalg.norm(axis))
+    return transform(turn, translation_m * direction / np.linalg.norm(direction))
+
+
+def _draw_uniform(rng: np.random.Generator, rotation_deg: float, translation_m: float) -> Array:
+    """(4, 4) T_delta with six components uniform within these values."""
+    angles, shift = rng.uniform(-1.0, 1.0, (2, 3))
+    turn = Rotation.from_euler("xyz", rotation_deg * angles, degrees=True)
+    return transform(turn, translation_m * shift)

@@ -10,8 +10,16 @@ from typing import Any
 
 from calibgraph.model.causes import CAUSES, action_of, cause_of
 from calibgraph.model.error_sources import ErrorSources
-from calibgraph.model.threshold import beside, in_unit
-from calibgraph.model.verdict import BRIGHTNESS, TOLERANCE, Check, Status, Verdict, rig_verdict
+from calibgraph.model.verdict import (
+    BRIGHTNESS,
+    TOLERANCE,
+    Check,
+    Status,
+    Verdict,
+    beside,
+    in_unit,
+    rig_verdict,
+)
 
 LEAST = 3
 """Reasons that are shown if there are so many: more only where each is the worst of a camera."""

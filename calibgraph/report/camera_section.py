@@ -9,11 +9,10 @@ from scipy.spatial.transform import Rotation
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import degrees_and_centimetres, invert, point_in_lidar
-from calibgraph.model.lens_difference import has_other_lens
+from calibgraph.model.lens import has_other_lens
 from calibgraph.model.metrics import PoseError, pose_error
 from calibgraph.model.rig import Camera
-from calibgraph.model.threshold import Direction, beside, in_unit, is_reachable
-from calibgraph.model.verdict import Check, Verdict
+from calibgraph.model.verdict import Check, Direction, Verdict, beside, in_unit, is_reachable
 from calibgraph.report import plots
 from calibgraph.report.page_overlays import Overlays, width_on_page
 from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionErrors

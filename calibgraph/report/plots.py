@@ -90,7 +90,7 @@ def residual_map(camera: Camera, errors: ReprojectionErrors) -> str:
 
 def lens_change(before: Camera, camera: Camera) -> str:
     """How far the estimated lens sees each ray from where the rig's did: arrows, and contours."""
-    from calibgraph.model.lens_difference import lens_difference
+    from calibgraph.model.lens import lens_difference
 
     size, rows = (camera.width_px, camera.height_px), ARROW_COLUMNS // 2
     figure, axes = image_figure(camera)

@@ -18,7 +18,7 @@ from calibgraph.model.metrics import Evaluation, PoseError, pose_error
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.summary import Summary
-from calibgraph.model.threshold import fixed
+from calibgraph.model.verdict import fixed
 
 CAMERA_AXES = (
     "pitch x\ndeg", "yaw y\ndeg", "roll z\ndeg", "x right\ncm", "y down\ncm", "z ahead\ncm",

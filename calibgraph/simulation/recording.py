@@ -14,7 +14,7 @@ from calibgraph.file_sets import written_together
 from calibgraph.files import require_place_for_folder, write_atomically, write_bytes
 from calibgraph.io.rigs import REFERENCE_FILE, RIG_FILE
 from calibgraph.model.geometry import relative_transform
-from calibgraph.model.perturbation import perturb
+from calibgraph.model.metrics import perturb
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, no_progress
 from calibgraph.simulation.cameras import camera_rays, render

@@ -7,7 +7,7 @@ from pathlib import Path
 from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_folder
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.perturbation import perturb
+from calibgraph.model.metrics import perturb
 from calibgraph.model.rig import Rig
 from calibgraph.simulation.correspondences import (
     MatcherErrors,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
-from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import inverse_ranges, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.solver.residual_scale import (

@@ -4,7 +4,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.graph.objective import relative_pose_graph
-from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.camera_pairs import usual_excess
 from calibgraph.solver.curvature import (

@@ -15,8 +15,7 @@ from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.objective import join, pose_key
 from calibgraph.graph.variables import seen_lens_key
-from calibgraph.model.error_components import UNKNOWN, error_components
-from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.model.places import Places
 from calibgraph.solver.conflicts import relative_pose_conflict
@@ -234,9 +233,8 @@ def error_model(
     pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
     components = variance_components(findings, cameras, shown, places=len(places))
     if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
-        unknown = error_components().matchers[UNKNOWN]
-        whole = unknown.systematic_rotation_rad, unknown.systematic_translation_m
-        components = common_error(components, whole, unknown.camera_share)
+        unknown = MatcherFindings(**error_components().matchers[UNKNOWN])
+        components = common_error(components, unknown.systematic_sigmas, unknown.camera_share)
     components = replace(
         components,
         pair_distortion_jacobian=pair_jacobians(

@@ -19,10 +19,9 @@ from calibgraph.graph.components import EXACT
 from calibgraph.graph.lens import FreeLensByPlace, LensTerm, LensVariable
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.config import LensPart
-from calibgraph.model.error_components import error_components
-from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
-from calibgraph.model.lens_knowledge import LensSigmas
+from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.curvature import FittedObjective, positive_part
 from calibgraph.solver.elimination import LatentPoseFit

@@ -7,7 +7,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.variables import lens_key
-from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.lens import LensEstimate
 from calibgraph.solver.elimination import LatentPoseFit
 from factors.free_lens import FOCAL, OFFSET, READOUT
 

@@ -10,7 +10,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.objective import pose_key
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
-from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import (
     pose_rows,
     relative_covariance,

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from calibgraph.errors import CorrespondenceError
 from calibgraph.io.correspondence_tables import parts_of_table
 from calibgraph.model.config import Config
-from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.correspondences import Correspondences, concatenate, rows_where
 from calibgraph.model.rig import Rig
-from calibgraph.model.table_columns import rows_where
 from calibgraph.solver.grid import best_in_cell, frame_edges
 from calibgraph.solver.repeats import number_repeats
 from calibgraph.solver.shared_error import with_common_error

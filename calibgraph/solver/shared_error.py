@@ -9,8 +9,7 @@ from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.error_components import error_components
-from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
 from calibgraph.solver.camera_pairs import ENOUGH_SURFACES, PairTerm
 from calibgraph.solver.curvature import Curvature

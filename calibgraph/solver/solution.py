@@ -12,7 +12,7 @@ from calibgraph.arrays import Array
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.solver.curvature import FittedObjective
 from calibgraph.solver.error_model import ErrorFit

@@ -20,8 +20,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.graph.components import EXACT, VarianceComponents, least_cost_of_distortion
 from calibgraph.graph.latent_poses import to_ordering
-from calibgraph.model.error_components import error_components
-from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.solver.elimination import LatentPoseFit, Linearization, join_linear
 from calibgraph.solver.pair_refinement import pair_sigmas
 from calibgraph.solver.scan_distortion import DistortionEvidence

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace, PairByPlace, place_of
-from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import error_components
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_pairs import PairTerm, usual_excess
 from calibgraph.solver.covariance import with_pseudo_frames

@@ -25,9 +25,13 @@ from calibgraph.tracking.sources import error_sources
 from calibgraph.tracking.state import State
 from calibgraph.tracking.sums import Sums, step_between
 from calibgraph.tracking.window import Window
-from calibgraph.trust.estimate import Estimate
-from calibgraph.trust.image_posteriors import ImagePosteriors, measured_pairs
-from calibgraph.trust.pose_posterior import PosePosterior, group_tied
+from calibgraph.trust.evidence import Estimate
+from calibgraph.trust.pose_posterior import (
+    ImagePosteriors,
+    PosePosterior,
+    group_tied,
+    measured_pairs,
+)
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
 from factors.conditioning import sigmas_of_hessian
@@ -127,21 +131,18 @@ def _verdict(
     *,
     conflicts: tuple[Conflict, ...],
 ) -> Verdict:
-    name, one = state.names[camera], state.cameras[camera]
+    one = state.cameras[camera]
     if not one.started:
         return _start_check(state, one)
     rows = pose_rows(camera)
     own = covariance[rows, rows]
     estimate = Estimate(
-        camera=state.rig.cameras[name],
         has_matches=True,
         used=int(one.counts.get("used", 0)),
         frames=int(sums.frames[camera]),
         covariance=None if np.isnan(own).any() else own,
         data_sigmas=sigmas_of_hessian(sums.hessian[camera]),
         conflicts=conflicts,
-        converged=True,
-        terms="full",
         scatter_only=not state.findings.states_common_error,
         tolerance=state.config.tolerance,
     )

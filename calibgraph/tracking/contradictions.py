@@ -13,7 +13,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import join, objective_graph
 from calibgraph.graph.variables import camera_key
-from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.model.rig import RelativePose
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict

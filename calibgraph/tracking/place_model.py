@@ -21,7 +21,7 @@ from calibgraph.graph.by_place import (
 )
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
-from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.curvature import convex_hessian
 from calibgraph.solver.elimination import LatentPoseFit, join_linear

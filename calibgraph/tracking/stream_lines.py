@@ -27,9 +27,13 @@ from pydantic_core import from_json
 
 from calibgraph.errors import CorrespondenceError, MotionError
 from calibgraph.files import describe
-from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.correspondences import (
+    COORDINATES,
+    INFORMATION,
+    Correspondences,
+    as_confidence,
+)
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.table_columns import COORDINATES, INFORMATION, as_confidence
 from calibgraph.tracking.frame_order import LONGEST_PLACE, with_place
 from calibgraph.tracking.stream_tables import Item, StreamFrame, refused
 

@@ -19,8 +19,13 @@ from calibgraph.io.correspondence_tables import (
     read_arrow,
     require_rows,
 )
-from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.table_columns import TWIST, TWIST_RULE, beyond_vehicles, check_schema
+from calibgraph.model.correspondences import (
+    TWIST,
+    TWIST_RULE,
+    Correspondences,
+    beyond_vehicles,
+    check_schema,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -2,7 +2,7 @@
 
 To add a check: a function from the evidence to checks per camera, in the file of its subject; its
 name in one of the tuples below; and a row in ``trust.thresholds`` if it compares a number with
-limits. Adding it to ``solution_checks.ESTIMATE_CHECKS`` applies it while driving, too.
+limits. In ``solution_checks.check_estimate`` it is made while driving, too.
 """
 
 from __future__ import annotations
@@ -12,10 +12,14 @@ from collections.abc import Callable, Sequence
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import ABOUT_THE_DATA, BRIGHTNESS, Check
-from calibgraph.trust.clock_checks import image_offset_checks, offset_checks
-from calibgraph.trust.competing_solution import competing_solution_checks
+from calibgraph.trust.agreement import (
+    competing_solution_checks,
+    one_pose_checks,
+    pair_agreement_checks,
+    place_checks,
+)
 from calibgraph.trust.conventions import likely_intended_guess
-from calibgraph.trust.evidence import Checks, Evidence, concatenate
+from calibgraph.trust.evidence import Checks, Evidence, RunEvidence, concatenate
 from calibgraph.trust.guess import (
     guess_checks,
     point_distance_checks,
@@ -25,19 +29,16 @@ from calibgraph.trust.guess import (
 from calibgraph.trust.image_checks import image_checks
 from calibgraph.trust.image_record import RunChecks
 from calibgraph.trust.inputs import describe_brightness
-from calibgraph.trust.intrinsics import intrinsics_checks
+from calibgraph.trust.lens_checks import image_offset_checks, intrinsics_checks, offset_checks
 from calibgraph.trust.lens_parameter import advise_together
-from calibgraph.trust.matcher_checks import matcher_checks
-from calibgraph.trust.pair_agreement import one_pose_checks, pair_agreement_checks
-from calibgraph.trust.place_checks import place_checks
-from calibgraph.trust.rematch_checks import (
+from calibgraph.trust.matcher_checks import (
     going_on_checks,
     last_round_checks,
+    matcher_checks,
     rematch_checks,
     repeated_file_checks,
     time_limit_checks,
 )
-from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.solution_checks import (
     assumed_spread_checks,
     bootstrap_checks,

@@ -2,51 +2,86 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
+from calibgraph.errors import CorrespondenceError
+from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Residuals
-from calibgraph.model.error_components import error_components
+from calibgraph.model.config import Terms
 from calibgraph.model.error_sources import ErrorSources
-from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import (
-    pose_rows,
-    twist_between,
-)
+from calibgraph.model.findings import MatcherFindings, error_components
+from calibgraph.model.geometry import pose_rows, twist_between
+from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import Check
+from calibgraph.model.verdict import TOLERANCE, Check
+from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.camera_pairs import PairTerm
+from calibgraph.solver.conflicts import Conflict
+from calibgraph.solver.objective import Transforms
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.solution import Solution
-from calibgraph.trust.bootstrap import bootstrap_covariance
-from calibgraph.trust.estimate import Estimate
-from calibgraph.trust.image_posteriors import (
+from calibgraph.trust.observability import prior_shares
+from calibgraph.trust.pose_posterior import (
     ImagePosteriors,
     MeasurePosteriors,
+    PosePosterior,
+    group_tied,
+    measure_posteriors,
     measured_pairs,
+    no_posteriors,
 )
-from calibgraph.trust.observability import prior_shares
-from calibgraph.trust.pose_posterior import PosePosterior, group_tied, no_posteriors
 
 Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """A solution, the first guess, and the values that checks compute from them.
+class Estimate:
+    """One camera's estimate and the values that its checks need, from a batch or while driving.
 
     Attributes:
-        solution: of the joint solve.
-        guess: the rig as it was first guessed.
-        measure_posteriors: the posteriors by the images, of the (6, 6) covariances by the matches
-            and of groups of cameras that move together; none where there are no images.
-        excluded: cameras that the user excluded; the solution may have excluded more.
+        has_matches: whether it had correspondences; else it was solved through relative poses.
+        used: correspondences in the final solve.
+        frames: frames that they come from.
+        covariance: (6, 6) of (rotation [rad], translation [m]), or None.
+        data_sigmas: (6,) the standard deviations if every correspondence were independent, or None.
+        conflicts: of the relative poses that name this camera.
+        held: whether nothing determines it.
+        excluded: whether the settings exclude its correspondences.
+        scatter_only: whether it is unknown how large the error is that all frames share.
+        tolerance: of the user: rotation [deg] and distance [cm].
+        lens: the parameters of lens and clock that were estimated.
+    """
+
+    has_matches: bool
+    used: int
+    frames: int
+    covariance: Array | None
+    data_sigmas: Array | None
+    conflicts: tuple[Conflict, ...]
+    converged: bool = True
+    terms: Terms = "full"
+    held: bool = False
+    excluded: bool = False
+    scatter_only: bool = False
+    tolerance: tuple[float, float] = TOLERANCE
+    lens: tuple[LensEstimate, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A solution, the rig as it was first guessed, and the values that checks compute from them.
+
+    ``excluded`` are the cameras that the user excluded; the solution may have excluded more.
     """
 
     solution: Solution
@@ -59,13 +94,11 @@ class Evidence:
         """Their names, in the rig's order."""
         return tuple(self.solution.T_camera_lidar)
 
-    @property
+    @cached_property
     def of_correspondences(self) -> Evidence:
         """The evidence of the solution without camera-to-camera matches."""
-        return self if self.solution.before_pairs is None else self._without_pairs
-
-    @cached_property
-    def _without_pairs(self) -> Evidence:
+        if self.solution.before_pairs is None:
+            return self
         return Evidence(self.solution.without_pairs(), self.guess, excluded=self.excluded)
 
     @property
@@ -126,22 +159,17 @@ class Evidence:
 
     @cached_property
     def tied(self) -> list[tuple[str, ...]]:
-        """The free cameras, in groups that can only be elsewhere together."""
-        free = [name for name in self.cameras if name not in self.solution.held]
-        return group_tied(free, self._relative_poses)
+        """The free cameras, in groups that can only be elsewhere together.
 
-    @property
-    def _relative_poses(self) -> Iterator[tuple[str, str, Array]]:
-        """Those that are known without the cloud, with (6, 6) covariances.
-
-        A measured one that contradicts the correspondences ties nothing.
+        A measured relative pose that contradicts the correspondences ties nothing.
         """
-        limit = error_components().contradiction_sigmas
-        conflicts = self.solution.marginals.conflicts
-        wrong = {(one.pair.a, one.pair.b) for one in conflicts if one.largest > limit}
-        for fit in self.solution.marginals.pair_fits:
-            yield fit.a, fit.b, fit.covariance
-        yield from measured_pairs(self.solution.inliers.rig.relative_poses, wrong)
+        free = [name for name in self.cameras if name not in self.solution.held]
+        limit, known = error_components().contradiction_sigmas, self.solution.marginals
+        wrong = {(one.pair.a, one.pair.b) for one in known.conflicts if one.largest > limit}
+        poses = self.solution.inliers.rig.relative_poses
+        right = [one for one in poses if (one.a, one.b) not in wrong]
+        by_images = [(fit.a, fit.b, fit.covariance) for fit in known.pair_fits]
+        return group_tied(free, [*by_images, *measured_pairs(right)])
 
     def probability_beyond(self, camera: str) -> float:
         """The probability that its error is beyond the tolerance, by its posterior."""
@@ -208,9 +236,7 @@ class Evidence:
     @cached_property
     def prior_shares(self) -> dict[str, float]:
         """Per camera, which share of its result comes from priors and relative poses."""
-        errors = self.solution.marginals.errors
-        known = None if errors is None else errors.fit.of_mount.covariance
-        return prior_shares(self.solution, known)
+        return prior_shares(self.solution)
 
     def estimate(self, camera: str) -> Estimate:
         """The input of the checks of one camera's estimate.
@@ -220,7 +246,6 @@ class Evidence:
         solution, block = self.solution, self.solution.inliers.blocks.get(camera)
         sigmas, conflicts = solution.marginals.data_sigmas, solution.marginals.conflicts
         return Estimate(
-            camera=solution.rig.cameras[camera],
             has_matches=camera in solution.objective.blocks,
             used=0 if block is None else len(block.frame),
             frames=0 if block is None else len(block.frame_edges) - 1,
@@ -237,6 +262,103 @@ class Evidence:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class RunEvidence:
+    """All rounds of matching and solving, and the SHA-256 of the files they read.
+
+    ``asks_guess``: whether the guess is a pose in question, as in ``check``.
+    """
+
+    run: MatchingRun
+    hashes: Mapping[str, str]
+    progress: Progress = no_progress
+    asks_guess: bool = False
+
+    @cached_property
+    def solution(self) -> Evidence:
+        """The evidence of the last round's solution."""
+        run = self.run
+        return Evidence(run.solution, run.guess, self._measure_posteriors, run.excluded)
+
+    def grade_by_images(self, checks: Checks) -> Checks:
+        """Checks on images, without a FAIL where those of the run's matcher WARN at most."""
+        if self.run.matcher.image_checks_can_fail:
+            return checks
+        return {
+            name: [replace(c, status="WARN") if c.status == "FAIL" else c for c in of_camera]
+            for name, of_camera in checks.items()
+        }
+
+    def _measure_posteriors(
+        self, covariances: Mapping[str, Array], groups: Sequence[Sequence[str]]
+    ) -> Mapping[str, PosePosterior]:
+        """By the images; empty with matchers that may use what these scores do not."""
+        run = self.run
+        if run.out_of_time or not run.matcher.image_checks_can_fail:
+            return {}
+        asked = run.guess.T_camera_lidar if self.asks_guess else None
+        data, rig, seed = run.dataset, run.solution.solved_rig, run.solution.config.seed
+        return measure_posteriors(data, rig, covariances, groups, asked=asked, seed=seed)
+
+
 def concatenate(parts: Sequence[Checks], cameras: Sequence[str]) -> dict[str, list[Check]]:
     """Per camera the checks of all parts, one part after the other."""
     return {name: [check for part in parts for check in part.get(name, ())] for name in cameras}
+
+
+Matches = TypeVar("Matches", CameraBlock, PairTerm)
+_MAX_TRIES = 20  # draws in turn that leave a camera with too few matches
+
+
+def bootstrap_covariance(solution: Solution) -> dict[str, Array]:
+    """Per camera (6, 6) scatter of xi in T_camera_lidar = exp(xi) solution.
+
+    Every draw takes as many frames as there are, with replacement, all cameras of a frame together;
+    it is gated and solved like the solution, from there. A draw that leaves a camera with too few
+    matches is repeated.
+
+    Returns:
+        Empty without draws, or where the terms do not use the correspondences.
+
+    Raises:
+        CorrespondenceError: if no draw has enough matches of every camera.
+    """
+    draws = solution.config.bootstrap
+    if not draws or not solution.objective.uses_correspondences:
+        return {}
+    rng = np.random.default_rng(solution.config.seed)
+    blocks = solution.objective.blocks.values()
+    frames = np.unique(np.concatenate([block.frame for block in blocks]))
+    results = [_solve_draw(solution, rng, frames) for _ in range(draws)]
+    return {
+        name: np.atleast_2d(np.cov([twist_between(r[name], T) for r in results], rowvar=False))
+        for name, T in solution.T_camera_lidar.items()
+    }
+
+
+def _solve_draw(
+    solution: Solution, rng: np.random.Generator, frames: NDArray[np.int64]
+) -> Transforms:
+    """The T_camera_lidar of one draw of frames."""
+    for _ in range(_MAX_TRIES):
+        drawn = rng.choice(frames, len(frames))
+        blocks = {name: _draw(b, drawn) for name, b in solution.objective.blocks.items()}
+        pairs = tuple(p for p in (_draw(q, drawn) for q in solution.inliers.pairs) if len(p.frame))
+        objective = replace(solution.objective, blocks=blocks, pairs=pairs)
+        try:
+            inliers = objective.without_outliers(solution.T_camera_lidar, solution.scales)
+            rough = inliers.minimize(solution.T_camera_lidar, solution.scales).T_camera_lidar
+            inliers = objective.without_outliers(rough, solution.scales)
+        except CorrespondenceError as error:
+            reason = error
+            continue
+        return inliers.minimize(rough, solution.scales).T_camera_lidar
+    raise CorrespondenceError(f"bootstrap: {reason}; give more frames, or leave bootstrap out")
+
+
+def _draw(block: Matches, drawn: NDArray[np.int64]) -> Matches:
+    """The matches of some frames; of a frame that was drawn twice, twice."""
+    starts = np.searchsorted(block.frame, drawn)
+    ends = np.searchsorted(block.frame, drawn, side="right")
+    rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, ends, strict=True)])
+    return block.select(np.sort(rows))

@@ -21,8 +21,7 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.verdict import Check
 from calibgraph.trust.conventions import convention_error_between, in_words
-from calibgraph.trust.evidence import Checks, Evidence
-from calibgraph.trust.run_evidence import RunEvidence
+from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
 from calibgraph.trust.thresholds import limit, threshold
 
 
@@ -35,15 +34,10 @@ def guess_checks(evidence: Evidence) -> Checks:
 
 
 def compare_with_guess(guess: Array, result: Array, findings: MatcherFindings) -> list[Check]:
-    """The distance of one camera's result from its guess, and the guess's length.
+    """The distance of one camera's result from its guess, both (4, 4), and the guess's length.
 
     A result may lie as far away as its matcher searches. One that is turned farther counts where a
     convention error of the guess explains it.
-
-    Args:
-        guess: (4, 4) T_camera_lidar.
-        result: (4, 4) T_camera_lidar.
-        findings: of the matcher, with its range.
     """
     range_deg = math.sqrt(3) * (findings.range_rotation_deg or 0.0)
     range_m = math.sqrt(3) * (findings.range_translation_m or 0.0)
@@ -78,13 +72,7 @@ def compare_with_other_guesses(
     12th power of own over other: there are six numbers a camera. If the other camera has no result,
     it is the 6th, so that the square root of the distances' ratio stands for as much.
 
-    Args:
-        camera: its name.
-        guesses: (4, 4) T_camera_lidar of all cameras.
-        results: the same of those that have one.
-
-    Returns:
-        One check; none for a single camera.
+    One check, by (4, 4) T_camera_lidar of guesses and results; none for a single camera.
     """
     others = [name for name in guesses if name != camera]
     if not others:
@@ -116,17 +104,11 @@ def _squared_distances(guesses: Mapping[str, Array], results: Mapping[str, Array
 
 def point_distance_checks(evidence: Evidence) -> Checks:
     """Whether the points can be in metres."""
-    row = threshold("point_distance")
-    return {
-        name: [row.check(float(np.median(_lengths(block.block.points_lidar_m))))]
-        for name, block in evidence.solution.objective.blocks.items()
-    }
-
-
-def _lengths(points: Array) -> Array:
-    """(n,) of (n, 3), which need not be contiguous."""
-    x, y, z = points.T
-    return np.asarray(np.sqrt(x * x + y * y + z * z))
+    checks, row = {}, threshold("point_distance")
+    for name, block in evidence.solution.objective.blocks.items():
+        x, y, z = block.block.points_lidar_m.T  # which need not be contiguous
+        checks[name] = [row.check(float(np.median(np.sqrt(x * x + y * y + z * z))))]
+    return checks
 
 
 _FRAME_M, _ALIKE_DEG, _ALIKE_CM = 1.0, 5.0, 50.0
@@ -137,11 +119,7 @@ _FRAME_M, _ALIKE_DEG, _ALIKE_CM = 1.0, 5.0, 50.0
 def describe_other_frame(guess: Mapping[str, Array], results: Mapping[str, Array]) -> str:
     """The frame of the guesses, where all cameras are moved alike; empty if they are not.
 
-    A single camera is if it is moved without a turn.
-
-    Args:
-        guess: (4, 4) T_camera_lidar.
-        results: (4, 4) T_camera_lidar of the cameras to compare.
+    A single camera is if it is moved without a turn. By (4, 4) T_camera_lidar.
     """
     T_frame_lidar = [invert(guess[name]) @ T for name, T in results.items()]
     if not T_frame_lidar:
@@ -178,11 +156,7 @@ def compare_with_range(
 ) -> list[Check]:
     """The largest component of the step from a guess to its result, over the matcher's range.
 
-    Args:
-        guess: (4, 4) T_camera_lidar from where the matcher started.
-        result: (4, 4) T_camera_lidar.
-        findings: of the matcher; without its range there are no checks.
-        frame: as of :func:`describe_other_frame`.
+    By (4, 4) T_camera_lidar. Without the range there are no checks.
     """
     step = relative_transform(result, guess)
     rotation_deg = np.degrees(Rotation.from_matrix(step[:3, :3]).as_rotvec())

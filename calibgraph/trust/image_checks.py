@@ -11,10 +11,9 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.progress import Progress
-from calibgraph.trust.evidence import Checks
+from calibgraph.trust.evidence import Checks, RunEvidence
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
 from calibgraph.trust.lens_parameter import IMAGES, check_parameter
-from calibgraph.trust.run_evidence import RunEvidence
 from calibgraph.trust.thresholds import limit, threshold
 
 

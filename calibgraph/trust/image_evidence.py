@@ -4,7 +4,7 @@ Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`
 
 * whether the result agrees with the images better than poses a degree or two, or some decimetres,
   away from it;
-* whether another lens fits the images better (:mod:`calibgraph.trust.lens_evidence`);
+* whether another lens fits the images better, with the pose free: a search, then two fits;
 * whether each image fits its own cloud better than the clouds of neighbouring frames.
 """
 
@@ -12,31 +12,103 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+import cv2
 import numpy as np
 
+from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.matching.structure.consensus import displaced_z_score, score_displaced, z_score
+from calibgraph.io.frame import Frame
+from calibgraph.matching.run import with_motion
+from calibgraph.matching.structure.consensus import (
+    displaced_z_score,
+    maximize_score,
+    score_displaced,
+    z_score,
+)
+from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
+from calibgraph.matching.structure.peaks import extract_correspondences
+from calibgraph.matching.structure.prepared_image import PreparedImage
+from calibgraph.matching.structure.schedule import LEVELS, Level
 from calibgraph.matching.structure.shift_scores import (
     ShiftScores,
     concatenate_scores,
     crop_grids,
+    score_frame,
 )
+from calibgraph.model.clock import at_pixels, clock_of
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress, no_progress
-from calibgraph.trust.frame_scores import WIDE, FrameScorer, Images
-from calibgraph.trust.lens_evidence import measure_lens
-from calibgraph.trust.lens_parameter import LensParameter
+from calibgraph.solver.camera_twist import apply_twist
+from calibgraph.solver.linear_fit import LinearFit, block_of, fit_camera
+from calibgraph.solver.scan_distortion import distortion_fields_px
+from calibgraph.trust.lens_parameter import (
+    NAMES,
+    Free,
+    LensParameter,
+    lens_fields_px,
+    lens_variable,
+    units_of,
+)
+from calibgraph.trust.thresholds import limit
+from factors import displace
 
+Images = Sequence[PreparedImage]
+"""Images of one camera, one per frame."""
+
+MAX_WINDOWS, SHARING_FRAMES = 10_000, 10
+"""Per camera over that many frames; with more frames, as many each."""
+WIDE, FINER = LEVELS[1], LEVELS[2]
 MAX_FRAMES = 20  # evenly spread over the dataset: bounds the time
 MIN_GROUPS = 30  # fewer groups of windows are no evidence
 
 PAIR_LEVEL = replace(WIDE, reach_rad=np.radians(1.2))
+
+
+class FrameScorer:
+    """Scores frames in parallel; clouds are decoded once."""
+
+    def __init__(self, dataset: Dataset, frames: Sequence[Frame], pool: ThreadPoolExecutor) -> None:
+        self.frames = frames
+        self.dataset = dataset
+        self._pool = pool
+        self._cache = cache_of(frames, FrameCache())
+
+    def load_images(self, name: str, camera: Camera) -> list[PreparedImage]:
+        """Images of a camera, one per frame."""
+        load = partial(self._cache.image, name=name, camera=camera)
+        return list(self._pool.map(load, self.frames))
+
+    def score(
+        self, images: Images, camera: Camera, level: Level, *, offset: int = 0
+    ) -> list[ShiftScores | None]:
+        """Score each image against the cloud ``offset`` frames later; None where there is none."""
+        one = partial(self._score_frame, camera=camera, level=level, offset=offset)
+        return list(self._pool.map(one, images, self.frames))
+
+    def score_together(self, images: Images, camera: Camera, level: Level) -> ShiftScores:
+        """Score all images against their own clouds."""
+        scores = self.score(images, camera, level)
+        return concatenate_scores([each for each in scores if each is not None])
+
+    def _score_frame(
+        self, image: PreparedImage, frame: Frame, *, camera: Camera, level: Level, offset: int
+    ) -> ShiftScores | None:
+        other = self.dataset.neighbour(frame, offset) if offset else frame
+        if other is None:
+            return None
+        most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
+        cloud, twist = self._cache.cloud(other), other.twist_per_s
+        return score_frame(
+            image, cloud, camera, level, frame=frame.index, max_windows=most, twist_per_s=twist
+        )
 
 
 @dataclass(frozen=True)
@@ -79,39 +151,25 @@ def measure_image_evidence(
     evidence = {}
     with core_pool() as cores, Threads(len(rig.cameras)) as pool:
         scorer = FrameScorer(dataset, frames, cores)
-        measure = partial(_measure_camera, scorer, seed=seed, places=places)
-        if extrinsics_only:
-            measure = partial(_measure_extrinsic, scorer)
+
+        def measure(name: str, camera: Camera) -> ImageEvidence:
+            images = scorer.load_images(name, camera)
+            each = scorer.score(images, camera, WIDE)
+            scores = concatenate_scores([one for one in each if one is not None])
+            if len(scores.weights) < MIN_GROUPS:
+                return ImageEvidence(len(scores.weights))
+            found = ImageEvidence(len(scores.weights), **_compare_with_displaced(scores))
+            if extrinsics_only:
+                return found
+            lens = measure_lens(scorer, images, camera, scores, seed=seed, places=places)
+            with_neighbours = _compare_with_neighbours(scorer, images, camera, each)
+            return replace(found, lens=lens, **with_neighbours)
+
         measured = pool.map(measure, rig.cameras, rig.cameras.values())
         for index, name in enumerate(rig.cameras):
             report(f"checking: {name}", index, len(rig.cameras))
             evidence[name] = next(measured)
     return evidence
-
-
-def _measure_extrinsic(scorer: FrameScorer, name: str, camera: Camera) -> ImageEvidence:
-    scores = scorer.score_together(scorer.load_images(name, camera), camera, WIDE)
-    groups = len(scores.weights)
-    if groups < MIN_GROUPS:
-        return ImageEvidence(groups)
-    return ImageEvidence(groups, **_compare_with_displaced(scores))
-
-
-def _measure_camera(
-    scorer: FrameScorer, name: str, camera: Camera, *, seed: int, places: Places
-) -> ImageEvidence:
-    images = scorer.load_images(name, camera)
-    each = scorer.score(images, camera, WIDE)
-    scores = concatenate_scores([one for one in each if one is not None])
-    groups = len(scores.weights)
-    if groups < MIN_GROUPS:
-        return ImageEvidence(groups)
-    return ImageEvidence(
-        groups,
-        lens=measure_lens(scorer, images, camera, scores, seed=seed, places=places),
-        **_compare_with_displaced(scores),
-        **_compare_with_neighbours(scorer, images, camera, each),
-    )
 
 
 def _compare_with_displaced(scores: ShiftScores) -> dict[str, Any]:
@@ -128,14 +186,7 @@ def _compare_with_displaced(scores: ShiftScores) -> dict[str, Any]:
 def _compare_with_neighbours(
     scorer: FrameScorer, images: Images, camera: Camera, wide: Sequence[ShiftScores | None]
 ) -> dict[str, Any]:
-    """Compare each image's agreement with its own cloud and with its neighbours' clouds.
-
-    Args:
-        scorer: of the frames.
-        images: of the camera.
-        camera: at the result.
-        wide: scores of the images with their own clouds, at ``WIDE``.
-    """
+    """Compare each image's agreement with its own cloud, at ``WIDE``, and its neighbours'."""
     before, after = (scorer.score(images, camera, PAIR_LEVEL, offset=offset) for offset in (-1, 1))
     own = [one and crop_grids(one, camera, PAIR_LEVEL) for one in wide]
     values = np.array([[_agreement(one) for one in all_of] for all_of in (before, own, after)])
@@ -159,3 +210,103 @@ def _agreement(scores: ShiftScores | None) -> float:
     if scores is None or not len(scores.weights):
         return math.nan
     return z_score(scores, np.zeros(6))
+
+
+SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)
+"""Half-widths of a search; a focal length wrong by 5 % displaces a result by up to 0.5 m."""
+SEARCH_LENS = 0.08, 0.15, 0.04, 0.08
+"""The same of the logarithm of the focal length, of k1, of the principal point in focal
+lengths, of the logarithm of fx / fy."""
+MAX_RADIAL = 0.3
+SEARCH_PRIOR = 1.0  # weak: the estimate is to be unbiased
+SEARCH_BLUR_STEPS = 1.0  # of the score grids, for the search only
+
+
+def measure_lens(  # noqa: PLR0913 - what is measured, and by what
+    scorer: FrameScorer,
+    images: Images,
+    camera: Camera,
+    scores: ShiftScores,
+    *,
+    seed: int,
+    places: Places = NOWHERE,
+) -> tuple[LensParameter, ...]:
+    """The lens that fits the images best, with the pose free; empty where images do not tell.
+
+    From a camera at the result and its scores there at the level ``WIDE``. Of the principal point,
+    the coordinate along the longer side of the image is free.
+    """
+    if camera.model == "equirectangular":
+        return ()  # its format determines it
+    # Across the longer side of the image, a principal point cannot be told from a rotation.
+    along = Free.CENTRE_X if camera.width_px >= camera.height_px else Free.CENTRE_Y
+    finer = Free.FOCAL, Free.RADIAL, along  # right shapes are nearer to zero without a finer fit
+    searched = *finer, Free.ASPECT
+    scores = _with_lens(scorer, camera, scores)
+    best = _search(camera, scores, searched, seed)
+    rough = _fit_at_peaks(scorer, camera, scores, best, places=places)
+    if rough is None:
+        return ()
+    change, lens, moved = rough.free(*finer), lens_variable(camera), np.zeros(len(Free))
+    moved[[*finer]] = change.values
+    most = MAX_RADIAL / lens.free.sigmas[Free.RADIAL]
+    moved[Free.RADIAL] = np.clip(moved[Free.RADIAL], -most, most)
+    refined = lens.put_into(apply_twist(camera, change.twist), moved)
+    again = _with_lens(scorer, refined, scorer.score_together(images, refined, FINER))
+    rest = _fit_at_peaks(scorer, refined, again, np.zeros(len(best)), places=places)
+    if rest is None:
+        return ()
+    fine, units, parameters = rest.counted_from(moved), units_of(camera), []
+    for name, number in zip(NAMES, searched, strict=True):
+        fit, others = fine if number in finer else rough, [n for n in finer if n != number]
+        of = LensParameter.of(name, units[[number]], fit.free(*others, number))
+        parameters.append(of)
+    return tuple(parameters)
+
+
+def _with_lens(scorer: FrameScorer, camera: Camera, scores: ShiftScores) -> ShiftScores:
+    """Scores with the lens as further unknowns, by points where they are when they are seen."""
+    twists = {frame.index: frame.twist_per_s for frame in scorer.frames}
+    known = {number: np.zeros(6) if one is None else one for number, one in twists.items()}
+    of_groups = np.array([known[number] for number in scores.frame.tolist()]).reshape(-1, 6)
+    times_s = clock_of(camera).times_s(scores.pixels_px[:, 1])
+    points_m = displace(scores.points_lidar_m, of_groups, -times_s)
+    return scores.with_unknowns(lens_fields_px(camera, points_m))
+
+
+def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: int) -> Array:
+    """The best twist and lens, (11,), by scores at the result; some of the lens is searched."""
+    columns = [*range(6), *(6 + number for number in lens)]
+    units = np.array([1.0, 1.0, camera.intrinsics_px.fx, 1.0]) * SEARCH_LENS
+    sigmas = np.array(lens_variable(camera).free.sigmas)[[*lens]]
+    smooth = replace(
+        scores,
+        grids=np.stack([cv2.GaussianBlur(g, (0, 0), SEARCH_BLUR_STEPS) for g in scores.grids]),
+        jacobian=np.ascontiguousarray(scores.jacobian[:, :, columns]),
+    )
+    widths = np.append(SEARCH_POSE, units / sigmas)
+    best = np.zeros(6 + len(Free))
+    best[columns] = maximize_score(smooth, widths, seed=seed, prior=SEARCH_PRIOR)
+    return best
+
+
+def _fit_at_peaks(
+    scorer: FrameScorer, camera: Camera, scores: ShiftScores, start: Array, *, places: Places
+) -> LinearFit | None:
+    """Fit pose and lens to the groups' peaks next to a start, (11,); the scan may be distorted."""
+    if not len(scores.weights):
+        return None
+    table = extract_correspondences(scores, start, "camera")
+    table = at_pixels(camera, with_motion(table, scorer.dataset))
+    block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
+    usual = MatcherFindings.from_metadata({"matcher": "structure"})
+    points = block.block.points_lidar_m
+    of_place = usual.place_variance * places.frames_per_place(block.frame_numbers)
+    bends = distortion_fields_px(camera, points) * np.reshape(usual.bend_sigmas, (3, 1, 1))
+    return fit_camera(
+        camera,
+        block,
+        np.concatenate([lens_fields_px(camera, points), bends]),
+        shared_variance=max(of_place, limit("lens_match_share") * len(block)),
+        considered=len(bends),
+    )

@@ -22,12 +22,11 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.files import describe
 from calibgraph.model.findings import IMAGES
 from calibgraph.model.geometry import pose_difference, twist_between
-from calibgraph.model.lens_difference import has_other_lens, lens_difference
+from calibgraph.model.lens import has_other_lens, lens_difference
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.trust.evidence import Checks, Evidence
-from calibgraph.trust.image_posteriors import MeasurePosteriors
-from calibgraph.trust.pose_posterior import PosePosterior
+from calibgraph.trust.pose_posterior import MeasurePosteriors, PosePosterior
 
 _SAME_SIGMAS = 1.0  # along every axis: at such a pose the images say the same
 _SAME_PX, _GRID = 0.5, 9  # all over the image, so many pixels a side: such a lens is the same

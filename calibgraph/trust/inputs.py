@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags import scan_duration_s
-from calibgraph.io.dataset import Dataset
-from calibgraph.io.frame import Frame
+from calibgraph.io.dataset import Dataset, spread_out
+from calibgraph.io.frame import Frame, ScanSteps, seconds_between, twist_by_scans
+from calibgraph.io.kept_frames import KeptFrame
 from calibgraph.matching.burnt_in import describe_burnt_in
 from calibgraph.model.clock import OF_IMAGES, unused_times
+from calibgraph.model.geometry import angle_deg, transform
 from calibgraph.model.plausibility import find_implausible
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.trust.conventions import likely_intended_guess
-from calibgraph.trust.joined_clouds import displacement_of_parts
-from calibgraph.trust.motion_checks import motion_doubts
 from calibgraph.trust.thresholds import threshold
 
 _log = logging.getLogger(__name__)
@@ -41,9 +46,7 @@ class Finding:
 def describe_repeats(what: str, digests: Iterable[tuple[str, str]]) -> str:
     """A line on frames with the same cloud or image, which are not independent; empty if none are.
 
-    Args:
-        what: the cloud, or the image of a camera.
-        digests: the name of each frame, and a digest of what it has.
+    By the name of each frame, and a digest of what it has.
     """
     first: dict[str, str] = {}
     repeated = [(first[d], name) for name, d in digests if first.setdefault(d, name) != name]
@@ -55,11 +58,7 @@ def describe_repeats(what: str, digests: Iterable[tuple[str, str]]) -> str:
 
 
 def describe_copies(copies: Iterable[tuple[str, str]]) -> str:
-    """A line on frames that were left out as copies; empty without any.
-
-    Args:
-        copies: the name of each, and of the frame that it is a copy of.
-    """
+    """A line on frames that were left out as copies of others; empty without any."""
     named = [(name, first) for copy, first in copies for name in (first, copy)]
     return describe_repeats("cloud and images", named)
 
@@ -68,12 +67,7 @@ _DARK, _BRIGHT = 30.0, 225.0  # of 255; images by day have 80 to 140, of a lit s
 
 
 def describe_brightness(name: str, means: Sequence[float]) -> str:
-    """Why the images of a camera show too little, by their mean gray levels; empty if they do not.
-
-    Args:
-        name: of the camera.
-        means: of each image that was looked at, 0 to 255.
-    """
+    """Why a camera's images show too little, by their mean gray levels, 0 to 255; else empty."""
     level = float(np.median(means)) if len(means) else _DARK
     if _DARK <= level <= _BRIGHT:
         return ""
@@ -84,18 +78,9 @@ def describe_brightness(name: str, means: Sequence[float]) -> str:
     )
 
 
-def find_doubts(rig: Rig, frame: Frame, cloud: Cloud) -> list[str]:
-    """Warnings about the values of a rig and about a frame's cloud.
-
-    Args:
-        rig: the guess.
-        frame: whose cloud it is.
-        cloud: (n, >= 3) x y z [m] in the LiDAR frame.
-    """
-    return [*find_implausible(rig), *_doubts_about_cloud(frame, cloud)]
-
-
-def _doubts_about_cloud(frame: Frame, cloud: Cloud) -> Iterator[str]:
+def find_doubts(rig: Rig, frame: Frame, cloud: Cloud) -> Iterator[str]:
+    """Warnings about the values of a rig and about a frame's cloud, (n, >= 3) [m]."""
+    yield from find_implausible(rig)
     distance = _distance_check(cloud)
     if distance.status != "PASS":
         yield distance.text
@@ -125,25 +110,18 @@ def _distance_check(cloud: Cloud) -> Check:
 
 
 def explain_guess(data: Dataset, rig: Rig, cloud: Cloud) -> str | None:
-    """The convention error of the guess that the images show; not looked for in other units.
-
-    Args:
-        data: images and clouds.
-        rig: the guess.
-        cloud: (n, >= 3) one of the clouds.
-    """
+    """The convention error of the guess that the images show; not looked for in other units."""
     return likely_intended_guess(data, rig) if _distance_check(cloud).status == "PASS" else None
 
 
 def count_points_in_view(rig: Rig, cloud: Cloud) -> dict[str, int]:
     """Per camera, the number of cloud points in the image at the guess."""
-    return {name: _count_seen(camera, cloud) for name, camera in rig.cameras.items()}
-
-
-def _count_seen(camera: Camera, cloud: Cloud) -> int:
-    T = camera.T_camera_lidar
-    pixels, valid = camera.lens.project(cloud[:, :3].astype(np.float64) @ T[:3, :3].T + T[:3, 3])
-    return int(np.sum(valid & camera.in_image(pixels)))
+    counts, points = {}, cloud[:, :3].astype(np.float64)
+    for name, camera in rig.cameras.items():
+        T = camera.T_camera_lidar
+        pixels, valid = camera.lens.project(points @ T[:3, :3].T + T[:3, 3])
+        counts[name] = int(np.sum(valid & camera.in_image(pixels)))
+    return counts
 
 
 def describe_out_of_view(in_view: Mapping[str, int]) -> list[str]:
@@ -163,21 +141,223 @@ def check_inputs(data: Dataset, rig: Rig, *, at_guess: bool = True) -> tuple[str
         DatasetError: if no camera has points of a cloud in view. One that has none may still be
             placed by co-visible features.
     """
-    known = data.frames[0].twist_per_s is not None
     doubts = _check_at_guess(data, rig) if at_guess else find_implausible(rig)
     doubts += motion_doubts(data)
     for text in doubts:
         _log.warning(text)
-    known_times = unused_times(rig, is_known=known, how=OF_IMAGES)
-    return (*known_times, *doubts, *describe_burnt_in(data))
+    known = data.frames[0].twist_per_s is not None
+    return (*unused_times(rig, is_known=known, how=OF_IMAGES), *doubts, *describe_burnt_in(data))
 
 
 def _check_at_guess(data: Dataset, rig: Rig) -> list[str]:
     frame = data.frames[len(data.frames) // 2]
     cloud = frame.load_cloud()
-    doubts = find_doubts(rig, frame, cloud)
+    doubts = [*find_doubts(rig, frame, cloud)]
     out_of_view = describe_out_of_view(count_points_in_view(rig, cloud))
     if len(out_of_view) < len(rig.cameras):
         return [*doubts, *out_of_view]
     reasons = [explain_guess(data, rig, cloud), *doubts, *out_of_view]
     raise DatasetError("; ".join(reason for reason in reasons if reason))
+
+
+APART_DEG, APART_M = 0.5, 0.1
+"""Least displacement that counts. On 19 recordings, 8 of them with clouds whose parts overlap,
+parts of one scan were within 0.39 deg and 12 cm, and hardly fitted better for it."""
+_SPLITS = (0.5, 0.75, 0.25)
+"""Where a cloud may be joined of two, whose points follow one another: of equal or other sizes."""
+_RANGE_M = 2.0, 50.0  # without the vehicle itself, and sparse points
+_TARGET, _SOURCE, _NEIGHBOURS = 10_000, 1_500, 10  # points that are compared
+_OVERLAP, _OVERLAP_M = 0.5, 0.5  # share of points with a neighbour so near; scans sweep on
+_REACH_M = (2.0, 1.0, 0.5, 0.5, 0.3, 0.3)  # of neighbours, per step of the registration
+_FLAT, _LINE, _PATCH_M2 = 0.02, 0.05, 1.0  # variances of neighbours on a surface, and not a line
+_LEAST_POINTS, _LEAST_M = 100, 0.01
+_EXPLAINED = 3.0  # root mean square of the motion along the normals, over what distance remains
+
+
+def displacement_of_parts(points_m: NDArray[np.floating]) -> tuple[float, float] | None:
+    """Displacement of two parts of a cloud that show the same surfaces: degrees and metres.
+
+    Of (n, >= 3) points in the order of the file. None if the parts agree, or show different
+    surfaces, as parts of one sweep do.
+    """
+    xyz = points_m[:, :3].astype(np.float64)
+    distance_m = np.linalg.norm(xyz, axis=1)
+    xyz = xyz[(distance_m > _RANGE_M[0]) & (distance_m < _RANGE_M[1])]
+    for share in _SPLITS:
+        first, second = np.split(xyz, [int(share * len(xyz))])
+        T = _register(_thin(first, _TARGET), _thin(second, _SOURCE))
+        if T is None:
+            continue
+        degrees, metres = angle_deg(T[:3, :3]), float(np.linalg.norm(T[:3, 3]))
+        if degrees > APART_DEG or metres > APART_M:
+            return degrees, metres
+    return None
+
+
+def _thin(points: Array, most: int) -> Array:
+    return points[:: max(1, len(points) // most)]
+
+
+def _register(target: Array, source: Array) -> Array | None:
+    """(4, 4) T_target_source, point to plane; None if it explains nothing, or too few overlap."""
+    if min(len(target), len(source)) < _LEAST_POINTS:
+        return None
+    tree = cKDTree(target)
+    if np.mean(tree.query(source)[0] < _OVERLAP_M) < _OVERLAP:
+        return None
+    T = np.eye(4)
+    for reach_m in _REACH_M:
+        moved = source @ T[:3, :3].T + T[:3, 3]
+        moved, normals, offsets = _planes(target, tree, moved, reach_m)
+        if len(moved) < _LEAST_POINTS:
+            return None
+        T = _step(moved, normals, offsets) @ T
+    back = moved - (moved - T[:3, 3]) @ T[:3, :3]
+    explained_m = math.sqrt(np.mean(np.einsum("ni,ni->n", back, normals) ** 2))
+    return T if explained_m > _EXPLAINED * _spread_m(offsets) else None
+
+
+def _spread_m(offsets_m: Array) -> float:
+    """The robust standard deviation of distances, at least the noise of a good LiDAR."""
+    return max(_LEAST_M, 1.5 * float(np.median(np.abs(offsets_m))))
+
+
+def _planes(
+    target: Array, tree: cKDTree, points: Array, reach_m: float
+) -> tuple[Array, Array, Array]:
+    """Points near a surface of the target, its normals (n, 3), and the distances to it (n,)."""
+    distance_m, index = tree.query(points, _NEIGHBOURS)
+    near = distance_m[:, 0] < reach_m
+    points, around = points[near], target[index[near]]
+    middle = around.mean(axis=1)
+    from_middle = around - middle[:, None]
+    variances, axes = np.linalg.eigh(from_middle.transpose(0, 2, 1) @ from_middle / _NEIGHBOURS)
+    flat = variances[:, 0] < _FLAT * variances[:, 1]
+    flat &= (variances[:, 1] > _LINE * variances[:, 2]) & (variances[:, 2] < _PATCH_M2)
+    points, normals = points[flat], axes[flat, :, 0]
+    return points, normals, np.einsum("ni,ni->n", points - middle[flat], normals)
+
+
+def _step(points: Array, normals: Array, offsets_m: Array) -> Array:
+    """(4, 4) the motion of points that brings them nearer to their surfaces, robustly."""
+    weights = 1.0 / (1.0 + (offsets_m / _spread_m(offsets_m)) ** 2)
+    jacobian = np.hstack([np.cross(points, normals), normals])
+    information = (jacobian * weights[:, None]).T @ jacobian
+    information += 1e-5 * np.trace(information) * np.eye(6)  # a plane alone does not hold it
+    step = -np.linalg.solve(information, (jacobian * weights[:, None]).T @ offsets_m)
+    return transform(Rotation.from_rotvec(step[:3]), step[3:])
+
+
+INTERVAL_S = 0.1  # between clouds, where they have no stamps
+MAX_STEPS = 10  # between the numbers of neighbouring clouds, if it is clouds that they count
+MAX_FRAMES = 10  # evenly spread: bounds the time
+_JERK, _JERK_M_S = 0.2, 1.0  # share and size by which the speeds to both neighbours may differ
+_FEWEST, _FAST_M_S, _TURN_RAD_S = 3, 2.0, 0.03  # that show a speed, and turns
+_OTHER_SPEED = 1.5  # times
+_KMH, _LIKE = 3.6, 0.15  # share by which a ratio may differ from that of km/h to m/s
+_OTHER_AXES, _THESE_AXES = 0.5, 0.9  # correlation of turns: at most, and with others at least
+_AXES = "wx", "wy", "wz"
+
+
+def motion_doubts(dataset: Dataset) -> list[str]:
+    """A line if neighbouring clouds show another speed than is given, or turns about other axes.
+
+    Without stamps the time between clouds is not known; then the speed is that per turn.
+    """
+    given = [f for f in dataset.frames if f.find_twist is None and f.twist_per_s is not None]
+    steps, pairs, timed = ScanSteps(), list[tuple[Array, Array]](), True
+    for frame in spread_out(given, MAX_FRAMES):
+        found = register_neighbours(dataset, frame, steps)
+        if found is not None and frame.twist_per_s is not None:
+            pairs.append((frame.twist_per_s, found))
+            near = dataset.neighbour(frame, 1)
+            timed &= near is not None and seconds_between(frame, near) is not None
+    if len(pairs) < _FEWEST:
+        return []
+    told, shown = (np.array(each) for each in zip(*pairs, strict=True))
+    return [*_axes_doubt(told[:, :3], shown[:, :3]), *_speed_doubt(told, shown, timed=timed)]
+
+
+def _axes_doubt(told: Array, shown: Array) -> list[str]:
+    if np.linalg.norm(shown, axis=1).mean() < _TURN_RAD_S:
+        return []
+    size = np.linalg.norm(told) * np.linalg.norm(shown)
+    alike = {
+        order: (told[:, order] * shown).sum() / max(size, 1e-12) for order in permutations(range(3))
+    }
+    best = max(alike, key=lambda order: alike[order])
+    if alike[0, 1, 2] > _OTHER_AXES or alike[best] < _THESE_AXES:
+        return []
+    names = ", ".join(_AXES[axis] for axis in best)
+    return [
+        "by neighbouring clouds, the LiDAR turns about other axes than its motion states: "
+        f"{names} in the place of {', '.join(_AXES)} would fit; check their order"
+    ]
+
+
+def _speed_doubt(told: Array, shown: Array, *, timed: bool) -> list[str]:
+    speeds = [np.linalg.norm(each[:, 3:], axis=1) for each in (told, shown)]
+    fast = speeds[1] > _FAST_M_S
+    if fast.sum() < _FEWEST:
+        return []
+    turns = [np.linalg.norm(each[fast, :3], axis=1).sum() for each in (told, shown)]
+    if not timed and turns[1] / fast.sum() < _TURN_RAD_S:
+        return []
+    scale = 1.0 if timed else turns[0] / turns[1]
+    by_clouds = scale * float(np.median(speeds[1][fast]))
+    ratio = float(np.median(speeds[0][fast])) / max(by_clouds, 1e-12)
+    if 1 / _OTHER_SPEED < ratio < _OTHER_SPEED:
+        return []
+    unit = "; is it in km/h?" if abs(ratio / _KMH - 1) < _LIKE else "; check its unit"
+    return [
+        f"by neighbouring clouds, the LiDAR moves at {by_clouds:.1f} m/s, by its motion at "
+        f"{ratio * by_clouds:.1f} m/s{unit}"
+    ]
+
+
+def registered_twists(dataset: Dataset) -> dict[int, Array]:
+    """By number of a kept frame whose motion is not known, its twist (6,) by both neighbours.
+
+    Found once: another thread that asks meanwhile waits.
+
+    Raises:
+        CalibrationError, OSError: if a cloud cannot be read.
+    """
+    chosen = spread_out(dataset.frames, MAX_FRAMES)
+    frames = [f for f in chosen if isinstance(f, KeptFrame) and f.twist_per_s is None]
+
+    def register() -> dict[int, Array]:
+        steps = ScanSteps()
+        found = ((frame.index, register_neighbours(dataset, frame, steps)) for frame in frames)
+        return {number: twist for number, twist in found if twist is not None}
+
+    key = "twists", *(frame.index for frame in frames)
+    return frames[0].derive_for_all(key, register) if frames else {}
+
+
+def register_neighbours(dataset: Dataset, frame: Frame, steps: ScanSteps) -> Array | None:
+    """(6,) the twist by both neighbours, if they are as far away as of one drive."""
+    near = [dataset.neighbour(frame, sign) for sign in (-1, 1)]
+    known = [(other, _later_s(frame, other)) for other in near if other is not None]
+    if len(known) < len(near) or not all(later_s for _, later_s in known):
+        return None
+    try:
+        before, after = (twist_by_scans(frame, [one], steps) for one in known)
+    except DatasetError:  # they do not fit
+        return None
+    jerk = np.linalg.norm(after[3:] - before[3:])
+    if jerk > _JERK * np.linalg.norm(after[3:]) + _JERK_M_S:
+        return None
+    return np.asarray((before + after) / 2)
+
+
+def _later_s(frame: Frame, other: Frame) -> float:
+    """How much later a neighbour was recorded: by stamps, or by the numbers of both clouds."""
+    by_stamps = seconds_between(frame, other)
+    if by_stamps is not None:
+        return by_stamps
+    stems = frame.cloud_path.stem, other.cloud_path.stem
+    steps = int(stems[1]) - int(stems[0]) if all(map(str.isdecimal, stems)) else 0
+    if not 0 < abs(steps) <= MAX_STEPS:  # other numbers, such as times
+        steps = 1 if other.index > frame.index else -1
+    return INTERVAL_S * steps

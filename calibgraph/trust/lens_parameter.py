@@ -21,7 +21,7 @@ from scipy.special import expit, logit, ndtr, softmax
 from calibgraph.arrays import Array
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.config import LensPart
-from calibgraph.model.lens_knowledge import LensSigmas
+from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Check, Status
 from calibgraph.solver.linear_fit import Freed

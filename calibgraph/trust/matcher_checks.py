@@ -1,18 +1,22 @@
-"""Checks of the matcher's findings."""
+"""Checks of the matcher's findings, and of its rounds: convergence, repeats, the second end."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from calibgraph.io.dataset import Dataset
+from calibgraph.matching.run import Rematch
 from calibgraph.matching.structure.acceptance import FEW_FRAMES, SEARCH, probability_by_chance
 from calibgraph.matching.structure.global_search import ALONE
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.threshold import Threshold
-from calibgraph.model.verdict import FAIL_ABOVE, TOLERANCE, Check
-from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.model.geometry import pose_difference
+from calibgraph.model.verdict import FAIL_ABOVE, TOLERANCE, WENT_ON, Check
+from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
+from calibgraph.trust.inputs import describe_copies, describe_repeats
 from calibgraph.trust.solution_checks import check_sigmas
 from calibgraph.trust.thresholds import threshold
 
@@ -25,47 +29,25 @@ def matcher_checks(evidence: Evidence) -> Checks:
     The error that all frames share is part of the error bar, with which it is checked; where there
     is no error bar it is checked alone.
     """
-    findings = _with_chance_of_few_frames(evidence)
-    shared_sigmas = findings.systematic_sigmas if evidence.joint_covariance is None else None
-    tolerance = evidence.solution.config.tolerance
-    return {
-        name: check_findings(findings, name, shared_sigmas, tolerance) for name in evidence.cameras
-    }
-
-
-def _with_chance_of_few_frames(evidence: Evidence) -> MatcherFindings:
-    """The findings without what is found by chance in more frames, where no search measures it."""
     table, findings = evidence.solution.correspondences, evidence.findings
-    few = {
+    few = {  # in more frames no search measures what is found by chance
         name: chance
         for name, chance in findings.chance.items()
         if len(np.unique(table.of_camera(name).frame)) <= FEW_FRAMES
     }
-    return replace(findings, chance=few)
-
-
-def check_findings(
-    findings: MatcherFindings,
-    camera: str,
-    shared_sigmas: tuple[float, float] | None = None,
-    tolerance: tuple[float, float] = TOLERANCE,
-) -> list[Check]:
-    """The checks of one camera's matches.
-
-    Args:
-        findings: of the matcher.
-        camera: whose.
-        shared_sigmas: rotation [rad], translation [m] of the error that all its frames share; None
-            where the error bar holds it.
-        tolerance: of the user [deg, cm].
-    """
-    shared = None if shared_sigmas is None else np.repeat(shared_sigmas, 3)
-    return [
-        *_search_checks(findings, camera),
-        *_share_checks(findings, camera),
-        *check_sigmas("error that the matcher's frames share", shared, tolerance),
-        *_agreement_checks(findings, camera),
-    ]
+    findings = replace(findings, chance=few)
+    known = evidence.joint_covariance is not None
+    sigmas = None if known else np.repeat(findings.systematic_sigmas, 3)
+    what, tolerance = "error that the matcher's frames share", evidence.solution.config.tolerance
+    return {
+        name: [
+            *_search_checks(findings, name),
+            *_share_checks(findings, name),
+            *check_sigmas(what, sigmas, tolerance),
+            *_agreement_checks(findings, name),
+        ]
+        for name in evidence.cameras
+    }
 
 
 def _agreement_checks(findings: MatcherFindings, camera: str) -> list[Check]:
@@ -76,18 +58,16 @@ def _agreement_checks(findings: MatcherFindings, camera: str) -> list[Check]:
     z_score, chance = findings.z_score.get(camera), findings.chance.get(camera)
     if chance is not None and camera in findings.missed:
         return []  # the check of the search has it
-    if chance is not None and z_score is not None and not _is_lost(z_score):
+    if z_score is None:
+        return []
+    is_lost = probability_by_chance(z_score, ALONE, _OF_FEW_FRAMES) > FAIL_ABOVE
+    if chance is not None and not is_lost:
         return [threshold("chance").check(chance)]
-    return [] if z_score is None else [threshold("z_score").check(z_score)]
-
-
-def _is_lost(z_score: float) -> bool:
-    """Whether a pose of this z-score after the last round may well be one by chance."""
-    return probability_by_chance(z_score, ALONE, _OF_FEW_FRAMES) > FAIL_ABOVE
+    return [threshold("z_score").check(z_score)]
 
 
 def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:
-    """Whether the matcher's global search found the camera, if it searched."""
+    """Whether the matcher's global search found the camera, and what it has in common agrees."""
     missed, found = findings.missed.get(camera), findings.found.get(camera)
     chance = findings.chance.get(camera)
     if missed is not None and chance is not None:
@@ -104,40 +84,122 @@ def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:
             "widen --search-deg and --search-m, or give more frames from more places"
         )
         return [Check("search", "FAIL", text, missed)]
-    if found is not None:
-        text = f"z-score {found:.1f} of image and cloud where the rounds began"
-        return [Check("search", "PASS", text, found), *_contradiction(findings, camera)]
-    return []
-
-
-def _contradiction(findings: MatcherFindings, camera: str) -> list[Check]:
-    """That what two cameras see in common places them where neither image accepts its pose."""
-    other = findings.contradicted.get(camera)
-    if other is None:
+    if found is None:
         return []
+    text = f"z-score {found:.1f} of image and cloud where the rounds began"
+    search, other = Check("search", "PASS", text, found), findings.contradicted.get(camera)
+    if other is None:
+        return [search]
     text = (
         f"its image and cloud agree at its pose, but features that it has in common with {other} "
         "place the two cameras elsewhere: do both images show the same thing that is no part of "
         "the scene, as a text, a logo or a part of the vehicle? Else one of the two is wrong"
     )
-    return [Check(f"features in common with {other}", "WARN", text, kind="contradiction")]
+    return [
+        search,
+        Check(f"features in common with {other}", "WARN", text, kind="contradiction"),
+    ]
 
 
 def _share_checks(findings: MatcherFindings, camera: str) -> list[Check]:
     """Checks of a learned matcher: dependence on its start, memorization, failed frames."""
     shares = (
-        (threshold("start_dependence"), findings.start_dependence.get(camera),
+        ("start_dependence", findings.start_dependence.get(camera),
          "of a displaced start remains in the matches"),
-        (threshold("memorization"), findings.memorization.get(camera),
+        ("memorization", findings.memorization.get(camera),
          "of a displaced start is undone even without the image"),
-        (threshold("failed_frames"), findings.failed_share.get(camera, 0.0),
+        ("failed_frames", findings.failed_share.get(camera, 0.0),
          "of the frames failed to be matched"),
     )  # fmt: skip
-    return [_check_share(row, share, text) for row, share, text in shares if share is not None]
+    return [
+        threshold(key).check_in_words(
+            share, f"{'an unknown share' if math.isnan(share) else f'{share:.0%}'} {text}"
+        )
+        for key, share, text in shares
+        if share is not None
+    ]
 
 
-def _check_share(row: Threshold, share: float, text: str) -> Check:
-    found = "an unknown share" if math.isnan(share) else f"{share:.0%}"
-    status = row.grade(share)
-    advice = f": {row.advice}" if row.advice and status != "PASS" else ""
-    return row.describe(share, status, f"{found} {text}{advice}")
+REMATCH_DEG, REMATCH_M = 0.5, 0.08
+"""How far the start of matching again is displaced from the result."""
+
+
+def last_round_checks(evidence: RunEvidence) -> Checks:
+    """How far the last of several rounds of matching still moved the cameras."""
+    rounds, tolerance = evidence.run.rounds, evidence.run.solution.config.tolerance
+    if len(rounds) == 1:
+        return {}
+    keys = ("last_round_rotation", "moved_deg"), ("last_round_translation", "moved_cm")
+    return {
+        name: [threshold(key, tolerance).check(moved[of]) for key, of in keys]
+        for name, moved in rounds[-1].items()
+    }
+
+
+def repeated_file_checks(evidence: RunEvidence) -> Checks:
+    """Which frames were copies, and whether others have the same cloud or image of a camera."""
+    run, cameras = evidence.run, evidence.solution.cameras
+    checks = check_repeated_files(run.dataset, evidence.hashes, cameras)
+    if run.copies:
+        check = Check("copies", "WARN", describe_copies(run.copies), len(run.copies))
+        checks = {name: [check, *each] for name, each in checks.items()}
+    return checks
+
+
+def check_repeated_files(
+    dataset: Dataset, hashes: Mapping[str, str], cameras: Sequence[str]
+) -> dict[str, list[Check]]:
+    """Per camera, a check of the first kind of file that frames have in common, if any."""
+    frames = [(f.name, f.image_paths, hashes[str(f.cloud_path)]) for f in dataset.frames]
+    of_clouds = describe_repeats("cloud", [(name, digest) for name, _, digest in frames])
+    checks: dict[str, list[Check]] = {}
+    for camera in cameras:
+        images = [(n, hashes[str(paths[camera])]) for n, paths, _ in frames if camera in paths]
+        text = describe_repeats(f"image of {camera}", images) or of_clouds
+        checks[camera] = [Check("equal files", "WARN", text)] if text else []
+    return checks
+
+
+def rematch_checks(evidence: RunEvidence) -> Checks:
+    """Whether matching again from a displaced start ended at the same result."""
+    return compare_ends(evidence.run.rematch, evidence.run.solution.config.tolerance)
+
+
+def compare_ends(rematch: Rematch | None, tolerance: tuple[float, float] = TOLERANCE) -> Checks:
+    """Per camera, the difference between both ends, for a tolerance [deg, cm]."""
+    if rematch is None:
+        return {}
+    start = f"matching again from a start {REMATCH_DEG:g} deg, {100 * REMATCH_M:g} cm off"
+    if rematch.again is None:
+        check = Check("matching again", "FAIL", f"{start} failed: {rematch.failure}")
+        return {name: [check] for name in rematch.first.cameras}
+    again, words = rematch.again.T_camera_lidar, f"{start}: difference"
+    rows = [threshold(f"rematch_{part}", tolerance) for part in ("rotation", "translation")]
+    apart = {n: pose_difference(T, again[n]) for n, T in rematch.first.T_camera_lidar.items()}
+    return {
+        name: [row.check(value, name=words) for row, value in zip(rows, values, strict=True)]
+        for name, values in apart.items()
+    }
+
+
+def going_on_checks(evidence: RunEvidence) -> Checks:
+    """Which rounds ended elsewhere than the images allow, and went on from there."""
+    text = (
+        "rounds of matching ended {:.2g} deg, {:.2g} cm away, where the images agree less, and "
+        "went on from where they agree better: this scene misleads coarse levels"
+    )
+    return {
+        name: [Check("rounds that went on", "WARN", text.format(*moved), moved[0], kind=WENT_ON)]
+        for name, moved in evidence.run.went_on.items()
+    }
+
+
+def time_limit_checks(evidence: RunEvidence) -> Checks:
+    """Whether the time limit left something out."""
+    run = evidence.run
+    if not run.out_of_time:
+        return {}
+    missed = f"{run.missed_rounds} rounds of matching and " if run.missed_rounds else ""
+    text = f"partial: there was no time for {missed}the checks against the images"
+    check = Check("time limit", "WARN", text, run.missed_rounds)
+    return {name: [check] for name in evidence.solution.cameras}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
+from calibgraph.model.geometry import camera_center, pose_rows
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.curvature import pose_hessian
@@ -26,11 +26,7 @@ _SHALLOW = 2.0  # ratio of far to near
 def weaknesses(solution: Solution, camera: str, scatter: Array | None) -> tuple[str, ...]:
     """Sentences about weakly observable parameters of one camera, the most important first.
 
-    Args:
-        solution: of the joint solve.
-        camera: whose.
-        scatter: (6, 6) covariance by the scatter between frames; if None, that of independent
-            matches is used.
+    By the (6, 6) scatter between frames; if there is none, by that of independent matches.
     """
     block = solution.inliers.blocks.get(camera)
     if block is None or not solution.objective.uses_correspondences:
@@ -46,12 +42,9 @@ def weaknesses(solution: Solution, camera: str, scatter: Array | None) -> tuple[
 
 
 def weakest_direction(covariance: Array) -> str:
-    """The eigenvector of the largest standard deviation, in words.
+    """The eigenvector of a (6, 6) covariance's largest standard deviation, in words.
 
-    Rotations and translations are compared relative to their tolerances.
-
-    Args:
-        covariance: (6, 6) of (rotation [rad], translation [m]) in the camera's axes.
+    Rotations [rad] and translations [m] are compared relative to their tolerances.
     """
     values, vectors = np.linalg.eigh(covariance / np.outer(_UNITS, _UNITS))
     component = vectors[:, -1] * np.sqrt(values[-1])
@@ -64,13 +57,7 @@ def weakest_direction(covariance: Array) -> str:
 
 
 def empty_parts(camera: Camera, block: CameraBlock, T_camera_lidar: Array) -> list[str]:
-    """Sentences about the parts of the image and of depth that have no matches.
-
-    Args:
-        camera: for the size of its image.
-        block: its matches.
-        T_camera_lidar: (4, 4).
-    """
+    """Sentences about the parts of the image and of depth that have no matches."""
     columns = np.clip(3 * (block.block.pixels_px[:, 0] + 0.5) / camera.width_px, 0, 2.999)
     shares = np.bincount(columns.astype(np.int64), minlength=3) / len(columns)
     words = []
@@ -78,7 +65,9 @@ def empty_parts(camera: Camera, block: CameraBlock, T_camera_lidar: Array) -> li
         if share < _SPARSE:
             few = "no matches" if share < _EMPTY else f"only {share:.1%} of the matches"
             words.append(f"the {third} third of the image has {few}")
-    near, far = depth_range(block, T_camera_lidar)
+    x, y, z = block.block.points_lidar_m.T - camera_center(T_camera_lidar)[:, None]
+    distances = np.sqrt(x * x + y * y + z * z)
+    near, far = quantile(distances, 0.02), quantile(distances, 0.98)
     if near > _NEAR_M:
         words.append(f"nothing nearer than {near:.2g} m")
     if far < _FAR_M:
@@ -88,36 +77,22 @@ def empty_parts(camera: Camera, block: CameraBlock, T_camera_lidar: Array) -> li
     return words
 
 
-def depth_range(block: CameraBlock, T_camera_lidar: Array) -> tuple[float, float]:
-    """Distances [m] from the camera between which 96 % of its matches lie."""
-    x, y, z = (
-        block.block.points_lidar_m.T - to_T_lidar_camera(T_camera_lidar).translation()[:, None]
-    )
-    distances = np.sqrt(x * x + y * y + z * z)
-    return quantile(distances, 0.02), quantile(distances, 0.98)
-
-
-def prior_shares(solution: Solution, covariance: Array | None) -> dict[str, float]:
+def prior_shares(solution: Solution) -> dict[str, float]:
     """Per camera, which share of its result comes from priors and relative poses, not from matches.
 
     It is the mean over the camera's six components of the priors' influence, the diagonal of
-    C H_prior: 0 if the matches decide alone, 1 if there are none.
-
-    Args:
-        solution: of the joint solve.
-        covariance: (6 N, 6 N) marginal C of its error model; None: of independent matches.
+    C H_prior: 0 if the matches decide alone, 1 if there are none. C is the (6 N, 6 N) marginal of
+    the error model; without one, of independent matches.
     """
-    T_camera_lidar = solution.T_camera_lidar
+    T_camera_lidar, errors = solution.T_camera_lidar, solution.marginals.errors
     cameras = list(T_camera_lidar)
     priors = pose_hessian(solution.inliers.pose_graph, cameras, T_camera_lidar)
-    known = _of_independent_matches(solution, priors) if covariance is None else covariance
+    known = None if errors is None else errors.fit.of_mount.covariance
+    if known is None:
+        hessian = priors.copy()
+        for name, of_camera in solution.fitted.robust_hessians.items():
+            rows = pose_rows(cameras.index(name))
+            hessian[rows, rows] += of_camera
+        known = np.asarray(np.linalg.pinv(hessian, hermitian=True))
     influence = np.diag(known @ priors).reshape(-1, 6).mean(axis=1)
     return dict(zip(cameras, np.clip(influence, 0.0, 1.0).tolist(), strict=True))
-
-
-def _of_independent_matches(solution: Solution, priors: Array) -> Array:
-    hessian, cameras = priors.copy(), list(solution.T_camera_lidar)
-    for name, of_camera in solution.fitted.robust_hessians.items():
-        rows = pose_rows(cameras.index(name))
-        hessian[rows, rows] += of_camera
-    return np.asarray(np.linalg.pinv(hessian, hermitian=True))

@@ -12,23 +12,25 @@ mean, not the sum: with that the truth is as likely under it as by one camera al
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import gtsam
 import numpy as np
-from scipy.special import expit
+from scipy.optimize import brentq
+from scipy.special import expit, logsumexp
 
 from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.consensus import FAR, log_likelihood
 from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import RelativePose, Rig
+from calibgraph.model.verdict import Check
 from calibgraph.parallel import Threads, core_pool
-from calibgraph.trust.frame_scores import FrameScorer
+from calibgraph.trust.image_evidence import FrameScorer
 from calibgraph.trust.probability import probability_beyond
-from calibgraph.trust.tempering import sample_posterior
+from calibgraph.trust.thresholds import threshold
 from factors import pose_sigmas
 
 MAX_FRAMES = 10  # evenly spread over the dataset: bounds the time
@@ -68,24 +70,14 @@ class PosePosterior:
         near, elsewhere = (_moments(samples) for samples in (self.near, self.elsewhere))
         return (1.0 - self.share) * near + self.share * elsewhere
 
-    def moved(self, adjoint: Array) -> PosePosterior:
-        """The same of another camera that moves with this one.
-
-        Args:
-            adjoint: (6, 6) from twists of this camera to those of the other.
-        """
-        return PosePosterior(self.near @ adjoint.T, self.elsewhere @ adjoint.T, self.share)
-
     def widest(self, covariance: Array) -> Array:
         """(6, 6): a covariance that is at least that of the poses elsewhere."""
         return widen(covariance, {0: _moments(self.elsewhere)})
 
     def probability_beyond(self, by_matches: Array, tolerance: tuple[float, float]) -> float:
-        """The probability of an error beyond the tolerance.
+        """The probability of an error beyond the tolerance [deg, cm].
 
-        Args:
-            by_matches: (6, 6) covariance; near the result the error is at least as wide.
-            tolerance: rotation [deg] and distance [cm].
+        Near the result the error is at least as wide as the (6, 6) covariance by the matches.
         """
         widened = widen(by_matches, {0: _moments(self.near)})
         near = max(probability_beyond(widened, tolerance), _share_beyond(self.near, tolerance))
@@ -146,7 +138,8 @@ def measure_posteriors(
             found = _posterior_of(likelihood, covariances[group[0]], seed)
             posteriors = {}
             for name, adjoint in zip(group, adjoints, strict=True):
-                of_camera = found.moved(adjoint)
+                near, elsewhere = found.near @ adjoint.T, found.elsewhere @ adjoint.T
+                of_camera = PosePosterior(near, elsewhere, found.share)
                 if asked is not None:
                     away = twist_between(asked[name], rig.T_camera_lidar[name])
                     of_first = np.asarray(np.linalg.solve(adjoint, away), np.float64)
@@ -181,10 +174,8 @@ def group_tied(
 ) -> list[tuple[str, ...]]:
     """The cameras in groups that can only be elsewhere together.
 
-    Args:
-        cameras: of the groups; others are left out.
-        known: two cameras and the (6, 6) covariance of their relative pose without the cloud. It
-            ties them if it is below ``TIED`` of ``REACH`` along every axis.
+    Two are tied by the (6, 6) covariance of their relative pose, known without the cloud, if it is
+    below ``TIED`` of ``REACH`` along every axis.
     """
     groups = {name: {name} for name in cameras}
     for a, b, covariance in known:
@@ -226,3 +217,118 @@ def _factor(covariance: Array, moments: Array) -> Array:
     ratios, axes = np.linalg.eigh(inverse @ moments @ inverse.T)
     stretch = axes * np.sqrt(np.maximum(ratios, 1.0)) @ axes.T
     return np.asarray(root @ stretch @ inverse)
+
+
+MeasurePosteriors = Callable[
+    [Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
+]
+"""The posteriors by the images, of the (6, 6) covariances by the matches and of groups of cameras
+that move together."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImagePosteriors:
+    """The (6 N, 6 N) error bar of matches beside the posteriors of cameras with scored images.
+
+    The wider one is reported, of a batch and while driving.
+    """
+
+    cameras: Sequence[str]
+    by_matches: Array
+    posteriors: Mapping[str, PosePosterior] = field(default_factory=dict)
+
+    def widen(self, joint: Array) -> Array:
+        """(6 N, 6 N): a covariance, widened where the images' evidence is flat."""
+        found = self.posteriors.items()
+        return widen(joint, {self.cameras.index(name): of.moments for name, of in found})
+
+    def probability_beyond(self, camera: str, tolerance: tuple[float, float]) -> float:
+        """The probability that a camera's error is beyond a tolerance [deg, cm]."""
+        rows = pose_rows(self.cameras.index(camera))
+        own = self.by_matches[rows, rows]
+        if camera not in self.posteriors:
+            return probability_beyond(own, tolerance)
+        return self.posteriors[camera].probability_beyond(own, tolerance)
+
+    def check_flatness(self) -> dict[str, Check]:
+        """Per camera with a posterior, whether the images leave its pose more open."""
+        if not self.posteriors:
+            return {}
+        wide, narrow = np.diag(self.widen(self.by_matches)), np.diag(self.by_matches)
+        ratios = np.sqrt(wide / narrow).reshape(-1, 6).max(axis=1)
+        row, of_cameras = threshold("flat_evidence"), zip(self.cameras, ratios, strict=True)
+        return {name: row.check(ratio) for name, ratio in of_cameras if name in self.posteriors}
+
+
+def measured_pairs(poses: Iterable[RelativePose]) -> Iterator[tuple[str, str, Array]]:
+    """Relative poses of a rig with their (6, 6) covariances."""
+    for pose in poses:
+        sigmas = np.repeat([pose.rotation_sigma_rad, pose.translation_sigma_m], 3)
+        yield pose.a, pose.b, np.diag(sigmas**2)
+
+
+_EFFECTIVE = 0.8  # share of the samples that each step keeps
+_MOVES = 3  # of every sample, after each step
+_STEP = 2.38  # over the square root of the dimension: the best width of a Metropolis move
+_NARROW = 0.3  # every other move is so much of that, for modes narrower than all samples together
+
+
+def sample_posterior(
+    likelihood: Callable[[Array], Array], prior: Array, *, samples: int, seed: int
+) -> tuple[Array, float]:
+    """Draw (n, k) samples of prior times likelihood; with the log of the integral, the evidence.
+
+    Sequential Monte Carlo: the likelihood enters with an exponent that grows from 0 to 1, in steps
+    that keep most samples effective. After each, samples are drawn again by their weights, and
+    moved by Metropolis steps as wide as they are. With 1000 samples a standard deviation repeats to
+    a tenth. The densest sample comes first.
+
+    Args:
+        likelihood: (n,) its logarithms at (n, k) points.
+        prior: (k, k) covariance of the prior, a Gaussian about 0.
+        samples: their number n.
+        seed: of the draws.
+    """
+    rng, root = np.random.default_rng(seed), np.linalg.cholesky(prior)
+    points = rng.standard_normal((samples, len(prior)))  # in standard deviations of the prior
+    values, exponent, evidence = likelihood(points @ root.T), 0.0, 0.0
+    while exponent < 1.0:
+        step = _next_step(values, 1.0 - exponent)
+        exponent += step
+        evidence += float(logsumexp(step * values)) - np.log(samples)
+        drawn = rng.choice(samples, samples, p=_weights(values, step))
+        points, values = points[drawn], values[drawn]
+        for _ in range(_MOVES):
+            proposed = points + _draw_moves(points, rng)
+            found = likelihood(proposed @ root.T)
+            odds = exponent * (found - values) + _log_prior(proposed) - _log_prior(points)
+            accepted = np.log(rng.random(samples)) < odds
+            points[accepted], values[accepted] = proposed[accepted], found[accepted]
+    densest_first = np.argsort(-(values + _log_prior(points)), kind="stable")
+    return points[densest_first] @ root.T, evidence
+
+
+def _next_step(values: Array, left: float) -> float:
+    """By how much the exponent can grow, at most by what is left."""
+
+    def excess(step: float) -> float:
+        weights = _weights(values, step)
+        return float(1.0 / (weights**2).sum()) - _EFFECTIVE * len(values)
+
+    return left if excess(left) >= 0 else float(brentq(excess, 0.0, left, rtol=1e-3))
+
+
+def _weights(values: Array, step: float) -> Array:
+    weights = np.exp(step * (values - values.max()))
+    return np.asarray(weights / weights.sum())
+
+
+def _draw_moves(points: Array, rng: np.random.Generator) -> Array:
+    count, size = points.shape
+    covariance = np.cov(points.T) + 1e-12 * np.eye(size)
+    widths = _STEP / np.sqrt(size) * rng.choice([1.0, _NARROW], (count, 1))
+    return np.asarray(widths * rng.multivariate_normal(np.zeros(size), covariance, count))
+
+
+def _log_prior(whitened: Array) -> Array:
+    return np.asarray(-0.5 * (whitened**2).sum(axis=1))

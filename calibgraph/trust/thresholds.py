@@ -13,8 +13,7 @@ from functools import lru_cache
 from statistics import NormalDist
 
 from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE
-from calibgraph.model.threshold import Threshold, ratio_of
-from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE
+from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Threshold, ratio_of
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.lens import MATCH_SHARE
 

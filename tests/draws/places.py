@@ -9,8 +9,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.graph.objective import pose_key
 from calibgraph.model.correspondences import Correspondences, concatenate
-from calibgraph.model.error_components import error_components
-from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
 from calibgraph.model.places import Places, as_groups
 from calibgraph.model.rig import Camera, Intrinsics, RelativePose, Rig
@@ -22,7 +21,7 @@ from factors import ProjectionBlock, block_factor
 Rng = np.random.Generator
 
 FRAMES = 3
-SIZES = error_components().matchers["structure"]
+SIZES = MatcherFindings(**error_components().matchers["structure"])
 FIFTH = MatcherErrors(noise_px=1.6**0.5, frame_noise_px=0.4**0.5, outlier_share=0.15)
 FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
@@ -56,9 +55,8 @@ def draw_places(
         rounds: how often all places are visited, one after the other.
     """
     truth, there = stereo(), []
-    findings = MatcherFindings(**vars(SIZES))
-    whole = np.repeat(findings.rigid_sigmas, 3)
-    bends = np.array(findings.bend_sigmas) * rng.standard_normal(3)
+    whole = np.repeat(SIZES.rigid_sigmas, 3)
+    bends = np.array(SIZES.bend_sigmas) * rng.standard_normal(3)
     at_place = np.repeat([SIZES.place_rotation_rad, SIZES.place_translation_m], 3)
     cloud = np.sqrt(1 - SIZES.camera_share) * whole * rng.standard_normal(6)
     cameras = np.sqrt(SIZES.camera_share) * whole * rng.standard_normal((2, 6))
@@ -82,7 +80,7 @@ def draw_places(
         true_points.append(points)
         tables.append(replace(table, points_lidar_m=bent, frame=table.frame + frames * visit))
         names[place] += range(frames * visit, frames * (visit + 1))
-    joined = concatenate(tables).with_findings(findings)
+    joined = concatenate(tables).with_findings(SIZES)
     aligned = align(truth, joined, np.concatenate(true_points))
     return Drawn(truth, joined.with_places(Places(places=as_groups(names))), aligned)
 

@@ -30,7 +30,7 @@ from calibgraph.io.clouds import load_cloud
 from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.io.feather import read_feather
 from calibgraph.model.camera_matches import NAMES, NUMBERS, PLANES
-from calibgraph.model.table_columns import COORDINATES
+from calibgraph.model.correspondences import COORDINATES
 from tests.io.written import CLOUD, pcd, ply
 
 DIGITS = [b"0", b"1", b"-1", b"3", b"255", b"499", b"501", b"65536", b"2147483648", b"4294967295",

@@ -25,8 +25,7 @@ from calibgraph.errors import CalibrationError, MotionError
 from calibgraph.graph.lens import LensVariable
 from calibgraph.matching.run import with_motion
 from calibgraph.model.clock import at_pixels, seen_at_rows, when_taken
-from calibgraph.model.lens_difference import lens_difference
-from calibgraph.model.lens_knowledge import IN_DOUBT, LensSigmas, state_calibrated
+from calibgraph.model.lens import IN_DOUBT, LensSigmas, lens_difference, state_calibrated
 from calibgraph.simulation.rigs import rig_of
 from tests.conftest import make_camera, make_pair
 

@@ -18,8 +18,14 @@ from calibgraph.model.error_sources import (
     ErrorSources,
 )
 from calibgraph.model.summary import LEAST, summarize
-from calibgraph.model.threshold import Direction, Threshold, beside, in_unit
-from calibgraph.model.verdict import ErrorProbability, rig_verdict
+from calibgraph.model.verdict import (
+    Direction,
+    ErrorProbability,
+    Threshold,
+    beside,
+    in_unit,
+    rig_verdict,
+)
 from calibgraph.trust.thresholds import threshold
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import calibgraph
 from calibgraph import Calibration, Check, Rig, Verdict, perturb
 from calibgraph.errors import DatasetError
-from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.lens import LensEstimate
 from calibgraph.report.camera_section import worked_point
 from calibgraph.report.frames import relocate_frames
 from calibgraph.report.plots import ARROW_COLUMNS, arrow_factor, mean_residuals

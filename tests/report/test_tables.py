@@ -17,7 +17,7 @@ from calibgraph import Rig, simulate_correspondences
 from calibgraph.audit import Audit, CameraAudit, Drift, Trend
 from calibgraph.audit import tables as audit_tables
 from calibgraph.model.calibration import Calibration, Residuals
-from calibgraph.model.lens_estimate import LensEstimate
+from calibgraph.model.lens import LensEstimate
 from calibgraph.model.metrics import Deviation, Evaluation, PoseError
 from calibgraph.model.verdict import ErrorProbability, Verdict
 from calibgraph.report import tables

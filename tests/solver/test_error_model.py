@@ -20,9 +20,8 @@ from calibgraph import (
 from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.config import Config, preset
-from calibgraph.model.error_components import error_components
 from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES
-from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import relative_covariance, relative_transform
 from calibgraph.model.verdict import COMMON_ERROR
 from calibgraph.simulation.correspondences import PoseSpread
@@ -65,7 +64,7 @@ def test_a_table_that_states_none_is_no_pass(pair: Rig, metadata: dict[str, Any]
 
 @pytest.mark.parametrize("matcher", ["structure", "cmrnext"])
 def test_a_known_matcher_has_its_usual_one(pair: Rig, matcher: str) -> None:
-    usual = error_components().matchers[matcher]
+    usual = MatcherFindings(**error_components().matchers[matcher])
     found = MatcherFindings.from_metadata({"matcher": matcher})
     assert found.systematic_rotation_rad == usual.systematic_rotation_rad
     assert found.place_variance == usual.place_variance

@@ -21,7 +21,7 @@ from calibgraph import (
     solve,
 )
 from calibgraph.model.config import TERMS
-from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import error_components
 from calibgraph.solver import objective
 from calibgraph.solver.joint import require_in_reach, solve_joint
 from calibgraph.trust.thresholds import threshold

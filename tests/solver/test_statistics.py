@@ -14,7 +14,7 @@ import calibgraph
 from calibgraph import Config, Correspondences, MatcherErrors, Rig, simulate_correspondences
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import relative_covariance
-from calibgraph.model.lens_knowledge import LensSigmas
+from calibgraph.model.lens import LensSigmas
 from calibgraph.solver.joint import solve_joint
 from tests.draws.lenses import put_lens_error, with_known_lenses
 from tests.draws.places import draw_places

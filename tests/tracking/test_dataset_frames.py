@@ -27,8 +27,8 @@ from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.model.config import Tracking as Settings
 from calibgraph.tracking import command, dataset_frames
 from calibgraph.tracking.command import Tracking, track
+from calibgraph.trust.evidence import RunEvidence
 from calibgraph.trust.pose_posterior import PosePosterior, no_posteriors
-from calibgraph.trust.run_evidence import RunEvidence
 from tests.conftest import stereo_relative_pose
 from tests.tracking.drives import FRAMES, Crashed, World, drive, flat, pair_of
 

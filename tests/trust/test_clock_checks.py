@@ -21,15 +21,15 @@ from calibgraph.model.geometry import invert
 from calibgraph.model.verdict import Check
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.joint import solve_joint
-from calibgraph.trust.clock_checks import (
+from calibgraph.trust.evidence import RunEvidence
+from calibgraph.trust.inputs import motion_doubts
+from calibgraph.trust.lens_checks import (
     _with_known_motion,
     check_offset,
     fit_offset,
     image_offset_checks,
 )
 from calibgraph.trust.lens_parameter import RESIDUALS, LensParameter
-from calibgraph.trust.motion_checks import motion_doubts
-from calibgraph.trust.run_evidence import RunEvidence
 from factors import Clock
 from tests.conftest import make_pair
 from tests.draws.clocks import draw_twists, put_clock_error

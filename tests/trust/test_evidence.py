@@ -26,8 +26,8 @@ from calibgraph import (
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pair_refinement import fit_pairs
+from calibgraph.trust.agreement import PairAgreement, check_agreement, pair_agreement
 from calibgraph.trust.evidence import Evidence
-from calibgraph.trust.pair_agreement import PairAgreement, check_agreement, pair_agreement
 from factors import pose_sigmas
 from tests.conftest import stereo_relative_pose
 from tests.solver.test_camera_pairs import simulated_pairs
@@ -149,7 +149,6 @@ def test_a_moved_camera_disagrees_by_its_motion(pair: Rig) -> None:
     found = agreement(pair.moved_to({"right": moved}), simulated_pairs(pair), COVARIANCE)
     assert found.degrees == pytest.approx(0.5, abs=0.1)
     assert found.sigmas > 4
-    assert found.residual_px > 5 * found.least_px
 
 
 def test_swapped_images_disagree_by_twice_the_baseline(pair: Rig) -> None:
@@ -158,16 +157,6 @@ def test_swapped_images_disagree_by_twice_the_baseline(pair: Rig) -> None:
     found = agreement(pair, swapped, COVARIANCE)
     assert found.centimetres == pytest.approx(100, abs=10)
     assert found.sigmas > 10
-
-
-def test_wrong_intrinsics_leave_residuals_that_no_place_explains(pair: Rig) -> None:
-    table, right = simulated_pairs(pair), pair.cameras["right"]
-    k = right.intrinsics_px
-    zoomed = right.model_copy(
-        update={"intrinsics_px": k.model_copy(update={"fx": 1.03 * k.fx, "fy": 1.03 * k.fy})}
-    )
-    wrong = pair.model_copy(update={"cameras": {**pair.cameras, "right": zoomed}})
-    assert agreement(wrong, table, None).least_px > 1.5 * agreement(pair, table, None).least_px
 
 
 def judged(truth: Rig, seen: Rig, matches: CameraMatches | None) -> Calibration:
@@ -191,7 +180,7 @@ def test_the_verdict_names_a_pair_whose_images_disagree(pair: Rig) -> None:
 
 
 def disagreement(a: str, b: str, sigmas: float) -> PairAgreement:
-    return PairAgreement(a, b, 0.3, 10.0, sigmas, 1.0, 0.5, 100)
+    return PairAgreement(a, b, 0.3, 10.0, sigmas)
 
 
 def test_a_camera_that_disagrees_with_all_its_neighbours_is_the_one_that_is_wrong() -> None:

@@ -22,7 +22,7 @@ from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.image_checks import check_images, evidence_checks, pairing_checks
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
 from calibgraph.trust.image_record import RunChecks, to_metadata
-from calibgraph.trust.joined_clouds import displacement_of_parts
+from calibgraph.trust.inputs import displacement_of_parts
 from calibgraph.trust.pose_posterior import PosePosterior
 from tests.conftest import SAMPLE, make_pair
 from tests.trust.conftest import simulated

@@ -14,11 +14,9 @@ from calibgraph import Camera, Dataset, Rig
 from calibgraph.io.frame import Frame
 from calibgraph.model.places import Places
 from calibgraph.solver.camera_twist import apply_twist
-from calibgraph.trust import lens_evidence
-from calibgraph.trust.frame_scores import WIDE, FrameScorer
+from calibgraph.trust import image_evidence
 from calibgraph.trust.image_checks import evidence_checks
-from calibgraph.trust.image_evidence import ImageEvidence
-from calibgraph.trust.lens_evidence import measure_lens
+from calibgraph.trust.image_evidence import WIDE, FrameScorer, ImageEvidence, measure_lens
 from calibgraph.trust.lens_parameter import (
     NAMES,
     Free,
@@ -106,7 +104,7 @@ def test_the_lens_is_applied_to_points_where_they_are_when_they_are_seen(
     def see(_: Camera, points_m: np.ndarray) -> np.ndarray:
         raise _Seen(points_m)
 
-    monkeypatch.setattr(lens_evidence, "lens_fields_px", see)
+    monkeypatch.setattr(image_evidence, "lens_fields_px", see)
     late = truth.model_copy(update={"time_offset_s": 0.05})
     data, twist = calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: late})), np.arange(6.0)
     files = [(f.index, f.name, f.cloud_path, f.image_paths) for f in data.frames[:2]]

@@ -10,7 +10,7 @@ import pytest
 import calibgraph
 from calibgraph import Correspondences, Rig, simulate_correspondences
 from calibgraph.rounds import match_in_rounds
-from calibgraph.trust.rematch_checks import compare_ends
+from calibgraph.trust.matcher_checks import compare_ends
 from tests.conftest import SAMPLE
 
 STATED = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}

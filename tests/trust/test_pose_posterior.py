@@ -13,7 +13,7 @@ from calibgraph import Dataset, Rig, load_dataset, load_rig
 from calibgraph.audit.judgement import Tolerance, judge_camera
 from calibgraph.model.error_sources import FLAT
 from calibgraph.model.geometry import twist_between
-from calibgraph.model.perturbation import perturb
+from calibgraph.model.metrics import perturb
 from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
@@ -24,10 +24,10 @@ from calibgraph.trust.pose_posterior import (
     PosePosterior,
     group_tied,
     measure_posteriors,
+    sample_posterior,
     widen,
 )
 from calibgraph.trust.probability import TABLES, judge
-from calibgraph.trust.tempering import sample_posterior
 from tests.trust.conftest import SAMPLE, simulated
 
 Array = NDArray[np.float64]

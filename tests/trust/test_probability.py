@@ -13,8 +13,14 @@ import numpy as np
 import pytest
 
 from calibgraph import Config, Rig, load_calibration, solve
-from calibgraph.model.threshold import Threshold
-from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, Check, ErrorProbability, Verdict
+from calibgraph.model.verdict import (
+    FAIL_ABOVE,
+    PASS_BELOW,
+    Check,
+    ErrorProbability,
+    Threshold,
+    Verdict,
+)
 from calibgraph.trust.probability import (
     STRUCTURE,
     TABLES,

@@ -20,12 +20,12 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
-from calibgraph.model.error_components import error_components
+from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import twist_between
 from calibgraph.solver.joint import solve_joint
-from calibgraph.trust.competing_solution import check_competing_solution
+from calibgraph.trust.agreement import check_competing_solution
+from calibgraph.trust.matcher_checks import check_repeated_files
 from calibgraph.trust.observability import weakest_direction
-from calibgraph.trust.rematch_checks import check_repeated_files
 from tests.conftest import SAMPLE
 from tests.trust.conftest import named, simulated
 
@@ -191,7 +191,7 @@ CONFIG = Config(learnt_weights=False)
 def five_places(rig: Rig, seed: int = 0) -> Correspondences:
     """As the matcher ``structure`` states them, without the errors that it states."""
     table = simulate_correspondences(rig, frames=15, matches=150, errors=ERRORS, seed=seed)
-    stated = vars(error_components().matchers["structure"])
+    stated = error_components().matchers["structure"]
     return replace(table, metadata={**table.metadata, **stated, "places": PLACES})
 
 

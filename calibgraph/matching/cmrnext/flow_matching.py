@@ -8,7 +8,7 @@ pose. It ranks matches, but is not calibrated: it is no probability.
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -30,8 +30,7 @@ from calibgraph.matching.cmrnext.inputs import (
 )
 from calibgraph.matching.cmrnext.network import CELL, CmrNext, upscale
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.error_components import error_components
-from calibgraph.model.findings import MatcherFindings
+from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.rig import Camera
 
 Maps = NDArray[np.float32]
@@ -235,7 +234,7 @@ class ImageResult:
 
 def to_findings(results: Mapping[str, Sequence[ImageResult]], last: Checkpoint) -> MatcherFindings:
     """Failed frames, in the last round the probes, and the shared error of the last network."""
-    prior = asdict(error_components().matchers["cmrnext"])
+    prior = error_components().matchers["cmrnext"]
     stated = {key: last.config[key] for key in prior if last.config.get(key) is not None}
     return MatcherFindings(
         failed_share={name: float(np.mean([r.failed for r in e])) for name, e in results.items()},

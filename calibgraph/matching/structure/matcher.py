@@ -4,7 +4,6 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from copy import copy
-from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -32,8 +31,7 @@ from calibgraph.matching.structure.window_weights import window_network
 from calibgraph.model.clock import clock_of
 from calibgraph.model.config import LensPart, Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
-from calibgraph.model.error_components import error_components
-from calibgraph.model.findings import STAGE1, MatcherFindings
+from calibgraph.model.findings import STAGE1, MatcherFindings, error_components
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress
@@ -251,7 +249,7 @@ class StructureMatcher:
         reach = SearchRange(self.levels[0].rotation_rad, self.levels[0].translation_m)
         findings = MatcherFindings(
             z_score=z_scores,
-            **asdict(error_components().matchers["structure"]),
+            **error_components().matchers["structure"],
             range_rotation_deg=reach.rotation_deg,
             range_translation_m=reach.translation_m,
         )

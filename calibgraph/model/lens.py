@@ -1,13 +1,17 @@
-"""Parameters of a lens and a clock that were estimated together with the extrinsics."""
+"""Lenses and clocks: what was estimated with the extrinsics, what is known, how two differ."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from calibgraph.arrays import Array
 from calibgraph.model.rig import Camera, IntrinsicsSigma, Rig
+from factors import unproject
 
 _PRIOR_SHARE = 0.9  # of the prior's standard deviation: above, the data have said nothing
 _TIED, _TIED_SHARE = 0.999, 0.5
@@ -21,7 +25,6 @@ _NEEDED = {
     "offset": "turns and changes of speed",
     "readout": "turns and changes of speed",
 }
-"""Of a distortion coefficient: below."""
 _LEAST_S = 1e-6  # that a rig may state
 _LEFT_SIGMAS = 2.0  # from the prior: beyond, they have
 
@@ -67,11 +70,9 @@ class LensEstimate:
     def printed(self) -> tuple[str, str, str, str]:
         """Value, sigma, prior and its sigma in ``printed_unit``, to two digits of the sigma."""
         scale = 1e3 if self.unit == "s" else 1.0
-        decimals = max(0, 1 - math.floor(math.log10(scale * self.sigma)))
-        value, sigma, prior, prior_sigma = (
-            f"{scale * number:.{decimals}f}"
-            for number in (self.value, self.sigma, self.prior, self.prior_sigma)
-        )
+        places = max(0, 1 - math.floor(math.log10(scale * self.sigma)))
+        numbers = np.multiply(scale, (self.value, self.sigma, self.prior, self.prior_sigma))
+        value, sigma, prior, prior_sigma = (f"{number:.{places}f}" for number in numbers)
         return value, sigma, prior, prior_sigma
 
     @property
@@ -91,13 +92,8 @@ class LensEstimate:
         pair = f"with {self.direction} {self.correlation:.2f}" if self.correlation > _NONE else ""
         if self.is_determined:
             return pair
-        undetermined = f"not determined by these data; record {self.needed}"
-        return "; ".join(filter(None, (undetermined, pair)))
-
-    @property
-    def needed(self) -> str:
-        """What to record, so that the data determine it."""
-        return _NEEDED.get(self.name, "matches near the corners of the image")
+        needed = _NEEDED.get(self.name, "matches near the corners of the image")
+        return "; ".join(filter(None, (f"not determined by these data; record {needed}", pair)))
 
 
 POSE_PARAMETERS = tuple(
@@ -164,3 +160,89 @@ def change_of_lens(
         for new, old in zip(parameters, before.get(name, parameters), strict=True)
     ]
     return max(changes, default=0.0)
+
+
+class LensSigmas(NamedTuple):
+    """Standard deviations of a lens where the rig states none.
+
+    Of the logarithm of both focal lengths, of each coordinate of the centre [px],
+    and of radial coefficients; tangential ones have ``TANGENTIAL_SHARE`` of these.
+    """
+
+    focal: float
+    centre_px: float
+    radial: float
+
+    @staticmethod
+    def calibrated(camera: Camera) -> LensSigmas:
+        """Of a lens that was calibrated with a target: 0.2 %; of 1000 px, a centre to 2 px."""
+        share = _CALIBRATED
+        return LensSigmas(share, share * camera.intrinsics_px.fx, share)
+
+    def state_in(self, camera: Camera) -> Camera:
+        """A camera with these sigmas, unless it states its own."""
+        if camera.intrinsics_sigma_px is not None or camera.model == "equirectangular":
+            return camera
+        focal_px = round(self.focal * camera.intrinsics_px.fx, 2)
+        sigma = IntrinsicsSigma(focal=focal_px, centre=round(self.centre_px, 2))
+        radial = camera.distortion_sigma or self.radial
+        return camera.model_copy(update={"intrinsics_sigma_px": sigma, "distortion_sigma": radial})
+
+
+IN_DOUBT = LensSigmas(0.02, 5.0, 0.05)
+"""Of a lens that is estimated, or known from words, a spec sheet or a field of view."""
+_CALIBRATED = 0.002
+
+
+def state_calibrated(rig: Rig) -> Rig:
+    """A rig whose lenses are from a calibration, with the sigmas of one where it states none."""
+    cameras = {n: LensSigmas.calibrated(c).state_in(c) for n, c in rig.cameras.items()}
+    return rig.model_copy(update={"cameras": cameras})
+
+
+def describe_unstated(rig: Rig) -> str:
+    """The cameras whose lens has no stated sigma, in a clause; empty without any."""
+    names = [
+        name
+        for name, camera in rig.cameras.items()
+        if camera.intrinsics_sigma_px is None and camera.model != "equirectangular"
+    ]
+    if not names:
+        return ""
+    return (
+        f"lens of {', '.join(names)}: counts as calibrated (the rig states no intrinsics_sigma_px)"
+    )
+
+
+def has_other_lens(camera: Camera, other: Camera) -> bool:
+    """Whether two lenses differ, or the sizes of their images."""
+    one, two = (
+        (each.width_px, each.height_px, each.model, each.lens.packed.tolist())
+        for each in (camera, other)
+    )
+    return one != two
+
+
+def corner_distance_px(camera: Camera, other: Camera) -> float:
+    """How far at most two lenses see the ray of a corner of the image apart.
+
+    Infinite where one of them has no such ray, NaN where the images differ in size.
+    """
+    if (camera.width_px, camera.height_px) != (other.width_px, other.height_px):
+        return float("nan")
+    right, bottom = camera.width_px - 1.0, camera.height_px - 1.0
+    corners = np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
+    apart = lens_difference(camera, other, corners)
+    return float(np.nan_to_num(np.hypot(*apart.T), nan=np.inf).max())
+
+
+def lens_difference(camera: Camera, other: Camera, pixels_px: Array) -> Array:
+    """How far another lens, of as large an image, sees the rays of (n, 2) pixels from them.
+
+    Returns:
+        (n, 2) pixels of the other lens less these; NaN where a lens has no such ray.
+    """
+    rays, known = unproject(camera.lens, pixels_px)
+    seen, valid = other.lens.project(rays)
+    known &= valid
+    return np.asarray(np.where(known[:, None], other.lens.subtract(seen, pixels_px), np.nan))

@@ -1,8 +1,9 @@
-"""Whether images are taken when their clouds are: the posterior of a free offset.
+"""Whether lens and clock are right, by matches: the posteriors of a free lens, and a free offset.
 
-Matches follow a wrong time as they follow a wrong pose, so the matcher matches again with the
-offset free, and pose and offset are fitted to these matches. Where the motion of the LiDAR is not
-known, neighbouring clouds are registered; without stamps they are taken to be 0.1 s apart.
+Wrong intrinsics leave a pattern in the residuals. Matches follow a wrong time as they follow a
+wrong pose, so the matcher matches again with the offset free, and pose and offset are fitted to
+these matches. Where the motion of the LiDAR is not known, neighbouring clouds are registered;
+without stamps they are taken to be 0.1 s apart.
 
 A constant motion straight ahead is equivalent to a camera that is mounted further ahead.
 """
@@ -25,19 +26,22 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.model.verdict import TOLERANCE, Check
+from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_twist import free_fields_px
-from calibgraph.solver.linear_fit import block_of, fit_camera
-from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.solver.linear_fit import Freed, LinearFit, block_of, fit_camera
+from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
+from calibgraph.trust.inputs import INTERVAL_S, MAX_FRAMES, registered_twists
 from calibgraph.trust.lens_parameter import (
     IMAGES,
     RESIDUALS,
     TIME,
+    Free,
     LensParameter,
     check_parameter,
+    lens_fields_px,
+    units_of,
 )
-from calibgraph.trust.motion_checks import INTERVAL_S, MAX_FRAMES, registered_twists
-from calibgraph.trust.run_evidence import RunEvidence
-from calibgraph.trust.thresholds import limit
+from calibgraph.trust.thresholds import limit, threshold
 from factors import FreeLens
 from factors.free_lens import CLOCK, OFFSET
 
@@ -105,10 +109,8 @@ def _motion_options(dataset: Dataset) -> str:
 def _fit_cameras(
     rig: Rig, table: Correspondences, findings: MatcherFindings
 ) -> list[tuple[str, LensParameter]]:
-    fits = (
-        (name, fit_offset(camera, table.of_camera(name), findings.place_variance))
-        for name, camera in rig.cameras.items()
-    )
+    rows = ((name, camera, table.of_camera(name)) for name, camera in rig.cameras.items())
+    fits = ((n, fit_offset(camera, own, findings.place_variance)) for n, camera, own in rows)
     return [(name, fit) for name, fit in fits if fit is not None]
 
 
@@ -131,7 +133,7 @@ def fit_offset(
     """Pose and offset by one camera's matches; None of too few matches or frames.
 
     Args:
-        camera: lens, clock, and the extrinsic of the result.
+        camera: at the result.
         table: its rows, with the motion of the LiDAR.
         place_variance: of what the matches of a place share, over that of independent ones.
     """
@@ -168,3 +170,61 @@ def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
         if frame.index in found or frame.twist_per_s is not None
     ]
     return dataset.only(frames) if len(frames) >= MIN_FRAMES else None, bool(found)
+
+
+_NUMBERS = {
+    "focal length": (Free.FOCAL,),
+    "principal point": (Free.CENTRE_X, Free.CENTRE_Y),
+    "distortion": (Free.RADIAL,),
+    "aspect ratio": (Free.ASPECT,),
+}
+_MAX_MATCHES = 20_000  # evenly chosen: bounds the time
+
+
+def intrinsics_checks(evidence: Evidence) -> Checks:
+    """Whether wrong intrinsics explain the residuals, and how much depends on the focal length.
+
+    By all matches, not only those within the gate. The variance of what the frames of a place share
+    is taken for at least that of a small share of each match. Of a panorama the format determines
+    the lens.
+    """
+    evidence = evidence.of_correspondences
+    cameras = evidence.solution.solved_rig.cameras
+    names = [n for n in evidence.fitted_blocks if cameras[n].model != "equirectangular"]
+    checks = map_on_cores(lambda name: _check_camera(evidence, name), names)
+    return dict(zip(names, checks, strict=True))
+
+
+def _check_camera(evidence: Evidence, name: str) -> list[Check]:
+    solution, block = evidence.solution, evidence.fitted_blocks[name]
+    camera, places = solution.solved_rig.cameras[name], solution.correspondences.places
+    of_place = places.frames_per_place(block.frame_numbers) * evidence.findings.place_variance
+    some = block.select_evenly(_MAX_MATCHES)
+    seen = some.select(some.errors_px(camera.T_camera_lidar)[1])
+    fit = fit_camera(
+        camera,
+        seen,
+        lens_fields_px(camera, seen.block.points_lidar_m),
+        loss_scale=solution.scales[name].loss_scale,
+        shared_variance=max(of_place, limit("lens_match_share") * len(some)),
+    )
+    if fit is None:
+        return []
+    units = units_of(camera)
+    freed = _free_each(fit)
+    found = (LensParameter.of(n, units[[*numbers]], freed[n]) for n, numbers in _NUMBERS.items())
+    checks = [check_parameter(each, RESIDUALS, solution.config.tolerance) for each in found]
+    # A focal length that is wrong by one percent is easily overlooked.
+    compensating = freed["focal length"].compensating
+    moved_m = float(np.linalg.norm(compensating[3:, 0])) / (100 * units[Free.FOCAL])
+    row = threshold("focal_sensitivity", solution.config.tolerance)
+    return [*checks, row.check(100 * moved_m)]
+
+
+def _free_each(fit: LinearFit) -> dict[str, Freed]:
+    """The fit of each parameter; those of as many numbers together."""
+    freed: dict[str, Freed] = {}
+    for count in (1, 2):
+        names = [name for name, numbers in _NUMBERS.items() if len(numbers) == count]
+        freed |= zip(names, fit.free_each([_NUMBERS[name] for name in names]), strict=True)
+    return freed

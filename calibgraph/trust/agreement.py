@@ -1,0 +1,235 @@
+"""Whether parts agree: cameras by their images, left-out matches, and places with each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibgraph.arrays import Array
+from calibgraph.graph.by_place import place_of
+from calibgraph.model.findings import error_components
+from calibgraph.model.geometry import (
+    pose_difference,
+    relative_covariance,
+    relative_transform,
+    twist_between,
+)
+from calibgraph.model.rig import Rig
+from calibgraph.model.verdict import Check, Threshold
+from calibgraph.solver.camera_block import CameraBlock, camera_block
+from calibgraph.solver.error_model import ErrorFit
+from calibgraph.solver.pair_refinement import PairFit
+from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
+from calibgraph.solver.solution import Solution
+from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.trust.thresholds import limit, threshold
+
+ONE_POSE_DEG, ONE_POSE_CM = 0.1, 1.0
+"""Housings do not fit closer; two results of one device's images end as near."""
+
+BLAME_SIGMAS = 1.0
+"""Factor by which one camera of a pair must disagree more with its other neighbours than the other
+one with its own, to be taken for the one that is wrong."""
+
+
+@dataclass(frozen=True)
+class PairAgreement:
+    """The relative pose of cameras a and b from images against the calibration.
+
+    ``degrees`` and ``centimetres`` are between the two T_b_a. ``sigmas`` is the largest difference
+    along an axis of b, in standard deviations; NaN where the calibration has no covariance.
+    """
+
+    a: str
+    b: str
+    degrees: float
+    centimetres: float
+    sigmas: float
+
+
+def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
+    """Whether the correspondences place the cameras relative to each other as the images do."""
+    own = evidence.of_correspondences
+    if evidence.solution.camera_matches is None or evidence.solution.before_pairs is None:
+        return {}
+    mount = own.solution.marginals.mount
+    rig = own.solution.rig.moved_to(mount.T_camera_lidar)
+    covariance = own.solution.marginals.known_or_prior(mount.covariance)
+    found = [
+        pair_agreement(rig, fit, covariance)
+        for fit in own.pair_fits
+        if own.fitted_blocks.keys() >= {fit.a, fit.b}
+    ]
+    return {
+        name: [check_agreement(one, name, found) for one in found if name in (one.a, one.b)]
+        for name in own.cameras
+    }
+
+
+def one_pose_checks(evidence: Evidence) -> dict[str, list[Check]]:
+    """Cameras that end at one pose, unless the rig ties them there: have they one device's images?
+
+    Nothing else in a result shows it: images have the pose of the device that took them.
+    """
+    rig, checks = evidence.solution.rig, dict[str, list[Check]]()
+    T = evidence.solution.T_camera_lidar
+    tied = {frozenset((one.a, one.b)) for one in rig.relative_poses if _is_one_pose(one.T_a_b)}
+    for a, b in combinations(T, 2):
+        if not _is_one_pose(relative_transform(T[a], T[b])) or {a, b} in tied:
+            continue
+        degrees, centimetres = pose_difference(T[a], T[b])
+        text = (
+            f"{a} and {b} end {degrees:.2g} deg, {centimetres:.2g} cm from each other: have they "
+            "the images of one device? If they are mounted so, state it in relative_poses"
+        )
+        for name in (a, b):
+            check = Check("cameras at one pose", "WARN", text, kind="one_pose")
+            checks.setdefault(name, []).append(check)
+    return checks
+
+
+def _is_one_pose(T_a_b: Array) -> bool:
+    degrees, centimetres = pose_difference(T_a_b, np.eye(4))
+    return degrees <= ONE_POSE_DEG and centimetres <= ONE_POSE_CM
+
+
+def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairAgreement]) -> Check:
+    """The check of one camera of a pair, which other pairs may show to be the other's fault."""
+    row, name = threshold("pair_agreement"), f"relative pose of {found.a} and {found.b} by images"
+    status, other = row.grade(found.sigmas), found.b if camera == found.a else found.a
+    text = (
+        f"images and correspondences contradict each other on the pose of {found.a} to {found.b} "
+        f"by {found.degrees:.2g} deg, {found.centimetres:.2g} cm, {found.sigmas:.3g} sigma"
+    )
+    own, of_other = (_elsewhere(one, found, all_found) for one in (camera, other))
+    if status == "PASS" or not of_other > max(row.warn, own + BLAME_SIGMAS):
+        text += "" if status == "PASS" else f": {row.advice}"
+        return row.describe(found.sigmas, status, text, name=name)
+    text += f": by its other pairs ({of_other:.3g} sigma) it is {other} that is wrong"
+    return row.describe(own, "WARN", text, name=name)
+
+
+def _elsewhere(camera: str, pair: PairAgreement, found: Sequence[PairAgreement]) -> float:
+    """Sigmas by which a camera disagrees with the cameras outside a pair; 0 without others."""
+    others = [one for one in found if one is not pair and camera in (one.a, one.b)]
+    return max((one.sigmas for one in others), default=0.0)
+
+
+def pair_agreement(rig: Rig, fit: PairFit, covariance: Array | None) -> PairAgreement:
+    """A pair by its images, A held near the calibration, against one that has not used them.
+
+    Args:
+        rig: mounts at the calibration.
+        fit: of the pair.
+        covariance: (6 N, 6 N) of the calibration, in the rig's order; None if unknown.
+    """
+    before = rig.T_camera_lidar
+    T_b_a = relative_transform(before[fit.b], before[fit.a])
+    degrees, centimetres = pose_difference(fit.T_b_a, T_b_a)
+    sigmas = float("nan")
+    if covariance is not None:
+        first, second = (tuple(rig.cameras).index(name) for name in (fit.a, fit.b))
+        own = relative_covariance(covariance, first, second, T_b_a)
+        variances = np.diag(own) + np.diag(fit.covariance)
+        sigmas = float(np.max(np.abs(twist_between(fit.T_b_a, T_b_a)) / np.sqrt(variances)))
+    return PairAgreement(fit.a, fit.b, degrees, centimetres, sigmas)
+
+
+_FEWEST_ITERATIONS = 50  # of MAGSAC, which also polishes its result
+_MISSED = 1e-6  # probability that no sample of a competing solution large enough to count is clean
+
+
+def competing_solution_checks(evidence: Evidence) -> Checks:
+    """Whether the matches that a solution leaves out agree on another extrinsic."""
+    solution = evidence.of_correspondences.solution
+    return {name: [check_competing_solution(solution, name)] for name in evidence.fitted_blocks}
+
+
+def check_competing_solution(solution: Solution, camera: str) -> Check:
+    """Ratio of the matches that agree on another extrinsic alone to those on this one alone."""
+    row, tolerance = threshold("competing_solution"), solution.config.tolerance
+    block, gate_px = _of_all_frames(solution, camera), solution.scales[camera].gate_px
+    ours = block.within_gate(solution.T_camera_lidar[camera], gate_px)
+    left_out = block.block.select(~ours)
+    T = None
+    if len(left_out):
+        iterations = _ransac_iterations(row.warn * int(ours.sum()), len(left_out))
+        T = frame_pose(
+            solution.rig.cameras[camera], left_out, solution.config, iterations=iterations
+        )
+    if T is None:
+        return row.describe(0.0, "PASS", f"{row.name}: none")
+    theirs = block.within_gate(T, gate_px)
+    degrees, centimetres = pose_difference(T, solution.T_camera_lidar[camera])
+    same = degrees < limit("competing_rotation", tolerance)
+    same = same and centimetres < limit("competing_translation", tolerance)
+    only_theirs, only_ours = int((theirs & ~ours).sum()), int((ours & ~theirs).sum())
+    share = 0.0 if same else only_theirs / max(only_ours, 1)
+    advice = f"the other is {degrees:.2g} deg, {centimetres:.2g} cm away; which one is right?"
+    return row.check(share, advice=advice)
+
+
+def _of_all_frames(solution: Solution, camera: str) -> CameraBlock:
+    """All matches of a camera, outlier frames included: they may agree on another pose."""
+    if not solution.counts[camera]["outlier_frames"]:
+        return solution.objective.blocks[camera]
+    rows = solution.correspondences.of_camera(camera)
+    return camera_block(solution.rig.cameras[camera], rows, solution.config)
+
+
+def _ransac_iterations(fewest: float, matches: int) -> int:
+    """Samples of 4 matches that find a competing solution if it is large enough for a warning."""
+    share = min(fewest / 2 / matches, 0.99)
+    needed = math.log(_MISSED) / math.log1p(-(share**4)) if share > 0 else math.inf
+    return int(min(max(needed, _FEWEST_ITERATIONS), RANSAC_ITERATIONS))
+
+
+def place_checks(evidence: Evidence) -> Checks:
+    """Whether any place contradicts the others, where there are enough to tell which."""
+    errors = evidence.solution.marginals.errors
+    if errors is None or len(errors.places) < error_components().robust_places:
+        return {}
+    return {name: _check_places(evidence, errors, name) for name in errors.model.blocks}
+
+
+def _check_places(evidence: Evidence, errors: ErrorFit, camera: str) -> list[Check]:
+    """The place that agrees least: by its distance, and by its inliers.
+
+    The distance is that of the camera or of the cloud there from where they are elsewhere; the
+    share of the matches within the gate counts over its median at the other places.
+    """
+    before, after = evidence.fitted_blocks[camera], evidence.solution.inliers.blocks[camera]
+    cameras = tuple(errors.model.cameras)
+    distances = errors.fit.linear.distances[:, [0, 1 + cameras.index(camera)]].max(axis=1)
+    kept, given = (_count(block, errors.places) for block in (after, before))
+    seen = np.flatnonzero(given)
+    if len(seen) < 2:  # noqa: PLR2004
+        return []
+    shares = kept[seen] / given[seen]
+    others = [max(np.median(np.delete(shares, index)), 1e-9) for index in range(len(seen))]
+    worst = (
+        ("place_distance", int(np.argmax(distances[seen])), distances[seen]),
+        ("place_inliers", int(np.argmin(shares / others)), shares / others),
+    )
+    return [
+        _check_place(threshold(key), float(values[at]), int(seen[at]), errors.places[seen[at]])
+        for key, at, values in worst
+    ]
+
+
+def _count(block: CameraBlock, places: Sequence[NDArray[np.int64]]) -> Array:
+    """(P,) correspondences at each place."""
+    place = place_of(block.frame_numbers, places)
+    return np.asarray(np.bincount(place, block.frame_counts, len(places)), dtype=np.float64)
+
+
+def _check_place(row: Threshold, value: float, place: int, frames: NDArray[np.int64]) -> Check:
+    first, last = int(frames[0]), int(frames[-1])
+    which = f"frame {first}" if first == last else f"frames {first} to {last}"
+    number = f"{value:.2g} {row.unit}".rstrip()
+    return row.check_in_words(value, f"{row.name}: {number} at place {place + 1} ({which})")
