@@ -12,8 +12,8 @@ from calibgraph.audit.result import ORDER, CameraAudit, LidarAudit, by_unit, lid
 from calibgraph.errors import CalibrationError
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.image_times import IMAGE_TIMES
 from calibgraph.model.result_files import CALIBRATION_FILE
+from calibgraph.model.rig import IMAGE_TIMES
 
 
 @dataclass(frozen=True, eq=False)

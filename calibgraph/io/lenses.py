@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model
-from calibgraph.model.lens_names import KNOWN, find_lens_model, plain_key
-from calibgraph.model.rig import Intrinsics
+from calibgraph.model.rig import KNOWN_LENSES, Intrinsics, find_lens_model, plain_key
 from factors import LensModel
 from factors.lens import COEFFICIENTS, ORDERS
 from factors.wide_lenses import check_mirror
@@ -74,7 +73,7 @@ def lens_model(name: str, where: Path | str) -> LensModel:
     if found is None:
         raise FileError(
             where,
-            f"lens model {name!r} is none of calibgraph's, which are {KNOWN}; calibrate the "
+            f"lens model {name!r} is none of calibgraph's, which are {KNOWN_LENSES}; calibrate the "
             "intrinsics with one of these",
         )
     return found

@@ -286,19 +286,16 @@ class Calibration:
         with written_together(path.parent, last=path.name) as new:
             content = self._to_mapping()
             for name, table in tables.items():
-                content[f"{Path(name).stem}_sha256"] = self._save_table(table, new / name)
+                key = f"{Path(name).stem}_sha256"
+                content[key] = None
+                if table is not None:
+                    metadata = {**table.metadata, result_files.VERDICT_KEY: self.verdict.status}
+                    replace(table, metadata=metadata).save(new / name)
+                    content[key] = sha256(new / name)
             write_yaml(new / path.name, content)
         for name in (name for name, table in tables.items() if table is None):
             path.with_name(name).unlink(missing_ok=True)  # of an older result
         return path
-
-    def _save_table(self, table: Correspondences | CameraMatches | None, path: Path) -> str | None:
-        """Write a table with the verdict in its metadata; its SHA-256."""
-        if table is None:
-            return None
-        verdict = {result_files.VERDICT_KEY: self.verdict.status}
-        replace(table, metadata=table.metadata | verdict).save(path)
-        return sha256(path)
 
     def __repr__(self) -> str:
         return f"Calibration({self.verdict.status}; {', '.join(self.rig.cameras)})"

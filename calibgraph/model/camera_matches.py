@@ -57,13 +57,11 @@ class CameraMatches:
     def __post_init__(self) -> None:
         n = len(self.frame)
         for name, shape in _SHAPES.items():
-            found = getattr(self, name).shape
-            if found != (n, *shape):
-                raise CorrespondenceError(
-                    f"{name} has shape {found}, expected {(n, *shape)} like the column frame"
-                )
-        for name in _SHAPES:
             view = getattr(self, name).view()
+            if view.shape != (n, *shape):
+                raise CorrespondenceError(
+                    f"{name} has shape {view.shape}, expected {(n, *shape)} like the column frame"
+                )
             view.flags.writeable = False
             object.__setattr__(self, name, view)
         self._check_values()
@@ -128,16 +126,10 @@ class CameraMatches:
         }
         columns["frame"] = self.frame
         columns |= dict(zip(NUMBERS, self.pixels_px.reshape(-1, 4).T, strict=True))
-        columns |= {
-            name: pa.array(column, from_pandas=True)  # a NaN becomes an empty cell
-            for name, column in zip(PLANES, self.planes_lidar_per_m.reshape(-1, 6).T, strict=True)
-        }
-        metadata = {
-            "format": FORMAT,
-            "cameras": json.dumps(self.cameras),
-            "matcher": json.dumps(self.metadata),
-        }
-        return pa.table(columns).replace_schema_metadata(metadata)
+        for name, column in zip(PLANES, self.planes_lidar_per_m.reshape(-1, 6).T, strict=True):
+            columns[name] = pa.array(column, from_pandas=True)  # a NaN becomes an empty cell
+        stated = {"cameras": json.dumps(self.cameras), "matcher": json.dumps(self.metadata)}
+        return pa.table(columns).replace_schema_metadata({"format": FORMAT, **stated})
 
     def _check_values(self) -> None:
         index, count = self.camera_index, len(self.cameras)

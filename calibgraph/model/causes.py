@@ -24,11 +24,7 @@ _FRAMES = "Look at the frames that disagree: leave out those in which a sensor m
 _SPREAD = "Give more matches, spread over the image and over distances."
 _LEARNED = "Use the matcher structure."
 
-_ESTIMATED_AS = {
-    "focal_length": "focal",
-    "distortion": "distortion",
-    "principal_point": "centre",
-}
+_ESTIMATED_AS = {"focal_length": "focal", "distortion": "distortion", "principal_point": "centre"}
 
 # fmt: off
 CAUSES: dict[str, Cause] = {

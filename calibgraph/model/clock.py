@@ -94,9 +94,7 @@ def at_pixels(camera: Camera, rows: Correspondences) -> Correspondences:
 def when_taken(camera: Camera, twist_per_s: Array | None) -> Camera:
     """The camera where it is when it takes the middle row, in the frame of the cloud.
 
-    Args:
-        camera: on the LiDAR.
-        twist_per_s: (6,) of the LiDAR, rotation [rad/s] and translation [m/s]; None: unknown.
+    By the (6,) twist of the LiDAR, rotation [rad/s] and translation [m/s]; None: unknown.
     """
     if twist_per_s is None or not camera.time_offset_s:
         return camera
@@ -111,9 +109,6 @@ def seen_at_rows(camera: Camera, points_lidar_m: Array, twist_per_s: Array | Non
         camera: where it is when it takes the middle row, see :func:`when_taken`.
         points_lidar_m: (w, l, 3), w bundles; all points of one are seen as late as its first.
         twist_per_s: (6,) of the LiDAR; None: unknown.
-
-    Returns:
-        (w, l, 3) in the LiDAR frame.
     """
     if twist_per_s is None or not camera.readout_s:
         return points_lidar_m

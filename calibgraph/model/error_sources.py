@@ -67,10 +67,8 @@ class ErrorSources:
     """The sources of one camera's error bar, about its worst axis and along its worst axis.
 
     Attributes:
-        rotation_deg: standard deviation about the axis where it is largest.
-        translation_cm: the same along an axis.
-        rotation: share of each source in the variance; they add up to 1.
-        translation: the same shares for the translation.
+        rotation_deg, translation_cm: standard deviation about and along the worst axis.
+        rotation, translation: share of each source in the variance; they add up to 1.
         forecast: the error bar [deg, cm] with that factor more frames and places.
     """
 
@@ -94,8 +92,7 @@ class ErrorSources:
     def action(self, tolerance: tuple[float, float]) -> str:
         """The action that shrinks the error bar enough for a PASS, in one sentence; empty if it is.
 
-        Args:
-            tolerance: rotation [deg] and distance [cm].
+        For a tolerance of rotation [deg] and distance [cm].
         """
         bar = self._larger(tolerance)
         if bar.sigma <= NEEDED * bar.tolerance:
@@ -108,14 +105,14 @@ class ErrorSources:
         for source, advice in _ADVICE.items():
             if bar.shares.get(source, 0.0) > _MOST:
                 return advice
-        enough = (times for times, both in self.forecast.items() if _is_enough(both, tolerance))
-        times = next(enough, MOST_TIMES)
-        if times < MOST_TIMES:
+        enough = [
+            times
+            for times, (deg, cm) in self.forecast.items()
+            if deg <= NEEDED * tolerance[0] and cm <= NEEDED * tolerance[1]
+        ]
+        if enough and enough[0] < MOST_TIMES:
             places = ", at more places" if bar.shares.get(PLACES, 0.0) > _MENTIONED else ""
-            return f"Record {times} times as many frames{places}."
-        return self._limited(bar)
-
-    def _limited(self, bar: _Bar) -> str:
+            return f"Record {enough[0]} times as many frames{places}."
         best = self.forecast.get(MOST_TIMES, (self.rotation_deg, self.translation_cm))
         least = in_unit(best[0] if bar.unit == "deg" else best[1], bar.unit, 2)
         return (
@@ -137,18 +134,10 @@ class _Bar(NamedTuple):
     tolerance: float
 
 
-def _is_enough(error_bar: tuple[float, float], tolerance: tuple[float, float]) -> bool:
-    return all(one <= NEEDED * most for one, most in zip(error_bar, tolerance, strict=True))
-
-
 def left_out(config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool) -> str:
     """The errors that the bars leave out: relative poses show the clouds' scale.
 
-    Args:
-        config: what was estimated, and of what the poses are.
-        rig: what it states of the cameras' times; its relative poses.
-        has_new_lens: whether parts of lenses or clocks were estimated.
-        motion_known: whether the correspondences come with the LiDAR's motion.
+    By what was estimated, what the rig states of times, and whether the LiDAR's motion is known.
     """
     free = has_new_lens and {*config.estimate} - {"offset", "readout"}
     lens = "other intrinsics" if free else "intrinsics"

@@ -171,15 +171,13 @@ def adjoint_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
 
 
 def adjoints(T_a_b: Array) -> Array:
-    """(f, 6, 6) Ad(T_a_b): twists in b, rotation first, to the same in a.
-
-    Args:
-        T_a_b: (f, 4, 4).
-    """
-    R = T_a_b[:, :3, :3]
+    """(f, 6, 6) Ad(T_a_b) of (f, 4, 4): twists in b, rotation first, to the same in a."""
+    R, crosses = T_a_b[:, :3, :3], np.zeros((len(T_a_b), 3, 3))
+    crosses[:, 2, 1], crosses[:, 0, 2], crosses[:, 1, 0] = x, y, z = T_a_b[:, :3, 3].T
+    crosses[:, 1, 2], crosses[:, 2, 0], crosses[:, 0, 1] = -x, -y, -z
     Ad = np.zeros((len(R), 6, 6))
     Ad[:, :3, :3] = Ad[:, 3:, 3:] = R
-    Ad[:, 3:, :3] = crosses(T_a_b[:, :3, 3]) @ R
+    Ad[:, 3:, :3] = crosses @ R
     return Ad
 
 
@@ -200,20 +198,10 @@ def retract_all(T_camera_lidar: Array, steps: Array) -> Array:
 def local_coordinates(T_camera_lidar: Array, T_lidar_camera: Array) -> Array:
     """(f, 6) tangents from one variable to others, as GTSAM's ``localCoordinates``.
 
-    Args:
-        T_camera_lidar: (4, 4) of the one, inverted.
-        T_lidar_camera: (f, 4, 4) of the others.
+    From a (4, 4), which is inverted, to (f, 4, 4).
     """
     tangents: Array = logarithms(T_camera_lidar @ T_lidar_camera)
     return tangents
-
-
-def crosses(v: Array) -> Array:
-    """(n, 3, 3) matrices of the cross product with (n, 3) vectors."""
-    found = np.zeros((len(v), 3, 3))
-    found[:, 2, 1], found[:, 0, 2], found[:, 1, 0] = x, y, z = v.T
-    found[:, 1, 2], found[:, 2, 0], found[:, 0, 1] = -x, -y, -z
-    return found
 
 
 def degrees_and_centimetres(covariance: Array) -> tuple[Array, Array]:

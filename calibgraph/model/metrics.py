@@ -63,11 +63,8 @@ class Evaluation:
 
     The pair ``"A->B"`` is T_B_A = T_B_lidar T_A_lidar^-1, which maps coordinates in A to
     coordinates in B; its errors are along the axes of B. ``deviations`` are of the cameras whose
-    reference has a covariance. ``lens_px`` is how far at most the lenses see the ray of a corner of
-    the image apart, of cameras whose lenses differ: infinite where one of them has no such ray, NaN
-    where the images differ in size.
-    ``time_offset_ms`` and ``readout_ms`` are differences of the cameras of which both rigs state
-    them.
+    reference has a covariance. ``lens_px`` is :func:`calibgraph.model.lens.corner_distance_px`, of
+    cameras whose lenses differ; times are differences of those that both rigs state.
     """
 
     cameras: dict[str, PoseError]

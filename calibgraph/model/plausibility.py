@@ -80,7 +80,9 @@ def _intrinsics(camera: Camera) -> Iterator[str]:
 def _distortion(camera: Camera) -> Iterator[str]:
     """Whether the lens reaches the image's border, and at a field angle near that without."""
     covered, reach_deg = _reach(camera)
-    _, plain_deg = _reach(camera.model_copy(update={"distortion": _without_distortion(camera)}))
+    mirror = camera.distortion[:1] if camera.model == "omnidirectional" else ()
+    none = (*mirror, *(0.0,) * (len(camera.distortion) - len(mirror)))
+    _, plain_deg = _reach(camera.model_copy(update={"distortion": none}))
     low, high = _DISTORTED
     if covered < _COVERED_SHARE and reach_deg < _COVERED_DEG:
         found = f"reaches {reach_deg:.3g} deg from its axis and covers {covered:.0%} of the image"
@@ -99,17 +101,8 @@ def _decentring(camera: Camera, reach_deg: float) -> float:
     first = {"pinhole": 2, "omnidirectional": 3}.get(camera.model)
     if first is None:
         return 0.0
-    return (
-        3.0
-        * math.hypot(*camera.distortion[first : first + 2])
-        * math.tan(math.radians(min(reach_deg, _COVERED_DEG)))
-    )
-
-
-def _without_distortion(camera: Camera) -> tuple[float, ...]:
-    """All zeros, but for the shape of an omnidirectional camera's mirror."""
-    mirror = camera.distortion[:1] if camera.model == "omnidirectional" else ()
-    return (*mirror, *(0.0,) * (len(camera.distortion) - len(mirror)))
+    size = 3.0 * math.hypot(*camera.distortion[first : first + 2])
+    return size * math.tan(math.radians(min(reach_deg, _COVERED_DEG)))
 
 
 def _reach(camera: Camera) -> tuple[float, float]:

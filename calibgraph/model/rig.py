@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,6 @@ from calibgraph.arrays import Array
 from calibgraph.errors import RigError
 from calibgraph.files import StrictNumbers, write_yaml
 from calibgraph.model.correspondences import MAX_COORDINATE
-from calibgraph.model.image_times import IMAGE_TIMES, ImageTimes
-from calibgraph.model.lens_names import find_lens_model
 from factors import Lens, LensModel
 from factors.lens import ORDERS
 
@@ -76,11 +74,8 @@ def rigid_transform(value: Any) -> Array:
     return T
 
 
-Transform = Annotated[
-    Array,
-    BeforeValidator(rigid_transform),
-    PlainSerializer(lambda T: T.tolist(), return_type=list),
-]
+_TO_LISTS = PlainSerializer(lambda array: array.tolist(), return_type=list)
+Transform = Annotated[Array, BeforeValidator(rigid_transform), _TO_LISTS]
 
 
 def _pose_covariance(value: Any) -> Array:
@@ -102,11 +97,46 @@ def _pose_covariance(value: Any) -> Array:
     return covariance
 
 
-PoseCovariance = Annotated[
-    Array,
-    BeforeValidator(_pose_covariance),
-    PlainSerializer(lambda covariance: covariance.tolist(), return_type=list),
-]
+PoseCovariance = Annotated[Array, BeforeValidator(_pose_covariance), _TO_LISTS]
+
+
+LENS_NAMES: Final[Mapping[LensModel, tuple[str, ...]]] = {
+    "pinhole": (
+        "pinhole", "plumb_bob", "radtan", "rational_polynomial", "radial_tangential", "radial",
+        "rational", "brown", "brown_conrady", "perspective", "opencv", "full_opencv", "standard",
+        "pinhole_radtan", "pinhole_radtan8", "pinhole_full", "pinhole_none", "none",
+    ),
+    "fisheye": (
+        "fisheye", "equidistant", "equi", "kannala_brandt", "opencv_fisheye", "kannala_brandt4",
+        "kannala_brandt8", "kb", "kb4", "kb8", "pinhole_equi", "pinhole_equidistant",
+        "pinhole_fisheye", "equidistant_fisheye", "fisheye_equidistant",
+    ),
+    "omnidirectional": (
+        "omnidirectional", "omni", "omnidir", "mei", "unified", "omni_radtan", "omni_none",
+    ),
+    "equirectangular": ("equirectangular", "panorama", "spherical", "equirect", "panoramic"),
+}  # fmt: skip
+"""Names of ROS, Kalibr, OpenCV, camodocal, COLMAP, Basalt, multical and others; the first is ours.
+Capitals, hyphens, blanks and a `Camera` or `model` at the end do not count."""
+
+KNOWN_LENSES: Final = "; ".join(
+    f"{model} ({', '.join(names[1:6])})" for model, names in LENS_NAMES.items()
+)
+"""The models and their commonest names, for messages."""
+
+
+def plain_key(name: str) -> str:
+    """A name without capitals and punctuation."""
+    return re.sub(r"[\W_]", "", name.lower())
+
+
+_MODELS = {plain_key(name): model for model, names in LENS_NAMES.items() for name in names}
+
+
+def find_lens_model(name: str) -> LensModel | None:
+    """The model here of a name that others give it; None if there is no such model here."""
+    key = plain_key(name)
+    return _MODELS.get(key) or _MODELS.get(re.sub(r"(camera|model|lens)+$", "", key) or key)
 
 
 def _checked_name(name: str) -> str:
@@ -140,12 +170,15 @@ Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Bounded = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=MAX_COORDINATE, allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]
+SecondsSigma = Annotated[float, Field(ge=1e-6, le=10)]
 
 
 class _Model(StrictNumbers):
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
 
+IMAGE_TIMES = "time_offset_s", "time_offset_sigma_s", "readout_s", "readout_sigma_s"
 KNOWLEDGE = "intrinsics_sigma_px", "distortion_sigma", *IMAGE_TIMES
 """Fields of a camera on its times, and how well these and the lens are known."""
 _LEFT_OUT = "covariance", "frame_id", "mount", *KNOWLEDGE
@@ -187,7 +220,7 @@ class Mount(_Model):
         return T
 
 
-class Camera(_Model, ImageTimes):
+class Camera(_Model):
     """One camera: its lens, its image size, and its extrinsic: a guess, or the reference.
 
     ``intrinsics_sigma_px`` and ``distortion_sigma`` (of radial coefficients) are how well the lens
@@ -195,6 +228,9 @@ class Camera(_Model, ImageTimes):
     its optical frame in ROS, as its bag names it, and ``mount`` the link of the robot's tree by
     which it hangs. ``covariance`` is that of a reference with error bars: (6, 6) of xi = (rotation
     [rad], translation [m]) in T_camera_lidar = exp(xi) T, in the camera's axes.
+
+    ``time_offset_s``: how long after the points of a frame the middle row is taken. ``readout_s``:
+    from the first row to the last, of a rolling shutter; negative where the last row is first.
     """
 
     model: Annotated[LensModel, BeforeValidator(_checked_model)] = "pinhole"
@@ -208,25 +244,22 @@ class Camera(_Model, ImageTimes):
     mount: Mount | None = None
     T_camera_lidar: Transform
     covariance: PoseCovariance | None = None
+    time_offset_s: Seconds | None = None
+    time_offset_sigma_s: SecondsSigma | None = None
+    readout_s: Seconds | None = None
+    readout_sigma_s: SecondsSigma | None = None
 
     @model_serializer(mode="wrap")
     def _leave_out_what_is_not_given(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         fields: dict[str, Any] = dump(self)
-        times_last = sorted(fields.items(), key=lambda field: field[0] in IMAGE_TIMES)
-        return {
-            name: value for name, value in times_last if value is not None or name not in _LEFT_OUT
-        }
+        return {n: value for n, value in fields.items() if value is not None or n not in _LEFT_OUT}
 
     @model_validator(mode="after")
-    def _image_fits_into_memory(self) -> Self:
+    def _lens_can_be_built(self) -> Self:
         if self.width_px * self.height_px > MAX_PIXELS:
             raise ValueError(
                 f"{self.width_px}x{self.height_px} px are over {MAX_PIXELS:.0e} pixels"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _lens_can_be_built(self) -> Self:
         _ = self.lens
         return self
 

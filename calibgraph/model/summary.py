@@ -96,9 +96,7 @@ def summarize(
 ) -> Summary:
     """The verdict of a rig, or of one camera, in few words."""
     of_rig, known = rig_verdict(verdicts, named=False), sources or {}
-    tolerance = (
-        TOLERANCE if of_rig.error_probability is None else of_rig.error_probability.tolerance
-    )
+    tolerance = of_rig.error_probability.tolerance if of_rig.error_probability else TOLERANCE
     worst, others = _by_cause(verdicts)
     reasons = sorted([*_unsure(verdicts), *_findings(worst), *_nearest(verdicts)], key=_rank)
     if of_rig.cannot_tell:
@@ -107,17 +105,20 @@ def summarize(
     folded = [*_findings(others), *(reason for reason in reasons if reason not in shown)]
     explained: set[str] = set()  # cameras that FAIL for a worse reason: their bar does not hold
     for at, reason in enumerate(shown):
-        of = [known[name] for name in reason.cameras if name in known and name not in explained]
-        shown[at] = _with_action_for(reason, of, tolerance)
+        of = {n: known[n] for n in reason.cameras if n in known and n not in explained}
+        if of and not CAUSES[reason.cause].action:  # the bar is the reason
+            action = of[_largest(of, tolerance)].action(tolerance)
+            shown[at] = replace(reason, action=action)
         explained.update(n for n in reason.cameras if verdicts[n].status == "FAIL")
     hold = {name: one for name, one in known.items() if verdicts[name].status != "FAIL"}
+    name = _largest(hold, tolerance)
     return Summary(
         of_rig.status,
         of_rig.cannot_tell,
         _error_probabilities(verdicts),
         tuple(shown),
         _actions(shown, verdicts),
-        _error_bar(hold, tolerance),
+        f"Least certain: {name}, {hold[name].describe(tolerance)}" if name else "",
         (*sorted(folded, key=_rank), *_group_sentences(weaknesses or {})),
         tuple(moves),
     )
@@ -132,7 +133,9 @@ def _by_cause(verdicts: Mapping[str, Verdict]) -> tuple[_Checks, _Checks]:
     others: _Checks = {}
     for camera, verdict in verdicts.items():
         causes: set[str] = set()
-        for check in sorted(_unexplained(verdict.checks), key=lambda check: -check.severity):
+        dark = [check for check in verdict.checks if check.name == BRIGHTNESS]
+        # Dark images explain all others, whose advice would be untrue.
+        for check in sorted(dark or verdict.checks, key=lambda check: -check.severity):
             cause = cause_of(check.kind or check.name)
             if check.status != "PASS":
                 (others if cause in causes else worst).setdefault(camera, []).append(check)
@@ -160,22 +163,9 @@ def _actions(reasons: Sequence[Reason], verdicts: Mapping[str, Verdict]) -> tupl
     )
 
 
-def _with_action_for(
-    reason: Reason, sources: Sequence[ErrorSources], tolerance: tuple[float, float]
-) -> Reason:
-    """The reason with the action that shrinks the largest error bar, if the bar is the reason."""
-    if CAUSES[reason.cause].action or not sources:
-        return reason
-    largest = max(sources, key=lambda one: one.over_tolerance(tolerance))
-    return replace(reason, action=largest.action(tolerance))
-
-
-def _error_bar(sources: Mapping[str, ErrorSources], tolerance: tuple[float, float]) -> str:
-    """The camera whose error bar is largest beside the tolerance, and what would help."""
-    if not sources:
-        return ""
-    name = max(sources, key=lambda one: sources[one].over_tolerance(tolerance))
-    return f"Least certain: {name}, {sources[name].describe(tolerance)}"
+def _largest(sources: Mapping[str, ErrorSources], tolerance: tuple[float, float]) -> str:
+    """The camera whose error bar is largest beside the tolerance; empty without any."""
+    return max(sources, key=lambda name: sources[name].over_tolerance(tolerance), default="")
 
 
 def _rank(reason: Reason) -> tuple[int, int]:
@@ -197,26 +187,18 @@ def _unsure(verdicts: Mapping[str, Verdict]) -> list[Reason]:
         if one is not None and one.of_error_bar:
             key = one.status, one.tolerated
             found[key] = (*found.get(key, ()), name)
-    return [
-        Reason(
-            status, names, f"the error bar is too wide for a tolerance of {tolerated}", "error bar"
-        )
-        for (status, tolerated), names in found.items()
-    ]
+    text = "the error bar is too wide for a tolerance of"
+    return [Reason(of[0], names, f"{text} {of[1]}", "error bar") for of, names in found.items()]
 
 
 def _error_probabilities(verdicts: Mapping[str, Verdict]) -> str:
     """The probabilities that cameras are off, the worst first, in one sentence."""
-    found = {
-        n: v.error_probability
-        for n, v in verdicts.items()
-        if v.error_probability and v.error_probability.status != "PASS"
-    }
-    ordered = sorted(found.items(), key=lambda item: (item[1].status, -item[1].probability))
-    if not ordered:
+    found = {n: v.error_probability for n, v in verdicts.items() if v.error_probability}
+    off = [(name, one) for name, one in found.items() if one.status != "PASS"]
+    if not off:
         return ""
-    percents = ", ".join(f"{name} {found.percent}" for name, found in ordered)
-    return f"{ordered[0][1].sentence}: {percents}"
+    off.sort(key=lambda item: (item[1].status, -item[1].probability))
+    return f"{off[0][1].sentence}: {', '.join(f'{name} {one.percent}' for name, one in off)}"
 
 
 def _findings(checks: Mapping[str, Sequence[Check]]) -> list[Reason]:
@@ -230,12 +212,6 @@ def _findings(checks: Mapping[str, Sequence[Check]]) -> list[Reason]:
     return [_reason(each) for each in severest]
 
 
-def _unexplained(checks: Sequence[Check]) -> Sequence[Check]:
-    """The checks without those that dark images explain: their advice would be untrue."""
-    dark = [check for check in checks if check.name == BRIGHTNESS]
-    return dark or checks
-
-
 def _nearest(verdicts: Mapping[str, Verdict]) -> list[Reason]:
     """The check nearest its limit, of each camera that may be off though all its checks PASS."""
     reasons = []
@@ -243,13 +219,11 @@ def _nearest(verdicts: Mapping[str, Verdict]) -> list[Reason]:
         found = verdict.error_probability
         all_pass = all(check.status == "PASS" for check in verdict.checks)
         if found and found.status != "PASS" and not found.of_error_bar and all_pass:
-            check = max(verdict.checks, key=lambda check: check.severity, default=None)
-            if check is not None:
+            for check in sorted(verdict.checks, key=lambda check: -check.severity)[:1]:
                 kind = check.kind or check.name
                 text = f"no check is beyond its limit; nearest to it is {check.text}"
-                reasons.append(
-                    Reason(verdict.status, (name,), text, cause_of(kind), action_of(kind), kind)
-                )
+                cause, action = cause_of(kind), action_of(kind)
+                reasons.append(Reason(verdict.status, (name,), text, cause, action, kind))
     return reasons
 
 

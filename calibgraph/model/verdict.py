@@ -19,28 +19,12 @@ START = "start"
 """Kind of the check of a tracked camera that has no estimate yet."""
 COMMON_ERROR = "common_error"
 """Kind of the check that a table states the error that its frames share."""
-ABOUT_THE_DATA = frozenset(
-    {
-        COMMON_ERROR,
-        "beyond_tolerance",
-        "copies",  # left out
-        "correspondences",
-        "correspondences_used",
-        "difference between even and odd frames",  # too few frames to split
-        "failed_frames",
-        "focal_sensitivity",
-        "frames",
-        "image evidence",
-        "images",
-        "prior_share",
-        "repeated_frames",
-        "sigma_rotation",
-        "sigma_translation",
-        START,
-        "terms",
-        "went_on",
-    }
-)
+ABOUT_THE_DATA = frozenset({
+    COMMON_ERROR, START, "beyond_tolerance", "copies", "correspondences", "correspondences_used",
+    "difference between even and odd frames", "failed_frames", "focal_sensitivity", "frames",
+    "image evidence", "images", "prior_share", "repeated_frames", "sigma_rotation",
+    "sigma_translation", "terms", "went_on",
+})  # fmt: skip
 """Kinds of checks that count data: beyond a limit, nothing seems wrong yet."""
 WENT_ON = "went_on"
 """Kind of the check of a camera whose pose was chosen by the images' posterior: it does not fail,
@@ -89,9 +73,9 @@ class Check:
         """Whether the status is the one that the limits give the value."""
         if self.value is None or self.warn is None or self.fail is None:
             return False
-        if self.warn <= self.fail:
-            return self.status == grade(not self.value <= self.warn, not self.value <= self.fail)
-        return self.status == grade(not self.value >= self.warn, not self.value >= self.fail)
+        sign = 1.0 if self.warn <= self.fail else -1.0
+        value, warn, fail = sign * self.value, sign * self.warn, sign * self.fail
+        return self.status == grade(not value <= warn, not value <= fail)
 
     @property
     def severity(self) -> float:
@@ -133,8 +117,6 @@ class ErrorProbability:
     Attributes:
         by_checks: that it is grossly wrong.
         by_error_bar: that its error bar allows more than the tolerance.
-        tolerance_deg: of the rotation.
-        tolerance_cm: of the position.
         bar_odds: factor of the odds of the second, as it held in cases with a known truth.
     """
 
@@ -164,9 +146,7 @@ class ErrorProbability:
             return f"over {_SURE:.0%}"
         if self.probability < _LEAST:
             return f"<{_LEAST:.1%}"
-        if self.probability < 1 - _SURE:
-            return f"{100 * self.probability:.1f}%"
-        return f"{100 * self.probability:.2g}%"
+        return f"{100 * self.probability:{'.1f' if self.probability < 1 - _SURE else '.2g'}}%"
 
     @property
     def tolerance(self) -> tuple[float, float]:
@@ -279,12 +259,7 @@ class Verdict:
 
 
 def rig_verdict(cameras: Mapping[str, Verdict], *, named: bool = True) -> Verdict:
-    """The verdict of a rig: its worst camera's, with the checks of all, by their names.
-
-    Args:
-        cameras: the verdicts of its cameras.
-        named: let the text of a check begin with the name of its camera.
-    """
+    """The verdict of a rig: its worst camera's, with the checks of all, named by their cameras."""
     checks = tuple(
         replace(check, text=f"{name}: {check.text}") if named else check
         for name, verdict in cameras.items()
@@ -300,7 +275,6 @@ def grade(warn: bool, fail: bool) -> Status:
     return "FAIL" if fail else "WARN" if warn else "PASS"
 
 
-# MERGED model.threshold: The limits of measured numbers, and the checks of a number by its limits.
 Direction = Literal["at most", "at least"]
 
 _CELL = 7  # characters of a number, of which eight and a name fit on 80 columns
@@ -381,13 +355,7 @@ def ratio_of(unit: str, tolerance: tuple[float, float]) -> float:
 
 
 def is_reachable(limit: float, unit: str, direction: Direction) -> bool:
-    """Whether a value can lie beyond a limit.
-
-    Args:
-        limit: of the value.
-        unit: of the value; a count is not negative, a share of a score can be.
-        direction: "at most" or "at least": on which side of the limit PASS lies.
-    """
+    """Whether a value can lie beyond a limit: no count is negative, a share of a score may be."""
     if direction == "at most":
         return limit < _LARGEST.get(unit, math.inf)
     return limit > 0 or unit == "share"

@@ -156,12 +156,10 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
     block, gate_px = _of_all_frames(solution, camera), solution.scales[camera].gate_px
     ours = block.within_gate(solution.T_camera_lidar[camera], gate_px)
     left_out = block.block.select(~ours)
-    T = None
+    T, seen_by = None, solution.rig.cameras[camera]
     if len(left_out):
         iterations = _ransac_iterations(row.warn * int(ours.sum()), len(left_out))
-        T = frame_pose(
-            solution.rig.cameras[camera], left_out, solution.config, iterations=iterations
-        )
+        T = frame_pose(seen_by, left_out, solution.config, iterations=iterations)
     if T is None:
         return row.describe(0.0, "PASS", f"{row.name}: none")
     theirs = block.within_gate(T, gate_px)

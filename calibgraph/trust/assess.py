@@ -12,75 +12,52 @@ from collections.abc import Callable, Sequence
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import ABOUT_THE_DATA, BRIGHTNESS, Check
-from calibgraph.trust.agreement import (
-    competing_solution_checks,
-    one_pose_checks,
-    pair_agreement_checks,
-    place_checks,
+from calibgraph.trust import (
+    agreement,
+    guess,
+    image_checks,
+    lens_checks,
+    matcher_checks,
+    solution_checks,
 )
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.evidence import Checks, Evidence, RunEvidence, concatenate
-from calibgraph.trust.guess import (
-    guess_checks,
-    point_distance_checks,
-    range_checks,
-    swap_checks,
-)
-from calibgraph.trust.image_checks import image_checks
 from calibgraph.trust.image_record import RunChecks
 from calibgraph.trust.inputs import describe_brightness
-from calibgraph.trust.lens_checks import image_offset_checks, intrinsics_checks, offset_checks
 from calibgraph.trust.lens_parameter import advise_together
-from calibgraph.trust.matcher_checks import (
-    going_on_checks,
-    last_round_checks,
-    matcher_checks,
-    rematch_checks,
-    repeated_file_checks,
-    time_limit_checks,
-)
-from calibgraph.trust.solution_checks import (
-    assumed_spread_checks,
-    bootstrap_checks,
-    estimate_checks,
-    flat_evidence_checks,
-    outlier_frame_checks,
-    prior_share_checks,
-    repeated_frame_checks,
-)
 
 _LOOKED_AT = 6  # frames whose brightness is measured
 
 SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
-    guess_checks,               # does a convention error explain the distance from the guess?
-    swap_checks,                # are the images of two cameras swapped?
-    point_distance_checks,      # are the points in metres?
-    flat_evidence_checks,       # do the images leave the pose more open than the matches?
-    estimate_checks,            # residuals, sigmas, relative poses, counts, convergence
-    pair_agreement_checks,      # do two cameras' images agree with the correspondences?
-    one_pose_checks,            # have two cameras one device's images?
-    matcher_checks,             # findings of the matcher: search, failed frames, z-score
-    competing_solution_checks,  # do the left-out matches agree on another extrinsic?
-    outlier_frame_checks,       # how many frames were left out?
-    place_checks,               # does a place contradict the others?
-    repeated_frame_checks,      # how many are of one place, or copies?
-    assumed_spread_checks,      # does the configured loss scale suit the residuals?
-    intrinsics_checks,          # would another lens explain the residuals?
-    offset_checks,              # would images of another time?
-    bootstrap_checks,           # does a bootstrap over frames give the reported covariance?
-    prior_share_checks,         # how much of it comes from the priors?
+    guess.guess_checks,                    # does a convention error explain how far it is?
+    guess.swap_checks,                     # are the images of two cameras swapped?
+    guess.point_distance_checks,           # are the points in metres?
+    solution_checks.flat_evidence_checks,  # do the images leave the pose more open?
+    solution_checks.estimate_checks,       # residuals, sigmas, relative poses, counts, convergence
+    agreement.pair_agreement_checks,       # do two cameras' images agree with the matches?
+    agreement.one_pose_checks,             # have two cameras one device's images?
+    matcher_checks.matcher_checks,         # findings of the matcher: search, failed frames, z-score
+    agreement.competing_solution_checks,   # do the left-out matches agree on another extrinsic?
+    solution_checks.outlier_frame_checks,  # how many frames were left out?
+    agreement.place_checks,                # does a place contradict the others?
+    solution_checks.repeated_frame_checks, # how many are of one place, or copies?
+    solution_checks.assumed_spread_checks, # does the configured loss scale suit the residuals?
+    lens_checks.intrinsics_checks,         # would another lens explain the residuals?
+    lens_checks.offset_checks,             # would images of another time?
+    solution_checks.bootstrap_checks,      # does a bootstrap give the reported covariance?
+    solution_checks.prior_share_checks,    # how much of it comes from the priors?
 )  # fmt: skip
 """Checks of a solution, from correspondences alone; those that name a cause come first."""
 
 RUN_CHECKS: tuple[Callable[[RunEvidence], Checks], ...] = (
-    last_round_checks,          # have the rounds of matching converged?
-    range_checks,               # is the result within the matcher's range?
-    repeated_file_checks,       # are the frames independent?
-    rematch_checks,             # does matching from a displaced start end here?
-    going_on_checks,            # did the rounds end elsewhere first?
-    time_limit_checks,          # was anything left out for lack of time?
-    image_checks,               # do the images agree with the result?
-    image_offset_checks,        # would they agree better at another time?
+    matcher_checks.last_round_checks,      # have the rounds of matching converged?
+    guess.range_checks,                    # is the result within the matcher's range?
+    matcher_checks.repeated_file_checks,   # are the frames independent?
+    matcher_checks.rematch_checks,         # does matching from a displaced start end here?
+    matcher_checks.going_on_checks,        # did the rounds end elsewhere first?
+    matcher_checks.time_limit_checks,      # was anything left out for lack of time?
+    image_checks.image_checks,             # do the images agree with the result?
+    lens_checks.image_offset_checks,       # would they agree better at another time?
 )  # fmt: skip
 """Checks of a run, which also need the matcher, the images or the clouds."""
 
@@ -130,19 +107,16 @@ def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:
     It takes seconds, so that a time limit that has passed does not prevent it.
     """
     failed = [n for n, each in checks.items() if any(check.status == "FAIL" for check in each)]
-    if not failed:
-        return {}
-    error = likely_intended_guess(evidence.run.dataset, evidence.run.guess)
-    if error is None:
-        return {}
-    check = Check("convention of the guess", "FAIL", error)
-    return dict.fromkeys(failed, [check])
+    run = evidence.run
+    error = likely_intended_guess(run.dataset, run.guess) if failed else None
+    found = [] if error is None else [Check("convention of the guess", "FAIL", error)]
+    return dict.fromkeys(failed, found)
 
 
-def implausible_checks(guess: Rig, checks: Checks) -> Checks:
+def implausible_checks(rig: Rig, checks: Checks) -> Checks:
     """Values of a rig that may explain why checks of a camera FAIL; they decide nothing."""
     found: dict[str, list[Check]] = {}
-    for line in find_implausible(guess):
+    for line in find_implausible(rig):
         name, _, text = line.partition(": ")
         of_camera = checks.get(name, ())
         if any(check.status == "FAIL" for check in of_camera):

@@ -36,8 +36,6 @@ _NEAR_DEG, _NEAR_M = 5.0, 0.5  # poses nearer than both are tried once
 _AS_NEAR = 0.2  # of the limits of distance: as near, of rough guesses
 _REFINED = 2  # of the corrected guesses
 _LEAST_POINTS = 300  # of a cloud in the image, so that windows of it can agree
-
-
 _AHEAD, _LEFT, _UP = np.eye(3)
 _SIDES = {"ahead": _AHEAD, "behind": -_AHEAD, "left": _LEFT, "right": -_LEFT, "up": _UP,
           "down": -_UP}  # fmt: skip
@@ -66,25 +64,24 @@ def undo_convention_errors(guess: Array) -> dict[str, Array]:
     The names are those of ``WORDS`` and of the 23 other axes that a cloud may have. Common errors
     come first.
     """
-    inverse = invert(guess)
-    position, transposed = guess.copy(), guess.copy()
-    position[:3, 3] = -guess[:3, :3] @ guess[:3, 3]
-    transposed[:3, :3] = guess[:3, :3].T
-    x, y, z, w = Rotation.from_matrix(guess[:3, :3]).as_quat()
+    inverse, R, t = invert(guess), guess[:3, :3], guess[:3, 3]
+    x, y, z, w = Rotation.from_matrix(R).as_quat()
+    rolled = {degrees: transform(Rotation.from_euler("z", degrees, degrees=True))
+              for degrees in (180.0, -90.0, 90.0)}  # fmt: skip
     return {
         "inverse": inverse,
         "camera-flu": T_OPTICAL_LINK @ guess,
         "inverse-camera-flu": T_OPTICAL_LINK @ inverse,
         **{name: guess @ transform(R) for name, R in _cloud_axes().items()},
-        "camera-upside-down": _rolled(180.0) @ guess,
-        "camera-clockwise": _rolled(-90.0) @ guess,
-        "camera-counterclockwise": _rolled(90.0) @ guess,
-        "position": position,
-        "transposed": transposed,
-        "millimetres": _in_millimetres(guess),
-        "inverse-millimetres": _in_millimetres(inverse),
-        "wxyz": _rotated(guess, y, z, w, x),
-        "xyzw": _rotated(guess, w, x, y, z),
+        "camera-upside-down": rolled[180.0] @ guess,
+        "camera-clockwise": rolled[-90.0] @ guess,
+        "camera-counterclockwise": rolled[90.0] @ guess,
+        "position": transform(R, -R @ t),
+        "transposed": transform(R.T, t),
+        "millimetres": transform(R, t / 1000.0),
+        "inverse-millimetres": transform(inverse[:3, :3], inverse[:3, 3] / 1000.0),
+        "wxyz": transform(Rotation.from_quat((y, z, w, x)), t),
+        "xyzw": transform(Rotation.from_quat((w, x, y, z)), t),
     }
 
 
@@ -105,17 +102,15 @@ def in_words(error: str) -> str:
 def correct_guess(rig: Rig, errors: Iterable[str]) -> Rig:
     """A rig with convention errors of its guess undone.
 
-    Args:
-        rig: with T_camera_lidar as it was read.
-        errors: names as of :func:`undo_convention_errors`, each for all cameras, or for one as
-            CAMERA=NAME.
+    The errors are those of :func:`undo_convention_errors`, each for all cameras, or for one as
+    CAMERA=NAME.
 
     Raises:
         RigError: if there is no such error, or no such camera.
     """
+    known = undo_convention_errors(np.eye(4))
     for text in errors:
         camera, _, error = text.rpartition("=")
-        known = undo_convention_errors(np.eye(4))
         if error not in known:
             raise RigError(f"no mistake {error!r} of a guess; known are {', '.join(known)}")
         names = [camera] if camera else [*rig.cameras]
@@ -140,48 +135,20 @@ def _cloud_axes() -> dict[str, Array]:
     return dict(sorted(others.items(), key=lambda item: (item[1][2, 2] < 1, np.trace(item[1]))))
 
 
-def _rolled(degrees: float) -> Array:
-    """(4, 4) a turn about the camera's axis."""
-    return transform(Rotation.from_euler("z", degrees, degrees=True))
-
-
-def _in_millimetres(guess: Array) -> Array:
-    metres = guess.copy()
-    metres[:3, 3] /= 1000.0
-    return metres
-
-
-def _rotated(guess: Array, *xyzw: float) -> Array:
-    """The guess with the rotation of a quaternion."""
-    T = guess.copy()
-    T[:3, :3] = Rotation.from_quat(xyzw).as_matrix()
-    return T
-
-
-def convention_error_between(guess: Array, result: Array) -> str | None:
-    """The convention error of a guess that, undone, leads near the result; its name."""
-    return _error_between({"": guess}, {"": result})
-
-
-def _error_between(guesses: Mapping[str, Array], results: Mapping[str, Array]) -> str | None:
-    """The error that, undone, leads near the results of all cameras, in the mean.
+def convention_error_between(
+    guesses: Mapping[str, Array], results: Mapping[str, Array]
+) -> str | None:
+    """The error that, undone, leads near the results of all cameras, in the mean; its name.
 
     Of errors that lead about as near, the first of the list, the most common one.
     """
     distances: dict[str, float] = {}
+    most_deg, most_m = limit("convention_rotation"), limit("convention_translation")
+    undone = {name: undo_convention_errors(guesses[name]) for name in results}
     for error in undo_convention_errors(np.eye(4)):
-        apart = [
-            _difference(undo_convention_errors(guesses[name])[error], T)
-            for name, T in results.items()
-        ]
-        if all(
-            degrees < limit("convention_rotation") and metres < limit("convention_translation")
-            for degrees, metres in apart
-        ):
-            shares = (
-                degrees / limit("convention_rotation") + metres / limit("convention_translation")
-                for degrees, metres in apart
-            )
+        apart = [_difference(undone[name][error], T) for name, T in results.items()]
+        if all(degrees < most_deg and metres < most_m for degrees, metres in apart):
+            shares = (degrees / most_deg + metres / most_m for degrees, metres in apart)
             distances[error] = sum(shares) / len(apart)
     least = min(distances.values(), default=0.0) + _AS_NEAR
     return next((error for error, distance in distances.items() if distance < least), None)
@@ -227,7 +194,7 @@ class _Trial:
             better = {n: one for n, one in found.items() if self._is_better(n, one, given[n])}
             if are_accepted([one.z_score for one in better.values()], ALONE * len(starts)):
                 poses = {name: one.body[name].T_camera_lidar for name, one in better.items()}
-                error = _error_between(lost, poses)
+                error = convention_error_between(lost, poses)
                 if error is not None:
                     return _sentence(error, [] if len(lost) == len(some) else [*better])
         return self._find_mirrored(lost, given)
@@ -246,17 +213,18 @@ class _Trial:
         trial = _Trial(frames, self.guess.model_copy(update={"cameras": cameras}))
         found = {name: trial._refine(trial._approach(name, T)) for name, T in lost.items()}
         names = [n for n, one in found.items() if _is_accepted(one) and _gains(one, given[n])]
-        if not names:
-            return None
-        return (
+        text = (
             f"the images of {' and '.join(names)} are mirrored: record them unmirrored, or flip "
             "the files left to right"
         )
+        return text if names else None
 
     def _is_better(self, name: str, found: Candidate, given: Candidate) -> bool:
         """Whether a pose agrees better than the guess, which no search from there would reach."""
-        guess = self.guess.T_camera_lidar[name]
-        return _gains(found, given) and not _in_reach(guess, found.body[name].T_camera_lidar)
+        guess, T = self.guess.T_camera_lidar[name], found.body[name].T_camera_lidar
+        degrees, metres = _difference(guess, T)
+        in_reach = degrees < math.sqrt(3) * SEARCH_DEG and metres < math.sqrt(3) * SEARCH_M
+        return _gains(found, given) and not in_reach
 
     def _refine(self, candidate: Candidate) -> Candidate:
         """The candidate refined, if it is worth it."""
@@ -277,9 +245,7 @@ class _Trial:
 
 def _sentence(error: str, cameras: Sequence[str]) -> str:
     """What is wrong with the guess of some cameras, of all if none is named; and what undoes it."""
-    options = " ".join(
-        f"--correct {name}" for name in ([f"{n}={error}" for n in cameras] or [error])
-    )
+    options = " ".join(f"--correct {n}={error}" for n in cameras) or f"--correct {error}"
     images = f"the images of {' and '.join(cameras)}" if cameras else "the images"
     return (
         f"{images} fit clearly better if {in_words(error)}; undo it with "
@@ -299,27 +265,16 @@ def _is_accepted(candidate: Candidate) -> bool:
 def _corrected(guess: Mapping[str, Array]) -> list[dict[str, Array]]:
     """The guesses with each convention error undone, without those that hardly differ."""
     by_camera = {name: undo_convention_errors(T) for name, T in guess.items()}
-    errors = [*next(iter(by_camera.values()), ())]
     kept: list[dict[str, Array]] = []
-    for error in errors:
+    for error in next(iter(by_camera.values()), ()):
         corrected = {name: each[error] for name, each in by_camera.items()}
-        if not any(
-            all(_is_near(T, other[name]) for name, T in corrected.items())
+        apart = (
+            [_difference(T, other[name]) for name, T in corrected.items()]
             for other in (guess, *kept)
-        ):
+        )
+        if not any(all(deg < _NEAR_DEG and m < _NEAR_M for deg, m in each) for each in apart):
             kept.append(corrected)
     return kept
-
-
-def _is_near(one: Array, two: Array) -> bool:
-    degrees, metres = _difference(one, two)
-    return degrees < _NEAR_DEG and metres < _NEAR_M
-
-
-def _in_reach(guess: Array, T_camera_lidar: Array) -> bool:
-    """Whether the matcher's search from a guess reaches a pose."""
-    degrees, metres = _difference(guess, T_camera_lidar)
-    return degrees < math.sqrt(3) * SEARCH_DEG and metres < math.sqrt(3) * SEARCH_M
 
 
 def _difference(one: Array, two: Array) -> tuple[float, float]:

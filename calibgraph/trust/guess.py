@@ -47,7 +47,7 @@ def compare_with_guess(guess: Array, result: Array, findings: MatcherFindings) -
     row = replace(row, warn=max(row.warn, range_m))
     is_turned = degrees > max(limit("guess_rotation"), range_deg)
     is_far = is_turned or row.grade(metres) != "PASS"
-    error = convention_error_between(guess, result) if is_far else None
+    error = convention_error_between({"": guess}, {"": result}) if is_far else None
     advice = "" if error is None else f"it seems that {in_words(error)}"
     check = row.check(metres, advice=advice)
     if error is not None and check.status == "PASS":

@@ -31,13 +31,9 @@ def image_checks(evidence: RunEvidence) -> Checks:
     rig, config = run.solution.without_pairs().solved_rig, run.solution.config
     try:
         checks = check_images(
-            run.dataset,
-            rig,
-            run.correspondences,
-            tolerance=config.tolerance,
-            seed=config.seed,
-            progress=evidence.progress,
-        )
+            run.dataset, rig, run.correspondences,
+            tolerance=config.tolerance, seed=config.seed, progress=evidence.progress,
+        )  # fmt: skip
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
         text = f"the images could not be checked: {error}"
         return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}

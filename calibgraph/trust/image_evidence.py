@@ -68,7 +68,6 @@ MAX_WINDOWS, SHARING_FRAMES = 10_000, 10
 WIDE, FINER = LEVELS[1], LEVELS[2]
 MAX_FRAMES = 20  # evenly spread over the dataset: bounds the time
 MIN_GROUPS = 30  # fewer groups of windows are no evidence
-
 PAIR_LEVEL = replace(WIDE, reach_rad=np.radians(1.2))
 
 
@@ -189,8 +188,10 @@ def _compare_with_neighbours(
     """Compare each image's agreement with its own cloud, at ``WIDE``, and its neighbours'."""
     before, after = (scorer.score(images, camera, PAIR_LEVEL, offset=offset) for offset in (-1, 1))
     own = [one and crop_grids(one, camera, PAIR_LEVEL) for one in wide]
-    values = np.array([[_agreement(one) for one in all_of] for all_of in (before, own, after)])
-    # (3, frames); NaN where there is no such cloud
+    values = np.array([  # (3, frames) z-scores at the result; NaN where there is no such cloud
+        [z_score(one, np.zeros(6)) if one and len(one.weights) else math.nan for one in all_of]
+        for all_of in (before, own, after)
+    ])  # fmt: skip
     comparable = np.isfinite(values[1]) & np.isfinite(values[[0, 2]]).any(axis=0)
     if not comparable.any():
         return {}
@@ -203,13 +204,6 @@ def _compare_with_neighbours(
         "pair_offset": 0 if sums[0] >= sums[1] else (-1, 1)[worse],
         "pair_margin": float((sums[0] - sums[1]) / (max(abs(sums[0]), abs(sums[1])) + 1e-12)),
     }
-
-
-def _agreement(scores: ShiftScores | None) -> float:
-    """The z-score at the result; NaN if there is nothing to score."""
-    if scores is None or not len(scores.weights):
-        return math.nan
-    return z_score(scores, np.zeros(6))
 
 
 SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)

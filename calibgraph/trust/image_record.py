@@ -83,13 +83,10 @@ class _Record(BaseModel):
 
 @dataclass(frozen=True)
 class RunChecks:
-    """The checks of a run, by what they need.
+    """The checks of a run, by what they need: a table, or its images, clouds and rounds.
 
-    Attributes:
-        of_solution: per camera, those that a table is enough for.
-        of_run: those of its images, clouds and rounds.
-        causes: what explains the failure of others; they come first.
-        unseen: cameras whose images were not looked at.
+    ``causes`` explain the failure of others; ``unseen`` cameras have images that were not looked
+    at.
     """
 
     of_solution: Checks
@@ -101,25 +98,22 @@ class RunChecks:
 def to_metadata(evidence: Evidence, checks: RunChecks) -> dict[str, Any]:
     """The record of a run, as a key of its table's metadata."""
     cameras = evidence.solution.solved_rig.cameras
+    posteriors = {
+        name: _Posterior.model_construct(near=of.near, elsewhere=of.elsewhere, share=of.share)
+        for name, of in evidence.posteriors.items()
+    }
     seen = {
         name: _Seen.model_construct(
             camera=cameras[name].model_copy(update={"covariance": None}),
             causes=tuple(checks.causes.get(name, ())),
             checks=tuple(checks.of_run.get(name, ())),
-            posterior=_posterior_of(evidence, name),
+            posterior=posteriors.get(name),
         )
         for name in evidence.cameras
     }
     tolerance = evidence.solution.config.tolerance
     record = _Record.model_construct(tolerance=tolerance, cameras=seen)
     return {IMAGES: record.model_dump(mode="json")}
-
-
-def _posterior_of(evidence: Evidence, name: str) -> _Posterior | None:
-    if name not in evidence.posteriors:
-        return None
-    of = evidence.posteriors[name]
-    return _Posterior.model_construct(near=of.near, elsewhere=of.elsewhere, share=of.share)
 
 
 @dataclass(frozen=True)
@@ -142,20 +136,20 @@ class ImageRecord:
 
     def posteriors_of(self, cameras: Mapping[str, Camera]) -> MeasurePosteriors:
         """What gives the posteriors about solved cameras that have the lens that was looked at."""
-        return lambda _, groups: self._posteriors(cameras, groups)
+        known = self.content.cameras
 
-    def _posteriors(
-        self, rig: Mapping[str, Camera], groups: Sequence[Sequence[str]]
-    ) -> dict[str, PosePosterior]:
-        found, known = {}, self.content.cameras
-        for name in (name for group in groups for name in group if name in known):
-            seen, camera = known[name], rig[name]
-            if seen.posterior is None or not _same_lens(seen.camera, camera):
-                continue
-            away = twist_between(seen.camera.T_camera_lidar, camera.T_camera_lidar)
-            near, elsewhere = seen.posterior.near + away, seen.posterior.elsewhere + away
-            found[name] = PosePosterior(near, elsewhere, seen.posterior.share)
-        return found
+        def measure(_: Any, groups: Sequence[Sequence[str]]) -> dict[str, PosePosterior]:
+            found = {}
+            for name in (name for group in groups for name in group if name in known):
+                seen, camera = known[name], cameras[name]
+                if seen.posterior is None or not _same_lens(seen.camera, camera):
+                    continue
+                away = twist_between(seen.camera.T_camera_lidar, camera.T_camera_lidar)
+                near, elsewhere = seen.posterior.near + away, seen.posterior.elsewhere + away
+                found[name] = PosePosterior(near, elsewhere, seen.posterior.share)
+            return found
+
+        return measure
 
     def checks(self, evidence: Evidence, of_solution: Checks) -> RunChecks:
         """Those of a solution of the table, with what was recorded of the cameras as they are."""
@@ -163,7 +157,10 @@ class ImageRecord:
             return RunChecks(of_solution, unseen=evidence.cameras)
         other = {name: self._other_than_seen(evidence, name) for name in evidence.cameras}
         seen = {name: self.content.cameras[name] for name, text in other.items() if not text}
-        of_run = {name: [*of.checks, *self._of_tolerance(evidence)] for name, of in seen.items()}
+        (deg, cm), wanted = self.content.tolerance, evidence.solution.config.tolerance
+        judged = f"its images were judged for a tolerance of {deg:g} deg, {cm:g} cm"
+        wider = [] if wanted == self.content.tolerance else [_not_compared(judged)]
+        of_run = {name: [*of.checks, *wider] for name, of in seen.items()}
         told = {
             name: [self._contradiction(evidence, name) or _not_compared(text)]
             for name, text in other.items()
@@ -192,13 +189,6 @@ class ImageRecord:
         )
         return Check("images", "FAIL", text)
 
-    def _of_tolerance(self, evidence: Evidence) -> list[Check]:
-        """What to say of checks that were made for a wider tolerance."""
-        (deg, cm), tolerance = self.content.tolerance, evidence.solution.config.tolerance
-        if tolerance == self.content.tolerance:
-            return []
-        return [_not_compared(f"its images were judged for a tolerance of {deg:g} deg, {cm:g} cm")]
-
     def _other_than_seen(self, evidence: Evidence, name: str) -> str:
         """Why nothing that was seen is of this camera of a solution; empty if it is."""
         if name in self.content.joined:
@@ -206,9 +196,8 @@ class ImageRecord:
         if name not in self.content.cameras:
             return "its images were not compared with clouds"
         seen, camera = self.content.cameras[name].camera, evidence.solution.solved_rig.cameras[name]
-        tolerance = evidence.solution.config.tolerance
-        if any(now > then for now, then in zip(tolerance, self.content.tolerance, strict=True)):
-            deg, cm = self.content.tolerance
+        (deg, cm), tolerance = self.content.tolerance, evidence.solution.config.tolerance
+        if tolerance[0] > deg or tolerance[1] > cm:
             return f"its images were judged for a tolerance of {deg:g} deg, {cm:g} cm"
         if not _same_lens(seen, camera):
             return "another lens was compared with its images"

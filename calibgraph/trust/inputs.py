@@ -185,17 +185,14 @@ def displacement_of_parts(points_m: NDArray[np.floating]) -> tuple[float, float]
     xyz = xyz[(distance_m > _RANGE_M[0]) & (distance_m < _RANGE_M[1])]
     for share in _SPLITS:
         first, second = np.split(xyz, [int(share * len(xyz))])
-        T = _register(_thin(first, _TARGET), _thin(second, _SOURCE))
+        step, step_source = len(first) // _TARGET, len(second) // _SOURCE
+        T = _register(first[:: max(1, step)], second[:: max(1, step_source)])
         if T is None:
             continue
         degrees, metres = angle_deg(T[:3, :3]), float(np.linalg.norm(T[:3, 3]))
         if degrees > APART_DEG or metres > APART_M:
             return degrees, metres
     return None
-
-
-def _thin(points: Array, most: int) -> Array:
-    return points[:: max(1, len(points) // most)]
 
 
 def _register(target: Array, source: Array) -> Array | None:

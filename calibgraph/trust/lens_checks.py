@@ -80,8 +80,10 @@ def image_offset_checks(evidence: RunEvidence) -> Checks:
     matcher = run.matcher.with_estimate(("offset",))
     if moved is None or matcher is run.matcher:
         return {}
-    if registered:
-        rig = _without_times(rig)
+    if registered:  # the result leaves out times where the motion is not known
+        none = dict.fromkeys(("time_offset_s", "time_offset_sigma_s", "readout_s"))
+        cameras = {name: each.model_copy(update=none) for name, each in rig.cameras.items()}
+        rig = rig.model_copy(update={"cameras": cameras})
     table = matcher.match(
         moved, rig, round_index=matcher.tracking_rounds[-1], progress=evidence.progress
     )
@@ -130,12 +132,9 @@ def check_offset(
 def fit_offset(
     camera: Camera, table: Correspondences, place_variance: float
 ) -> LensParameter | None:
-    """Pose and offset by one camera's matches; None of too few matches or frames.
+    """Pose and offset by one camera's matches, with the LiDAR's motion; None of too few.
 
-    Args:
-        camera: at the result.
-        table: its rows, with the motion of the LiDAR.
-        place_variance: of what the matches of a place share, over that of independent ones.
+    ``place_variance`` is what the matches of a place share, over that of independent ones.
     """
     table = at_pixels(camera, table.select(np.argsort(table.frame, kind="stable")))
     if len(np.unique(table.frame)) < MIN_FRAMES or table.twist_per_s is None:
@@ -149,13 +148,6 @@ def fit_offset(
     shared = max(of_place, limit("lens_match_share") * len(block))
     fit = fit_camera(camera, block, fields, shared_variance=shared)
     return None if fit is None else LensParameter.of(TIME, np.array([sigma_s]), fit.free(0))
-
-
-def _without_times(rig: Rig) -> Rig:
-    """The rig without times, which the result leaves out where the motion is not known."""
-    none = dict.fromkeys(("time_offset_s", "time_offset_sigma_s", "readout_s"))
-    cameras = {name: each.model_copy(update=none) for name, each in rig.cameras.items()}
-    return rig.model_copy(update={"cameras": cameras})
 
 
 def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
@@ -173,11 +165,9 @@ def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
 
 
 _NUMBERS = {
-    "focal length": (Free.FOCAL,),
-    "principal point": (Free.CENTRE_X, Free.CENTRE_Y),
-    "distortion": (Free.RADIAL,),
-    "aspect ratio": (Free.ASPECT,),
-}
+    "focal length": (Free.FOCAL,), "principal point": (Free.CENTRE_X, Free.CENTRE_Y),
+    "distortion": (Free.RADIAL,), "aspect ratio": (Free.ASPECT,),
+}  # fmt: skip
 _MAX_MATCHES = 20_000  # evenly chosen: bounds the time
 
 

@@ -52,17 +52,13 @@ RESIDUALS, IMAGES = "residuals over the image", "images"
 """What an estimate is by."""
 
 KINDS = {
-    by: {name: prefix + name.replace(" ", "_") for name in _WORDS}
+    (by, name): prefix + name.replace(" ", "_")
     for by, prefix in ((RESIDUALS, "lens_"), (IMAGES, ""))
+    for name in _WORDS
 }
 """Kinds of the checks."""
-LENS_KINDS = frozenset(kind for kinds in KINDS.values() for kind in kinds.values())
-_PART_OF = {
-    kind: part
-    for kinds in KINDS.values()
-    for name, kind in kinds.items()
-    if (part := _WORDS[name][0]) is not None
-}
+LENS_KINDS = frozenset(KINDS.values())
+_PART_OF = {kind: part for (_, name), kind in KINDS.items() if (part := _WORDS[name][0])}
 _ESTIMATE = re.compile(r"(run with --estimate )[a-z,]+((?: --[a-z-]+ [\w.]+)?)")
 
 _NAMES = FOCAL, "k1", CENTRE_X, CENTRE_Y, ASPECT
@@ -185,17 +181,12 @@ class LensParameter:
 
 
 def _beside_others(name: str, freed: Freed, others: int) -> tuple[Array, Array]:
-    """(m,) values and (m, m) covariance of unknowns beside others, each of them usual or wrong.
+    """(m,) values and (m, m) covariance of unknowns beside others, the first of a fit.
 
     A focal length that is 1 % off is no less rare beside a distortion than alone. So the other
     unknowns have the errors of lens parameters, too: the mean and the covariance over all of their
     combinations of usual and wrong. Not beside an aspect ratio: a wrong fy alone is a wrong focal
     length, too, which stays free.
-
-    Args:
-        name: of the unknowns.
-        freed: the fit, with all of them free.
-        others: how many of its first unknowns are the others.
     """
     first, last = slice(others), slice(others, None)
     values, covariance = freed.values, freed.covariance
@@ -233,13 +224,9 @@ def _with_sigma(value: float, sigma: float) -> str:
 def check_parameter(
     found: LensParameter, by: str, tolerance: tuple[float, float] = TOLERANCE, options: str = ""
 ) -> Check:
-    """Whether a lens parameter is wrong: the value of the check is the probability.
+    """Whether a lens parameter is wrong, by RESIDUALS or IMAGES: the value is the probability.
 
-    Args:
-        found: its estimate.
-        by: RESIDUALS or IMAGES.
-        tolerance: of the user [deg, cm].
-        options: that its estimate needs, as " --interval-s 0.1".
+    For a tolerance [deg, cm]; ``options`` are those that its estimate needs, " --interval-s 0.1".
     """
     row, probability, (deg, cm) = threshold("lens"), found.probability(tolerance), found.moved
     status, (part, *_) = row.grade(probability), _WORDS[found.name]
@@ -248,7 +235,7 @@ def check_parameter(
         advice = "correct the time stamps" if found.name == TIME else row.advice
         text += f": {advice}" + (f"; or run with --estimate {part}{options}" if part else "")
     check = row.describe(probability, status, text, name=f"{found.name} by the {by}: {row.name}")
-    return replace(check, kind=KINDS[by][found.name])
+    return replace(check, kind=KINDS[by, found.name])
 
 
 def advise_together(checks: Sequence[Check]) -> list[Check]:
@@ -273,11 +260,9 @@ def advise_together(checks: Sequence[Check]) -> list[Check]:
 
 
 def probability_of_lens(values: Iterable[tuple[str, Status, float | None]]) -> float:
-    """The probability that the worst of the lens parameters is wrong.
+    """The probability that the worst of the lens parameters is wrong, by (kind, status, value).
 
-    Args:
-        values: kind, status and value of checks. One that is a WARN counts as one, whatever its
-            value.
+    One that is a WARN counts as one, whatever its value.
     """
     most: dict[Status, float] = {"FAIL": 1.0, "WARN": FAIL_ABOVE, "PASS": PASS_BELOW}
     of_lens = [(status, value) for kind, status, value in values if kind in LENS_KINDS]

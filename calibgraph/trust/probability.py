@@ -50,18 +50,13 @@ _DIRECTIONS = 400  # over which the error bar is integrated: to 1e-3 of a probab
 def judge(
     checks: Sequence[Check], beyond: float, tolerance: tuple[float, float], model: str
 ) -> Verdict:
-    """The verdict of one camera's result.
+    """The verdict of one camera's result, by its checks and by its posterior.
 
-    Args:
-        checks: of the camera.
-        beyond: the probability that its error is beyond the tolerance, by its posterior.
-        tolerance: rotation [deg] and distance [cm].
-        model: TABLES or STRUCTURE.
+    By that, ``beyond`` is the probability of an error beyond the tolerance [deg, cm]; the model is
+    TABLES or STRUCTURE.
     """
-    of_checks = probability_of_checks(checks, model)
-    odds = _models()[model]["bar_odds"]
-    found = ErrorProbability(of_checks, beyond, *tolerance, bar_odds=odds)
-    return Verdict(tuple(checks), found)
+    of_checks, odds = probability_of_checks(checks, model), _models()[model]["bar_odds"]
+    return Verdict(tuple(checks), ErrorProbability(of_checks, beyond, *tolerance, bar_odds=odds))
 
 
 def model_of(matcher: str) -> str:
@@ -106,13 +101,8 @@ def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
     left_out = {*LENS_KINDS, COMMON_ERROR, CHANCE, FLAT_EVIDENCE, WENT_ON, IMAGES_ELSEWHERE}
     left_out |= ABOUT_THE_DATA if CHANCE in worst else frozenset()
     kept = {kind: severity for kind, severity in worst.items() if kind not in left_out}
-    return {**kept, WORST: worst_sign(kept)}
-
-
-def worst_sign(severities: Mapping[str, float]) -> float:
-    """The worst severity, by kind, of those that can show an error."""
-    signs = (value for kind, value in severities.items() if kind not in ABOUT_THE_DATA)
-    return max(signs, default=0.0)
+    signs = (value for kind, value in kept.items() if kind not in ABOUT_THE_DATA)
+    return {**kept, WORST: max(signs, default=0.0)}
 
 
 def contributions(
@@ -134,11 +124,8 @@ def steps(severity: float) -> tuple[float, float, float]:
 def probability_beyond(covariance: Array | None, tolerance: tuple[float, float]) -> float:
     """The probability that an error of this covariance exceeds the tolerance; 0 without one.
 
-    Rotation and distance count as independent.
-
-    Args:
-        covariance: (6, 6) rotation [rad] and translation [m].
-        tolerance: rotation [deg] and distance [cm].
+    Of a (6, 6) covariance [rad, m] and a tolerance [deg, cm]; rotation and distance count as
+    independent.
     """
     if covariance is None:
         return 0.0

@@ -8,9 +8,9 @@ check: a row here, a function that looks the row up by its key, and that functio
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
+from typing import NamedTuple
 
 from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Threshold, ratio_of
@@ -187,16 +187,10 @@ THRESHOLDS: tuple[Threshold, ...] = (
 # fmt: on
 
 
-@dataclass(frozen=True)
-class Limit:
+class Limit(NamedTuple):
     """A number that decides whether a check counts, or that it is compared with.
 
-    Attributes:
-        key: by which checks look it up.
-        value: the number.
-        unit: of it.
-        meaning: what it decides.
-        of_tolerance: whether it grows with a tolerance above the default.
+    One that is ``of_tolerance`` grows with a tolerance above the default.
     """
 
     key: str

@@ -32,8 +32,7 @@ from calibgraph.io.lenses import (
 )
 from calibgraph.io.rotations import pose_of_quaternion
 from calibgraph.model.geometry import invert
-from calibgraph.model.lens_names import plain_key
-from calibgraph.model.rig import Intrinsics, Size, rigid_transform
+from calibgraph.model.rig import Intrinsics, Size, plain_key, rigid_transform
 from calibgraph.yaml_text import describe_value, parse_yaml
 from factors import LensModel
 from factors.lens import COEFFICIENTS
