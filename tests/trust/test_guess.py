@@ -197,10 +197,8 @@ ERRORS = tuple(undo_convention_errors(np.eye(4)))
 def test_every_error_has_its_words_and_is_recognised_by_undoing_it() -> None:
     """The corrections of a wrong guess hold the right one, under the error's name."""
     truth = make_camera((0.8, 0.3, -0.4), yaw_deg=50).T_camera_lidar
-    found = {
-        error: convention_error_between({"": mistaken(error, truth)}, {"": truth})
-        for error in ERRORS
-    }
+    guesses = {error: {"": mistaken(error, truth)} for error in ERRORS}
+    found = {e: convention_error_between(guess, {"": truth}) for e, guess in guesses.items()}
     assert found == {error: error for error in ERRORS}
     assert len({in_words(error) for error in ERRORS}) == len(ERRORS) == 12 + 23
 
