@@ -94,6 +94,49 @@ def test_help_imports_nothing_heavy() -> None:
         assert command in done.stdout
 
 
+WITHOUT_EXTRAS = """
+import re, sys
+from importlib.metadata import distribution, packages_distributions
+from packaging.requirements import Requirement
+
+def normal(name):
+    return re.sub("[-_.]+", "-", name).lower()
+
+def add(name):
+    if normal(name) not in needed:
+        needed.add(normal(name))
+        for each in map(Requirement, distribution(name).requires or ()):
+            if not each.marker or each.marker.evaluate({"extra": ""}):
+                add(each.name)
+
+class Hidden:
+    def find_spec(self, name, *_):
+        of = {normal(each) for each in packages.get(name.partition(".")[0], ())}
+        if of and not of & needed:
+            raise ModuleNotFoundError(f"No module named {name!r}")
+
+needed, packages = set(), packages_distributions()
+add("calibgraph")
+sys.meta_path.insert(0, Hidden())
+from calibgraph.cli.app import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["doctor", SAMPLE], ["calibrate", SAMPLE],
+     ["evaluate", SAMPLE / "rig.yaml", SAMPLE / "reference.yaml"], ["rig", SAMPLE / "rig.yaml"]],
+    ids=lambda words: words[0],
+)  # fmt: skip
+def test_commands_need_no_package_of_an_extra(command: list[str | Path], tmp_path: Path) -> None:
+    """Those of ``pip install calibgraph`` alone are found, with all that they need."""
+    out = ["--out", tmp_path / "out"] if command[0] == "calibrate" else []
+    words = [sys.executable, "-c", WITHOUT_EXTRAS, *command, *out]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize("given", ["", "3"])
 def test_libraries_get_one_thread_unless_the_user_gave_more(given: str) -> None:
     code = (

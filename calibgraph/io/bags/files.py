@@ -9,7 +9,6 @@ from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack
 from copy import copy
-from dataclasses import dataclass
 from functools import partial
 from heapq import heappop, heappush, merge
 from io import BytesIO
@@ -30,20 +29,10 @@ from rosbags.rosbag1 import Reader
 
 from calibgraph.errors import FileError
 from calibgraph.files import read_yaml
-from calibgraph.io.bags.storage import METADATA, REPAIR_ROS2
+from calibgraph.io.bags.storage import METADATA, REPAIR_ROS2, Topic
 
 ENCODINGS = ("cdr", "ros1")
 """How messages of ROS 2 and of ROS 1 are serialized."""
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic of a bag; the type names the encoding if that is none of ROS."""
-
-    name: str
-    type: str
-    count: int
-    encoding: str = "cdr"
 
 
 def make_topic(name: str, type_: str, count: int, encoding: str) -> Topic:

@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibgraph.errors import FileError, needs_extra
-from calibgraph.io.bags.files import Topic
-from calibgraph.io.bags.storage import errors_in_one_line, is_bag, require_closed
+from calibgraph.io.bags.storage import Topic, errors_in_one_line, is_bag, require_closed
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path, PurePath
 
 from calibgraph.errors import CalibrationError, FileError, in_words
@@ -12,6 +13,16 @@ _SUFFIXES = (".bag", ".mcap", ".db3")
 _UNPACK = {".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz", ".lz4": "unlz4", ".zst": "unzstd",
            ".zstd": "unzstd", ".zip": "unzip", ".7z": "7z x"}  # fmt: skip
 _REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover"}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag; the type names the encoding if that is none of ROS."""
+
+    name: str
+    type: str
+    count: int
+    encoding: str = "cdr"
 
 
 def is_bag(path: Path | str) -> bool:
