@@ -196,7 +196,7 @@ def displacement(case: Key, cameras: list[str], stated: Stated) -> tuple[str, in
 
 
 def deployed(now: Rig, of: str, twist: Array) -> Rig:
-    """The rig of which ``now`` differs: T_deployed_now = exp(twist) of a camera or the LiDAR."""
+    """The deployed rig: T_deployed_now = exp(twist) for one camera of ``now``, or for its LiDAR."""
     T = now.T_camera_lidar
     if of == LIDAR:
         T_now_deployed = gtsam.Pose3.Expmap(-twist).matrix()

@@ -73,7 +73,7 @@ def draw_shared(rng: Rng) -> tuple[Array, Array]:
 
 
 def solve_one(kind: str, shared: tuple[Array, Array], seed: int) -> Calibration:
-    """The result of one recording, of which the guess is the truth; its table states the errors."""
+    """The result of one recording, from the true rig as its guess; the table states its errors."""
     truth = stereo()
     seen = truth if kind == "sharp" else displaced(truth, *shared)
     table = simulate_correspondences(

@@ -101,7 +101,7 @@ def _over_exposed(image: Any) -> Any:
 
 
 def _painted(change: Callable[[Any], Any], *names: str) -> Callable[[Scene], Dataset]:
-    """The images of these cameras, or of all, changed."""
+    """Makes the dataset of a scene, with the images of these cameras changed; of all if none."""
 
     def paint(scene: Scene) -> Dataset:
         chosen = [name for name in scene.truth.cameras if not names or name in names]

@@ -9,8 +9,8 @@ information of independent correspondences. The other cases are of the tracker, 
 from the error model: a vehicle stands, creeps, drives on, or circles one block; each drive has 60
 frames, which name their places. Moves and drifts that it reports are false: nothing moves.
 
-NEES is the squared error in the metric of its covariance; its mean over 6 should be 1. The region
-that should hold 95 % of the errors is that of a chi-squared law with 6 degrees of freedom.
+NEES is the squared error in the metric of its covariance; its mean over 6 should be 1. Of the
+errors, 95 % should lie within the 95 % quantile of chi-squared with 6 degrees of freedom.
 """
 
 from __future__ import annotations
