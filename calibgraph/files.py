@@ -10,7 +10,7 @@ import tempfile
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 from pydantic import BaseModel, ValidationError, ValidationInfo, field_validator
@@ -234,7 +234,7 @@ class StrictNumbers(BaseModel):
     @classmethod
     def _refuse_truth_values(cls, value: Any, info: ValidationInfo) -> Any:
         wanted = cls.model_fields[info.field_name or ""].annotation
-        if wanted is not bool and holds_truth_value(value):
+        if bool not in (wanted, *get_args(wanted)) and holds_truth_value(value):
             raise ValueError(f"expected no truth value, found {describe_value(value)}")
         return value
 

@@ -7,6 +7,7 @@ import io
 import os
 import pickle
 import shutil
+import signal
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -39,6 +40,9 @@ MEMORY = Path("/dev/shm")
 if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > 4e9:  # a run writes 0.8 GB
     # Results and states are synced to disk, thousands of times in all: that costs nothing there.
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+
+# A shell gives what it starts in the background no Ctrl-C, and that is inherited by every process.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "sample"

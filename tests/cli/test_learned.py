@@ -7,9 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 import calibgraph
-from calibgraph import Rig, load_rig
+from calibgraph import FileError, Rig, load_rig
+from calibgraph.cli.settings import RareSettings, read_settings
 from tests.conftest import SAMPLE, Call
 from tests.matching.cmrnext.builders import good_content, saved
 
@@ -28,6 +30,18 @@ def test_weights_are_checked_and_converted(weights: Path, tmp_path: Path, call: 
     described = json.loads(call("weights", converted, "--json")[1])
     assert described["network"]["fourier_levels"] == 12
     assert described["config"]["max_r"] == 1.0
+
+
+def test_rare_settings_are_read_from_a_file(tmp_path: Path) -> None:
+    values = {"stamps": "record", "sync_tolerance_s": 0.1, "start_from": "joint", "device": "cpu",
+              "iterations": 2, "half_resolution": True, "batch": 3, "terms": "stage1"}  # fmt: skip
+    assert values.keys() == RareSettings.model_fields.keys()
+    config = tmp_path / "config.yaml"
+    config.write_text(yaml.safe_dump(values))
+    assert read_settings(config)[1].model_dump() == values
+    config.write_text("iterations: true")
+    with pytest.raises(FileError, match="iterations: expected no truth value"):
+        read_settings(config)
 
 
 @pytest.mark.slow

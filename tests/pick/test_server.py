@@ -128,10 +128,13 @@ def test_what_was_answered_outlives_kill_9(tmp_path: Path) -> None:
         ) as process:
             assert process.stderr is not None
             url = process.stderr.readline().partition(": ")[0]
-            assert len(json.loads(ask(url, "session")[1])["pairs"]) == expected
-            assert ask(url, "pairs", [true_pair(0)])[0] == 200
-            process.send_signal(ends)
-            process.wait(20)
+            try:
+                assert len(json.loads(ask(url, "session")[1])["pairs"]) == expected
+                assert ask(url, "pairs", [true_pair(0)])[0] == 200
+                process.send_signal(ends)
+                process.wait(20)
+            finally:
+                process.kill()
     assert process.returncode in (0, 130)
 
 

@@ -252,7 +252,7 @@ def _words(topic: str) -> Words:
     """What distinguishes a camera: its namespace, and its own words in the topic's last part."""
     space = _space(topic).strip("/").split("/")
     own = "_".join(_own(topic))
-    if not own and space[-1].startswith("image"):
+    if not own and space[-1].startswith("image") and not _own(space[-1]):
         space.pop()  # of /left/image_raw/camera_info
     return tuple(word for word in (*space, own) if word)
 

@@ -270,7 +270,7 @@ def renamed(image: str, info: str) -> Change:
         if name not in NAMES:
             return each
         topic = info if each.topic.endswith("camera_info") else image
-        return replace(each, topic=topic.format(name))
+        return replace(each, topic=topic.format(name, NAMES.index(name)))
 
     return change
 
@@ -285,6 +285,8 @@ def renamed(image: str, info: str) -> Change:
         ("/rig/{}_camera_image_raw/compressed", "/rig/{}_camera_info"),
         ("/rig/{}_camera/image_raw/compressed", "/rig/{}_camera/image_raw/camera_info"),
         ("/rig/{}_rgb", "/rig/{}_camera_info"),
+        ("/image_{1}/image_raw/compressed", "/image_{1}/camera_info"),
+        ("/image{1}/image_raw/compressed", "/image{1}/image_raw/camera_info"),
     ],
 )
 def test_cameras_of_one_namespace_have_their_own_lens(
@@ -293,7 +295,7 @@ def test_cameras_of_one_namespace_have_their_own_lens(
     bag = recording(tmp_path, renamed(image, info))
     by_frame = {camera.frame_id: camera for camera in rig_of_bag(bag).cameras.values()}
     assert len(by_frame) == len(NAMES)
-    topics = {name: image.format(name) for name in NAMES}
+    topics = {name: image.format(name, n) for n, name in enumerate(NAMES)}
     for name, camera in rig_of_bag(bag, BagOptions(topics=topics)).cameras.items():
         assert camera.frame_id == f"{name}_optical"
         np.testing.assert_allclose(camera.T_camera_lidar, RIG.T_camera_lidar[name], atol=1e-9)
