@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.model.pose_kernel import MAX_DAMPING, descend
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spreads
+from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, CUT, robust_spreads
 from factors import ProjectionBlock, to_runs
 from factors.block_sums import unpack_sums
 
@@ -120,22 +120,26 @@ class FrameFits:
         return 6 * self.spreads**2 / self.counts
 
 
-def fit_each_frame(block: CameraBlock, T_camera_lidar: Array) -> FrameFits:
+def fit_each_frame(block: CameraBlock, own: Array, common: Array) -> FrameFits:
     """Fit every frame alone by damped Gauss-Newton steps, its loss as wide as its residuals spread.
 
     Args:
         block: of one camera.
-        T_camera_lidar: (f, 4, 4) starts of its frames.
+        own: (f, 4, 4) T_camera_lidar of its frames, by PnP of each.
+        common: (4, 4) T_camera_lidar that a frame starts from if its own fits worse.
     """
-    runs, T = to_runs(block.frame_edges), T_camera_lidar
-    least = block.least_spreads(runs)
+    runs = to_runs(block.frame_edges)
+    least, T = block.least_spreads(runs), np.broadcast_to(common, own.shape)
+    at_own, at_common = (robust_spreads(block.all_sizes(each, runs)[1], runs) for each in (own, T))
+    T = np.where((at_own <= at_common)[:, None, None], own, T)
     for _ in range(_OWN_STEPS):
         sizes = block.all_sizes(T, runs)[1]
         spreads = np.minimum(np.maximum(robust_spreads(sizes, runs), least), _MAX_SPREAD)
         sums = block.block.packed_run_sums(T, runs, CAUCHY_SCALE_SIGMAS * spreads)
         T = move_damped(sums, T, most_rad=_MAX_STEP_RAD)[0]
     counts = block.frame_counts.astype(np.float64)
-    spreads = _about_common_extrinsic(spreads, counts)
+    inside = np.add.reduceat(sizes <= CUT * np.repeat(spreads, block.frame_counts), runs[:, 0])
+    spreads = _about_common_extrinsic(spreads, counts, inside)
     return FrameFits(
         T_camera_lidar=T,
         counts=counts,
@@ -146,13 +150,14 @@ def fit_each_frame(block: CameraBlock, T_camera_lidar: Array) -> FrameFits:
     )
 
 
-def _about_common_extrinsic(spreads: Array, counts: Array) -> Array:
+def _about_common_extrinsic(spreads: Array, counts: Array, inside: Array) -> Array:
     """(f,) spreads of residuals about the common extrinsic, from those about each frame's own.
 
-    Six unknowns take their share of 2 n residuals; where they take most, the spread is at least
-    that of a typical frame.
+    Six unknowns take their share of 2 n residuals; where they take most of the ``inside``, from
+    which a spread is measured, it is at least that of a typical frame: among outliers there is
+    always a pose that fits a few matches exactly.
     """
     grown = spreads * np.sqrt(2 * counts / np.maximum(2 * counts - 6, 1))
-    enough = counts >= _MIN_MATCHES
+    enough = inside >= _MIN_MATCHES
     typical = float(np.median(grown[enough] if enough.any() else grown))
     return np.asarray(np.where(enough, grown, np.maximum(grown, typical)))

@@ -125,8 +125,8 @@ def weigh_frames(
     if len(edges) - 1 < MIN_FRAMES_TO_WEIGH:
         return block, T_camera_lidar, 0
     numbers = block.frame[edges[:-1]]
-    starts = np.array([by_frame.get(number, T_camera_lidar) for number in numbers.tolist()])
-    frames = fit_each_frame(block, starts)
+    own = np.array([by_frame.get(number, T_camera_lidar) for number in numbers.tolist()])
+    frames = fit_each_frame(block, own, T_camera_lidar)
     sigmas = confidence_sigmas(frames.sizes, confidence)
     start = densest_start(block, frames, T_camera_lidar)
     T_consensus, weights = find_consensus(frames, start)

@@ -25,7 +25,7 @@ MIN_SIGMA_PX = 0.05
 """Least spread of the scale `auto`: noise-free data would have none, and a loss of zero width."""
 
 _START_QUANTILE, _START_FACTOR = 0.2, 1.762  # median of a Rayleigh distribution over that quantile
-_CUT = 4.0  # medians, 4.7 sigma in two dimensions: inliers lie below
+CUT = 4.0  # medians, 4.7 sigma in two dimensions: inliers lie below
 _ROUNDS = 100
 
 
@@ -72,7 +72,7 @@ def scale_from(sigma_px: float, spread: float, config: Config) -> ResidualScale:
 def robust_spread(values: Array) -> float:
     """The median of the inliers among values of which outliers may be the majority.
 
-    Starts from a low quantile and takes the median of what lies within _CUT times the spread, until
+    Starts from a low quantile and takes the median of what lies within CUT times the spread, until
     it is constant: clean values give their median; a broad background, up to three quarters of all,
     hardly changes it; and values without a core give a large spread, since their median then grows.
     """
@@ -112,7 +112,7 @@ def iterate_spread(quantile_below: Callable[[float, float], float]) -> float:
     """
     spread = _START_FACTOR * quantile_below(math.inf, _START_QUANTILE)
     for _ in range(_ROUNDS):
-        before, spread = spread, quantile_below(_CUT * spread, 0.5)
+        before, spread = spread, quantile_below(CUT * spread, 0.5)
         if math.isnan(spread):
             return before
         if abs(spread - before) <= 1e-6 * before:
@@ -140,7 +140,7 @@ def _fill_spreads(ordered, edges, start, rounds, found):  # type: ignore[no-unty
         values = ordered[edges[i] : edges[i + 1]]
         spread = start[1] * _quantile_below(values, math.inf, start[0])
         for _ in range(rounds):
-            before, spread = spread, _quantile_below(values, _CUT * spread, 0.5)
+            before, spread = spread, _quantile_below(values, CUT * spread, 0.5)
             if math.isnan(spread):
                 spread = before
                 break

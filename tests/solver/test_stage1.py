@@ -25,7 +25,8 @@ from calibgraph.model.geometry import pose_difference
 from calibgraph.simulation.correspondences import PoseSpread
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver import stage1
-from calibgraph.solver.frame_poses import fit_frames, move_damped
+from calibgraph.solver.camera_block import camera_blocks
+from calibgraph.solver.frame_poses import fit_each_frame, fit_frames, move_damped
 from calibgraph.solver.frame_weights import confidence_sigmas
 from calibgraph.solver.geodesic_median import geodesic_median
 from calibgraph.solver.joint import solve_joint
@@ -279,6 +280,22 @@ def sigmas_learnt(sizes_of: Callable[[Array, Array], Array], count: int) -> tupl
     confidence = rng.uniform(0, 1, count)
     noise = np.hypot(*rng.standard_normal((2, count))) / 1.17741  # its median is 1
     return confidence, confidence_sigmas(sizes_of(confidence, noise), confidence)
+
+
+@pytest.mark.parametrize(("outliers", "least", "median"), [(0.7, 0.3, 1.1), (0.9, 100.0, 400.0)])
+def test_a_few_matches_that_fit_exactly_make_no_frame_precise(
+    outliers: float, least: float, median: float
+) -> None:
+    """Noise is 1 px. Of 30 matches with 27 outliers, some pose always fits seven to 0.1 px."""
+    rig, errors = rig_of("kitti"), MatcherErrors(noise_px=1.0, outlier_share=outliers)
+    table = simulate_correspondences(rig, frames=100, matches=30, errors=errors, seed=1)
+    for name, block in camera_blocks(rig, table, Config()).items():
+        T = rig.cameras[name].T_camera_lidar
+        starts = [perturb(rig, rotation_deg=3, translation_m=0.3, seed=k) for k in range(100)]
+        own = np.array([start.cameras[name].T_camera_lidar for start in starts])
+        spreads = fit_each_frame(block, own, T).spreads
+        assert spreads.min() > least
+        assert np.median(spreads) < median
 
 
 def test_what_confidences_are_worth_is_learnt() -> None:
