@@ -179,7 +179,7 @@ def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
         config=solution.config,
         stage1_T_camera_lidar=solution.T_hat,
         weaknesses=Later(
-            lambda: {n: weaknesses(solution, n, evidence.scatter_of(n)) for n in cameras}
+            lambda: {n: weaknesses(solution, n, evidence.covariance_by_matches(n)) for n in cameras}
         ),
         prior_share=evidence.prior_shares,
         error_sources=Later(lambda: evidence.error_sources),

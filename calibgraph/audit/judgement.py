@@ -27,7 +27,7 @@ from calibgraph.audit.significance import (
     detectable,
     tail_of_axis,
 )
-from calibgraph.model.error_sources import MOST_TIMES
+from calibgraph.model.error_sources import MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
 from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
@@ -71,8 +71,9 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
         rad, metres = MatcherFindings(**error_components().matchers[UNKNOWN]).systematic_sigmas
         covariance = covariance + np.diag(pose_sigmas(rotation_rad=rad, translation_m=metres) ** 2)
     sigma = np.sqrt(np.diag(covariance))
-    quantiles = _quantiles(evidence, name, covariance)
-    most, least, sources = tolerance.twist, np.zeros(6), evidence.error_sources.get(name)
+    sources = evidence.error_sources.get(name)
+    quantiles = _quantiles(evidence, name, sources)
+    most, least = tolerance.twist, np.zeros(6)
     if sources is not None:
         now = np.array([sources.rotation_deg, sources.translation_cm])
         least = np.repeat(sources.forecast[MOST_TIMES] / now, 3)
@@ -98,14 +99,14 @@ def has_too_few_frames(evidence: Evidence, name: str) -> bool:
     return few and evidence.covariance_of(name) is not None
 
 
-def _quantiles(evidence: Evidence, name: str, covariance: Array) -> Quantiles:
+def _quantiles(evidence: Evidence, name: str, sources: ErrorSources | None) -> Quantiles:
     tail = tail_of_axis(len(evidence.cameras))
-    known = Quantiles.from_freedom(np.inf, tail)
-    block, scatter = evidence.solution.inliers.blocks.get(name), evidence.scatter_of(name)
-    if block is None or scatter is None:
+    known, block = Quantiles.from_freedom(np.inf, tail), evidence.solution.inliers.blocks.get(name)
+    if block is None or sources is None:
         return known
     estimated = Quantiles.from_freedom(block.frames - 1 + PSEUDO_FRAMES, tail)
-    return estimated.beside_known(np.diag(scatter) / np.diag(covariance), known)
+    shares = [axis.get(MATCHES, 0.0) for axis in (sources.rotation, sources.translation)]
+    return estimated.beside_known(np.repeat(shares, 3), known)
 
 
 def _deviation(evidence: Evidence, name: str) -> Array:

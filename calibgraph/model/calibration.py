@@ -113,8 +113,7 @@ class Calibration:
         rig: the rig with the estimated extrinsics; of lenses and clocks that were estimated, with
             these and their standard deviations.
         initial_rig: the rig that the solve started from.
-        covariance: clustered by frames, plus the error that all frames share by the matcher's
-            findings: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
+        covariance: the marginal of the error model: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
             [rad], translation [m]) in the camera's axes; None where not determined.
         joint_covariance: (6 N, 6 N) over all cameras in the rig's order, or None.
         pair_covariance: per pair "A->B" of cameras with error bars, (6, 6) of xi in T_B_A = exp(xi)
@@ -132,8 +131,8 @@ class Calibration:
         lens: per camera whose lens was estimated, its parameters; the lens itself is the rig's.
         lens_covariance: per camera of ``lens``, (6 + k, 6 + k) of xi and of its parameters in their
             order and units, as ``joint_parameters(lens[name])`` names them.
-        bootstrap: of ``solve(..., bootstrap=N)``: per camera, (6, 6) scatter of N solutions from
-            frames drawn with replacement, like ``covariance``, as a check of it.
+        bootstrap: of ``Config(bootstrap=N)``: per camera, (6, 6) scatter over N draws of frames,
+            with replacement, like ``covariance``, as a check of it.
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
             ``images``, a file per camera.
         moves: of ``track``: what moved, since when, how far, in words.
@@ -187,7 +186,8 @@ class Calibration:
         """The factor graph whose optimum is the result and whose marginal is its covariance.
 
         ``print(result.graph)`` lists every factor; ``calibgraph.graph.variables`` names the
-        variables. With the paper's presets it is Eq. 5, and the covariance is clustered by frames.
+        variables. With the paper's presets it is Eq. 5, and the covariance is the
+        marginal of the error model that the preset ``auto`` fits.
 
         Raises:
             ValueError: if the result was read from a file, or comes from another process.

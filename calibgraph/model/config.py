@@ -97,8 +97,8 @@ class Config(StrictNumbers):
         tolerance_cm: distance by which a camera may be off: the verdict is about more.
         common_deg, common_cm: standard deviation per camera axis of the error that all frames of a
             table share, if the table does not state it; 0 if they share none.
-        bootstrap: how many times to solve again with frames drawn with replacement, as a check
-            of the covariance; 0 for none.
+        bootstrap: how many draws of frames, with replacement, whose scatter checks the
+            covariance; 0 for none.
         of: the poses that are reported: ``alignment``, where the points, as this LiDAR delivers
             them, meet the images; or ``mount``, where the sensors are, with a wider error bar.
         estimate: parts of each lens that are estimated with the extrinsics, by ``calibrate`` and

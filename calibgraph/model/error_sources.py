@@ -12,7 +12,6 @@ from calibgraph.model.verdict import in_unit
 
 MATCHES = "scatter of the matches"
 PLACES = "errors that a place shares"
-UNMODELLED = f"{PLACES}, which the preset does not model"
 COMMON = "common error of the matcher"
 ELEVATION = "LiDAR's elevation offset"
 STRETCH = "LiDAR's elevation scale"
@@ -33,8 +32,6 @@ MOST_TIMES = TIMES[-1]
 """Stands for any number of frames, and is no advice."""
 
 _ADVICE = {
-    UNMODELLED: "Leave preset out of --config: auto models the errors that frames of a place share "
-    "and has smaller error bars; the presets of the paper do not model them.",
     LENSES: "State how well lenses and clocks are known (intrinsics_sigma_px, distortion_sigma, "
     "time_offset_sigma_s), or calibrate them with a target.",
     ESTIMATED: "Estimate fewer parts of the lens (--estimate), state how well it is known "
@@ -45,7 +42,6 @@ _ADVICE = {
 SHRINKS_WITH = {
     MATCHES: "more frames",
     PLACES: "frames at more places",
-    UNMODELLED: "the preset auto",
     COMMON: "measured relative_poses or priors",
     ELEVATION: "measured relative_poses",
     STRETCH: "measured relative_poses",

@@ -106,13 +106,15 @@ class PairTerm:
         """H (12, 12), b (12,) and c, in the tangents of ``T_lidar_a`` and ``T_lidar_b``."""
         return pair_sums(self.block, *self._poses(T_camera_lidar))
 
-    def frame_gradients(self, T_camera_lidar: Mapping[str, Array]) -> Array:
-        """(f, 12) b of each frame."""
+    def frame_sums(self, T_camera_lidar: Mapping[str, Array]) -> tuple[Array, Array]:
+        """(f, 12, 12) H and (f, 12) b of each frame."""
         poses = self._poses(T_camera_lidar)
         if isinstance(self.block, SurfaceBlock):
-            return self.block.frame_sums(*poses, self.frame_edges).gradient
+            sums = self.block.frame_sums(*poses, self.frame_edges)
+            return sums.hessian, sums.gradient
+        chain = pair_chain(*poses)
         relative = self.block.frame_sums(poses[0].between(poses[1]), self.frame_edges)
-        return np.asarray(relative.gradient @ pair_chain(*poses))
+        return chain.T @ relative.hessian @ chain, relative.gradient @ chain
 
     @property
     def _axes(self) -> int:

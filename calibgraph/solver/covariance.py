@@ -1,4 +1,4 @@
-"""Cluster-robust covariance: matches of one frame share their errors, frames do not."""
+"""Covariances by the scatter between frames, whose matches share errors, and by single matches."""
 
 import numpy as np
 
@@ -6,16 +6,14 @@ from calibgraph.arrays import Array
 from calibgraph.graph.objective import relative_pose_graph
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import pose_rows
-from calibgraph.solver.camera_pairs import usual_excess
 from calibgraph.solver.curvature import (
-    Curvature,
     FittedObjective,
     add_pair_hessians,
     pose_hessian,
+    robust_hessians_of,
     rows_of_pair,
-    unknown,
 )
-from calibgraph.solver.objective import Objective
+from factors import to_runs
 from factors.conditioning import sigmas_of_hessian
 
 ENOUGH_FRAMES = 5
@@ -28,82 +26,54 @@ numbers from few frames is too small for their joint error (its inverse, by (F -
 frames)."""
 
 
-def cluster_robust_covariance(at: FittedObjective, curvature: Curvature) -> Array | None:
-    """Covariance of all extrinsics at a solution, ``H^-1 (sum_f g_f g_f^T + few + M) H^-1``.
+def bootstrap_covariances(at: FittedObjective, draws: int, seed: int) -> dict[str, Array]:
+    """Per camera, (6, 6) scatter of xi in T_camera_lidar = exp(xi) estimate over draws of frames.
 
-    g_f is the gradient of the correspondences of frame f, over all cameras jointly; ``few`` is the
-    allowance for few frames, see :func:`with_pseudo_frames`; M the curvature of the measured
-    relative poses, which is the covariance of their gradients if their sigmas hold. H is the true
-    Hessian of the robust cost (by differences of its exact gradient), with the priors: the
-    iteratively reweighted one would be too large, and the errors too small. Priors have no part in
-    the middle: their means come from the same correspondences.
+    Every draw takes as many frames as there are, with replacement, all cameras of a frame together.
+    Its minimum is that of the quadratics of its frames at the estimate.
 
     Args:
-        at: the minimum.
-        curvature: there.
+        at: the minimum of all frames.
+        draws: how many.
+        seed: of the draws.
 
     Returns:
-        (6 N, 6 N) in the order of ``T_camera_lidar``: of xi in T_camera_lidar = exp(xi) estimate,
-        xi = (rotation [rad], translation [m]) in each camera's axes. Cameras that are held are
-        unknown by a radian and a metre. None without correspondences, or where H is singular.
+        Empty without draws, or where the terms do not use the correspondences.
     """
-    inliers = at.objective
-    if not inliers.uses_correspondences or not inliers.blocks or curvature.inverse is None:
-        return None
-    no_bar = unknown([name in at.held for name in at.cameras])
-    known = np.diag(no_bar) == 0
-    gradients = frame_gradients(at)
-    counts = [_frames_behind(name, inliers) for name in at.cameras]
-    scatter = with_pseudo_frames(
-        gradients.T @ gradients,
-        curvature.whole,
-        np.repeat(counts, 6).astype(np.float64),
-        usual_scatter(at, curvature),
-    )
-    covariance = curvature.sandwich(scatter + curvature.measured)
-    return np.asarray(covariance * np.outer(known, known) + no_bar)
+    if not draws or not at.objective.uses_correspondences:
+        return {}
+    gradients, hessians = _by_frame(at)
+    priors = pose_hessian(at.objective.pose_graph, at.cameras, at.T_camera_lidar)
+    priors += np.diag(np.repeat(np.isin(at.cameras, at.held), 6).astype(np.float64))
+    rng, frames = np.random.default_rng(seed), len(gradients)
+    times = rng.multinomial(frames, np.full(frames, 1 / frames), draws).astype(np.float64)
+    drawn = priors + np.tensordot(times, hessians, 1) + 1e-6 * np.eye(priors.shape[0])
+    steps = np.linalg.solve(drawn, -(times @ gradients)[:, :, None])[:, :, 0]
+    scatter = np.atleast_2d(np.cov(steps, rowvar=False))
+    rows = map(pose_rows, range(len(at.cameras)))
+    return {name: scatter[own, own] for name, own in zip(at.cameras, rows, strict=True)}
 
 
-def usual_scatter(at: FittedObjective, curvature: Curvature) -> Array:
-    """(6 N, 6 N) scatter of all frames' gradients if matches are correlated as usual.
-
-    Of n independent matches it is their Hessian; with a correlation r, 1 + r (n - 1) times that.
-    """
-    usual = np.zeros_like(curvature.whole)
-    for name, block in at.objective.blocks.items():
-        rows = pose_rows(at.cameras.index(name))
-        excess = error_components().frame_correlation * (len(block) / block.frames - 1)
-        usual[rows, rows] = (1 + excess) * curvature.of_correspondences[rows, rows]
-    for pair in at.objective.pairs:
-        own = np.zeros_like(usual)
-        add_pair_hessians(own, [pair], at.T_camera_lidar)
-        usual += usual_excess([pair]) * own
-    return usual
-
-
-def _frames_behind(name: str, inliers: Objective) -> int:
-    """How many frames' gradients a camera's pose has a part in."""
-    if name in inliers.blocks:
-        return inliers.blocks[name].frames
-    tied = [pair.frame for pair in inliers.pairs if name in (pair.a, pair.b)]
-    return len(np.unique(np.concatenate(tied))) if tied else 1
-
-
-def frame_gradients(at: FittedObjective) -> Array:
-    """(f, 6 N) gradient of each frame's correspondences and pairs, over all cameras."""
+def _by_frame(at: FittedObjective) -> tuple[Array, Array]:
+    """(f, 6 N) gradients and (f, 6 N, 6 N) Hessians of half the cost of each frame."""
     cameras, blocks, pairs = at.cameras, at.objective.blocks, at.objective.pairs
-    own = {name: block.frame_numbers for name, block in blocks.items()}
-    of_pairs = [pair.frame for pair in pairs]
-    numbers = np.unique(np.concatenate([np.empty(0, np.int64), *own.values(), *of_pairs]))
-    gradients = np.zeros((len(numbers), 6 * len(cameras)))
-    for name in blocks:
-        rows = np.searchsorted(numbers, own[name])
-        gradients[rows, pose_rows(cameras.index(name))] = at.frame_gradients[name]
+    of = [block.frame_numbers for block in blocks.values()] + [pair.frame for pair in pairs]
+    numbers, size = np.unique(np.concatenate(of)), 6 * len(cameras)
+    gradients, hessians = np.zeros((len(numbers), size)), np.zeros((len(numbers), size, size))
+    for name, block in blocks.items():
+        rows, own = np.searchsorted(numbers, block.frame_numbers), pose_rows(cameras.index(name))
+        one, pose = at.projections[name], at.pose(name)
+        sums = one.frame_sums(pose, block.frame_edges)
+        gradients[rows, own] = sums.gradient
+        hessians[rows, own, own] = robust_hessians_of(
+            one, pose, sums.hessian, to_runs(block.frame_edges)
+        )
     for pair in pairs:
-        rows = np.searchsorted(numbers, np.unique(pair.frame))
-        columns = rows_of_pair(cameras, pair)
-        gradients[np.ix_(rows, columns)] += pair.frame_gradients(at.T_camera_lidar)
-    return gradients
+        rows, columns = np.searchsorted(numbers, np.unique(pair.frame)), rows_of_pair(cameras, pair)
+        hessian, gradient = pair.frame_sums(at.T_camera_lidar)
+        gradients[np.ix_(rows, columns)] += gradient
+        hessians[np.ix_(rows, columns, columns)] += hessian
+    return gradients, hessians
 
 
 def with_pseudo_frames(

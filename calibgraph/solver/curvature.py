@@ -14,51 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.graph.objective import relative_pose_graph
-from calibgraph.model.geometry import pose_rows, retract_all, to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.geometry import retract_all, to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import to_values
 from factors import ProjectionBlock
-from factors.conditioning import invert_or_none
 
 _STEP = 1e-5  # rad and m: of the central differences of the gradient
 _STEPS = _STEP * np.vstack([np.eye(6), -np.eye(6)])
-
-
-@dataclass(frozen=True, eq=False)
-class Curvature:
-    """Second derivatives of the robust cost at a solution, (6 N, 6 N), in its tangent.
-
-    Attributes:
-        of_correspondences: of each camera's own.
-        measured: of the measured relative poses: the covariance of their gradients if their sigmas
-            hold.
-        whole: of all terms, with 1 for what nothing determines (``held`` cameras).
-    """
-
-    of_correspondences: Array
-    measured: Array
-    whole: Array
-
-    @cached_property
-    def inverse(self) -> Array | None:
-        """None where a direction is not determined."""
-        return invert_or_none(self.whole)
-
-    def sandwich(self, scatter: Array) -> Array:
-        """``H^-1 S H^-1`` for a positive semidefinite S, which it is as well, in spite of rounding.
-
-        Raises:
-            ValueError: if a direction is not determined.
-        """
-        if self.inverse is None:
-            raise ValueError("a direction of the solution is not determined")
-        values, vectors = np.linalg.eigh(scatter)
-        root = self.inverse @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-        covariance: Array = root @ root.T
-        return covariance
 
 
 def convex_hessian(hessian: Array, otherwise: Array) -> Array:
@@ -78,11 +42,6 @@ def _is_positive_definite(hessian: Array) -> bool:
     except np.linalg.LinAlgError:
         return False
     return True
-
-
-def unknown(chosen: Sequence[bool]) -> Array:
-    """(6 N, 6 N) diagonal, 1 for the chosen cameras."""
-    return np.diag(np.repeat(np.array(chosen, dtype=np.float64), 6))
 
 
 def add_pair_hessians(
@@ -203,20 +162,6 @@ class FittedObjective:
         """Per camera with correspondences, (f, 6) gradients of half the cost of its frames."""
         blocks = self.objective.blocks
         return {n: b.frame_gradients(self.pose(n), self.scales[n]) for n, b in blocks.items()}
-
-    @cached_property
-    def curvature(self) -> Curvature:
-        """The curvature of all terms, the gate's own among them."""
-        inliers, cameras, T_camera_lidar = self.objective, self.cameras, self.T_camera_lidar
-        own = np.zeros((6 * len(cameras), 6 * len(cameras)))
-        for name, hessian in self.robust_hessians.items():
-            rows = pose_rows(cameras.index(name))
-            own[rows, rows] = convex_hessian(hessian + inliers.gate_hessian.get(name, 0.0), hessian)
-        measured = relative_pose_graph(cameras, inliers.rig.relative_poses)
-        whole = own + pose_hessian(inliers.pose_graph, cameras, T_camera_lidar)
-        add_pair_hessians(whole, inliers.pairs, T_camera_lidar)
-        whole += unknown([name in self.held for name in cameras])
-        return Curvature(own, pose_hessian(measured, cameras, T_camera_lidar), whole)
 
     def data_only(self) -> FittedObjective:
         """The correspondences alone, at their minimum near here."""

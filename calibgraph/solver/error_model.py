@@ -98,8 +98,9 @@ def refine_with_error_model(
     """The optimum of the error model, where it differs from that of independent matches.
 
     With nothing but the matches of one place, and no scan distortion, both optima are equal; then
-    no model is made. Measured relative poses that contradict the correspondences take no part, so
-    that a wrong one, or two swapped cameras, do not move the others.
+    no model is made, nor with the paper's presets, whose estimate is the minimum of Eq. 5. Measured
+    relative poses that contradict the correspondences take no part, so that a wrong one, or two
+    swapped cameras, do not move the others.
 
     Args:
         at: the optimum for independent matches.
@@ -114,7 +115,8 @@ def refine_with_error_model(
     several = inliers.blocks and len(split_frames(inliers, places)) > 1
     distorted = any(findings.bend_sigmas)
     known = inliers.rig.relative_poses, inliers.lenses
-    if not (several or distorted or inliers.pairs or any(known)):
+    is_paper = inliers.config.preset != "auto"
+    if is_paper or not (several or distorted or inliers.pairs or any(known)):
         return None, optimum
     free = fit_without_priors(at, findings, places) if inliers.rig.relative_poses else None
     if free is not None:
@@ -135,7 +137,7 @@ def fit_without_priors(
     at: FittedObjective, findings: MatcherFindings, places: Places
 ) -> ErrorFit | None:
     """The fit of correspondences and pairs alone; None as of :func:`fit_errors`."""
-    if at.objective.config.preset != "auto" or not at.objective.uses_correspondences:
+    if not at.objective.uses_correspondences:
         return None
     return fit_errors(at.data_only(), findings, places)
 
@@ -165,11 +167,10 @@ def fit_errors(at: FittedObjective, findings: MatcherFindings, places: Places) -
         places: which frames share a place.
 
     Returns:
-        None without correspondences, with a preset of the paper, or where a direction of a camera
-        is not determined.
+        None without correspondences, or where a direction of a camera is not determined.
     """
     inliers = at.objective
-    if inliers.config.preset != "auto" or not inliers.uses_correspondences or not inliers.blocks:
+    if not inliers.uses_correspondences or not inliers.blocks:
         return None
     frames = split_frames(inliers, places)
     model = error_model(at, findings, frames)

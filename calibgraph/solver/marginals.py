@@ -1,12 +1,12 @@
-"""The covariance of a solution, and all that it is made of: the marginal of its graph.
+"""The covariance of a solution, and all that it is made of: the marginal of the error model.
 
-With the preset ``auto`` it is the marginal of the error model. The paper's presets have no error
-model: there it is the sandwich, by the scatter between frames.
+With the preset ``auto`` the estimate is the optimum of that model. With the paper's presets the
+estimate is the minimum of Eq. 5, and the model serves for its covariance alone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -16,12 +16,12 @@ from calibgraph.arrays import Array
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.error_sources import COMMON, PAIRS, TIMES, UNMODELLED, ErrorSources
+from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
-from calibgraph.solver.covariance import cluster_robust_covariance, data_sigmas
-from calibgraph.solver.curvature import Curvature, FittedObjective
+from calibgraph.solver.covariance import data_sigmas
+from calibgraph.solver.curvature import FittedObjective
 from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
 from calibgraph.solver.error_shares import (
@@ -29,9 +29,9 @@ from calibgraph.solver.error_shares import (
     sources_by_camera,
     variances_by_source,
 )
-from calibgraph.solver.objective import Objective, Transforms
+from calibgraph.solver.objective import Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
-from calibgraph.solver.shared_error import error_between, shared_scatter, shared_variance_ratio
+from calibgraph.solver.shared_error import shared_variance_ratio
 from factors import pose_sigmas
 
 _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unknown
@@ -92,37 +92,25 @@ class Marginals:
 
     @cached_property
     def covariance(self) -> Array | None:
-        """(6 N, 6 N): the marginal of the error model; with the paper's presets, the sandwich."""
-        if self.at.objective.config.preset == "auto":
-            return None if self.errors is None else self.errors.fit.covariance
-        if self.scatter is None:
-            return None
-        shared = self.shared_variance_ratio * self._shared(self.at.objective, self.at.curvature)
-        return (
-            self.scatter + shared + error_between(self.at.T_camera_lidar, self.at.objective.pairs)
-        )
+        """(6 N, 6 N): the marginal of the error model."""
+        return None if self.errors is None else self.errors.fit.covariance
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """The graph whose optimum and marginal they are; with the paper's presets, Eq. 5."""
-        if self.errors is not None:
+        if self.errors is not None and self.at.objective.config.preset == "auto":
             return latent_pose_graph(self.errors.model)
         return self.at.objective.graph(self.at.scales)
 
     @cached_property
     def errors(self) -> ErrorFit | None:
-        """The error model of the solution; None with the paper's presets.
+        """The error model of the solution; None as of ``fit_errors``.
 
         The shared error is at least as large as pairs of images show, even if the loss rejects
         them.
         """
         found = self.fit or fit_errors(self.at, self.findings, self.table.places)
         return None if found is None else found.with_shared_ratio(self.shared_variance_ratio)
-
-    @cached_property
-    def scatter(self) -> Array | None:
-        """(6 N, 6 N) covariance by the scatter between frames, or None."""
-        return cluster_robust_covariance(self.at, self.at.curvature)
 
     @cached_property
     def data_sigmas(self) -> Array | None:
@@ -137,29 +125,12 @@ class Marginals:
         Args:
             joint: (6 N, 6 N) the reported covariance, which may be wider than that of the matches.
         """
-        if self.covariance is None:
-            return {}
-        total, held = np.diag(self.covariance), self.at.held
         if self.errors is None:
-            parts = self._sandwich_parts
-            fixed = parts[COMMON] + parts[PAIRS]
-            forecast = {times: fixed + (total - fixed) / times for times in TIMES}
-        else:
-            parts, forecast = variances_by_source(self.errors), predict_variances(self.errors)
+            return {}
+        total, held = np.diag(self.errors.fit.covariance), self.at.held
+        parts, forecast = variances_by_source(self.errors), predict_variances(self.errors)
         numbers = {n: k for k, n in enumerate(self.cameras) if n not in held}
         return sources_by_camera(joint, total, parts, forecast, numbers=numbers)
-
-    @property
-    def _sandwich_parts(self) -> dict[str, Array]:
-        """Per source but the matches, (6 N,) variances, with the paper's presets."""
-        inliers, T_camera_lidar = self.at.objective, self.at.T_camera_lidar
-        no_places = replace(self.findings, place_variance=0.0)
-        every, common = (
-            self.shared_variance_ratio * np.diag(self._shared(inliers, self.at.curvature, findings))
-            for findings in (self.findings, no_places)
-        )
-        between = np.diag(error_between(T_camera_lidar, inliers.pairs))
-        return {COMMON: common, UNMODELLED: every - common, PAIRS: between}
 
     @cached_property
     def shared_variance_ratio(self) -> float:
@@ -196,19 +167,6 @@ class Marginals:
         held = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2
         return np.diag(np.tile(held, len(self.cameras)))
 
-    def _shared(
-        self, inliers: Objective, curvature: Curvature, findings: MatcherFindings | None = None
-    ) -> Array:
-        """(6 N, 6 N) covariance of a solution by the prior of the error that all frames share."""
-        places = self.table.places
-        repeats = {
-            name: places.frames_per_place(block.frame_numbers)
-            for name, block in inliers.blocks.items()
-        }
-        T_camera_lidar = {name: self.at.T_camera_lidar[name] for name in inliers.cameras}
-        scatter = shared_scatter(findings or self.findings, T_camera_lidar, curvature, repeats)
-        return curvature.sandwich(scatter)
-
     @property
     def _data_only(self) -> JointPoses | None:
         """The solution of the correspondences alone; None where the terms do not use them."""
@@ -219,14 +177,7 @@ class Marginals:
             alone = fit_without_priors(self.at, self.findings, self.table.places)
         if alone is not None:
             return JointPoses.of(alone.fit)
-        free = self.at.data_only()
-        is_auto = self.at.objective.config.preset == "auto"
-        scatter = None if is_auto else cluster_robust_covariance(free, free.curvature)
-        if scatter is None:
-            return JointPoses(free.T_camera_lidar, None)
-        shared = self._shared(free.objective, free.curvature)
-        between = error_between(free.T_camera_lidar, free.objective.pairs)
-        return JointPoses(free.T_camera_lidar, scatter + (shared + between))
+        return JointPoses(self.at.data_only().T_camera_lidar, None)
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:

@@ -11,10 +11,8 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
-from calibgraph.solver.camera_pairs import ENOUGH_SURFACES, PairTerm
-from calibgraph.solver.curvature import Curvature
-from calibgraph.solver.pair_refinement import PairFit, pair_sigmas
-from factors import pose_sigmas
+from calibgraph.solver.camera_pairs import ENOUGH_SURFACES
+from calibgraph.solver.pair_refinement import PairFit
 
 
 def with_common_error(table: Correspondences, config: Config) -> Correspondences:
@@ -38,48 +36,6 @@ def with_common_error(table: Correspondences, config: Config) -> Correspondences
             f"{100 * translation_m:.3g} cm; leave common_deg and common_cm out"
         )
     return table
-
-
-def shared_scatter(
-    findings: MatcherFindings,
-    T_camera_lidar: Mapping[str, Array],
-    curvature: Curvature,
-    repeats: Mapping[str, float],
-) -> Array:
-    """(6 N, 6 N) covariance of the gradient, by the error that all frames share.
-
-    Three parts. The cloud is displaced as a rigid body, for all cameras alike, and the matches of
-    each camera are displaced by themselves: each with its share of the variance of
-    ``systematic_sigmas``. And frames of one place show the same objects, so that a part of their
-    error repeats: as ``place_variance`` times the covariance of one frame's matches, if they were
-    independent. Their scatter, in which this part is missing, is added elsewhere.
-
-    Args:
-        findings: the matcher's error.
-        T_camera_lidar: the solution, all cameras.
-        curvature: there.
-        repeats: per camera with correspondences, how many frames share a place, in the mean.
-    """
-    rotation_rad, translation_m = findings.systematic_sigmas
-    whole = np.diag(pose_sigmas(rotation_rad=rotation_rad, translation_m=translation_m) ** 2)
-    camera, cloud = findings.camera_share * whole, (1.0 - findings.camera_share) * whole
-    cameras = list(T_camera_lidar)
-    to_cameras = np.concatenate([gtsam.Pose3(T).AdjointMap() for T in T_camera_lidar.values()])
-    displaced = to_cameras @ cloud @ to_cameras.T + np.kron(np.eye(len(cameras)), camera)
-    matches = curvature.of_correspondences
-    scatter = np.asarray(matches @ displaced @ matches)
-    for name, repeated in repeats.items():
-        rows = pose_rows(cameras.index(name))
-        scatter[rows, rows] += findings.place_variance * repeated * matches[rows, rows]
-    return scatter
-
-
-def error_between(T_camera_lidar: Mapping[str, Array], pairs: Sequence[PairTerm]) -> Array:
-    """(6 N, 6 N) covariance of the error of relative poses from images, half in each camera."""
-    of_pair = np.diag(pair_sigmas() ** 2)
-    seen = {name for pair in pairs for name in (pair.a, pair.b)}
-    cameras = np.diag([float(name in seen) for name in T_camera_lidar])
-    return np.asarray(np.kron(cameras, of_pair / 2))
 
 
 def shared_variance_ratio(

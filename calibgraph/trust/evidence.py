@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CorrespondenceError
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.config import Terms
@@ -24,9 +21,8 @@ from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.conflicts import Conflict
-from calibgraph.solver.objective import Transforms
+from calibgraph.solver.covariance import bootstrap_covariances
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.observability import prior_shares
@@ -194,11 +190,6 @@ class Evidence:
         marginals, joint = self.solution.marginals, self.joint_covariance
         return marginals.pair_fits if not self.posteriors else marginals.fit_pairs_near(joint)
 
-    def scatter_of(self, camera: str) -> Array | None:
-        """(6, 6) of one camera, by the scatter between frames."""
-        scatter = self.solution.marginals.scatter
-        return None if scatter is None else self._rows_of(scatter, camera)
-
     def covariance_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, with the error that all the matcher's frames share."""
         return self._block(self.joint_covariance, camera)
@@ -231,7 +222,8 @@ class Evidence:
     @cached_property
     def bootstrap(self) -> dict[str, Array]:
         """Per camera (6, 6) scatter of re-solves from frames drawn again; empty if not wanted."""
-        return bootstrap_covariance(self.solution)
+        config = self.solution.config
+        return bootstrap_covariances(self.solution.fitted, config.bootstrap, config.seed)
 
     @cached_property
     def prior_shares(self) -> dict[str, float]:
@@ -304,61 +296,3 @@ class RunEvidence:
 def concatenate(parts: Sequence[Checks], cameras: Sequence[str]) -> dict[str, list[Check]]:
     """Per camera the checks of all parts, one part after the other."""
     return {name: [check for part in parts for check in part.get(name, ())] for name in cameras}
-
-
-Matches = TypeVar("Matches", CameraBlock, PairTerm)
-_MAX_TRIES = 20  # draws in turn that leave a camera with too few matches
-
-
-def bootstrap_covariance(solution: Solution) -> dict[str, Array]:
-    """Per camera (6, 6) scatter of xi in T_camera_lidar = exp(xi) solution.
-
-    Every draw takes as many frames as there are, with replacement, all cameras of a frame together;
-    it is gated and solved like the solution, from there. A draw that leaves a camera with too few
-    matches is repeated.
-
-    Returns:
-        Empty without draws, or where the terms do not use the correspondences.
-
-    Raises:
-        CorrespondenceError: if no draw has enough matches of every camera.
-    """
-    draws = solution.config.bootstrap
-    if not draws or not solution.objective.uses_correspondences:
-        return {}
-    rng = np.random.default_rng(solution.config.seed)
-    blocks = solution.objective.blocks.values()
-    frames = np.unique(np.concatenate([block.frame for block in blocks]))
-    results = [_solve_draw(solution, rng, frames) for _ in range(draws)]
-    return {
-        name: np.atleast_2d(np.cov([twist_between(r[name], T) for r in results], rowvar=False))
-        for name, T in solution.T_camera_lidar.items()
-    }
-
-
-def _solve_draw(
-    solution: Solution, rng: np.random.Generator, frames: NDArray[np.int64]
-) -> Transforms:
-    """The T_camera_lidar of one draw of frames."""
-    for _ in range(_MAX_TRIES):
-        drawn = rng.choice(frames, len(frames))
-        blocks = {name: _draw(b, drawn) for name, b in solution.objective.blocks.items()}
-        pairs = tuple(p for p in (_draw(q, drawn) for q in solution.inliers.pairs) if len(p.frame))
-        objective = replace(solution.objective, blocks=blocks, pairs=pairs)
-        try:
-            inliers = objective.without_outliers(solution.T_camera_lidar, solution.scales)
-            rough = inliers.minimize(solution.T_camera_lidar, solution.scales).T_camera_lidar
-            inliers = objective.without_outliers(rough, solution.scales)
-        except CorrespondenceError as error:
-            reason = error
-            continue
-        return inliers.minimize(rough, solution.scales).T_camera_lidar
-    raise CorrespondenceError(f"bootstrap: {reason}; give more frames, or leave bootstrap out")
-
-
-def _draw(block: Matches, drawn: NDArray[np.int64]) -> Matches:
-    """The matches of some frames; of a frame that was drawn twice, twice."""
-    starts = np.searchsorted(block.frame, drawn)
-    ends = np.searchsorted(block.frame, drawn, side="right")
-    rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, ends, strict=True)])
-    return block.select(np.sort(rows))

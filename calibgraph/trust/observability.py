@@ -23,15 +23,15 @@ _NEAR_M, _FAR_M = 6.0, 20.0
 _SHALLOW = 2.0  # ratio of far to near
 
 
-def weaknesses(solution: Solution, camera: str, scatter: Array | None) -> tuple[str, ...]:
+def weaknesses(solution: Solution, camera: str, covariance: Array | None) -> tuple[str, ...]:
     """Sentences about weakly observable parameters of one camera, the most important first.
 
-    By the (6, 6) scatter between frames; if there is none, by that of independent matches.
+    By the (6, 6) covariance of its pose; if there is none, by that of independent matches.
     """
     block = solution.inliers.blocks.get(camera)
     if block is None or not solution.objective.uses_correspondences:
         return ()
-    how, covariance = "weakest direction, by the scatter of the frames", scatter
+    how = "weakest direction"
     if covariance is None:
         how = "weakest direction, by the matches as if each were independent"
         independent = solution.fitted.projections[camera].sums(solution.fitted.pose(camera))

@@ -140,7 +140,7 @@ def bootstrap_checks(evidence: Evidence) -> Checks:
     """Whether the reported covariance is as large as the bootstrap's, if there is one."""
     row, checks = threshold("bootstrap_sigma"), {}
     for name, bootstrap in evidence.bootstrap.items():
-        reported = evidence.scatter_of(name)
+        reported = evidence.covariance_by_matches(name)
         if reported is not None:
             ratio = float(np.sqrt(np.max(np.diag(bootstrap) / np.diag(reported))))
             checks[name] = [row.check(ratio)]

@@ -14,7 +14,6 @@ from calibgraph.model.error_sources import (
     LENSES,
     MATCHES,
     MOST_TIMES,
-    UNMODELLED,
     ErrorSources,
 )
 from calibgraph.model.summary import LEAST, summarize
@@ -162,7 +161,6 @@ WIDE = ErrorSources(
     [
         (ESTIMATED, "Estimate fewer parts of the lens"),
         (LENSES, "State how well lenses and clocks are known"),
-        (UNMODELLED, "preset out"),
     ],
 )
 def test_a_wide_bar_advises_on_its_largest_source(source: str, expected: str) -> None:

@@ -22,18 +22,15 @@ from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.config import Config, preset
 from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES
 from calibgraph.model.findings import MatcherFindings, error_components
-from calibgraph.model.geometry import relative_covariance, relative_transform
 from calibgraph.model.verdict import COMMON_ERROR
 from calibgraph.simulation.correspondences import PoseSpread
-from calibgraph.solver.camera_pairs import pair_terms
 from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.curvature import Curvature
 from calibgraph.solver.elimination import join_linear
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.error_shares import variances_by_source
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.pair_refinement import PairFit, fit_pairs, pair_sigmas
-from calibgraph.solver.shared_error import error_between, shared_scatter, shared_variance_ratio
+from calibgraph.solver.pair_refinement import PairFit, fit_pairs
+from calibgraph.solver.shared_error import shared_variance_ratio
 from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.trust.evidence import Evidence
 from factors import pose_sigmas
@@ -216,56 +213,7 @@ def test_recording_is_advised_only_where_it_shrinks_the_error_bar_enough(pair: R
     assert f"{best_deg:.2g} deg" in limited
 
 
-FINDINGS = MatcherFindings(systematic_rotation_rad=2e-3, systematic_translation_m=0.03)
 EACH = pose_sigmas(rotation_rad=2e-3, translation_m=0.03) ** 2
-
-
-def alone(rig: Rig) -> Curvature:
-    """Of correspondences that tie each camera by itself."""
-    own = np.diag(np.tile([4e6, 3e6, 2e6, 9e4, 8e4, 7e4], len(rig.cameras)))
-    return Curvature(own, np.zeros_like(own), own)
-
-
-def test_every_camera_has_it_and_half_of_its_variance_is_that_of_the_whole_cloud(
-    pair: Rig,
-) -> None:
-    bent = alone(pair)
-    joint = bent.sandwich(shared_scatter(FINDINGS, pair.T_camera_lidar, bent, {}))
-    assert np.diag(joint)[:3] == pytest.approx(EACH[:3], rel=1e-9)
-    lever_m2 = 2e-3**2 / 2  # the cloud turns about the LiDAR, under a metre from the cameras
-    for rows in (slice(3, 6), slice(9, 12)):
-        assert (np.diag(joint)[rows] >= 0.999 * EACH[3:]).all()
-        assert (np.diag(joint)[rows] <= EACH[3:] + lever_m2).all()
-    relative = relative_covariance(
-        joint, 0, 1, relative_transform(*(pair.T_camera_lidar[n] for n in ("right", "left")))
-    )
-    # What both share is not between them: two halves are left of two whole ones.
-    assert np.diag(relative)[:3] == pytest.approx(EACH[:3], rel=1e-9)
-
-
-def test_the_part_of_a_place_does_not_fall_with_the_number_of_its_frames(pair: Rig) -> None:
-    findings = MatcherFindings(place_variance=4.0)
-    found = []
-    for count in (1, 10):
-        own = count * alone(pair).of_correspondences
-        bent = Curvature(own, np.zeros_like(own), own)
-        frames = dict.fromkeys(pair.cameras, float(count))
-        found.append(bent.sandwich(shared_scatter(findings, pair.T_camera_lidar, bent, frames)))
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-12, atol=1e-20)
-    np.testing.assert_allclose(
-        found[0], 4 * np.linalg.inv(alone(pair).of_correspondences), rtol=1e-9, atol=1e-20
-    )
-
-
-def test_the_error_of_images_is_between_cameras_that_share_features_alone(pair: Rig) -> None:
-    terms, T = pair_terms(pair, simulated_pairs(pair), Config()), pair.T_camera_lidar
-    assert not error_between(T, ()).any()
-    relative = relative_covariance(
-        error_between(T, terms), 0, 1, relative_transform(T["right"], T["left"])
-    )
-    # Half of the pair's variance is in the left camera, half a metre away, which adds to it.
-    own = pair_sigmas()
-    assert np.sqrt(np.diag(relative)) == pytest.approx(own, abs=0.5 * own[0])
 
 
 @pytest.mark.parametrize("size", [2.0, 4.0])

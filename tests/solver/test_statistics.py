@@ -44,7 +44,7 @@ def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> Non
         table = simulate_correspondences(pair, frames=frames, matches=100, errors=errors, seed=seed)
         solved = solve_joint(pair, table)  # without the checks, which take most of a solve's time
         found, true = solved.T_camera_lidar, pair.T_camera_lidar
-        joint = solved.marginals.scatter
+        joint = solved.covariance
         T_right_left = found["right"] @ np.linalg.inv(found["left"])
         xi_pair = error(T_right_left, true["right"] @ np.linalg.inv(true["left"]))
         for name, xi, covariance in (
