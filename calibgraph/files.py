@@ -7,7 +7,6 @@ import json
 import os
 import re
 import tempfile
-import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -244,16 +243,6 @@ def holds_truth_value(value: object) -> bool:
     if isinstance(value, (list, tuple)):
         return any(map(holds_truth_value, value))
     return isinstance(value, (bool, np.bool_))
-
-
-def commented_defaults(model: type[BaseModel]) -> str:
-    """A YAML file with all defaults of a model, each with its description."""
-    lines = []
-    for name, field in model.model_fields.items():
-        description = " ".join((field.description or "").split())
-        lines += textwrap.wrap(description, 98, initial_indent="# ", subsequent_indent="# ")
-        lines += [yaml_text({name: field.default}).strip(), ""]
-    return "\n".join(lines)
 
 
 def checked_model(model: type[Model], content: Any, path: Path | str) -> Model:

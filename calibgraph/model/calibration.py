@@ -113,8 +113,9 @@ class Calibration:
         rig: the rig with the estimated extrinsics; of lenses and clocks that were estimated, with
             these and their standard deviations.
         initial_rig: the rig that the solve started from.
-        covariance: the marginal of the error model: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
-            [rad], translation [m]) in the camera's axes; None where not determined.
+        covariance: the marginal of the error model: per camera, (6, 6) of xi in T_camera_lidar =
+            exp(xi) estimate, xi = (rotation [rad], translation [m]) in the camera's axes; None
+            where not determined.
         joint_covariance: (6 N, 6 N) over all cameras in the rig's order, or None.
         pair_covariance: per pair "A->B" of cameras with error bars, (6, 6) of xi in T_B_A = exp(xi)
             estimate, in B's axes: of the cameras as they are mounted, whatever the cloud.

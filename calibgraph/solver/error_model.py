@@ -76,16 +76,6 @@ class ErrorFit:
         fit = self.fit.with_model(replace(self.model, components=components))
         return replace(self, fit=fit, ratios=replace(self.ratios, shared=least))
 
-    def scan_distortion(self, prior_sigmas: Sequence[float]) -> tuple[Array, Array]:
-        """(3,) offset of elevations [rad], their stretch, motion [m]; (3,) standard deviations.
-
-        Args:
-            prior_sigmas: (3,) prior standard deviations that the matcher states.
-        """
-        values, covariance = self.fit.distortion
-        unit = np.asarray(prior_sigmas)
-        return unit * values, unit * np.sqrt(np.diag(covariance))
-
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
         """Per camera, (4, 4)."""

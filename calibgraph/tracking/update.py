@@ -90,13 +90,11 @@ def shared_parts(update: Update) -> tuple[int, ...]:
     return tuple(id(value) for part in parts for value in part.values())
 
 
-def json_line(update: Update) -> str:
-    """The update as one line of JSON; units are in the keys, matrices row by row."""
-    return json_lines([update])[0]
-
-
 def json_lines(updates: Sequence[Update]) -> list[str]:
-    """A line of each update; what frames that were taken in at once share is encoded once."""
+    """A line of JSON of each update; units are in the keys, matrices row by row.
+
+    What frames that were taken in at once share is encoded once.
+    """
     estimates: dict[tuple[int, ...], dict[str, str]] = {}
     lines = []
     for update in updates:

@@ -102,8 +102,9 @@ def test_what_the_cameras_show_of_the_bends_moves_them_back() -> None:
     config = Config(learnt_weights=False, prior_weight=0.0, relative_prior_weight=0.0)
     without = solve_joint(rig, replace(bent, metadata=table.metadata), config)
     solution = solve_joint(rig, bent, config)
-    values, sigmas = solution.errors.scan_distortion(bent.findings.bend_sigmas)
-    assert abs(values[2] - 0.1) < 3 * sigmas[2] < 0.06
+    values, covariance = solution.errors.fit.distortion
+    unit = bent.findings.bend_sigmas[2]
+    assert abs(unit * values[2] - 0.1) < 3 * unit * np.sqrt(covariance[2, 2]) < 0.06
     mounts = solution.errors.fit.of_mount.T_camera_lidar
     for name, T in rig.T_camera_lidar.items():
         before, after = (

@@ -21,7 +21,7 @@ from calibgraph import (
 )
 from calibgraph.tracking.frame_group import in_groups, update_all
 from calibgraph.tracking.stream_tables import StreamFrame
-from calibgraph.tracking.update import json_line
+from calibgraph.tracking.update import json_lines
 from calibgraph.trust.pose_posterior import PosePosterior
 from factors import pose_sigmas
 from tests.conftest import make_camera
@@ -98,7 +98,7 @@ def expected_lines(rig: Rig, *parts: Sequence[Correspondences], together: int = 
             assert isinstance(group, list)
             for updates in update_all(tracker, group):
                 assert isinstance(updates, list)
-                lines += map(json_line, updates)
+                lines += json_lines(updates)
     return lines
 
 

@@ -25,7 +25,7 @@ from calibgraph import (
 from calibgraph.tracking import durable, tracker
 from calibgraph.tracking.state_bytes import Kind, encode
 from calibgraph.tracking.state_database import DATABASE, StateDatabase
-from calibgraph.tracking.update import json_line
+from calibgraph.tracking.update import json_lines
 from tests.conftest import KANNALA, Call
 from tests.tracking.drives import (
     World,
@@ -137,7 +137,7 @@ def test_a_tracker_that_throws_leaves_the_state_as_it_was(
             calibrator.update(world.tables[7])
     with DurableCalibrator(tmp_path, rig) as calibrator:
         assert calibrator.tracker.to_bytes() == before
-        assert json_line(calibrator.update(world.tables[7])) == world.lines[7]
+        assert json_lines([calibrator.update(world.tables[7])]) == [world.lines[7]]
 
 
 @pytest.mark.parametrize("updates", [5, 6, 7, 11, 12])
@@ -153,7 +153,7 @@ def test_a_kill_before_and_after_a_snapshot_is_written_costs_nothing(
     with DurableCalibrator(tmp_path / "copy", world.guess) as resumed:
         assert resumed.repeated and resumed.damages == ()
         found = [resumed.repeated[-1], *map(resumed.update, world.tables[updates:])]
-    assert [json_line(update) for update in found] == world.lines[updates - 1 :]
+    assert json_lines(found) == world.lines[updates - 1 :]
     calibrator.close()
 
 
@@ -174,12 +174,10 @@ def test_of_updates_in_one_write_a_kill_leaves_all_or_none(
         if done:
             shutil.copytree(state, copy)
         found += map(calibrator.update, world.tables[9:])
-    assert [json_line(update) for update in found] == world.lines[3:]
+    assert json_lines(found) == world.lines[3:]
     with DurableCalibrator(copy, world.guess) as resumed:
         assert resumed.tracker.frame == (found[5].frame if done else found[0].frame - 1)
-        assert [json_line(update) for update in resumed.repeated[3:]] == (
-            world.lines[3:9] if done else []
-        )
+        assert json_lines(resumed.repeated[3:]) == (world.lines[3:9] if done else [])
 
 
 def test_a_saved_tracker_continues_with_the_same_numbers(pair: Rig, tmp_path: Path) -> None:

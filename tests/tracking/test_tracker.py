@@ -24,7 +24,7 @@ from calibgraph import (
 )
 from calibgraph.tracking import tracker as tracker_module
 from calibgraph.tracking.cause import Steps, find_cause
-from calibgraph.tracking.update import json_line
+from calibgraph.tracking.update import json_lines
 from tests.conftest import KANNALA, make_camera, stereo_relative_pose
 from tests.tracking.drives import ERRORS, drive, drive_at, moved, pair_of, step_of
 
@@ -340,7 +340,7 @@ def test_nonsense_neither_throws_nor_harms(kind: str, share: float, frames: int)
     tracker = IncrementalCalibrator(perturb(rig, rotation_deg=1, translation_m=0.1, seed=3))
     for frame, good in enumerate(drive(rig, frames)):
         table = degenerate(frame // 2, good, rng) if rng.random() < share else good
-        line = json_line(tracker.update(table, frame=frame))
+        (line,) = json_lines([tracker.update(table, frame=frame)])
     again = IncrementalCalibrator.from_bytes(tracker.to_bytes())
     assert again.to_bytes() == tracker.to_bytes()
     for name, camera in json.loads(line)["cameras"].items():
