@@ -31,7 +31,7 @@ from factors.block_arrays import (
     to_runs,
 )
 from factors.block_sums import BlockSums, square_root, unpack_sums
-from factors.kernel import COST, GRADIENT, HESSIAN, accumulate, evaluate
+from factors.kernel import COST, CURVATURE, HESSIAN, SUMS, accumulate, evaluate
 from factors.kernel_projection import MATRICES, RAYS
 from factors.lens import Lens
 from factors.loss import loss_id
@@ -141,35 +141,22 @@ class ProjectionBlock(RobustBlock):
         sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
         return unpack_sums(sums.sum(axis=0))
 
-    def gradients_at_each(self, T_camera_lidar: Array) -> Array:
-        """(p, 6) b of the whole block at each of (p, 4, 4) poses."""
-        return unpack_sums(self._sums_at_each(T_camera_lidar, GRADIENT)).gradient
-
-    def run_gradients_at_each(self, T_camera_lidar: Array, runs: NDArray[np.int64]) -> Array:
-        """(r, p, 6) b of each of (r, 2) runs at each of (p, 4, 4) poses."""
-        return unpack_sums(self._run_sums_at_each(T_camera_lidar, runs, GRADIENT)).gradient
-
     def costs_at_each(self, T_camera_lidar: Array) -> Array:
-        """(p,) c of the whole block at each of (p, 4, 4) poses."""
-        return unpack_sums(self._sums_at_each(T_camera_lidar, COST)).cost
+        """(p,) c of the whole block at each of (p, 4, 4) poses; every chunk at all in turn."""
+        count, chunks = len(T_camera_lidar), self._chunks
+        poses, each = np.tile(T_camera_lidar, (len(chunks), 1, 1)), np.repeat(chunks, count, axis=0)
+        costs = self._run_sums(poses, each, None, COST)[:, 27]
+        return np.asarray(costs.reshape(len(chunks), count).sum(axis=0))
 
-    def _sums_at_each(self, T_camera_lidar: Array, wanted: int) -> Array:
-        """(p, 28) sums of the whole block at (p, 4, 4) poses; each chunk at all of them in turn."""
-        sums = self._run_sums_at_each(T_camera_lidar, self._chunks, wanted)
-        return np.asarray(sums.sum(axis=0))
+    def frame_sums(
+        self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike, *, curvature: bool = False
+    ) -> BlockSums:
+        """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked.
 
-    def _run_sums_at_each(
-        self, T_camera_lidar: Array, runs: NDArray[np.int64], wanted: int
-    ) -> Array:
-        """(r, p, 28) sums of each run at each pose."""
-        count = len(T_camera_lidar)
-        poses, each = np.tile(T_camera_lidar, (len(runs), 1, 1)), np.repeat(runs, count, axis=0)
-        return self._run_sums(poses, each, None, wanted).reshape(len(runs), count, 28)
-
-    def frame_sums(self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike) -> BlockSums:
-        """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked."""
-        runs = to_runs(np.asarray(edges, dtype=np.int64))
-        return unpack_sums(self._run_sums(_T_camera_lidar(T_lidar_camera)[None], runs, None))
+        With ``curvature``, also the second derivative of half the cost of each.
+        """
+        poses, runs = _T_camera_lidar(T_lidar_camera)[None], to_runs(np.asarray(edges, np.int64))
+        return unpack_sums(self._run_sums(poses, runs, None, CURVATURE if curvature else HESSIAN))
 
     def run_sums(
         self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None = None
@@ -199,8 +186,9 @@ class ProjectionBlock(RobustBlock):
         shared = wanted == HESSIAN and len(runs) * len(self) >= _WORTH_SHARING
         shared = shared and int((runs[:, 1] - runs[:, 0]).sum()) >= _WORTH_SHARING
         scales = np.array([self.scale]) if scales is None else scales
-        sums = np.empty((len(runs), 28))
-        for kind in (RAYS, self.lens.kind) if self._has_rays() else (self.lens.kind,):
+        sums = np.empty((len(runs), SUMS[wanted]))
+        rays = self._has_rays() and wanted != CURVATURE
+        for kind in (RAYS, self.lens.kind) if rays else (self.lens.kind,):
             # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
             accumulate(kind, shared=shared)(
                 self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,

@@ -22,11 +22,15 @@ class BlockSums:
         hessian: (6, 6) or (f, 6, 6), H above, in GTSAM's tangent of ``T_lidar_camera``.
         gradient: (6,) or (f, 6), b above.
         cost: () or (f,), c above; GTSAM's error is half of it.
+        curvature: the second derivative of half the cost, like ``hessian``, where it was asked
+            for; but for the second derivative of the residuals, which is their noise over the focal
+            length as large.
     """
 
     hessian: Array
     gradient: Array
     cost: Array
+    curvature: Array | None = None
 
 
 def square_root(sums: BlockSums) -> tuple[Array, Array]:
@@ -72,5 +76,7 @@ _PLACES = np.array([[min(i, j) * (11 - min(i, j)) // 2 + max(i, j) for j in rang
 
 
 def unpack_sums(sums: Array) -> BlockSums:
-    """Split (..., 28) kernel sums: 21 of the upper triangle of H, 6 of b, 1 of c."""
-    return BlockSums(sums.take(_PLACES, axis=-1), sums[..., 21:27], sums[..., 27])
+    """Split (..., 28 or 49) kernel sums: 21 of the upper triangle of H, 6 of b, 1 of c, 21 more."""
+    more = sums[..., 28:]
+    curvature = more.take(_PLACES, axis=-1) if more.shape[-1] else None
+    return BlockSums(sums.take(_PLACES, axis=-1), sums[..., 21:27], sums[..., 27], curvature)

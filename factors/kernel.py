@@ -18,8 +18,10 @@ from numba.core.errors import NumbaWarning
 
 from factors.compiled import compiled, one_at_a_time
 from factors.kernel_projection import (
+    ACROSS,
     FAST,
     MATRICES,
+    PSI,
     RAYS,
     ROWS,
     RU,
@@ -39,6 +41,7 @@ from factors.kernel_sums import (
     sum_rays,
     sum_tile,
     sum_tile_gradients,
+    turn_to_residuals,
     weigh,
     whiten,
 )
@@ -47,8 +50,11 @@ from factors.lens_kernels import PINHOLE, is_projectable
 # Open3D brings an older libtbb than numba uses; numba then takes another library, as good.
 warnings.filterwarnings("ignore", "The TBB threading layer requires", NumbaWarning)
 
-COST, GRADIENT, HESSIAN = range(3)
-"""Which sums are wanted: c; c and b; or all."""
+COST, HESSIAN, CURVATURE = range(3)
+"""Which sums are wanted: c; H, b and c; or the second derivative of c / 2 besides."""
+
+SUMS = {COST: 28, HESSIAN: 28, CURVATURE: 49}
+"""How many that is: 21 of H, 6 of b, 1 of c, 21 of the second derivative."""
 
 
 @cache
@@ -57,7 +63,7 @@ def accumulate(kind: int, *, shared: bool = False) -> Any:
 
     @compiled(fastmath=FAST, parallel=shared)
     def accumulate_runs(lens, poses, columns, whitening, loss, scales, runs, wanted, out):  # type: ignore[no-untyped-def]
-        """Fill (r, 28) sums over the runs ``runs[i, 0]:runs[i, 1]``: 21 of H, 6 of b, 1 of c.
+        """Fill (r, SUMS) sums over the runs ``runs[i, 0]:runs[i, 1]``.
 
         ``poses`` (r, 4, 4) are T_camera_lidar and ``scales`` (r,) the loss', each of one run, or
         (1, 4, 4) and (1,) of all; ``columns`` (5, n) are x y z u v; ``whitening`` is (3, n):
@@ -68,7 +74,7 @@ def accumulate(kind: int, *, shared: bool = False) -> Any:
             T = poses[np.int64(i) if len(poses) > 1 else 0]
             scale = scales[np.int64(i) if len(scales) > 1 else 0]
             sums, tile = out[i], np.empty((ROWS, TILE))
-            for k in range(28):
+            for k in range(len(sums)):
                 sums[k] = 0.0
             for start in range(runs[i, 0], runs[i, 1], TILE):
                 n = runs[i, 1] - start if runs[i, 1] - start < TILE else TILE
@@ -87,13 +93,14 @@ def accumulate(kind: int, *, shared: bool = False) -> Any:
                     continue
                 if kind == RAYS:
                     apply_weights(whitening, start, n, tile)
-                    if wanted == HESSIAN:
-                        sum_rays(lens, n, tile, sums)
+                    sum_rays(lens, n, tile, sums)
                     sum_ray_gradients(lens, n, tile, sums)
                 else:
-                    if wanted == HESSIAN:
-                        sum_tile(n, tile, sums)
+                    sum_tile(n, tile, tile[PSI], sums)
                     sum_tile_gradients(n, tile, sums)
+                    if wanted == CURVATURE:
+                        turn_to_residuals(loss, scale, n, tile)
+                        sum_tile(n, tile, tile[ACROSS], sums[28:])
 
     return one_at_a_time(accumulate_runs) if shared else accumulate_runs
 

@@ -22,6 +22,9 @@ TILE = 256
 frame, the loss' weight psi, and scratch for products."""
 ROWS = 13
 
+ACROSS = PRODUCT
+"""The weight of the derivatives across the residual, where PSI has the weight of those along it."""
+
 (A, B, W) = (X, Y, Z)
 """Of an undistorted pinhole, in place of the point: x/z, y/z and 1/z."""
 

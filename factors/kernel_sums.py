@@ -1,9 +1,15 @@
-"""The sums over a tile: whitening, the loss and its weights, and the 28 sums of H, b and c."""
+"""The sums over a tile: whitening, the loss and its weights, the 28 sums of H, b and c.
+
+The second derivative of rho(s) / 2 is J^T (psi I + 2 psi' r r^T) J, but for the second derivative
+of r. In the axes along the residual and across it the middle is diagonal, so that it is summed
+like H, with another weight along.
+"""
 
 import math
 
 from factors.compiled import compiled
 from factors.kernel_projection import (
+    ACROSS,
     FAST,
     PRODUCT,
     PSI,
@@ -22,7 +28,7 @@ from factors.kernel_projection import (
     Y,
     Z,
 )
-from factors.loss import CAUCHY, loss_and_weight
+from factors.loss import CAUCHY, loss_and_weight, weight_along
 
 _SMALL = 1e-100  # far from the smallest float by more than four factors
 
@@ -99,8 +105,24 @@ def _sum_of_logarithms(values, n, products):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True, fastmath=FAST)
-def sum_tile(n, tile, out):  # type: ignore[no-untyped-def]
-    """Add the 21 sums of H = J^T psi J of a tile.
+def turn_to_residuals(loss, scale, n, tile):  # type: ignore[no-untyped-def]
+    """Derivatives along the residual and across it, in place of u and v, and their weights."""
+    ru, rv, along, across = tile[RU], tile[RV], tile[PSI], tile[ACROSS]
+    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
+    for i in range(n):
+        s = ru[i] * ru[i] + rv[i] * rv[i]
+        size = math.sqrt(s)
+        c, d = (ru[i] / size, rv[i] / size) if s > 0.0 else (1.0, 0.0)
+        u0, u1, u2, v0, v1, v2 = ux[i], uy[i], uz[i], vx[i], vy[i], vz[i]
+        ux[i], uy[i], uz[i] = c * u0 + d * v0, c * u1 + d * v1, c * u2 + d * v2
+        vx[i], vy[i], vz[i] = c * v0 - d * u0, c * v1 - d * u1, c * v2 - d * u2
+        across[i] = along[i]
+        along[i] = weight_along(loss, scale, s, across[i])
+
+
+@compiled(part=True, fastmath=FAST)
+def sum_tile(n, tile, of_v, out):  # type: ignore[no-untyped-def]
+    """Add the 21 sums of H = J^T psi J of a tile; ``of_v``: the weights of v, PSI has those of u.
 
     q = X^-1 p has dq / d(rotation, translation) = ([q]x, -I), and g^T [q]x = (g x q)^T. With the
     3x3 matrix m = psi g g^T, summed over u and v, and c = m [q]x, the blocks of H are [q]x^T c, c
@@ -108,12 +130,12 @@ def sum_tile(n, tile, out):  # type: ignore[no-untyped-def]
     """
     d00 = d01 = d02 = d11 = d12 = d22 = m00 = m01 = m02 = m11 = m12 = m22 = 0.0
     c00 = c01 = c02 = c10 = c11 = c12 = c20 = c21 = c22 = 0.0
-    rx, ry, rz, rp = tile[X], tile[Y], tile[Z], tile[PSI]
+    rx, ry, rz, of_u = tile[X], tile[Y], tile[Z], tile[PSI]
     ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
     for i in range(n):
-        x, y, z, psi = rx[i], ry[i], rz[i], rp[i]
+        x, y, z, p, q = rx[i], ry[i], rz[i], of_u[i], of_v[i]
         u0, u1, u2, v0, v1, v2 = ux[i], uy[i], uz[i], vx[i], vy[i], vz[i]
-        p0, p1, p2, q0, q1, q2 = psi * u0, psi * u1, psi * u2, psi * v0, psi * v1, psi * v2
+        p0, p1, p2, q0, q1, q2 = p * u0, p * u1, p * u2, q * v0, q * v1, q * v2
         xx, xy, xz = p0 * u0 + q0 * v0, p0 * u1 + q0 * v1, p0 * u2 + q0 * v2
         yy, yz, zz = p1 * u1 + q1 * v1, p1 * u2 + q1 * v2, p2 * u2 + q2 * v2
         # Of the rows of c^T: rotation about an axis, by x, y, z.

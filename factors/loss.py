@@ -58,6 +58,21 @@ def loss_and_weight(loss, scale, s):  # type: ignore[no-untyped-def]
     return k / 3.0 * (1.0 - w * w * w), w * w
 
 
+@compiled(forceinline=True)
+def weight_along(loss, scale, s, psi):  # type: ignore[no-untyped-def]
+    """Return psi + 2 psi' s: the second derivative of rho / 2 along the residual."""
+    k = scale * scale
+    if loss == CAUCHY:
+        return psi - 2.0 * psi * psi * s / k
+    if loss == HUBER:
+        return 1.0 if s <= k else 0.0
+    if loss == GEMAN_MCCLURE:
+        return psi - 4.0 * psi * math.sqrt(psi) * s / k
+    if loss == TUKEY:
+        return psi - 4.0 * math.sqrt(psi) * s / k
+    return psi
+
+
 def losses_and_weights(loss: int, scale: float, squares: Array) -> tuple[Array, Array]:
     """(n,) losses and (n,) weights of (n,) squared residuals, see :func:`loss_and_weight`."""
     found = np.empty((2, len(squares)))

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -109,10 +108,6 @@ class CameraBlock:
     def with_scale(self, scale: ResidualScale) -> ProjectionBlock:
         """The projection block with its loss, in units of the residuals' sigma."""
         return self.block.rescale(scale=scale.loss_scale / scale.sigma, sigma=scale.sigma)
-
-    def frame_gradients(self, T_lidar_camera: gtsam.Pose3, scale: ResidualScale) -> Array:
-        """(f, 6) gradient of half the robust cost of each frame."""
-        return self.with_scale(scale).frame_sums(T_lidar_camera, self.frame_edges).gradient
 
     def select(self, rows: NDArray[Any]) -> CameraBlock:
         """Some rows: a mask or an index array."""

@@ -10,10 +10,9 @@ from calibgraph.solver.curvature import (
     FittedObjective,
     add_pair_hessians,
     pose_hessian,
-    robust_hessians_of,
+    robust_hessians,
     rows_of_pair,
 )
-from factors import to_runs
 from factors.conditioning import sigmas_of_hessian
 
 ENOUGH_FRAMES = 5
@@ -62,12 +61,8 @@ def _by_frame(at: FittedObjective) -> tuple[Array, Array]:
     gradients, hessians = np.zeros((len(numbers), size)), np.zeros((len(numbers), size, size))
     for name, block in blocks.items():
         rows, own = np.searchsorted(numbers, block.frame_numbers), pose_rows(cameras.index(name))
-        one, pose = at.projections[name], at.pose(name)
-        sums = one.frame_sums(pose, block.frame_edges)
-        gradients[rows, own] = sums.gradient
-        hessians[rows, own, own] = robust_hessians_of(
-            one, pose, sums.hessian, to_runs(block.frame_edges)
-        )
+        gradients[rows, own] = at.frame_sums[name].gradient
+        hessians[rows, own, own] = robust_hessians(at.frame_sums[name])
     for pair in pairs:
         rows, columns = np.searchsorted(numbers, np.unique(pair.frame)), rows_of_pair(cameras, pair)
         hessian, gradient = pair.frame_sums(at.T_camera_lidar)

@@ -5,7 +5,7 @@ Covariances and error models are computed from these: of the correspondences, an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,15 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import retract_all, to_T_camera_lidar, to_T_lidar_camera
-from calibgraph.parallel import map_on_cores
+from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_pairs import PairTerm
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import to_values
-from factors import ProjectionBlock
-
-_STEP = 1e-5  # rad and m: of the central differences of the gradient
-_STEPS = _STEP * np.vstack([np.eye(6), -np.eye(6)])
+from factors import BlockSums, ProjectionBlock
 
 
 def convex_hessian(hessian: Array, otherwise: Array) -> Array:
@@ -84,38 +80,24 @@ def pose_equations(
     return hessian, gradient
 
 
-def robust_hessian(block: ProjectionBlock, T_lidar_camera: gtsam.Pose3) -> Array:
-    """(6, 6) derivative of the gradient of half the robust cost, by central differences.
+def robust_hessians(sums: BlockSums) -> Array:
+    """(f, 6, 6) second derivatives of half the robust cost of frames, by their sums.
 
-    Where the robust cost is not convex, the reweighted Hessian, which is positive semidefinite.
+    Where it is not convex, the reweighted Hessian, which is positive semidefinite.
 
     Args:
-        block: correspondences of one camera.
-        T_lidar_camera: where; the Hessian is in its tangent.
+        sums: with the curvature, of (f) frames.
     """
-    gradients = block.gradients_at_each(_steps_from(T_lidar_camera))[None]
-    return np.asarray(_convex(gradients, lambda: block.sums(T_lidar_camera).hessian[None])[0])
+    assert sums.curvature is not None
+    if _is_positive_definite(sums.curvature):
+        return sums.curvature
+    return np.array([*map(convex_hessian, sums.curvature, sums.hessian)])
 
 
-def robust_hessians_of(
-    block: ProjectionBlock, T_lidar_camera: gtsam.Pose3, sums: Array, runs: NDArray[np.int64]
-) -> Array:
-    """(r, 6, 6) :func:`robust_hessian` of each of (r, 2) runs, whose reweighted ones are known."""
-    gradients = block.run_gradients_at_each(_steps_from(T_lidar_camera), runs)
-    return _convex(gradients, lambda: sums)
-
-
-def _steps_from(T_lidar_camera: gtsam.Pose3) -> Array:
-    return retract_all(np.tile(to_T_camera_lidar(T_lidar_camera), (12, 1, 1)), _STEPS)
-
-
-def _convex(gradients: Array, reweighted: Callable[[], Array]) -> Array:
-    """(r, 6, 6) by (r, 12, 6) gradients to both sides; the other where it is not convex."""
-    halves: Array = (gradients[:, :6] - gradients[:, 6:]) / (4 * _STEP)
-    hessians = halves + halves.swapaxes(1, 2)
-    if not _is_positive_definite(hessians):
-        return np.array([*map(convex_hessian, hessians, reweighted())])
-    return hessians
+def robust_hessian(sums: BlockSums) -> Array:
+    """(6, 6) the same of all frames together."""
+    assert sums.curvature is not None
+    return convex_hessian(sums.curvature.sum(axis=0), sums.hessian.sum(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,19 +131,20 @@ class FittedObjective:
         return {n: b.with_scale(self.scales[n]) for n, b in self.objective.blocks.items()}
 
     @cached_property
-    def robust_hessians(self) -> Mapping[str, Array]:
-        """Per camera with correspondences, their (6, 6) `robust_hessian`; empty without terms."""
+    def frame_sums(self) -> Mapping[str, BlockSums]:
+        """Per camera with correspondences, the sums of its frames; empty without terms."""
         if not self.objective.uses_correspondences:
             return {}
-        blocks = self.projections
-        hessians = map_on_cores(robust_hessian, [*blocks.values()], [self.pose(n) for n in blocks])
-        return dict(zip(blocks, hessians, strict=True))
+        edges = {name: block.frame_edges for name, block in self.objective.blocks.items()}
+        return {
+            name: block.frame_sums(self.pose(name), edges[name], curvature=True)
+            for name, block in self.projections.items()
+        }
 
     @cached_property
-    def frame_gradients(self) -> Mapping[str, Array]:
-        """Per camera with correspondences, (f, 6) gradients of half the cost of its frames."""
-        blocks = self.objective.blocks
-        return {n: b.frame_gradients(self.pose(n), self.scales[n]) for n, b in blocks.items()}
+    def robust_hessians(self) -> Mapping[str, Array]:
+        """Per camera with correspondences, their (6, 6) :func:`robust_hessian`."""
+        return {name: robust_hessian(sums) for name, sums in self.frame_sums.items()}
 
     def data_only(self) -> FittedObjective:
         """The correspondences alone, at their minimum near here."""

@@ -87,7 +87,7 @@ def within_place(at: FittedObjective, name: str, placed: BlockByPlace) -> Within
     root = np.linalg.cholesky(hessians.sum(axis=0) + WEAK)
     robust = at.robust_hessians[name]
     true = convex_hessian(robust + at.objective.gate_hessian.get(name, 0.0), robust) + WEAK
-    scatter = frame_scatter(block, at.frame_gradients[name], placed, true)
+    scatter = frame_scatter(block, at.frame_sums[name].gradient, placed, true)
     frames = placed.frames.astype(np.float64)
     covariance, efficiency = relative_covariance(scatter, root, true)
     return WithinPlace(

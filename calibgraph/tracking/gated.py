@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.solver.block_residuals import BlockResiduals
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
-from calibgraph.solver.curvature import robust_hessians_of
+from calibgraph.solver.curvature import robust_hessians
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.tracking.sums import Sums, step_between
-from factors import to_runs
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +66,8 @@ class Gated:
         inside = np.concatenate([[0], counts.cumsum()])
         pose = residuals.T_lidar_camera
         block = raw.select(inliers).with_scale(scale)
-        here = block.frame_sums(pose, inside)
-        hessian = robust_hessians_of(block, pose, here.hessian, to_runs(inside))
-        hessian = hessian + residuals.gate_hessians(scale, edges)
+        here = block.frame_sums(pose, inside, curvature=True)
+        hessian = robust_hessians(here) + residuals.gate_hessians(scale, edges)
         score = here.gradient
         sums = Sums.of(
             hessian=hessian,

@@ -80,8 +80,8 @@ def _regate_camera(
         found[frame] = frames[frame].inliers[camera]
     inliers = raw.select(np.concatenate(found))
     block = inliers.with_scale(scale)
-    here = block.frame_sums(T_lidar_camera, inliers.frame_edges)
-    robust = robust_hessian(block, T_lidar_camera)
+    here = block.frame_sums(T_lidar_camera, inliers.frame_edges, curvature=True)
+    robust = robust_hessian(here)
     residuals = BlockResiduals.at(to_T_camera_lidar(gate), raw)
     true = convex_hessian(robust + residuals.gate_hessians(scale)[0], robust)
     missing = true - hessian.sum(axis=0)

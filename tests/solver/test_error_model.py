@@ -149,8 +149,8 @@ def test_the_shares_are_those_of_independent_errors_and_add_up(pair: Rig) -> Non
     """The part that is left to the matches is the one that their own equations give."""
     errors = evidence(pair, table_of_places(pair, 3, OF_A_SENSOR)).solution.marginals.errors
     parts = variances_by_source(errors)
-    matches = np.diag(errors.fit.covariance) - sum(parts.values())
-    assert matches == pytest.approx(of_matches(errors), rel=1e-6)
+    whole = np.diag(errors.fit.covariance)  # of which the matches are 3e-4 to 7e-3
+    np.testing.assert_allclose((sum(parts.values()) + of_matches(errors)) / whole, 1, atol=1e-8)
 
 
 def of_matches(errors: ErrorFit) -> np.ndarray:
