@@ -15,8 +15,8 @@ def track(
     source: list[Path] = Argument(
         ...,
         metavar="SOURCE...",
-        help="Table of correspondences (.parquet, .csv), a growing folder of them, or - for "
-        "standard input (a JSON line per frame). With --matcher: dataset folders, KITTI "
+        help="Table of correspondences (.parquet, .csv), or - for standard input (a JSON line per "
+        "frame). With --matcher: dataset folders, KITTI "
         "sequences or ROS bags of one rig, as one drive.",
     ),
     out: Path = Option(
@@ -25,7 +25,6 @@ def track(
         help="Folder for the state, the result and a picture. A state in it is resumed.",
     ),
     step: int = Option(1, min=1, help="Take every N-th frame only."),
-    follow: bool = Option(False, "--follow", help="Wait for new files in the folder."),
     matcher: str | None = Option(None, metavar="NAME", help="Match frames: structure or cmrnext."),
     interval_s: options.IntervalS = None,
     motion: options.Motion = None,
@@ -67,7 +66,6 @@ def track(
         config=settings,
         out=out,
         every=step,
-        follow=follow,
         matcher=chosen,
         interval_s=interval_s,
         bag=bag_options_from(None, motion=motion, **rare.of_bags),

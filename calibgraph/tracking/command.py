@@ -44,7 +44,6 @@ class Tracking:
         config: settings.
         out: folder for the state, the result and the picture.
         every: take every so-many-th frame.
-        follow: wait for new files.
         matcher: for the frames of datasets; None for tables.
         interval_s: between neighbouring clouds of folders, whose registration shows the motion.
         bag: how bags are read.
@@ -54,7 +53,6 @@ class Tracking:
     config: Config
     out: Path
     every: int = 1
-    follow: bool = False
     matcher: Matcher | None = None
     interval_s: float | None = None
     bag: BagOptions | None = None
@@ -67,7 +65,7 @@ def track(
 
     Args:
         settings: see there.
-        source: a table, a folder, or -; with a matcher, dataset folders.
+        source: a table, or -; with a matcher, dataset folders.
         notify: called with warnings and events as sentences.
 
     Returns:
@@ -78,7 +76,7 @@ def track(
     """
     require_stdout()
     history = History()
-    waits = settings.follow or str(source[0]) == "-"  # frames come at their own times
+    waits = str(source[0]) == "-"  # frames come at their own times
     with _stopped_by_signals() as stop:
         if waits:
             warm_up_tracker()
@@ -140,7 +138,7 @@ def _opened(
     result_of = partial(IncrementalCalibrator.calibration, sources=True)
     folder = settings.out / STATE_FOLDER
     if settings.matcher is None:
-        items = frames_of(str(source[0]), follow=settings.follow, stop=stop)
+        items = frames_of(str(source[0]), stop=stop)
         calibrator = DurableCalibrator(folder, settings.rig, settings.config)
     else:
         drive = _drive(settings, settings.matcher, source)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # Colours that differ for the colour-blind too (Okabe and Ito, "Color universal design").
 _AXES = {"x": "#0072B2", "y": "#E69F00", "z": "#009E73"}
-_EVENTS: dict[Kind, str] = {  # the more important first: their labels find a place first
+_EVENTS: dict[Kind, str] = {
     "moved": "#D55E00",
     "drifts": "#A0408A",
     "blind": "#555555",
@@ -31,8 +31,6 @@ _INSTEAD = "#000000"
 _POSE = 6
 
 _WIDTH_IN, _ROW_IN, _FRAME_IN = 16.0, 2.5, 1.5
-_LABEL_LEVELS = 2  # of labels over each other
-_LETTER = 0.0112  # width of a label's letter, as a share of the panel's
 _NAME_LETTERS = 24
 _SIGMAS = 3.0
 _SURE = 3.0  # times the median sigma: an estimate with more does not set the scale
@@ -156,10 +154,7 @@ def _limits(xi: Array, sigma: Array) -> tuple[float, float]:
 
 
 def _draw_events(panel: Axes, events: Sequence[Event], zero: int, newest: int) -> None:
-    """A line where each began, shaded until it was found, and a label over it where there is room.
-
-    A blind camera's is shaded until it has matches again.
-    """
+    """A line where each began, shaded until it was found; a blind camera's until it has matches."""
     across = panel.get_xaxis_transform()
     for kind in {event.kind for event in events}:
         of_kind = [event for event in events if event.kind == kind]
@@ -169,7 +164,6 @@ def _draw_events(panel: Axes, events: Sequence[Event], zero: int, newest: int) -
         panel.vlines(starts, 0, 1, color=colour, linewidth=1.2, transform=across)
         shades = list(zip(starts, widths, strict=True))
         panel.broken_barh(shades, (0, 1), color=colour, alpha=0.12, linewidth=0, transform=across)
-    _label_events(panel, events, zero)
 
 
 def _end(event: Event, events: Sequence[Event], newest: int) -> int:
@@ -178,32 +172,6 @@ def _end(event: Event, events: Sequence[Event], newest: int) -> int:
         return event.detected_frame
     later = [e.frame for e in events if e.kind == "back" and e.frame >= event.frame]
     return min(later, default=newest)
-
-
-def _label_events(panel: Axes, events: Sequence[Event], zero: int) -> None:
-    """Labels over the panel, none over another: those without room are left out."""
-    start, end = panel.get_xlim()
-    taken: list[list[tuple[float, float]]] = [[] for _ in range(_LABEL_LEVELS)]
-    order = [*_EVENTS]
-    for event in sorted(events, key=lambda e: order.index(e.kind) if e.kind in order else -1):
-        place = event.frame - zero
-        text = event.kind if event.camera is not None else f"LiDAR {event.kind}"
-        half = _LETTER * (end - start) * (len(text) + 1) / 2
-        middle = float(np.clip(place, start + half, end - half))
-        extent = (middle - half, middle + half)
-        level = next((n for n, others in enumerate(taken) if _is_free(extent, others)), None)
-        if level is None or not start <= place <= end:
-            continue
-        taken[level].append(extent)
-        panel.annotate(
-            text, (middle, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2 + 11 * level),
-            textcoords="offset points", ha="center", va="bottom", fontsize=9,
-            color=_EVENTS.get(event.kind, _INSTEAD),
-        )  # fmt: skip
-
-
-def _is_free(extent: tuple[float, float], others: Sequence[tuple[float, float]]) -> bool:
-    return all(extent[1] <= left or right <= extent[0] for left, right in others)
 
 
 def _legend(kinds: set[Kind]) -> list[Artist]:

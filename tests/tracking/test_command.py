@@ -205,24 +205,3 @@ def test_a_second_signal_ends_it_at_once_and_loses_nothing(
         signal.signal(signal.SIGINT, before)
     _, out, _ = piped(world.rig, as_lines(world.tables), "--out", tmp_path)
     assert given[:3] + out.splitlines() == world.lines
-
-
-def test_a_growing_folder_is_followed_until_a_signal(
-    world: World, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    given: list[str] = []
-
-    def write(line: str) -> None:
-        """After each file is done, the next one comes."""
-        given.append(line)
-        if len(given) == FRAMES:
-            signal.raise_signal(signal.SIGTERM)
-        elif len(given) % 7 == 0:
-            concatenate(world.tables[7:]).save(folder / "2.parquet")
-
-    monkeypatch.setattr(command, "print_line", write)
-    concatenate(world.tables[:7]).save(folder / "1.parquet")
-    code, _, _ = call("track", world.rig, folder, "--follow", "--out", tmp_path / "out")
-    assert code == 0 and given == world.lines

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -262,71 +261,6 @@ def test_json_lines_cut_or_damaged_anywhere_raise_nothing() -> None:
             assert isinstance(item, StreamFrame) or "\n" not in item.message
 
 
-def test_a_folder_gives_its_tables_in_the_order_of_their_names(tmp_path: Path) -> None:
-    for name, numbers in {"b.csv": [1, 2], "a.parquet": [5], ".hidden.parquet": [9]}.items():
-        table(numbers).save(tmp_path / name)
-    (tmp_path / "notes.txt").write_text("no table")
-    (tmp_path / "c.parquet").write_bytes(b"half")
-    *frames, refused = outcomes(frames_of(tmp_path))
-    assert frames == [5, 1, 2]
-    assert "c.parquet: cannot be read" in str(refused)
-
-
-class Following:
-    """A followed folder; its frames are pulled until there are so many, or time is up."""
-
-    def __init__(self, folder: Path) -> None:
-        self._until = float("inf")
-        self._frames = frames_of(folder, follow=True, stop=self._stop)
-
-    def _stop(self) -> bool:
-        return time.monotonic() > self._until
-
-    def next(self, *, seconds: float = 10) -> int | str | None:
-        self._until = time.monotonic() + seconds
-        item = next(self._frames, None)
-        return None if item is None else outcomes([item])[0]
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter waits than for real writers."""
-    monkeypatch.setattr(streams, "POLL_S", 0.01)
-    monkeypatch.setattr(streams, "QUIET_S", 0.4)
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_followed_folder_gives_each_file_once_whenever_it_comes(tmp_path: Path) -> None:
-    table([1]).save(tmp_path / "b.parquet")
-    following = Following(tmp_path)
-    assert following.next() == 1
-    table([2]).save(tmp_path / "c.parquet")
-    assert following.next() == 2
-    table([0]).save(tmp_path / "a.parquet")
-    assert following.next() == 0
-    assert following.next(seconds=0.1) is None
-
-
-@pytest.mark.usefixtures("quick")
-def test_a_followed_file_is_read_when_it_is_complete(tmp_path: Path) -> None:
-    table([1]).save(tmp_path / "whole.parquet")
-    data = (tmp_path / "whole.parquet").read_bytes()
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    growing = folder / "a.parquet"
-
-    def write() -> None:
-        for part in range(4):
-            with growing.open("ab") as file:
-                file.write(data[len(data) * part // 4 : len(data) * (part + 1) // 4])
-            time.sleep(0.05)
-
-    writer = threading.Thread(target=write)
-    writer.start()
-    assert Following(folder).next() == 1
-    writer.join()
-
-
 @pytest.fixture
 def pipe() -> Iterator[tuple[BinaryIO, BinaryIO]]:
     """The reading and the writing end of a pipe."""
@@ -368,8 +302,8 @@ def test_a_source_that_is_none_is_refused_at_once(tmp_path: Path) -> None:
     calls: dict[str, Callable[[], object]] = {
         "missing.parquet: cannot be read": lambda: frames_of(tmp_path / "missing.parquet"),
         "cannot be read": lambda: frames_of("x" * 300),
-        "is neither a file nor a folder": lambda: frames_of(tmp_path / "pipe"),
-        "only a folder can be followed": lambda: frames_of(tmp_path / "a.parquet", follow=True),
+        "is no file; pipe it in": lambda: frames_of(tmp_path / "pipe"),
+        "is no table of correspondences; to track a dataset": lambda: frames_of(tmp_path),
     }
     for message, call in calls.items():
         with pytest.raises(FileError, match=message):
