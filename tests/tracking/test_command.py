@@ -44,7 +44,7 @@ def test_every_update_is_a_line_of_json(world: World, call: Call, tmp_path: Path
     }
 
 
-@pytest.mark.parametrize("kind", ["lines", "by camera", "csv", "folder"])
+@pytest.mark.parametrize("kind", ["lines", "by camera", "csv"])
 def test_every_source_gives_the_same_lines(
     kind: str, world: World, call: Call, piped: Call, tmp_path: Path
 ) -> None:
@@ -54,10 +54,7 @@ def test_every_source_gives_the_same_lines(
         code, text, _ = piped(world.rig, as_lines(world.tables), *out)
     else:
         source = tmp_path / "given"
-        if kind == "folder":
-            for number in (0, 7):
-                whole.select((whole.frame // 7) * 7 == number).save(source / f"{number}.parquet")
-        elif kind == "csv":
+        if kind == "csv":
             source = source.with_suffix(".csv")
             whole.save(source)
             config = tmp_path / "config.yaml"  # since a CSV file states nothing
