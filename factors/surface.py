@@ -123,7 +123,7 @@ def _sum_runs(  # type: ignore[no-untyped-def]
     kind, lens, T_a, T_b, rays, planes, pixels, loss, scale, sigma, edges, sums
 ):
     """Fill (r, 13, 13): H, b in the last column, and c in the corner."""
-    tile = np.empty((13, 2 * TILE))
+    tile = np.empty((13, 2 * TILE + 8))  # rows of 4096 bytes would share cache lines
     for run in range(len(edges) - 1):
         T = T_a[run if len(T_a) > 1 else 0]
         M = _relative_pose(T, T_b[run if len(T_b) > 1 else 0])

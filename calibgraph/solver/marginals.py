@@ -148,8 +148,8 @@ class Marginals:
 
     @cached_property
     def pair_fits(self) -> list[PairFit]:
-        """The relative poses of pairs by images, the first camera held near the solution."""
-        return self.fit_pairs_near(self.covariance)
+        """The relative poses of pairs by images, the first camera held near its correspondences."""
+        return self.fit_pairs_near(self.covariance) if self.alone is None else self.alone.pair_fits
 
     def fit_pairs_near(self, joint: Array | None) -> list[PairFit]:
         """The same, the first camera held by some (6 N, 6 N) covariance."""
