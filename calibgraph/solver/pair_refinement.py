@@ -3,29 +3,29 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.objective import pose_key
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import (
-    pose_rows,
+    invert,
+    local_coordinates,
     relative_covariance,
     relative_transform,
-    to_T_lidar_camera,
+    retract_all,
 )
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_pairs import PairTerm, pair_graph, pair_terms, usual_excess
-from calibgraph.solver.curvature import FittedObjective
+from calibgraph.solver.camera_pairs import PairTerm, pair_terms, usual_excess
+from calibgraph.solver.curvature import FittedObjective, rows_of_pair
+from calibgraph.solver.frame_poses import DAMPING
 from calibgraph.solver.objective import Objective
-from calibgraph.solver.optimizer import Optimum, optimize
+from calibgraph.solver.optimizer import Optimum
 from factors import EpipolarBlock, pose_sigmas
 
 _NARROWINGS = 4  # steps from the spread at the estimate to the least one
-_PAIR_RESCALINGS = 6
+_MAX_STEPS, _MAX_STEP, _CONVERGED = 30, 0.1, 1e-6  # of a pair alone: rad, m
 _HELD_RAD, _HELD_M = np.radians(1.0), 0.2  # of the first camera, while its pair is fitted alone
 
 
@@ -70,7 +70,7 @@ def _least_sigmas(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]
         pair = frozenset((term.a, term.b))
         if pair not in found:
             own = [other for other in terms if {other.a, other.b} == pair]
-            found[pair] = fit_pair((term.a, term.b), own, T_camera_lidar, covariance)
+            found[pair], _ = fit_pair((term.a, term.b), own, T_camera_lidar, covariance)
     return np.array([term.sigma_px(found[frozenset((term.a, term.b))]) for term in terms])
 
 
@@ -85,8 +85,10 @@ def fit_pair(
     terms: Sequence[PairTerm],
     start: Mapping[str, Array],
     covariance_a: Array,
-) -> dict[str, Array]:
+) -> tuple[dict[str, Array], Array]:
     """Both cameras of a pair by what they see in common, the first held near its start.
+
+    By Gauss-Newton steps; before each the terms' sigmas are those of their residuals.
 
     Args:
         names: A and B.
@@ -95,18 +97,29 @@ def fit_pair(
         covariance_a: (6, 6) of the start of A, of xi in T_camera_lidar = exp(xi) start.
 
     Returns:
-        (4, 4) T_camera_lidar of both.
+        (4, 4) T_camera_lidar of both; their (12, 12) covariance, if features of a frame err as
+        usual.
     """
-    keys = {name: pose_key(names, name) for name in names}
-    # T_camera_lidar = exp(xi) start is T_lidar_camera = start exp(-xi): the same covariance.
-    noise = gtsam.noiseModel.Gaussian.Covariance(covariance_a)
-    held = gtsam.PriorFactorPose3(keys[names[0]], to_T_lidar_camera(start[names[0]]), noise)
-    T = {name: start[name] for name in names}
-    for _ in range(_PAIR_RESCALINGS):
-        graph = pair_graph([term.with_sigma(term.sigma_px(T)) for term in terms], keys)
-        graph.add(held)
-        T = optimize(graph, names, T).T_camera_lidar
-    return T
+    T, held = np.stack([start[name] for name in names]), np.linalg.pinv(covariance_a)
+    prior, excess = np.zeros((12, 12)), usual_excess(terms)
+    prior[:6, :6] = held
+    for _ in range(_MAX_STEPS):
+        now, data, gradient = dict(zip(names, T, strict=True)), np.zeros((12, 12)), np.zeros(12)
+        for term in terms:
+            sums = term.with_sigma(term.sigma_px(now)).sums(now)
+            rows = rows_of_pair(names, term)
+            data[np.ix_(rows, rows)] += sums.hessian
+            gradient[rows] += sums.gradient
+        away = local_coordinates(start[names[0]], invert(T[:1]))[0]
+        gradient[:6] += held @ away
+        hessian = prior + data
+        step = -np.linalg.solve(hessian + DAMPING * np.diag(np.diag(hessian)), gradient)
+        step *= min(1.0, _MAX_STEP / np.abs(step).max())
+        T = retract_all(T, np.asarray(step.reshape(2, 6)))
+        if np.abs(step).max() < _CONVERGED:
+            break
+    covariance = np.linalg.pinv(prior + data / excess, hermitian=True)
+    return dict(zip(names, T, strict=True)), np.asarray(covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,32 +168,7 @@ def fit_pairs(rig: Rig, matches: CameraMatches, config: Config, held: Array) -> 
         )
         if terms:
             of_a = held[cameras.index(a)]
-            T = fit_pair((a, b), terms, rig.T_camera_lidar, of_a)
-            both = covariance_of_fit((a, b), terms, T, of_a)
+            T, both = fit_pair((a, b), terms, rig.T_camera_lidar, of_a)
             own = relative_covariance(both, 0, 1, relative_transform(T[b], T[a]))
             fits.append(PairFit(a, b, terms, T, own + np.diag(pair_sigmas() ** 2)))
     return fits
-
-
-def covariance_of_fit(
-    names: tuple[str, str],
-    terms: Sequence[PairTerm],
-    T_camera_lidar: Mapping[str, Array],
-    covariance_a: Array,
-) -> Array:
-    """(12, 12) covariance of A and B after ``fit_pair``, if features of a frame err as usual.
-
-    Args:
-        names: A and B.
-        terms: of this pair.
-        T_camera_lidar: (4, 4) of both, as fitted.
-        covariance_a: (6, 6) by which A was held.
-    """
-    hessian = np.zeros((12, 12))
-    hessian[:6, :6] = np.linalg.pinv(covariance_a, hermitian=True)
-    excess = usual_excess(terms)
-    for term in terms:
-        rows = np.r_[tuple(pose_rows(names.index(name)) for name in (term.a, term.b))]
-        scaled = term.with_sigma(term.sigma_px(T_camera_lidar))
-        hessian[np.ix_(rows, rows)] += scaled.sums(T_camera_lidar).hessian / excess
-    return np.asarray(np.linalg.pinv(hessian, hermitian=True))

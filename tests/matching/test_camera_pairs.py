@@ -104,7 +104,7 @@ def test_kitti_pairs_are_found_from_a_displaced_first_camera(realdata: Path, seq
     pair = ("image_2", "image_3")
     for _ in range(3):
         terms = pair_terms(rig, with_surfaces(matches, data, rig), Config())
-        rig = start.moved_to(fit_pair(pair, terms, start.T_camera_lidar, held))
+        rig = start.moved_to(fit_pair(pair, terms, start.T_camera_lidar, held)[0])
     error = calibgraph.evaluate(rig, reference).pairs["image_2->image_3"]
     assert error.rotation_error_deg < 0.08
     assert error.translation_error_cm < 4
