@@ -123,7 +123,7 @@ def agrees_at_its_place(state: State, closed: ClosedPlaces, camera: int, own: Ou
         own: the frame, with the T_lidar_camera that fits it.
     """
     one, frame = state.cameras[camera], state.live_frames[-1]
-    if one.summary.walk or state.config.preset != "auto" or not states_places(state):
+    if one.summary.walk or not states_places(state):
         return False
     gated = Gated.at(own.T_lidar_camera, own.raw, one.scale, state.references[camera])
     if not gated.sums.matches[0]:

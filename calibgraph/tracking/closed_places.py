@@ -163,12 +163,7 @@ class ClosedPlaces:
             every = every.with_camera_at(state.live_frames[-1].place, camera, own)
         earlier = self.quadratics | quadratics_of(state, every, state.drifting)
         seen = self.seen if self.is_settled else FrameSpread.of(state, every)
-        if state.config.preset == "auto":
-            kept, rows = self._split(every, touched)
-        else:  # the weights of a preset of the paper
-            every = every.bounded(most=0)
-            earlier = quadratics_of(state, every)
-            frames, kept, rows = (), (), [0] if every.frames.any() else []
+        kept, rows = self._split(every, touched)
         data = PlaceData.of(state, earlier, frames, {every.names[row]: row for row in rows})
         model = place_model(state, every, seen, data)
         conflicts = Conflicts()

@@ -213,8 +213,7 @@ def _distortion(state: State, camera: int, places: int) -> DistortionEvidence | 
         return None
     own = state.all_distortion[camera]
     found = DistortionEvidence.none(WEAK, places=places)
-    if state.config.preset == "auto":
-        found.information[0], found.vector[0] = own.information[0], own.vector[0]
+    found.information[0], found.vector[0] = own.information[0], own.vector[0]
     return replace(found, jacobian=own.jacobian, hessian=own.hessian)
 
 

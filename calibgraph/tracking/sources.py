@@ -20,14 +20,14 @@ from calibgraph.tracking.state import State
 def error_sources(state: State, joint: Array | None) -> dict[str, ErrorSources]:
     """Per camera, the shares of its error bar.
 
-    None with a preset of the paper, without error bars of all cameras, and where a camera drifts:
-    then the graph of the places is not the whole.
+    None without error bars of all cameras, and where a camera drifts: then the graph of the places
+    is not the whole.
 
     Args:
         state: of the tracker.
         joint: (6 N, 6 N) the reported covariance.
     """
-    if joint is None or state.drifting or state.config.preset != "auto":
+    if joint is None or state.drifting:
         return {}
     whole = changed(state, epochs=(*state.epochs, changed(state.epochs[-1], frames=())))
     errors = ErrorFit(ClosedPlaces.of(whole).fit, (), state.sizes)
