@@ -37,7 +37,7 @@ def relative_pose_conflict(
     pair: RelativePose,
     cameras: tuple[str, ...],
     T_camera_lidar: Mapping[str, Array],
-    covariance: Array | None,
+    covariance: Array,
 ) -> Conflict:
     """The difference of a relative pose from an estimate, and the sigma expected of it.
 
@@ -45,16 +45,12 @@ def relative_pose_conflict(
         pair: the measured relative pose.
         cameras: names in the order of the covariance.
         T_camera_lidar: per camera, (4, 4) from the correspondences alone.
-        covariance: (6 N, 6 N) of these, or None.
+        covariance: (6 N, 6 N) of these.
     """
     estimated = relative_transform(T_camera_lidar[pair.a], T_camera_lidar[pair.b])
     difference = gtsam.Pose3.Logmap(gtsam.Pose3(invert(pair.T_a_b) @ estimated))
-    variance = (
-        pose_sigmas(rotation_rad=pair.rotation_sigma_rad, translation_m=pair.translation_sigma_m)
-        ** 2
-    )
-    if covariance is not None:
-        places = cameras.index(pair.a), cameras.index(pair.b)
-        of_pair = relative_covariance(covariance, *places, invert(estimated))
-        variance = variance + np.diag(of_pair)
-    return Conflict(pair, difference, np.sqrt(variance))
+    sigmas = pair.rotation_sigma_rad, pair.translation_sigma_m
+    own = pose_sigmas(rotation_rad=sigmas[0], translation_m=sigmas[1]) ** 2
+    places = cameras.index(pair.a), cameras.index(pair.b)
+    of_pair = relative_covariance(covariance, *places, invert(estimated))
+    return Conflict(pair, difference, np.sqrt(own + np.diag(of_pair)))

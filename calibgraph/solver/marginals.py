@@ -29,37 +29,11 @@ from calibgraph.solver.error_shares import (
     sources_by_camera,
     variances_by_source,
 )
-from calibgraph.solver.objective import Transforms
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
 from calibgraph.solver.shared_error import shared_variance_ratio
 from factors import pose_sigmas
 
 _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unknown
-
-
-@dataclass(frozen=True, eq=False)
-class JointPoses:
-    """Poses of several cameras, with the covariance of all.
-
-    Attributes:
-        T_camera_lidar: per camera, (4, 4).
-        covariance: (6 M, 6 M) in the order of ``T_camera_lidar``, or None.
-        errors: the error model that they are of; None where there is none.
-    """
-
-    T_camera_lidar: Transforms
-    covariance: Array | None
-    errors: LatentPoseFit | None = None
-
-    @staticmethod
-    def of(errors: LatentPoseFit) -> JointPoses:
-        """Optimum and marginal of an error model."""
-        return JointPoses(errors.T_camera_lidar, errors.covariance, errors)
-
-    @property
-    def mount(self) -> JointPoses:
-        """The same of the mounts, between which relative poses are measured."""
-        return self if self.errors is None else JointPoses.of(self.errors.of_mount)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,15 +110,14 @@ class Marginals:
     def shared_variance_ratio(self) -> float:
         """Variance of the shared error relative to its prior, from co-visible features."""
         mount = None if self.alone is None else self.alone.mount
-        if self.alone is None or mount is None or mount.covariance is None:
+        if self.alone is None or mount is None:
             return 1.0
         return shared_variance_ratio(mount.T_camera_lidar, mount.covariance, self.alone.pair_fits)
 
     @property
-    def mount(self) -> JointPoses:
-        """Poses and covariance of the mounts, between which images show relative poses."""
-        found = JointPoses(self.at.T_camera_lidar, self.covariance)
-        return found if self.errors is None else JointPoses.of(self.errors.fit.of_mount)
+    def mount(self) -> LatentPoseFit | None:
+        """The fit of the mounts, between which images and measurements show relative poses."""
+        return None if self.errors is None else self.errors.fit.of_mount
 
     @cached_property
     def pair_fits(self) -> list[PairFit]:
@@ -167,29 +140,21 @@ class Marginals:
         held = pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2
         return np.diag(np.tile(held, len(self.cameras)))
 
-    @property
-    def _data_only(self) -> JointPoses | None:
-        """The solution of the correspondences alone; None where the terms do not use them."""
-        if not self.at.objective.uses_correspondences:
-            return None
-        alone = None if self.errors is None else self.errors.without_priors
-        if alone is None:
-            alone = fit_without_priors(self.at, self.findings, self.table.places)
-        if alone is not None:
-            return JointPoses.of(alone.fit)
-        return JointPoses(self.at.data_only().T_camera_lidar, None)
-
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:
-        """The factors of relative poses between cameras that both have correspondences."""
+        """The factors of relative poses between cameras that both have correspondences.
+
+        None where these determine no pose without the factors: then nothing contradicts them.
+        """
         cameras = tuple(self.at.objective.blocks)
         measured = self.at.objective.rig.relative_poses
         pairs = [pair for pair in measured if pair.a in cameras and pair.b in cameras]
-        free = self._data_only if pairs else None
+        if not pairs:
+            return ()
+        free = None if self.errors is None else self.errors.without_priors
+        free = free or fit_without_priors(self.at, self.findings, self.table.places)
         if free is None:
             return ()
-        mount = free.mount
-        return tuple(
-            relative_pose_conflict(pair, cameras, mount.T_camera_lidar, mount.covariance)
-            for pair in pairs
-        )
+        mount = free.fit.of_mount
+        names, T, covariance = mount.linear.model.cameras, mount.T_camera_lidar, mount.covariance
+        return tuple(relative_pose_conflict(pair, names, T, covariance) for pair in pairs)

@@ -57,9 +57,9 @@ def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
     own = evidence.of_correspondences
     if evidence.solution.camera_matches is None or evidence.solution.before_pairs is None:
         return {}
-    mount = own.solution.marginals.mount
-    rig = own.solution.rig.moved_to(mount.T_camera_lidar)
-    covariance = own.solution.marginals.known_or_prior(mount.covariance)
+    if (mount := own.solution.marginals.mount) is None:  # they determine no pose
+        return {}
+    rig, covariance = own.solution.rig.moved_to(mount.T_camera_lidar), mount.covariance
     found = [
         pair_agreement(rig, fit, covariance)
         for fit in own.pair_fits

@@ -128,7 +128,7 @@ class Evidence:
     def mount_covariance(self) -> Array | None:
         """(6 N, 6 N) second moments of the mounts about the solution, widened alike."""
         mount = self.solution.marginals.mount
-        if mount.covariance is None:
+        if mount is None:
             return None
         of, T = mount.T_camera_lidar, self.solution.T_camera_lidar
         away = np.concatenate([twist_between(of[name], T[name]) for name in T])
