@@ -125,7 +125,8 @@ main()
 
 @pytest.mark.parametrize(
     "command",
-    [["doctor", SAMPLE], ["calibrate", SAMPLE],
+    [["doctor", SAMPLE],
+     ["calibrate", SAMPLE, "--frames", "0:2", "--search-deg", "4", "--search-m", "0.3"],
      ["evaluate", SAMPLE / "rig.yaml", SAMPLE / "reference.yaml"], ["rig", SAMPLE / "rig.yaml"]],
     ids=lambda words: words[0],
 )  # fmt: skip
