@@ -22,16 +22,20 @@ from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.config import Config, preset
 from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES
 from calibgraph.model.findings import MatcherFindings, error_components
+from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.verdict import COMMON_ERROR
 from calibgraph.simulation.correspondences import PoseSpread
+from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.elimination import join_linear
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.error_shares import variances_by_source
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
+from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.shared_error import shared_variance_ratio
 from calibgraph.solver.variance_components import VarianceRatios
+from calibgraph.solver.within_place import block_by_place
 from calibgraph.trust.evidence import Evidence
 from factors import pose_sigmas
 from tests.draws.places import displaced
@@ -310,3 +314,24 @@ def test_few_places_are_never_taken_for_better_than_usual_and_one_says_nothing(p
     """At one place nothing is measured twice, so nothing is learnt, whatever the error."""
     for places, size in ((4, 0.0), (1, 25.0)):
         assert errors_of(pair, table_of(pair, places, size, 0)).ratios == VarianceRatios()
+
+
+def test_a_larger_variance_and_a_smaller_weight_divide_the_sums(pair: Rig) -> None:
+    """Of matches with information of their own; the loss bends at the same pixels."""
+    table = simulate_correspondences(pair, frames=2, matches=50, errors=MatcherErrors(noise_px=1.0))
+    stretched = np.tile([0.5, 0.1, 2.0], (len(table), 1))
+    table = replace(table, information_px=stretched)
+    blocks = camera_blocks(pair, table, Config())
+    for name, T in pair.T_camera_lidar.items():
+        block, pose = blocks[name], to_T_lidar_camera(T)
+        scale = ResidualScale(1.0, 3.0, 9.0, 1.0)
+        placed = block_by_place(block, scale, [np.arange(2)])
+        one, two = placed.sums(T[None]), placed.with_variance(4.0).sums(T[None])
+        for part in ("hessian", "gradient", "cost"):
+            np.testing.assert_allclose(getattr(two, part), getattr(one, part) / 4, rtol=1e-12)
+        quadratic = replace(scale, loss_scale=1e6)
+        all_of_it, light = (
+            each.with_scale(quadratic).sums(pose).hessian
+            for each in (block, block.with_weights(np.full(len(block), 0.25)))
+        )
+        np.testing.assert_allclose(light, all_of_it / 4, rtol=1e-6)
