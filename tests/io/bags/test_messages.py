@@ -167,6 +167,12 @@ def test_png_is_read_in_the_order_in_which_it_was_stored() -> None:
     np.testing.assert_array_equal(png(wide, "mono16; png compressed ")[1:, :, 0], GRAY[1:])
 
 
+def test_a_compressed_mosaic_gives_its_colours_back() -> None:
+    mosaic = np.tile(np.uint8([[30, 90], [90, 200]]), (20, 30))
+    found = png(mosaic, "bayer_rggb8; png compressed ")
+    np.testing.assert_array_equal(found[2:-2, 2:-2], np.full((36, 56, 3), (200, 90, 30)))
+
+
 def test_images_that_cannot_be_read_are_named() -> None:
     cut = MAKE.image(BGR, "bgr8", START_NS)
     cut.data = cut.data[:-1]
