@@ -14,8 +14,8 @@ from calibgraph.model.metrics import PoseError, pose_error
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Check, Direction, Verdict, beside, in_unit, is_reachable
 from calibgraph.report import plots
-from calibgraph.report.page_overlays import Overlays, width_on_page
-from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionErrors
+from calibgraph.report.page_overlays import width_on_page
+from calibgraph.report.reprojection_errors import ReprojectionErrors
 
 _WORST_FIRST = ("FAIL", "WARN", "PASS")
 
@@ -111,7 +111,7 @@ class CameraSection:
         sigmas, bootstrap: (3,) of rotation [deg], and of translation [cm]; None where there are
             none, or they do not hold.
         no_error_bar: why there is none; empty if there is one.
-        overlays: None where there is no image.
+        overlays: the cloud on an image, before and after; None where there is no image.
         overlay_width_px: at most so wide they are shown.
         diagrams: pictures as data URIs, by the name of their caption in the template; those that
             the data allow.
@@ -127,7 +127,7 @@ class CameraSection:
     sigmas: Sequence[Array] | None
     bootstrap: Sequence[Array] | None
     no_error_bar: str
-    overlays: Overlays | None
+    overlays: tuple[str, ...] | None
     overlay_width_px: int
     diagrams: Mapping[str, str]
     matrix: str
@@ -140,9 +140,9 @@ def camera_section(
     result: Calibration,
     name: str,
     index: int,
-    overlays: Overlays | None,
+    overlays: tuple[str, ...] | None,
     *,
-    errors: BeforeAfter | None,
+    errors: ReprojectionErrors | None,
     diagrams: Mapping[str, str],
 ) -> CameraSection:
     """Collect what the page shows of a camera."""
@@ -163,7 +163,7 @@ def camera_section(
         matrix=matrix_text(camera.T_camera_lidar),
         pose=pose_text(camera.T_camera_lidar),
         inverse=pose_text(invert(camera.T_camera_lidar)),
-        worked=worked_point(camera, None if errors is None else errors.after),
+        worked=worked_point(camera, errors),
     )
 
 
@@ -173,17 +173,17 @@ def _why_no_error_bar(result: Calibration, name: str) -> str:
     return "not by these correspondences" if result.sigmas(name) is None else ""
 
 
-def camera_diagrams(result: Calibration, name: str, errors: BeforeAfter | None) -> dict[str, str]:
+def camera_diagrams(
+    result: Calibration, name: str, errors: ReprojectionErrors | None
+) -> dict[str, str]:
     """Residuals, coverage, lens and convergence of a camera, as data URIs by name."""
     found: dict[str, str] = {}
     before, camera = result.initial_rig.cameras[name], result.rig.cameras[name]
     if errors is not None:
-        after = errors.after
-        sigma_px = result.residuals[name].sigma_px
-        found["residuals"] = plots.residual_scatter(after, sigma_px)
-        found["by_distance"] = plots.residual_by_distance(after)
-        found["over_image"] = plots.residual_map(camera, after)
-        found["coverage"] = plots.coverage(camera, after)
+        found["residuals"] = plots.residual_scatter(errors, result.residuals[name].sigma_px)
+        found["by_distance"] = plots.residual_by_distance(errors)
+        found["over_image"] = plots.residual_map(camera, errors)
+        found["coverage"] = plots.coverage(camera, errors)
     if name in result.lens and has_other_lens(before, camera):
         found["lens"] = plots.lens_change(before, camera)
     rounds = [cameras[name] for cameras in result.rounds if name in cameras]
