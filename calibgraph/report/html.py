@@ -13,6 +13,8 @@ from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.io.frame import frame_of_entry
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
+from calibgraph.model.geometry import degrees_and_centimetres, invert
+from calibgraph.model.metrics import pose_error
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
@@ -22,10 +24,16 @@ from calibgraph.model.result_files import (
     TABLES,
     require_own_tables,
 )
-from calibgraph.report.camera_section import camera_diagrams, camera_section
+from calibgraph.report.camera_section import (
+    camera_diagrams,
+    check_cells,
+    matrix_text,
+    pose_text,
+    worked_point,
+)
 from calibgraph.report.frames import recording_name
 from calibgraph.report.kit import load_template
-from calibgraph.report.page_overlays import depth_scale, draw_overlays
+from calibgraph.report.page_overlays import depth_scale, draw_overlays, width_on_page
 from calibgraph.report.point_overlay import write_overlays
 from calibgraph.report.reprojection_errors import reprojection_errors
 from calibgraph.solver.camera_pairs import match_errors_px
@@ -64,10 +72,18 @@ def render_page(result: Calibration) -> str:
         pairs = {name: (guess.cameras[name], camera) for name, camera in rig.cameras.items()}
         overlays, overlays_left_out = draw_overlays(shown, pairs)
     cameras = [
-        camera_section(result, name, index, overlays.get(name), errors=errors.get(name),
-                       diagrams=camera_diagrams(result, name, errors.get(name)))
-        for index, name in enumerate(result.rig.cameras)
-    ]  # fmt: skip
+        {
+            "name": name,
+            "anchor": f"camera-{index}",
+            "verdict": result.camera_verdicts[name],
+            "moved": pose_error(camera.T_camera_lidar, guess.T_camera_lidar[name]),
+            "sigmas": result.error_bar(name),
+            "overlays": overlays.get(name),
+            "diagrams": camera_diagrams(result, name, errors.get(name)),
+            "worked": worked_point(camera, errors.get(name)),
+        }
+        for index, (name, camera) in enumerate(rig.cameras.items())
+    ]
     summary = result.summary
     return load_template("page.html.j2").render(
         result=result,
@@ -80,6 +96,12 @@ def render_page(result: Calibration) -> str:
         export_formats=EXPORT_FORMATS,
         pairs={name: result.error_bar(name) for name in result.pair_covariance},
         between=_camera_pairs(result),
+        check_cells=check_cells,
+        matrix_text=matrix_text,
+        pose_text=pose_text,
+        invert=invert,
+        degrees_and_centimetres=degrees_and_centimetres,
+        width_on_page=width_on_page,
         depth_scale=depth_scale(),
         shown=shown,
         overlays_left_out=overlays_left_out,
