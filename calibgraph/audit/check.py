@@ -13,7 +13,7 @@ from calibgraph.audit.judgement import (
     judge_camera,
     judge_lidar,
 )
-from calibgraph.audit.matching import Matching, match_from_deployed
+from calibgraph.audit.matching import match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
 from calibgraph.audit.significance import Tolerance
 from calibgraph.errors import CorrespondenceError, FileError
@@ -27,7 +27,6 @@ from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.same_images import require_different_images
-from calibgraph.model.calibration import package_versions
 from calibgraph.model.config import Config, Reported
 from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 from calibgraph.model.rig import Rig
@@ -98,9 +97,10 @@ def check(
     deployed = rig.model_copy(update={"relative_poses": ()})
     with watch("choose_frames"):
         data = _open(dataset, deployed, full)
-    matching = Matching(data, deployed, full, Config(seed=seed), report)
     try:
-        run = match_from_deployed(matching, watch)
+        run = match_from_deployed(
+            data, deployed, full, Config(seed=seed), watch=watch, progress=report
+        )
         with watch("places"):
             run = assign_places(run)
         run = refine_with_camera_pairs(run, report)
@@ -119,7 +119,7 @@ def check(
     sources = tuple(map(str, data.folders))
     return Audit(
         cameras, lidar, deployed, middle, sources,
-        tolerance_deg, tolerance_cm, len(data.frames), watch.seconds, package_versions(),
+        tolerance_deg, tolerance_cm, len(data.frames), watch.seconds,
     )  # fmt: skip
 
 

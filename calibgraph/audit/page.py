@@ -14,7 +14,6 @@ from calibgraph.files import write_text
 from calibgraph.model.calibration import FRAMES_SENTENCE
 from calibgraph.model.rig import Camera
 from calibgraph.model.summary import Reason
-from calibgraph.report.camera_section import matrix_text
 from calibgraph.report.kit import load_template
 from calibgraph.report.page_overlays import depth_scale, draw_overlays, width_on_page
 
@@ -47,9 +46,7 @@ def write_audit_report(audit: Audit, path: Path | str) -> Path:
         overlays=overlays,
         overlays_left_out=left_out,
         reasons=_reasons(audit),
-        detectable=_detectable(audit),
         twist_cells=twist_cells,
-        matrix_text=matrix_text,
         width_on_page=width_on_page,
         depth_scale=depth_scale(),
         frames_sentence=FRAMES_SENTENCE,
@@ -68,23 +65,6 @@ def _reasons(audit: Audit) -> list[Reason]:
         alike[key] = (*alike.get(key, ()), name)
     reasons = [Reason(status, names, text) for (status, text), names in alike.items()]
     return sorted(reasons, key=lambda reason: ("WRONG", "CANNOT TELL", "OK").index(reason.status))
-
-
-def _detectable(audit: Audit) -> str:
-    """The smallest detectable change over all cameras."""
-    known = [c.detectable for c in audit.cameras.values() if c.detectable is not None]
-    missing = [name for name, c in audit.cameras.items() if c.detectable is None]
-    sentences = []
-    if known:
-        worst = np.max(known, axis=0)
-        degrees, centimetres = np.degrees(worst[:3]).max(), 100 * worst[3:].max()
-        sentences += [
-            f"With a probability of 90 %, a turn of any camera about an axis by {degrees:.2f} deg, "
-            f"or a shift along one by {centimetres:.1f} cm."
-        ]
-    if missing:
-        sentences += [f"Unknown for {', '.join(missing)}."]
-    return " ".join(sentences)
 
 
 def measured_camera(deployed: Camera, audit: CameraAudit) -> Camera | None:

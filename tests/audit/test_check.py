@@ -15,7 +15,7 @@ import pytest
 import calibgraph
 from calibgraph import Audit, Correspondences, Dataset, Rig, simulate_correspondences
 from calibgraph.audit.check import provenance
-from calibgraph.audit.matching import Matching, match_from_deployed
+from calibgraph.audit.matching import match_from_deployed
 from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import KeptFrame, keep_frames
 from calibgraph.matching.protocol import FullMatcher
@@ -194,8 +194,9 @@ class MatcherOfTruth:
 def rounds_from(deployed: Rig, matcher: MatcherOfTruth) -> list[int]:
     """The rounds that are run from a deployed rig."""
     data, config = calibgraph.load_dataset(SAMPLE, TRUTH), Config().changed(stage1="rig")
-    matching = Matching(data, deployed, FullMatcher(matcher), config, no_progress)
-    match_from_deployed(matching, Stopwatch())
+    match_from_deployed(
+        data, deployed, FullMatcher(matcher), config, watch=Stopwatch(), progress=no_progress
+    )
     return matcher.asked
 
 
