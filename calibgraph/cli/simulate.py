@@ -19,8 +19,7 @@ def simulate(
         ...,
         metavar="SCENARIO",
         help="street: a dataset of scans and images of a drive along a procedural street. "
-        "kitti, walkley, surround, fisheye: a table of correspondences, with the errors of the "
-        "paper's matcher (kitti, walkley) or in between.",
+        "kitti, walkley: a table of correspondences, with the errors of the paper's matcher.",
     ),
     out: Path = Option(..., metavar="DIR", help="Folder to write."),
     frames: int = Option(10, help="Number of frames."),

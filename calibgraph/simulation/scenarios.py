@@ -66,7 +66,6 @@ def scenario_of(name: str) -> Scenario:
 
     ``kitti`` and ``walkley`` resemble the paper's Stage-1 results (``benchmarks/notes/paper.md``):
     errors along the axes that most frames share, and confidences that are high or informative.
-    ``surround`` and ``fisheye`` have six and four cameras and a matcher in between.
 
     Raises:
         ValueError: if there is no such scenario.
@@ -106,14 +105,4 @@ _ERRORS = {
         failed_share=0.03,
     ),
 }
-_ERRORS["surround"] = replace(
-    _ERRORS["walkley"],
-    noise_px=1.0,
-    field_px=1.0,
-    frame_noise_px=0.5,
-    stuck_share=0.3,
-    stuck_pose=PoseSpread((0.2, 0.2, 0.2), (0.1, 0.1, 0.1)),
-    outlier_share=0.15,
-)
-_ERRORS["fisheye"] = _ERRORS["surround"]
 SCENARIOS = tuple(_ERRORS)
