@@ -5,11 +5,10 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from importlib import import_module
-from itertools import islice
 from typing import Any
 
 import pyarrow as pa
@@ -24,8 +23,6 @@ from calibgraph.parallel import count_cores
 from calibgraph.progress import Progress, no_progress
 
 _READERS = 16  # threads that look at inputs: a listing of an object store takes 50 ms
-_AHEAD = 2000
-"""Tasks submitted at a time: a manifest may have millions of rows, a cluster hundreds of cores."""
 _STATE = ["vehicle", "recording", "status", "verdict", "error_kind", "input_hash", "versions"]
 
 
@@ -130,14 +127,9 @@ def dask_executor(address: str) -> Iterator[Executor]:
 
 def _outcomes(executor: Executor, tasks: Iterable[Task]) -> Iterator[tuple[Job, Outcome]]:
     """Jobs with their outcomes, as they end."""
-    waiting, running = iter(tasks), dict[Future[Outcome], Job]()
-    while True:
-        for task in islice(waiting, _AHEAD - len(running)):
-            running[executor.submit(run_job, task)] = task.job
-        if not running:
-            return
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
-            yield running.pop(future), _outcome_of(future)
+    running = {executor.submit(run_job, task): task.job for task in tasks}
+    for future in as_completed([*running]):
+        yield running.pop(future), _outcome_of(future)
 
 
 def _outcome_of(future: Future[Outcome]) -> Outcome:
