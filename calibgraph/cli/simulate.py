@@ -51,7 +51,6 @@ def simulate(
     ),
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
-    from calibgraph.file_sets import require_own_folder
     from calibgraph.io.rigs import load_rig
     from calibgraph.simulation.recording import simulate_street
     from calibgraph.simulation.rigs import RIG_NAMES, rig_of
@@ -65,7 +64,6 @@ def simulate(
         "vary_layout": vary_layout or None,
     }  # fmt: skip
     street = {name: value for name, value in of_street.items() if value is not None}
-    require_own_folder(out)
     with progress_bar() as progress, checked_arguments():
         if scenario == STREET:
             name = street.pop("rig", RIG)

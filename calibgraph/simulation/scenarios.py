@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from calibgraph.errors import FileError
-from calibgraph.files import require_place_for_folder
+from calibgraph.file_sets import require_own_folder
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.metrics import perturb
 from calibgraph.model.rig import Rig
@@ -44,17 +43,14 @@ def simulate_table(
 
     Raises:
         ValueError: if there is no such scenario, or an argument is out of range.
-        FileError: if one of the files exists.
+        FileError: if the folder holds files.
     """
     scenario = scenario_of(name)
     if not 1 <= frames <= MAX_FRAMES:
         raise ValueError(f"{frames} frames: expected 1 to {MAX_FRAMES}")
     guess = perturb(scenario.rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
-    require_place_for_folder(out)
+    require_own_folder(out)
     paths = [out / name for name in ("correspondences.parquet", "reference.yaml", "rig.yaml")]
-    for path in paths:
-        if path.exists():
-            raise FileError(path, "is there already; write into another folder, or remove it")
     scenario.draw(frames, seed).save(paths[0])
     scenario.rig.save(paths[1])
     guess.save(paths[2])
