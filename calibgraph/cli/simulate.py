@@ -54,7 +54,7 @@ def simulate(
     from calibgraph.io.rigs import load_rig
     from calibgraph.simulation.recording import simulate_street
     from calibgraph.simulation.rigs import RIG_NAMES, rig_of
-    from calibgraph.simulation.scenarios import scenario_of, simulate_table
+    from calibgraph.simulation.scenarios import SCENARIOS, simulate_table
 
     common: dict[str, Any] = {
         "frames": frames, "rotation_deg": rotation_deg, "translation_m": translation_m, "seed": seed
@@ -70,7 +70,7 @@ def simulate(
             is_file = name not in RIG_NAMES and name and Path(name).exists()
             truth = load_rig(name) if is_file else rig_of(name)
             written = simulate_street(out, truth, **street, **common, progress=progress)
-        elif street and scenario_of(scenario):
+        elif street and scenario in SCENARIOS:
             named = " and ".join(f"--{name.replace('_', '-')}" for name in street)
             raise ValueError(
                 f"scenario {scenario!r} has its own rig and matcher, {named} would change nothing; "

@@ -129,7 +129,7 @@ def _calibrate(task: Task, local: Callable[[str], Path]) -> tuple[dict[str, Any]
     rig = load_rig(local(job.rig)) if job.rig else None
     paths = [local(uri) for uri in job.recordings]
     if job.is_table and rig is not None:
-        return _cells(solve(rig, paths[0], settings.config, settings.terms))
+        return _cells(solve(rig, paths[0], settings.config))
     given = {"search_deg": settings.search_deg, "search_m": settings.search_m}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if settings.frames is not None:
@@ -138,7 +138,6 @@ def _calibrate(task: Task, local: Callable[[str], Path]) -> tuple[dict[str, Any]
         load_dataset(paths, rig, frames=settings.frames),
         matcher=StructureMatcher(seed=settings.config.seed, **options),
         config=settings.config,
-        terms=settings.terms,
         time_limit_s=task.limits.timeout_s / 2,  # the rest is for the checks
     )
     return _cells(result)

@@ -15,7 +15,7 @@ from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import checked_model
 from calibgraph.fleet.rows import SCHEMA
 from calibgraph.fleet.uris import fingerprint, in_arrow, join, read_bytes
-from calibgraph.model.config import Config, Terms, config_from
+from calibgraph.model.config import Config, config_from
 from calibgraph.yaml_text import parse_yaml
 
 Key = tuple[str, str]
@@ -23,7 +23,7 @@ Key = tuple[str, str]
 _SEPARATOR = ";"  # between several recordings in one cell
 _OWN = ("vehicle", "recording", "rig", "settings")
 _MOST_BYTES, _MOST_SETTINGS_BYTES = 2**31, 2**20
-_MATCHING = ("frames", "search_deg", "search_m", "terms")
+_MATCHING = ("frames", "search_deg", "search_m")
 
 
 class Settings(BaseModel):
@@ -37,7 +37,6 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     config: Config = Config()
-    terms: Terms = "full"
     frames: str | None = None
     search_deg: float | None = Field(default=None, gt=0)
     search_m: float | None = Field(default=None, gt=0)
