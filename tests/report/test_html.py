@@ -110,6 +110,11 @@ def test_images_before_and_after_are_in_the_page(
     for name in sample_result.rig.cameras:
         for when in ("before", "after"):
             assert f'alt="{name} {when}, coloured by distance"' in text
+    matches = sample_result.camera_matches
+    assert matches is not None
+    for a, b in matches.pairs():
+        row = text.split(f"<td>{a}, {b}</td>")[1].split("</tr>")[0]
+        assert f">{len(matches.of_pair(a, b))}</td>" in row and f"pose of {a} to {b}" in row
     for key in sample_result.config.model_dump():
         assert key in text
     for path, digest in sample_result.inputs.items():
