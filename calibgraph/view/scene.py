@@ -13,7 +13,7 @@ from calibgraph.io.frame import Frame, frame_of_entry
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
-from calibgraph.report.point_overlay import depth_colours
+from calibgraph.report.point_overlay import depth_colours, visible_points
 
 Colours = NDArray[np.uint8]
 
@@ -101,12 +101,9 @@ def _view_image(
 
 def project_cloud(camera: Camera, points_lidar_m: NDArray[np.float32]) -> Projected:
     """The points of a cloud (n, 3) on a camera's image, an even choice of very many."""
-    T = camera.T_camera_lidar
-    points = points_lidar_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-    pixels, valid = camera.lens.project(points)
-    seen = np.flatnonzero(valid & camera.in_image(pixels))
-    seen = seen[:: max(1, -(-len(seen) // _MAX_POINTS))]
-    return Projected(pixels[seen], _by_distance(points[seen]))
+    points, pixels = visible_points(points_lidar_m.astype(np.float64), camera)
+    step = max(1, -(-len(pixels) // _MAX_POINTS))
+    return Projected(pixels[::step], _by_distance(points[::step]))
 
 
 def _by_distance(points: NDArray[np.floating]) -> Colours:
