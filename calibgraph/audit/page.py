@@ -14,7 +14,7 @@ from calibgraph.files import write_text
 from calibgraph.model.calibration import FRAMES_SENTENCE
 from calibgraph.model.rig import Camera
 from calibgraph.model.summary import Reason
-from calibgraph.report.kit import load_template
+from calibgraph.report.kit import page_template
 from calibgraph.report.page_overlays import depth_scale, draw_overlays, width_on_page
 
 
@@ -39,7 +39,7 @@ def write_audit_report(audit: Audit, path: Path | str) -> Path:
     cameras = {name: [each for each in (camera, measured[name]) if each is not None]
                for name, camera in audit.deployed.cameras.items()}  # fmt: skip
     overlays, left_out = draw_overlays(audit.shown, cameras)
-    page = load_template("page.html.j2", "calibgraph.audit").render(
+    page = page_template("calibgraph.audit").render(
         audit=audit,
         date=datetime.now(UTC).date().isoformat(),
         measured=measured,

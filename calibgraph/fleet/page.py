@@ -15,7 +15,7 @@ from calibgraph.audit.fleet_model import FleetModel, Mount, fit_fleet
 from calibgraph.audit.observations import NAMES, newest_rows, observe, words
 from calibgraph.audit.result import twist_cells
 from calibgraph.fleet.rows import Store, read_rows
-from calibgraph.report.kit import load_template
+from calibgraph.report.kit import page_template
 
 STATES = ("PASS", "NO RESULT", "WARN", "FAIL")
 """The worst last."""
@@ -144,7 +144,7 @@ def _page(report: FleetReport) -> str:
             vehicle["cameras"][alike].append(of.camera[k])
     counts = Counter(STATES[vehicle["state"]] for vehicle in vehicles.values())
     listed = [(name, each) for name, each in vehicles.items() if each["state"] != _PASS]
-    return load_template("page.html.j2", "calibgraph.fleet").render(
+    return page_template("calibgraph.fleet").render(
         states=STATES,
         counts=counts,
         vehicles=sorted(listed, key=lambda one: -int(one[1]["state"])),

@@ -32,7 +32,7 @@ from calibgraph.report.camera_section import (
     worked_point,
 )
 from calibgraph.report.frames import recording_name
-from calibgraph.report.kit import load_template
+from calibgraph.report.kit import page_template
 from calibgraph.report.page_overlays import depth_scale, draw_overlays, width_on_page
 from calibgraph.report.point_overlay import write_overlays
 from calibgraph.report.reprojection_errors import reprojection_errors
@@ -85,7 +85,7 @@ def render_page(result: Calibration) -> str:
         for index, (name, camera) in enumerate(rig.cameras.items())
     ]
     summary = result.summary
-    return load_template("page.html.j2").render(
+    return page_template("calibgraph.report").render(
         result=result,
         cameras=cameras,
         summary=summary,
