@@ -76,8 +76,8 @@ def check(
     no part, since they may be as outdated as the extrinsics.
 
     Args:
-        rig: the deployed calibration, of alignments; of a result's folder or file the answer also
-            has where it is from.
+        rig: the deployed calibration, of alignments. For the path of a result, the audit also has
+            the result's verdict, and whether it was made from this recording.
         dataset: a recent recording: a dataset, its folder, a KITTI odometry sequence, or several.
         tolerance_deg: largest turn of a camera that is OK.
         tolerance_cm: largest shift of a camera that is OK.
