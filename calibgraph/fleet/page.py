@@ -136,7 +136,7 @@ def _page(report: FleetReport) -> str:
     for k in np.lexsort([of.camera, of.vehicle]):
         date = dates[k] if np.isfinite(of.day[k]) else ""
         vehicle = vehicles.setdefault(str(of.vehicle[k]), {
-            "model": of.model[k], "batch": of.batch[k], "date": date, "state": _PASS,
+            "model": str(of.model[k]), "batch": str(of.batch[k]), "date": date, "state": _PASS,
             "cameras": defaultdict(list)})  # fmt: skip
         vehicle["state"] = max(vehicle["state"], report.state[k])
         if report.state[k] != _PASS:  # the same of several cameras is one line

@@ -45,6 +45,7 @@ def page_of(rows: pa.Table, folder: Path) -> Path:
 def page(rows: pa.Table, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of these rows; the first vehicle has a name that would end the script."""
     hostile = column(rows, "vehicle", [HOSTILE] * 6 + rows["vehicle"].to_pylist()[6:])
+    hostile = column(hostile, "model", ["\u202e"] * 6 + rows["model"].to_pylist()[6:])
     return page_of(hostile, tmp_path_factory.mktemp("page"))
 
 
@@ -64,6 +65,7 @@ def test_a_browser_shows_it_without_errors_and_without_a_network(
 ) -> None:
     rendering = render(page, tmp_path)
     assert rendering.errors == []
+    assert "<td>\\u202e</td>" in page.read_text() and "\u202e" not in page.read_text()
     assert rendering.requests == []
     red = (rendering.picture == (0x20, 0, 0xB0)).all(axis=2)  # BGR
     assert red.sum() > 1000
