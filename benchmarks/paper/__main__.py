@@ -22,7 +22,7 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.prog = "python -m benchmarks.paper"
     add = parser.add_argument
-    add("data", metavar="DATA", help="a simulated scenario: kitti, walkley, surround, fisheye; a "
+    add("data", metavar="DATA", help="a simulated scenario: kitti, walkley; a "
         "dataset folder with a reference.yaml; or kitti:DIR,DIR, KITTI odometry sequences of one "
         "rig; recordings are matched again in every draw")  # fmt: skip
     add("--frames", type=int, nargs="+", default=[10, 100], help="at most as many as there are")

@@ -26,7 +26,8 @@ from calibgraph.model.metrics import perturb
 from calibgraph.model.rig import RelativePose, Rig
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
-from calibgraph.simulation.scenarios import SCENARIOS, scenario_of
+from calibgraph.simulation.rigs import rig_of
+from calibgraph.simulation.scenarios import SCENARIOS, draw_scenario
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.objective import Transforms
 from calibgraph.solver.preprocess import preprocess
@@ -73,7 +74,7 @@ class Source:
     def reference(self) -> Rig:
         """The truth of a scenario, the reference of recordings."""
         if not self.folders:
-            return scenario_of(self.name).rig
+            return rig_of(self.name)
         own = self.folders[0] / REFERENCE_FILE
         return load_rig(own if own.is_file() else self.folders[0])
 
@@ -94,7 +95,7 @@ class Source:
         reference = self.reference()
         guess = perturb(reference, rotation_deg=GUESS_DEG, translation_m=GUESS_M, seed=guess_seed)
         if not self.folders:
-            table = scenario_of(self.name).draw(frames, own_seed)
+            table = draw_scenario(self.name, frames, own_seed)
             return Draw(guess, table, reference, theirs, seed)
         data = load_dataset(self.folders, guess)
         count = len(data.frames)

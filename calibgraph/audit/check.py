@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import NamedTuple
 
 from pydantic import BaseModel
 
@@ -13,7 +12,7 @@ from calibgraph.audit.judgement import (
     judge_camera,
     judge_lidar,
 )
-from calibgraph.audit.matching import Matching, match_from_deployed
+from calibgraph.audit.matching import match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
 from calibgraph.audit.significance import Tolerance
 from calibgraph.errors import CorrespondenceError, FileError
@@ -21,13 +20,13 @@ from calibgraph.files import load_model
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.frame import hash_source
 from calibgraph.io.kept_frames import keep_frames
+from calibgraph.io.rigs import load_rig
 from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.frame_choice import CANDIDATES, without_copies
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.same_images import require_different_images
-from calibgraph.model.calibration import package_versions
 from calibgraph.model.config import Config, Reported
 from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 from calibgraph.model.rig import Rig
@@ -62,7 +61,7 @@ DOUBTS: tuple[Callable[[Evidence], Checks], ...] = (
 
 @with_own_threads
 def check(
-    rig: Rig,
+    rig: Rig | Path | str,
     dataset: Datasets,
     *,
     tolerance_deg: float = 0.5,
@@ -77,7 +76,8 @@ def check(
     no part, since they may be as outdated as the extrinsics.
 
     Args:
-        rig: the deployed calibration, of alignments.
+        rig: the deployed calibration, of alignments. For the path of a result, the audit also has
+            the result's verdict, and whether it was made from this recording.
         dataset: a recent recording: a dataset, its folder, a KITTI odometry sequence, or several.
         tolerance_deg: largest turn of a camera that is OK.
         tolerance_cm: largest shift of a camera that is OK.
@@ -95,23 +95,27 @@ def check(
     """
     tolerance, report = Tolerance(tolerance_deg, tolerance_cm), progress or no_progress
     full, watch = find_matcher(matcher, seed=seed), Stopwatch()
-    deployed = rig.model_copy(update={"relative_poses": ()})
+    loaded = rig if isinstance(rig, Rig) else load_rig(rig)
+    deployed = loaded.model_copy(update={"relative_poses": ()})
+    given = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, deployed)
+    same_recording, verdict = (False, None) if isinstance(rig, Rig) else provenance(rig, given)
     with watch("choose_frames"):
-        data = _open(dataset, deployed, full)
-    matching = Matching(data, deployed, full, Config(seed=seed), report)
+        data = _open(given, deployed, full)
     try:
-        run = match_from_deployed(matching, watch)
+        run = match_from_deployed(
+            data, deployed, full, Config(seed=seed), watch=watch, progress=report
+        )
         with watch("places"):
             run = assign_places(run)
         run = refine_with_camera_pairs(run, report)
         with watch("checks"):
             cameras, lidar = _judge(run, tolerance, report)
     except CorrespondenceError as error:
-        too_few_matches = error.camera in rig.cameras and error.row is None
+        too_few_matches = error.camera in deployed.cameras and error.row is None
         if not too_few_matches:  # a wrong table
             raise
         nothing = CameraAudit("CANNOT TELL", f"{error}; {SEARCHES_FARTHER}")
-        cameras = dict.fromkeys(rig.cameras, nothing)
+        cameras = dict.fromkeys(deployed.cameras, nothing)
         lidar = None
     finally:
         full.release()
@@ -119,13 +123,12 @@ def check(
     sources = tuple(map(str, data.folders))
     return Audit(
         cameras, lidar, deployed, middle, sources,
-        tolerance_deg, tolerance_cm, len(data.frames), watch.seconds, package_versions(),
+        tolerance_deg, tolerance_cm, len(data.frames), watch.seconds, same_recording, verdict,
     )  # fmt: skip
 
 
-def _open(dataset: Datasets, deployed: Rig, matcher: FullMatcher) -> Dataset:
+def _open(data: Dataset, deployed: Rig, matcher: FullMatcher) -> Dataset:
     """The frames that the matcher is given, without copies, which are logged."""
-    data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, deployed)
     data, most = keep_frames(data), matcher.most_frames
     require_different_images(data, deployed)
     data = keep_frames(hide_burnt_in(data, deployed))
@@ -213,24 +216,17 @@ class _Result(BaseModel):
     config: _Part = _Part()
 
 
-class Provenance(NamedTuple):
-    """Whether the recording is the deployed result's own; its verdict, None of other rigs."""
-
-    same_recording: bool = False
-    verdict: Status | None = None
-
-
-def provenance(rig: Path, data: Dataset) -> Provenance:
-    """Where a deployed calibration is from.
+def provenance(rig: Path | str, data: Dataset) -> tuple[bool, Status | None]:
+    """Whether a recording is the deployed result's own; its verdict, None of other rigs.
 
     Only clouds with the name of one of its inputs are read.
 
     Raises:
         FileError: if the result is malformed, or of mounts; or a cloud cannot be read.
     """
-    path = rig / CALIBRATION_FILE if rig.is_dir() else rig
+    path = Path(rig) / CALIBRATION_FILE if Path(rig).is_dir() else Path(rig)
     if not is_calibration_file(path):
-        return Provenance()
+        return False, None
     result = load_model(_Result, path)
     if result.config.of != "alignment":
         raise FileError(
@@ -240,4 +236,4 @@ def provenance(rig: Path, data: Dataset) -> Provenance:
     names = {Path(source).name for source in result.inputs}
     clouds = (frame.cloud_path for frame in data.frames if frame.cloud_path.name in names)
     same = any(hash_source(cloud) in result.inputs.values() for cloud in clouds)
-    return Provenance(same, result.verdict.status)
+    return same, result.verdict.status

@@ -83,7 +83,6 @@ def drift(
     hashes = {name: {*result.inputs.values()} for name, result in opened.items()}
     return Drift(
         results=names,
-        at=at,
         cameras=judged,
         trends={name: trend for name, trend in trends.items() if trend is not None},
         lidar=tuple(
@@ -231,4 +230,4 @@ def _trend(found: Deviations, at: Array, unit: str, limits: Limits) -> Trend | N
     reason = describe_motion(whole, sigma, clear, CAMERA_AXES)
     reason += f" from the first to the last result{'' if changed else why}"
     reason = reason if clear.any() else "no significant trend"
-    return Trend(changed, reason, change, sigma / span, unit, span)
+    return Trend(changed, reason, change, sigma / span, unit)

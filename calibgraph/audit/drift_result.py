@@ -27,7 +27,6 @@ class Trend:
         slope: (6,) rotation [rad], translation [m], per unit.
         sigma: (6,) standard deviations of ``slope``.
         unit: "day", or "result" for the order in which they were given.
-        span: from the first to the last result, in this unit.
     """
 
     changed: bool
@@ -35,7 +34,6 @@ class Trend:
     slope: Array
     sigma: Array
     unit: str
-    span: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +42,6 @@ class Drift:
 
     Attributes:
         results: their names.
-        at: (n,) when each was recorded [days], or its place in the order given.
         cameras: per camera, one entry per result.
         trends: per camera with an error bar in three results or more.
         lidar: per result, the motion of the LiDAR where one explains the deviations of all
@@ -55,7 +52,6 @@ class Drift:
     """
 
     results: tuple[str, ...]
-    at: Array
     cameras: Mapping[str, tuple[CameraAudit, ...]]
     trends: Mapping[str, Trend]
     lidar: tuple[LidarAudit | None, ...]

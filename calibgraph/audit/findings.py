@@ -59,14 +59,14 @@ class Finding:
         batch = f"batch {self.batch}" if self.batch else "all vehicles"
         return {
             "mount": f"{where}: the mount moved in {self.at} vehicles, more than other cameras'",
-            "batch": f"{where}: {batch} differs from the model by {_size(self.change)}",
-            "date": f"{where}: {batch} changed on {self.at} by {_size(self.change)}",
-            "drift": f"{where}: drifts with {self.at}, {_size(self.change * self.reach)} "
+            "batch": f"{where}: {batch} differs from the model by {describe_size(self.change)}",
+            "date": f"{where}: {batch} changed on {self.at} by {describe_size(self.change)}",
+            "drift": f"{where}: drifts with {self.at}, {describe_size(self.change * self.reach)} "
             f"over its range of {self.reach:,.0f}",
         }[self.kind]
 
 
-def _size(change: Array) -> str:
+def describe_size(change: Array) -> str:
     """Angle and distance."""
     degrees = math.degrees(float(np.linalg.norm(change[:3])))
     return f"{degrees:.2g} deg, {100 * float(np.linalg.norm(change[3:])):.2g} cm"

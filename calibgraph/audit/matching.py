@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import cached_property
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.io.dataset import Dataset
@@ -11,7 +9,6 @@ from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun, RoundSummary, summarize_round
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import pose_difference
-from calibgraph.model.places import Places
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Status
 from calibgraph.progress import Progress, Stopwatch
@@ -23,52 +20,43 @@ _REACH_DEG, _REACH_CM = 0.7, 20.0
 """Errors of the start that the tracking rounds correct."""
 
 
-@dataclass(frozen=True, eq=False)
-class Matching:
-    """Input of the rounds of matching."""
-
-    data: Dataset
-    deployed: Rig
-    matcher: FullMatcher
-    config: Config
-    progress: Progress
-
-    @cached_property
-    def places(self) -> Places:
-        """During which frames the vehicle stands."""
-        return find_stationary(self.data, self.deployed)
-
-
-def match_from_deployed(matching: Matching, watch: Stopwatch) -> MatchingRun:
+def match_from_deployed(
+    data: Dataset,
+    deployed: Rig,
+    matcher: FullMatcher,
+    config: Config,
+    *,
+    watch: Stopwatch,
+    progress: Progress,
+) -> MatchingRun:
     """Match in as few rounds as settle: the last tracking round, all of these, or all rounds.
 
     Raises:
         CorrespondenceError: if no camera has enough correspondences.
     """
-    tracking = matching.matcher.tracking_rounds
+    tracking, places = matcher.tracking_rounds, find_stationary(data, deployed)
+
+    def match(rounds: Sequence[int]) -> MatchingRun:
+        estimate, summaries = deployed, list[RoundSummary]()
+        for index in rounds:
+            with watch("match"):
+                table = matcher.match(data, estimate, round_index=index, progress=progress)
+                table = table.with_places(places)
+            with watch("solve"):
+                solution = solve_without_failing(estimate, table, config)
+            summaries.append(summarize_round(table, estimate, solution.solved_rig))
+            estimate = solution.solved_rig
+        return MatchingRun(data, matcher, deployed, table, solution, tuple(summaries), watch)
+
     if not tracking:
-        return _run_rounds(matching, range(matching.matcher.rounds), watch)
+        return match(range(matcher.rounds))
     if len(tracking) > 1:  # the last alone, if it ends where it begins, as a converged run
         with suppress(CorrespondenceError):
-            run = _run_rounds(matching, tracking[-1:], watch)
+            run = match(tracking[-1:])
             if not run.solution.held and _has_settled(run, still="PASS"):
                 return run
-    run = _run_rounds(matching, tracking, watch)
-    return run if _has_settled(run) else _run_rounds(matching, (0, *tracking), watch)
-
-
-def _run_rounds(matching: Matching, rounds: Sequence[int], watch: Stopwatch) -> MatchingRun:
-    data, matcher, config = matching.data, matching.matcher, matching.config
-    estimate, summaries = matching.deployed, list[RoundSummary]()
-    for index in rounds:
-        with watch("match"):
-            table = matcher.match(data, estimate, round_index=index, progress=matching.progress)
-            table = table.with_places(matching.places)
-        with watch("solve"):
-            solution = solve_without_failing(estimate, table, config)
-        summaries.append(summarize_round(table, estimate, solution.solved_rig))
-        estimate = solution.solved_rig
-    return MatchingRun(data, matcher, matching.deployed, table, solution, tuple(summaries), watch)
+    run = match(tracking)
+    return run if _has_settled(run) else match((0, *tracking))
 
 
 def _has_settled(run: MatchingRun, still: Status = "WARN") -> bool:

@@ -10,23 +10,12 @@ import gtsam
 import numpy as np
 
 from calibgraph.audit.result import Audit, CameraAudit, twist_cells
-from calibgraph.errors import CalibrationError
 from calibgraph.files import write_text
 from calibgraph.model.calibration import FRAMES_SENTENCE
-from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
 from calibgraph.model.summary import Reason
-from calibgraph.report.camera_section import matrix_text
-from calibgraph.report.kit import load_template
-from calibgraph.report.page_overlays import (
-    PICTURES_BYTES,
-    depth_scale,
-    draw_by_depth,
-    width_on_page,
-)
-
-Pictures = dict[str, tuple[str, str | None]]
-"""The cloud on an image of each camera, as data URIs: as deployed, and as measured, if it was."""
+from calibgraph.report.kit import page_template
+from calibgraph.report.page_overlays import depth_scale, draw_overlays, width_on_page
 
 
 def write_audit_report(audit: Audit, path: Path | str) -> Path:
@@ -47,17 +36,17 @@ def write_audit_report(audit: Audit, path: Path | str) -> Path:
     """
     measured = {name: measured_camera(audit.deployed.cameras[name], camera)
                 for name, camera in audit.cameras.items()}  # fmt: skip
-    pictures, left_out = _draw(audit, measured)
-    page = load_template("page.html.j2", "calibgraph.audit").render(
+    cameras = {name: [each for each in (camera, measured[name]) if each is not None]
+               for name, camera in audit.deployed.cameras.items()}  # fmt: skip
+    overlays, left_out = draw_overlays(audit.shown, cameras)
+    page = page_template("calibgraph.audit").render(
         audit=audit,
         date=datetime.now(UTC).date().isoformat(),
         measured=measured,
-        overlays=pictures,
-        pictures_left_out=left_out,
+        overlays=overlays,
+        overlays_left_out=left_out,
         reasons=_reasons(audit),
-        detectable=_detectable(audit),
         twist_cells=twist_cells,
-        matrix_text=matrix_text,
         width_on_page=width_on_page,
         depth_scale=depth_scale(),
         frames_sentence=FRAMES_SENTENCE,
@@ -78,43 +67,9 @@ def _reasons(audit: Audit) -> list[Reason]:
     return sorted(reasons, key=lambda reason: ("WRONG", "CANNOT TELL", "OK").index(reason.status))
 
 
-def _detectable(audit: Audit) -> str:
-    """The smallest detectable change over all cameras."""
-    known = [c.detectable for c in audit.cameras.values() if c.detectable is not None]
-    missing = [name for name, c in audit.cameras.items() if c.detectable is None]
-    sentences = []
-    if known:
-        worst = np.max(known, axis=0)
-        degrees, centimetres = np.degrees(worst[:3]).max(), 100 * worst[3:].max()
-        sentences += [
-            f"With a probability of 90 %, a turn of any camera about an axis by {degrees:.2f} deg, "
-            f"or a shift along one by {centimetres:.1f} cm."
-        ]
-    if missing:
-        sentences += [f"Unknown for {', '.join(missing)}."]
-    return " ".join(sentences)
-
-
 def measured_camera(deployed: Camera, audit: CameraAudit) -> Camera | None:
     """The camera where it was measured; None if nothing was measured."""
     if audit.deviation is None:
         return None
     T_now_deployed = gtsam.Pose3.Expmap(-audit.deviation).matrix()
     return deployed.moved_to(np.asarray(T_now_deployed @ deployed.T_camera_lidar))
-
-
-def _draw(audit: Audit, measured: dict[str, Camera | None]) -> tuple[Pictures, str | None]:
-    """The pictures; the reason why some are missing, None if none are."""
-    drawn: Pictures = {}
-    budget, frame = PICTURES_BYTES // (2 * len(audit.cameras)), audit.shown
-    try:
-        cloud = frame.load_cloud()[:, :3].astype(np.float64)
-        for name, camera in audit.deployed.cameras.items():
-            if name in frame.image_paths:
-                image, cameras = frame.load_image(name, camera), (camera, measured[name])
-                seen = [when_taken(each, frame.twist_per_s) for each in cameras if each is not None]
-                before, *now = (draw_by_depth(image, cloud, each, budget) for each in seen)
-                drawn[name] = before, now[0] if now else None
-    except (CalibrationError, OSError) as error:
-        return drawn, str(error)
-    return drawn, None

@@ -82,7 +82,6 @@ class Audit:
         tolerance_deg, tolerance_cm: largest turn and shift that are OK.
         frames: number of frames that were matched.
         timings_s: wall time per stage.
-        versions: of this package and the libraries that matter.
         same_recording: whether the deployed calibration was made from these very frames, so that
             errors that they repeat cannot be seen.
         deployed_verdict: of the result that is deployed, when it was made; None of other rigs.
@@ -97,7 +96,6 @@ class Audit:
     tolerance_cm: float
     frames: int
     timings_s: Mapping[str, float] = field(default_factory=dict)
-    versions: Mapping[str, str] = field(default_factory=dict)
     same_recording: bool = False
     deployed_verdict: Status | None = None
 

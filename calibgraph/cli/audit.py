@@ -1,7 +1,6 @@
 """The commands that compare calibrations with a recording, and with each other: check, drift."""
 
 from contextlib import suppress
-from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -33,24 +32,20 @@ def check(
     but the page, if one is wanted.
     """
     from calibgraph.audit import check
-    from calibgraph.audit.check import provenance
     from calibgraph.audit.significance import Tolerance
     from calibgraph.files import require_new_file
-    from calibgraph.io.rigs import load_rig
 
     if out is not None:
         require_new_file(out, ".html", ".htm", force=force)
     with checked_arguments():
         Tolerance(tolerance_deg, tolerance_cm)
         matcher = matcher_from("structure", seed=seed, all_frames=frames is not None)
-    data, deployed = dataset_from(dataset, rig, frames), load_rig(rig)
-    origin = provenance(rig, data)
+    data = dataset_from(dataset, rig, frames)
     with progress_bar() as progress:
         audit = check(
-            deployed, data, tolerance_deg=tolerance_deg, tolerance_cm=tolerance_cm,
+            rig, data, tolerance_deg=tolerance_deg, tolerance_cm=tolerance_cm,
             matcher=matcher, seed=seed, progress=progress,
         )  # fmt: skip
-    audit = replace(audit, same_recording=origin.same_recording, deployed_verdict=origin.verdict)
     if out is not None:
         from calibgraph.audit.page import write_audit_report
 

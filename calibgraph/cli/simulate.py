@@ -19,8 +19,7 @@ def simulate(
         ...,
         metavar="SCENARIO",
         help="street: a dataset of scans and images of a drive along a procedural street. "
-        "kitti, walkley, surround, fisheye: a table of correspondences, with the errors of the "
-        "paper's matcher (kitti, walkley) or in between.",
+        "kitti, walkley: a table of correspondences, with the errors of the paper's matcher.",
     ),
     out: Path = Option(..., metavar="DIR", help="Folder to write."),
     frames: int = Option(10, help="Number of frames."),
@@ -52,11 +51,10 @@ def simulate(
     ),
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
-    from calibgraph.file_sets import require_own_folder
     from calibgraph.io.rigs import load_rig
     from calibgraph.simulation.recording import simulate_street
     from calibgraph.simulation.rigs import RIG_NAMES, rig_of
-    from calibgraph.simulation.scenarios import scenario_of, simulate_table
+    from calibgraph.simulation.scenarios import SCENARIOS, simulate_table
 
     common: dict[str, Any] = {
         "frames": frames, "rotation_deg": rotation_deg, "translation_m": translation_m, "seed": seed
@@ -66,14 +64,13 @@ def simulate(
         "vary_layout": vary_layout or None,
     }  # fmt: skip
     street = {name: value for name, value in of_street.items() if value is not None}
-    require_own_folder(out)
     with progress_bar() as progress, checked_arguments():
         if scenario == STREET:
             name = street.pop("rig", RIG)
             is_file = name not in RIG_NAMES and name and Path(name).exists()
             truth = load_rig(name) if is_file else rig_of(name)
             written = simulate_street(out, truth, **street, **common, progress=progress)
-        elif street and scenario_of(scenario):
+        elif street and scenario in SCENARIOS:
             named = " and ".join(f"--{name.replace('_', '-')}" for name in street)
             raise ValueError(
                 f"scenario {scenario!r} has its own rig and matcher, {named} would change nothing; "

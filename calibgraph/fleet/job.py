@@ -24,7 +24,8 @@ from calibgraph.child_process import (
     output_to,
 )
 from calibgraph.errors import CalibrationError
-from calibgraph.fleet.task import Outcome, Task, describe_failure, release
+from calibgraph.fleet.manifest import Job
+from calibgraph.fleet.task import Limits, Outcome, describe_failure, release
 from calibgraph.fleet.uris import fetch
 
 _LOG, _MOST_LOG = "log.txt", 2**16
@@ -32,15 +33,15 @@ _kept = threading.local()
 _children: list[ChildProcess] = []
 
 
-def run_job(task: Task) -> Outcome:
+def run_job(job: Job, limits: Limits, of_release: str) -> Outcome:
     """Run a job in the child process of this thread.
 
     Raises:
         CalibrationError: if this machine has another version of the package than the command.
     """
-    if task.release != release():
+    if of_release != release():
         raise CalibrationError(
-            f"a worker has calibgraph {release()}, the command {task.release}; install the same "
+            f"a worker has calibgraph {release()}, the command {of_release}; install the same "
             "version on all machines"
         )
     if getattr(_kept, "child", None) not in _children:
@@ -51,7 +52,7 @@ def run_job(task: Task) -> Outcome:
         try:
             _kept.child.start()
             start = time.perf_counter()  # the libraries' loading is not the job's time
-            outcome: Outcome = _kept.child.ask((task, Path(folder)), task.limits.timeout_s)
+            outcome: Outcome = _kept.child.ask((job, limits, Path(folder)), limits.timeout_s)
         except ChildEndedError as error:
             outcome = Outcome(error_kind="worker died", error=str(error))
         except ChildTimeoutError as error:
@@ -79,11 +80,11 @@ def main() -> None:
 
     fetched: list[Path] = []
 
-    def answer(request: tuple[Task, Path], _: object) -> Outcome:
-        task, folder = request
+    def answer(request: tuple[Job, Limits, Path], _: object) -> Outcome:
+        job, limits, folder = request
         fetched[:] = [folder]
-        with output_to(folder / _LOG), memory_limit(task.limits.memory_bytes):
-            return execute(task, folder)
+        with output_to(folder / _LOG), memory_limit(limits.memory_bytes):
+            return execute(job, limits, folder)
 
     def remove_fetched() -> None:
         for folder in fetched:
@@ -92,11 +93,11 @@ def main() -> None:
     answer_requests(answer, remove_fetched)
 
 
-def execute(task: Task, folder: Path) -> Outcome:
+def execute(job: Job, limits: Limits, folder: Path) -> Outcome:
     """Run a job here; what is wrong with its data or its machine is part of the outcome."""
     places = dict[str, str]()
     try:
-        return Outcome(_calibrate(task, lambda uri: _local(uri, task, folder, places)))
+        return Outcome(_calibrate(job, limits, lambda uri: _local(uri, limits, folder, places)))
     except Exception as error:
         kind, text = describe_failure(error)
     for place, uri in places.items():
@@ -104,12 +105,12 @@ def execute(task: Task, folder: Path) -> Outcome:
     return Outcome(error_kind=kind, error=str(CalibrationError(text)))  # in one line
 
 
-def _local(uri: str, task: Task, folder: Path, places: dict[str, str]) -> Path:
+def _local(uri: str, limits: Limits, folder: Path, places: dict[str, str]) -> Path:
     """The local path of a URI, noted in ``places`` for messages."""
     target = folder / str(len(places))
     target.mkdir()
     try:
-        path = fetch(uri, target, task.limits.fetch_bytes)
+        path = fetch(uri, target, limits.fetch_bytes)
     except CalibrationError:
         raise
     except Exception as error:  # of any store's client: the next time it may work
@@ -118,18 +119,20 @@ def _local(uri: str, task: Task, folder: Path, places: dict[str, str]) -> Path:
     return path
 
 
-def _calibrate(task: Task, local: Callable[[str], Path]) -> tuple[dict[str, Any], ...]:
+def _calibrate(
+    job: Job, limits: Limits, local: Callable[[str], Path]
+) -> tuple[dict[str, Any], ...]:
     """The cells of each camera's row."""
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
     from calibgraph.matching.structure import StructureMatcher
     from calibgraph.pipeline import calibrate, solve
 
-    job, settings = task.job, task.job.settings
+    settings = job.settings
     rig = load_rig(local(job.rig)) if job.rig else None
     paths = [local(uri) for uri in job.recordings]
     if job.is_table and rig is not None:
-        return _cells(solve(rig, paths[0], settings.config, settings.terms))
+        return _cells(solve(rig, paths[0], settings.config))
     given = {"search_deg": settings.search_deg, "search_m": settings.search_m}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if settings.frames is not None:
@@ -138,8 +141,7 @@ def _calibrate(task: Task, local: Callable[[str], Path]) -> tuple[dict[str, Any]
         load_dataset(paths, rig, frames=settings.frames),
         matcher=StructureMatcher(seed=settings.config.seed, **options),
         config=settings.config,
-        terms=settings.terms,
-        time_limit_s=task.limits.timeout_s / 2,  # the rest is for the checks
+        time_limit_s=limits.timeout_s / 2,  # the rest is for the checks
     )
     return _cells(result)
 

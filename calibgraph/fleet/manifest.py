@@ -3,7 +3,6 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import checked_model
 from calibgraph.fleet.rows import SCHEMA
 from calibgraph.fleet.uris import fingerprint, in_arrow, join, read_bytes
-from calibgraph.model.config import Config, Terms, config_from
+from calibgraph.model.config import Config, config_from
 from calibgraph.yaml_text import parse_yaml
 
 Key = tuple[str, str]
@@ -24,7 +23,7 @@ Key = tuple[str, str]
 _SEPARATOR = ";"  # between several recordings in one cell
 _OWN = ("vehicle", "recording", "rig", "settings")
 _MOST_BYTES, _MOST_SETTINGS_BYTES = 2**31, 2**20
-_MATCHING = ("frames", "search_deg", "search_m", "terms")
+_MATCHING = ("frames", "search_deg", "search_m")
 
 
 class Settings(BaseModel):
@@ -38,7 +37,6 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     config: Config = Config()
-    terms: Terms = "full"
     frames: str | None = None
     search_deg: float | None = Field(default=None, gt=0)
     search_m: float | None = Field(default=None, gt=0)
@@ -150,8 +148,8 @@ def _job(row: int, folder: str, *, vehicle: Any, recording: Any, rig: Any, setti
         raise ValueError(f"vehicle {vehicle!r}: expected a name; give the column as text")
     if not vehicle.isprintable():
         raise ValueError(f"vehicle {vehicle!r}: has control characters; rename it")
-    found = recording.split(_SEPARATOR) if isinstance(recording, str) else recording
-    if not isinstance(found, list) or not found or not all(u and isinstance(u, str) for u in found):
+    found = recording.split(_SEPARATOR) if isinstance(recording, str) else []
+    if not found or not all(found):
         raise ValueError(f"recording {recording!r}: expected a path or URI, or several between ;")
     if rig is not None and not isinstance(rig, str):
         raise ValueError(f"rig {rig!r}: expected a path or URI")
@@ -166,20 +164,16 @@ def _job(row: int, folder: str, *, vehicle: Any, recording: Any, rig: Any, setti
 
 
 def _settings(folder: str, cell: Any) -> Settings:
-    """Settings from a mapping, its text, or the URI of a YAML file."""
-    where = "settings"
-    if isinstance(cell, Mapping):  # a struct of Arrow has null for what a row leaves out
-        content = {name: value for name, value in cell.items() if value is not None}
-    elif cell and not isinstance(cell, str):
-        raise ValueError(f"settings {cell!r}: expected a mapping, or the URI of a YAML file")
-    else:
-        text = cell or "{}"
-        if not text.lstrip().startswith("{"):
-            where = join(folder, text)
-            try:
-                text = read_bytes(where, _MOST_SETTINGS_BYTES).decode()
-            except UnicodeDecodeError as error:
-                raise FileError(where, f"is not a text file ({error.reason})") from error
-        content = parse_yaml(text, where)
+    """Settings from the text of a mapping, or the URI of a YAML file."""
+    if cell is not None and not isinstance(cell, str):
+        raise ValueError(f"settings {cell!r}: expected the text of a mapping, or a YAML file's URI")
+    text, where = cell or "{}", "settings"
+    if not text.lstrip().startswith("{"):
+        where = join(folder, text)
+        try:
+            text = read_bytes(where, _MOST_SETTINGS_BYTES).decode()
+        except UnicodeDecodeError as error:
+            raise FileError(where, f"is not a text file ({error.reason})") from error
+    content = parse_yaml(text, where)
     matching = {name: content.pop(name) for name in _MATCHING if name in content}
     return checked_model(Settings, {**matching, "config": config_from(content, where)}, where)

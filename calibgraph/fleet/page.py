@@ -1,6 +1,7 @@
 """What a fleet's rows show: the model's files, and one page with the state of each camera."""
 
 import json
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,16 +10,16 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from calibgraph.arrays import Array
-from calibgraph.audit.findings import Finding, find_changes, moved_lidars
+from calibgraph.audit.findings import Finding, describe_size, find_changes, moved_lidars
 from calibgraph.audit.fleet_model import FleetModel, Mount, fit_fleet
 from calibgraph.audit.observations import NAMES, newest_rows, observe, words
+from calibgraph.audit.result import twist_cells
 from calibgraph.fleet.rows import Store, read_rows
-from calibgraph.report.kit import load_template
+from calibgraph.report.kit import page_template
 
-STATES = ("PASS", "WARN", "FAIL", "NO RESULT")
-_PASS, _WARN, _FAIL, _NO_RESULT = range(4)
-_UNITS = np.repeat([np.radians(1e-3), 1e-4], 3)  # thousandths of a degree, tenths of a millimetre
+STATES = ("PASS", "NO RESULT", "WARN", "FAIL")
+"""The worst last."""
+_PASS, _NO_RESULT, _WARN, _FAIL = range(4)
 _LONGEST_REASON = 200  # characters
 
 
@@ -72,14 +73,15 @@ def report_of(rows: pa.Table) -> FleetReport:
     of_lidar = np.isin(fleet.observations.vehicle, np.array(lidars, dtype=np.str_))
     own = {
         "the LiDAR was moved, or the rig taken apart": of_lidar,
-        "the camera was moved in its mount": fleet.apart & ~of_lidar,
+        "the camera was moved in its mount by {}": fleet.apart & ~of_lidar,
         "no error bar": ~measured & done & (verdict != "FAIL"),
     }
     given = [rows.column(name).to_pylist() if name in rows.column_names else [None] * len(rows)
              for name in ("reasons", "error")]  # fmt: skip
     reasons = []
     for k, (why, error) in enumerate(zip(*given, strict=True)):
-        of_row = [text for text, of in own.items() if of[k]]
+        size = describe_size(fleet.deviation[k])
+        of_row = [text.format(size) for text, of in own.items() if of[k]]
         reasons.append("; ".join([*of_row, *(why or ()), *([error] if error else ())]))
     return FleetReport(fleet, find_changes(fleet), lidars, state, reasons)
 
@@ -129,40 +131,25 @@ def _mount(mount: Mount) -> dict[str, Any]:
 
 def _page(report: FleetReport) -> str:
     """One HTML page that needs nothing else: no network, no files beside it."""
-    known = report.fleet.observations.day
-    known = known[np.isfinite(known)]
-    newest = str(np.datetime64(int(known.max()), "D")) if len(known) else ""
-    content = payload(report)
-    template = load_template("page.html.j2", "calibgraph.fleet")
-    return template.render(content=content, vehicles=len(content["vehicles"]), newest=newest)
-
-
-def payload(report: FleetReport) -> dict[str, Any]:
-    """What the page's script reads: names once, numbers as integers."""
-    of = report.fleet.observations
-    order = np.lexsort([of.camera, of.vehicle])
-    vehicles, first, vehicle = np.unique(of.vehicle[order], return_index=True, return_inverse=True)
-    texts = {"model": of.model[order][first], "batch": of.batch[order][first],
-             "camera": of.camera[order],
-             "reason": [report.reasons[k][:_LONGEST_REASON] for k in order]}  # fmt: skip
-    named = {name: np.unique(np.array(each, dtype=np.str_), return_inverse=True)
-             for name, each in texts.items()}  # fmt: skip
-    sigma = np.sqrt(np.diagonal(of.covariance, axis1=1, axis2=2))
-    names = [named[name][0].tolist() for name in ("camera", "model", "batch", "reason")]
-    return {
-        "states": STATES, "vehicles": vehicles.tolist(),
-        **dict(zip(("cameras", "models", "batches", "reasons"), names, strict=True)),
-        "findings": [[finding.kind, finding.text] for finding in report.findings],
-        **{name: numbers.tolist() for name, (_, numbers) in named.items()},
-        "vehicle": vehicle.tolist(),
-        "day": np.nan_to_num(of.day[order][first], nan=-1).astype(int).tolist(),
-        "state": report.state[order].tolist(),
-        **{name: _integers(np.where(of.measured[:, None], values, np.nan)[order])
-           for name, values in (("deviation", report.fleet.deviation), ("sigma", sigma))},
-    }  # fmt: skip
-
-
-def _integers(twists: Array) -> list[int | None]:
-    """(6 n,) of twists, None where they are unknown."""
-    scaled = (twists / _UNITS).ravel().tolist()
-    return [None if np.isnan(value) else round(value) for value in scaled]
+    of, vehicles = report.fleet.observations, dict[str, dict[str, Any]]()
+    dates = np.where(np.isfinite(of.day), of.day, 0).astype("datetime64[D]").astype(str)
+    for k in np.lexsort([of.camera, of.vehicle]):
+        date = dates[k] if np.isfinite(of.day[k]) else ""
+        vehicle = vehicles.setdefault(str(of.vehicle[k]), {
+            "model": str(of.model[k]), "batch": str(of.batch[k]), "date": date, "state": _PASS,
+            "cameras": defaultdict(list)})  # fmt: skip
+        vehicle["state"] = max(vehicle["state"], report.state[k])
+        if report.state[k] != _PASS:  # the same of several cameras is one line
+            alike = STATES[report.state[k]], report.reasons[k][:_LONGEST_REASON]
+            vehicle["cameras"][alike].append(of.camera[k])
+    counts = Counter(STATES[vehicle["state"]] for vehicle in vehicles.values())
+    listed = [(name, each) for name, each in vehicles.items() if each["state"] != _PASS]
+    return page_template("calibgraph.fleet").render(
+        states=STATES,
+        counts=counts,
+        vehicles=sorted(listed, key=lambda one: -int(one[1]["state"])),
+        newest=max((vehicle["date"] for vehicle in vehicles.values()), default=""),
+        findings=report.findings,
+        mounts=[mount for mounts in report.fleet.mounts.values() for mount in mounts.values()],
+        spread_cells=lambda mount: twist_cells(np.sqrt(np.diag(mount.spread)), 3),
+    )

@@ -5,11 +5,10 @@ import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from importlib import import_module
-from itertools import islice
 from typing import Any
 
 import pyarrow as pa
@@ -18,14 +17,12 @@ from calibgraph.errors import CalibrationError, FileError, needs_extra
 from calibgraph.fleet.job import end_children, interrupt_jobs, run_job
 from calibgraph.fleet.manifest import Job, Key, load_manifest
 from calibgraph.fleet.rows import ROWS, SCHEMA, Store, read_rows
-from calibgraph.fleet.task import Limits, Outcome, Task, release
+from calibgraph.fleet.task import Limits, Outcome, release
 from calibgraph.model.calibration import package_versions
 from calibgraph.parallel import count_cores
 from calibgraph.progress import Progress, no_progress
 
 _READERS = 16  # threads that look at inputs: a listing of an object store takes 50 ms
-_AHEAD = 2000
-"""Tasks submitted at a time: a manifest may have millions of rows, a cluster hundreds of cores."""
 _STATE = ["vehicle", "recording", "status", "verdict", "error_kind", "input_hash", "versions"]
 
 
@@ -74,10 +71,9 @@ def run_fleet(
     with store.locked():
         rows, hashes = _known_rows(out, found.jobs), _hashes(found.jobs, report)
         todo = [job for job in found.jobs if not _is_finished(rows[job.key], hashes[job.key])]
-        tasks = [Task(job, limits, release()) for job in todo]
         failed = 0
         with nullcontext(executor) if executor is not None else thread_executor() as opened:
-            for count, (job, outcome) in enumerate(_outcomes(opened, tasks), start=1):
+            for count, (job, outcome) in enumerate(_outcomes(opened, todo, limits), start=1):
                 rows[job.key] = _rows_of(job, outcome, hashes[job.key])
                 table = pa.Table.from_pylist(rows[job.key], schema=SCHEMA)
                 others = found.others.take(pa.array([job.row] * len(table)))
@@ -86,7 +82,7 @@ def run_fleet(
                 _write(store, job, outcome, table)
                 failed += outcome.error_kind is not None
                 stage = f"calibrating ({failed} failed)" if failed else "calibrating"
-                report(stage, count, len(tasks))
+                report(stage, count, len(todo))
     every = [row for job in found.jobs for row in rows[job.key]]
     verdicts = Counter(row["verdict"] for row in every if row["status"] == "done")
     failures = Counter(row["error_kind"] for row in every if row["status"] != "done")
@@ -128,16 +124,13 @@ def dask_executor(address: str) -> Iterator[Executor]:
             executor.shutdown(wait=False)  # cancels what has not ended
 
 
-def _outcomes(executor: Executor, tasks: Iterable[Task]) -> Iterator[tuple[Job, Outcome]]:
+def _outcomes(
+    executor: Executor, jobs: Iterable[Job], limits: Limits
+) -> Iterator[tuple[Job, Outcome]]:
     """Jobs with their outcomes, as they end."""
-    waiting, running = iter(tasks), dict[Future[Outcome], Job]()
-    while True:
-        for task in islice(waiting, _AHEAD - len(running)):
-            running[executor.submit(run_job, task)] = task.job
-        if not running:
-            return
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
-            yield running.pop(future), _outcome_of(future)
+    running = {executor.submit(run_job, job, limits, release()): job for job in jobs}
+    for future in as_completed([*running]):
+        yield running.pop(future), _outcome_of(future)
 
 
 def _outcome_of(future: Future[Outcome]) -> Outcome:

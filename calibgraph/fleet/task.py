@@ -1,11 +1,10 @@
-"""What a worker gets and what it returns: a job with its limits, and the job's outcome."""
+"""The limits of a job, and its outcome."""
 
 import traceback
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from calibgraph.errors import CalibrationError
-from calibgraph.fleet.manifest import Job
 from calibgraph.model.calibration import version_of
 
 ErrorKind = Literal["bad input", "io", "out of memory", "timeout", "worker died", "internal error"]
@@ -37,15 +36,6 @@ class Limits:
     timeout_s: float = 3600.0
     memory_bytes: int | None = None
     fetch_bytes: float = 50e9
-
-
-@dataclass(frozen=True)
-class Task:
-    """A job as it is sent to a worker by this release of the package."""
-
-    job: Job
-    limits: Limits
-    release: str
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
     """A result as plain values; every key names its unit."""
     cameras = {}
     for name, T in result.T_camera_lidar.items():
-        residuals = result.residuals.get(name)
         cameras[name] = {
             "T_camera_lidar": T.tolist(),
             "verdict": result.camera_verdicts[name].status,
@@ -26,10 +25,10 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
             "reasons": list(result.camera_verdicts[name].reasons),
             "actions": list(result.summary_of(name).actions),
             **_sigmas(result, name),
-            "residuals": None if residuals is None else vars(residuals),
+            "residuals": _values(result.residuals.get(name)),
             "weaknesses": list(result.weaknesses.get(name, ())),
             "prior_share": result.prior_share.get(name),
-            "error_sources": _sources(result, name),
+            "error_sources": _values(result.error_sources.get(name)),
             "counts": result.counts[name],
             "lens": [
                 {**vars(one), "is_determined": one.is_determined}
@@ -58,9 +57,8 @@ def _probability(verdict: Verdict) -> float | None:
     return None if verdict.error_probability is None else verdict.error_probability.probability
 
 
-def _sources(result: Calibration, name: str) -> dict[str, Any] | None:
-    sources = result.error_sources.get(name)
-    return None if sources is None else vars(sources)
+def _values(of: object | None) -> dict[str, Any] | None:
+    return None if of is None else vars(of)
 
 
 def _sigmas(result: Calibration, name: str) -> dict[str, list[float] | bool | None]:

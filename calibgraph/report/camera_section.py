@@ -1,52 +1,31 @@
-"""The page's section about one camera: its checks as rows of a table, its diagrams, one point."""
-
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+"""The page's section about one camera: its checks as cells of a table, its diagrams, one point."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.geometry import degrees_and_centimetres, invert, point_in_lidar
-from calibgraph.model.lens import has_other_lens
-from calibgraph.model.metrics import PoseError, pose_error
+from calibgraph.model.geometry import point_in_lidar
 from calibgraph.model.rig import Camera
-from calibgraph.model.verdict import Check, Direction, Verdict, beside, in_unit, is_reachable
+from calibgraph.model.verdict import Check, Direction, beside, in_unit, is_reachable
 from calibgraph.report import plots
-from calibgraph.report.page_overlays import Overlays, width_on_page
-from calibgraph.report.reprojection_errors import BeforeAfter, ReprojectionErrors
-
-_WORST_FIRST = ("FAIL", "WARN", "PASS")
+from calibgraph.report.reprojection_errors import ReprojectionErrors
 
 
-@dataclass(frozen=True)
-class CheckRow:
-    """One check with its value and its thresholds, as text; empty where there is none."""
+def check_cells(check: Check) -> tuple[str, str, str]:
+    """The value of a check and its thresholds, as text; empty where there is none.
 
-    check: Check
-    found: str
-    warn: str
-    fail: str
-
-
-def _severity(check: Check) -> int:
-    return _WORST_FIRST.index(check.status)
-
-
-def check_row(check: Check) -> CheckRow:
-    """A check with its thresholds; their order gives the side on which values are bad.
-
-    A status that the value does not give, since it depends on more, has none.
+    The order of the thresholds gives the side on which values are bad. A status that the value
+    does not give, since it depends on more, has none.
     """
     if check.value is None:
-        return CheckRow(check, "", "", "")
+        return "", "", ""
     if check.warn is None or check.fail is None or not check.is_graded:
-        return CheckRow(check, in_unit(check.value, check.unit), "", "")
+        return in_unit(check.value, check.unit), "", ""
     side: Direction = "at least" if check.warn > check.fail else "at most"
     warn, fail = (_threshold(side, limit, check.unit) for limit in (check.warn, check.fail))
     found = beside(check.value, check.fail if check.status == "FAIL" else check.warn, check.unit)
-    return CheckRow(check, found, warn, fail)
+    return found, warn, fail
 
 
 def _threshold(side: Direction, limit: float, unit: str) -> str:
@@ -101,91 +80,16 @@ def pose_text(T: Array) -> str:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class CameraSection:
-    """What the template prints of one camera beside what the result has.
-
-    Attributes:
-        rows: its checks, the worst first.
-        moved: change from the guess.
-        sigmas, bootstrap: (3,) of rotation [deg], and of translation [cm]; None where there are
-            none, or they do not hold.
-        no_error_bar: why there is none; empty if there is one.
-        overlays: None where there is no image.
-        overlay_width_px: at most so wide they are shown.
-        diagrams: pictures as data URIs, by the name of their caption in the template; those that
-            the data allow.
-        matrix, pose, inverse: of T_camera_lidar, and of the ROS transform, as text.
-        worked: one point step by step.
-    """
-
-    name: str
-    anchor: str
-    verdict: Verdict
-    rows: Sequence[CheckRow]
-    moved: PoseError
-    sigmas: Sequence[Array] | None
-    bootstrap: Sequence[Array] | None
-    no_error_bar: str
-    overlays: Overlays | None
-    overlay_width_px: int
-    diagrams: Mapping[str, str]
-    matrix: str
-    pose: str
-    inverse: str
-    worked: str
-
-
-def camera_section(
-    result: Calibration,
-    name: str,
-    index: int,
-    overlays: Overlays | None,
-    *,
-    errors: BeforeAfter | None,
-    diagrams: Mapping[str, str],
-) -> CameraSection:
-    """Collect what the page shows of a camera."""
-    camera, verdict = result.rig.cameras[name], result.camera_verdicts[name]
-    bootstrap = result.bootstrap.get(name) if result.error_bar_holds(name) else None
-    return CameraSection(
-        name=name,
-        anchor=f"camera-{index}",
-        verdict=verdict,
-        rows=[check_row(check) for check in sorted(verdict.checks, key=_severity)],
-        moved=pose_error(result.T_camera_lidar[name], result.initial_rig.T_camera_lidar[name]),
-        sigmas=result.error_bar(name),
-        bootstrap=None if bootstrap is None else degrees_and_centimetres(bootstrap),
-        no_error_bar=_why_no_error_bar(result, name),
-        overlays=overlays,
-        overlay_width_px=width_on_page(camera),
-        diagrams=diagrams,
-        matrix=matrix_text(camera.T_camera_lidar),
-        pose=pose_text(camera.T_camera_lidar),
-        inverse=pose_text(invert(camera.T_camera_lidar)),
-        worked=worked_point(camera, None if errors is None else errors.after),
-    )
-
-
-def _why_no_error_bar(result: Calibration, name: str) -> str:
-    if not result.error_bar_holds(name):
-        return "since the verdict is FAIL"
-    return "not by these correspondences" if result.sigmas(name) is None else ""
-
-
-def camera_diagrams(result: Calibration, name: str, errors: BeforeAfter | None) -> dict[str, str]:
-    """Residuals, coverage, lens and convergence of a camera, as data URIs by name."""
-    found: dict[str, str] = {}
-    before, camera = result.initial_rig.cameras[name], result.rig.cameras[name]
+def camera_diagrams(
+    result: Calibration, name: str, errors: ReprojectionErrors | None
+) -> dict[str, str]:
+    """Residuals, coverage and convergence of a camera, as data URIs by name."""
+    found, camera = dict[str, str](), result.rig.cameras[name]
     if errors is not None:
-        after = errors.after
-        sigma_px = result.residuals[name].sigma_px
-        found["residuals"] = plots.residual_scatter(after, sigma_px)
-        found["by_distance"] = plots.residual_by_distance(after)
-        found["over_image"] = plots.residual_map(camera, after)
-        found["coverage"] = plots.coverage(camera, after)
-    if name in result.lens and has_other_lens(before, camera):
-        found["lens"] = plots.lens_change(before, camera)
+        found["residuals"] = plots.residual_scatter(errors, result.residuals[name].sigma_px)
+        found["by_distance"] = plots.residual_by_distance(errors)
+        found["over_image"] = plots.residual_map(camera, errors)
+        found["coverage"] = plots.coverage(camera, errors)
     rounds = [cameras[name] for cameras in result.rounds if name in cameras]
     if len(rounds) > 1:
         found["convergence"] = plots.convergence(rounds)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +42,7 @@ def new_picture(width_in: float, height_in: float) -> Figure:
     return new_figure(height_in, width_in, dpi=_PICTURE_DPI, layout="constrained")
 
 
-def save_picture(figure: Figure, path: Path, metadata: Mapping[str, str] | None = None) -> None:
+def save_picture(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, atomically.
 
     Raises:
@@ -53,7 +52,7 @@ def save_picture(figure: Figure, path: Path, metadata: Mapping[str, str] | None 
 
     with warnings.catch_warnings():  # a name in letters that the font lacks: drawn as boxes
         warnings.filterwarnings("ignore", "Glyph", UserWarning)
-        write_atomically(path, lambda part: figure.savefig(part, format="png", metadata=metadata))
+        write_atomically(path, lambda part: figure.savefig(part, format="png"))
 
 
 def image_figure(camera: Camera, right_in: float = 0.1) -> tuple[Figure, Axes]:

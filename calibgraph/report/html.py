@@ -2,14 +2,19 @@
 
 import shlex
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import yaml
 
 from calibgraph.file_sets import written_together
 from calibgraph.files import write_text
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats.names import EXPORT_FORMATS
+from calibgraph.io.frame import frame_of_entry
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
+from calibgraph.model.geometry import degrees_and_centimetres, invert
+from calibgraph.model.metrics import pose_error
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
     CALIBRATION_FILE,
@@ -19,13 +24,19 @@ from calibgraph.model.result_files import (
     TABLES,
     require_own_tables,
 )
-from calibgraph.report.camera_section import camera_diagrams, camera_section
+from calibgraph.report.camera_section import (
+    camera_diagrams,
+    check_cells,
+    matrix_text,
+    pose_text,
+    worked_point,
+)
 from calibgraph.report.frames import recording_name
-from calibgraph.report.kit import load_template
-from calibgraph.report.page_overlays import draw_overlays
-from calibgraph.report.page_pairs import match_scale, pair_sections
+from calibgraph.report.kit import page_template
+from calibgraph.report.page_overlays import depth_scale, draw_overlays, width_on_page
 from calibgraph.report.point_overlay import write_overlays
-from calibgraph.report.reprojection_errors import errors_before_after
+from calibgraph.report.reprojection_errors import reprojection_errors
+from calibgraph.solver.camera_pairs import match_errors_px
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:
@@ -52,15 +63,29 @@ def write_report(result: Calibration, path: Path | str) -> Path:
 
 def render_page(result: Calibration) -> str:
     """The page as text, its diagrams drawn into it."""
-    errors = errors_before_after(result)
-    overlays, overlays_left_out = draw_overlays(result, errors)
+    errors, rig, guess = reprojection_errors(result), result.rig, result.initial_rig
+    overlays, overlays_left_out = dict[str, tuple[str, ...]](), None
+    shown = frame_of_entry(result.frames[len(result.frames) // 2]) if result.frames else None
+    if shown is None:
+        overlays_left_out = "the result was made from a table, which names no images"
+    else:
+        pairs = {name: (guess.cameras[name], camera) for name, camera in rig.cameras.items()}
+        overlays, overlays_left_out = draw_overlays(shown, pairs)
     cameras = [
-        camera_section(result, name, index, overlays.get(name), errors=errors.get(name),
-                       diagrams=camera_diagrams(result, name, errors.get(name)))
-        for index, name in enumerate(result.rig.cameras)
-    ]  # fmt: skip
+        {
+            "name": name,
+            "anchor": f"camera-{index}",
+            "verdict": result.camera_verdicts[name],
+            "moved": pose_error(camera.T_camera_lidar, guess.T_camera_lidar[name]),
+            "sigmas": result.error_bar(name),
+            "overlays": overlays.get(name),
+            "diagrams": camera_diagrams(result, name, errors.get(name)),
+            "worked": worked_point(camera, errors.get(name)),
+        }
+        for index, (name, camera) in enumerate(rig.cameras.items())
+    ]
     summary = result.summary
-    return load_template("page.html.j2").render(
+    return page_template("calibgraph.report").render(
         result=result,
         cameras=cameras,
         summary=summary,
@@ -70,14 +95,39 @@ def render_page(result: Calibration) -> str:
         export_command=_export_command(result),
         export_formats=EXPORT_FORMATS,
         pairs={name: result.error_bar(name) for name in result.pair_covariance},
-        between=pair_sections(result),
-        match_scale=match_scale(),
+        between=_camera_pairs(result),
+        check_cells=check_cells,
+        matrix_text=matrix_text,
+        pose_text=pose_text,
+        invert=invert,
+        degrees_and_centimetres=degrees_and_centimetres,
+        width_on_page=width_on_page,
+        depth_scale=depth_scale(),
+        shown=shown,
         overlays_left_out=overlays_left_out,
         residuals_left_out=not errors,
         config=yaml.safe_dump(result.config.model_dump(), sort_keys=False, allow_unicode=True),
         frames_sentence=FRAMES_SENTENCE,
         tangent_sentence=TANGENT_SENTENCE,
     )
+
+
+def _camera_pairs(result: Calibration) -> list[dict[str, Any]]:
+    """What each pair of cameras sees in common, in the rig's order, with the check of it."""
+    table, rows = result.camera_matches, list[dict[str, Any]]()
+    if table is None:
+        return rows
+    for a, b in table.pairs():
+        matches = table.of_pair(a, b)
+        errors_px = match_errors_px(result.rig, matches)
+        known, name = errors_px[~np.isnan(errors_px)], f"relative pose of {a} and {b} by images"
+        rows.append({
+            "name": f"{a}, {b}", "matches": len(matches), "surfaces": len(known),
+            "frames": len(np.unique(matches.frame)),
+            "median_px": f"{np.median(known):.2f}" if len(known) else "-",
+            "check": next((c for c in result.camera_verdicts[a].checks if c.name == name), None),
+        })  # fmt: skip
+    return rows
 
 
 def _export_command(result: Calibration) -> str:

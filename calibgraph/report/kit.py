@@ -7,24 +7,20 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Te
 from calibgraph.errors import printable
 
 
-def load_template(name: str, package: str = "calibgraph.report", folder: str = "") -> Template:
-    """A page's template, which may use ``base.html.j2`` and ``macros.html.j2`` of the report."""
-    return _environment(package, folder).get_template(name)
-
-
-def _seen(value: object) -> object:
-    """Texts of others without characters that are not seen; markup is ours."""
-    return printable(value) if type(value) is str else value
-
-
 @cache
-def _environment(package: str, folder: str) -> Environment:
-    loaders = [PackageLoader(package, folder), PackageLoader("calibgraph.report", "")]
-    return Environment(
-        loader=ChoiceLoader(loaders),
+def page_template(package: str) -> Template:
+    """A package's page, which may use ``base.html.j2`` and ``macros.html.j2`` of the report."""
+    environment = Environment(
+        loader=ChoiceLoader([PackageLoader(each, "") for each in (package, "calibgraph.report")]),
         autoescape=True,
         finalize=_seen,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    return environment.get_template("page.html.j2")
+
+
+def _seen(value: object) -> object:
+    """Texts of others without characters that are not seen; markup is ours."""
+    return printable(value) if type(value) is str else value

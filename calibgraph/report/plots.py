@@ -18,8 +18,6 @@ from calibgraph.report.figure import (
 from calibgraph.report.reprojection_errors import ReprojectionErrors
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from calibgraph.model.rig import Camera
 
 # Colours that the colour-blind can tell apart (Okabe and Ito, "Color universal design").
@@ -31,7 +29,6 @@ _MEDIAN_BINS = 15
 _MIN_PER_BIN = 10
 ARROW_COLUMNS = 12  # cells across the image
 _COVERAGE_COLUMNS = 20
-_CONTOUR_FINENESS = 6  # points of a contour to a cell of an arrow
 _ROUND_FACTORS = np.array([1.0, 2.0, 5.0, 10.0])
 _MIN_MOVE = 1e-4  # deg or cm: zero on a logarithmic axis
 
@@ -82,41 +79,13 @@ def residual_map(camera: Camera, errors: ReprojectionErrors) -> str:
     axes.plot(*_thin(inliers.pixels_px).T, ".", color=_INLIER, markersize=2, alpha=0.35)
     centres, means, cell_px = mean_residuals(camera, inliers, ARROW_COLUMNS)
     factor = arrow_factor(means, cell_px)
-    _add_arrows(axes, centres, factor * means)
+    axes.quiver(
+        *centres.T, *(factor * means).T, angles="xy", scale_units="xy", scale=1.0, color=_OUTLIER,
+        width=0.005, headwidth=3.5, headlength=3.5, headaxislength=3, minshaft=2, zorder=3,
+    )  # fmt: skip
     title = f"mean residual per cell, drawn {factor:g} times as long"
     axes.set_title(title if len(means) else "too few matches per cell for arrows", fontsize=9)
     return to_data_uri(figure)
-
-
-def lens_change(before: Camera, camera: Camera) -> str:
-    """How far the estimated lens sees each ray from where the rig's did: arrows, and contours."""
-    from calibgraph.model.lens import lens_difference
-
-    size, rows = (camera.width_px, camera.height_px), ARROW_COLUMNS // 2
-    figure, axes = image_figure(camera)
-    finer = _CONTOUR_FINENESS * np.array([ARROW_COLUMNS, rows])
-    sides = [
-        np.linspace(0.0, pixels - 1.0, count) for pixels, count in zip(size, finer, strict=True)
-    ]
-    grid = np.stack(np.meshgrid(*sides), axis=-1)
-    change = lens_difference(before, camera, grid.reshape(-1, 2)).reshape(grid.shape)
-    lengths = np.ma.masked_invalid(np.hypot(change[..., 0], change[..., 1]))
-    lines = axes.contour(*sides, lengths, levels=5, colors=_INLIER, linewidths=1.0)
-    axes.clabel(lines, fontsize=8, fmt="%g px")
-    coarse = (slice(_CONTOUR_FINENESS // 2, None, _CONTOUR_FINENESS),) * 2
-    known = np.isfinite(change[coarse]).all(axis=-1)
-    starts, arrows = grid[coarse][known], change[coarse][known]
-    factor = arrow_factor(arrows, float(size[0] / ARROW_COLUMNS))
-    _add_arrows(axes, starts, factor * arrows)
-    axes.set_title(f"how far rays move in the image, drawn {factor:g} times as long", fontsize=9)
-    return to_data_uri(figure)
-
-
-def _add_arrows(axes: Axes, starts: Array, vectors: Array) -> None:
-    axes.quiver(
-        *starts.T, *vectors.T, angles="xy", scale_units="xy", scale=1.0, color=_OUTLIER,
-        width=0.005, headwidth=3.5, headlength=3.5, headaxislength=3, minshaft=2, zorder=3,
-    )  # fmt: skip
 
 
 def coverage(camera: Camera, errors: ReprojectionErrors) -> str:

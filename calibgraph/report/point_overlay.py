@@ -82,12 +82,9 @@ def draw_points(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
         points_lidar_m: (n, 3) in the LiDAR frame.
         camera: lens and extrinsic.
     """
-    T = camera.T_camera_lidar
-    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    pixels, valid = camera.lens.project(points)
-    valid &= camera.in_image(pixels)
-    order = np.argsort(-np.linalg.norm(points[valid], axis=1))
-    points, pixels = points[valid][order], pixels[valid][order]
+    points, pixels = visible_points(points_lidar_m, camera)
+    order = np.argsort(-np.linalg.norm(points, axis=1))
+    points, pixels = points[order], pixels[order]
     column, row = np.rint(pixels).astype(np.intp).T
     colours = depth_colours(np.linalg.norm(points, axis=1))
     drawn = image.copy()
@@ -96,6 +93,15 @@ def draw_points(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
         rows = np.clip(row + dy - side // 2, 0, image.shape[0] - 1)
         drawn[rows, np.clip(column + dx - side // 2, 0, image.shape[1] - 1)] = colours
     return drawn
+
+
+def visible_points(points_lidar_m: Array, camera: Camera) -> tuple[Array, Array]:
+    """The points that a camera sees: (m, 3) in its frame, and (m, 2) their pixels."""
+    T = camera.T_camera_lidar
+    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    pixels, valid = camera.lens.project(points)
+    valid &= camera.in_image(pixels)
+    return points[valid], pixels[valid]
 
 
 def _dot_side(pixels: int, points: int) -> int:

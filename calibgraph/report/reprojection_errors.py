@@ -1,9 +1,9 @@
-"""The reprojection errors of each camera's correspondences, at the guess and at the result."""
+"""The reprojection errors of each camera's correspondences, at the result."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,11 @@ from calibgraph.solver.preprocess import preprocess
 
 @dataclass(frozen=True, eq=False)
 class ReprojectionErrors:
-    """The errors of one camera's preprocessed correspondences at one extrinsic.
+    """The errors of one camera's preprocessed correspondences.
 
     Attributes:
         points_lidar_m: (n, 3) in the LiDAR frame.
         pixels_px: (n, 2) matched pixels.
-        projected_px: (n, 2) projections of the points.
         vectors_px: (n, 2) projected less matched, along the directions that the match constrains:
             for an edge, across it. The gate compares its length.
         distances_m: (n,) from the camera to the points.
@@ -32,7 +31,6 @@ class ReprojectionErrors:
 
     points_lidar_m: Array
     pixels_px: Array
-    projected_px: Array
     vectors_px: Array
     distances_m: Array
     frame: NDArray[np.int64]
@@ -58,15 +56,8 @@ class ReprojectionErrors:
         return replace(self, **columns)
 
 
-class BeforeAfter(NamedTuple):
-    """The errors of the same correspondences at the guess and at the result."""
-
-    before: ReprojectionErrors
-    after: ReprojectionErrors
-
-
-def errors_before_after(result: Calibration) -> dict[str, BeforeAfter]:
-    """Errors before and after of each camera with correspondences; empty without a table.
+def reprojection_errors(result: Calibration) -> dict[str, ReprojectionErrors]:
+    """The errors of each camera with correspondences; empty without a table.
 
     Raises:
         CorrespondenceError: if the table does not belong to the result's rig.
@@ -76,14 +67,11 @@ def errors_before_after(result: Calibration) -> dict[str, BeforeAfter]:
     # The last of several rounds of matching started near the result, not at the guess.
     start = result.rig if len(result.rounds) > 1 else result.initial_rig
     table = preprocess(start, result.correspondences, result.config).table
-    rigs = result.initial_rig, result.rig
-    ends = [(rig, camera_blocks(rig, table, result.config)) for rig in rigs]
+    blocks = camera_blocks(result.rig, table, result.config)
     return {
-        name: BeforeAfter(
-            *(_errors_at(rig.T_camera_lidar[name], of[name], measured.gate_px) for rig, of in ends)
-        )
+        name: _errors_at(result.T_camera_lidar[name], blocks[name], measured.gate_px)
         for name, measured in result.residuals.items()
-        if name in ends[0][1]
+        if name in blocks
     }
 
 
@@ -95,7 +83,6 @@ def _errors_at(T_camera_lidar: Array, matches: CameraBlock, gate_px: float) -> R
     everything = ReprojectionErrors(
         points_lidar_m=block.points_lidar_m,
         pixels_px=block.pixels_px,
-        projected_px=block.pixels_px + residuals,
         vectors_px=constrained(residuals, matches.information),
         distances_m=np.linalg.norm(points_camera, axis=1),
         frame=matches.frame,

@@ -4,12 +4,10 @@ import json
 import os
 import shutil
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from calibgraph.audit import audit_summary, check
-from calibgraph.audit.check import provenance
 from calibgraph.audit.page import write_audit_report
 from calibgraph.child_process import Note, answer_requests, memory_limit, output_to
 from calibgraph.errors import CalibrationError
@@ -149,12 +147,10 @@ def _check(task: JobTask, progress: Progress) -> JobOutcome:
     settings = CheckSettings.model_validate(task.job.settings)
     rig = _input(task, RIG)
     assert rig is not None  # of each job
-    deployed = load_rig(rig)
     options: dict[str, Any] = {} if settings.frames is None else {"most_frames": None}
-    data = load_dataset(_recordings(task), deployed, frames=settings.frames)
-    origin = provenance(rig, data)
+    data = load_dataset(_recordings(task), load_rig(rig), frames=settings.frames)
     audit = check(
-        deployed,
+        rig,
         data,
         tolerance_deg=settings.tolerance_deg,
         tolerance_cm=settings.tolerance_cm,
@@ -162,7 +158,6 @@ def _check(task: JobTask, progress: Progress) -> JobOutcome:
         seed=settings.seed,
         progress=progress,
     )
-    audit = replace(audit, same_recording=origin.same_recording, deployed_verdict=origin.verdict)
     progress("writing", 0, 1)
     write_audit_report(audit, task.folder / WORK / FILES / REPORT_FILE)
     _write_summary(task, audit_summary(audit))

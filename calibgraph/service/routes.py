@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from calibgraph.model.result_files import REPORT_FILE
-from calibgraph.report.kit import load_template
+from calibgraph.report.kit import page_template
 from calibgraph.service.data_folder import ARCHIVE, FILES, LOG, RESULT, SUMMARY
 from calibgraph.service.job_requests import RECORDING, RIG, TABLE, TEXTS, JobKind, JobProgress
 from calibgraph.service.jobs import JobRecord, JobState
@@ -174,7 +174,7 @@ def result(id: str, part: Literal["result", "report.html", "files.zip"], state: 
 @router.get("/", include_in_schema=False)
 def jobs_page(state: State, before: Before = None) -> HTMLResponse:
     """The page for people: jobs, verdicts, reports; all text in it is escaped."""
-    template = load_template("page.html.j2", "calibgraph.service")
+    template = page_template("calibgraph.service")
     return HTMLResponse(template.render(list=list_jobs(state, before=before)))
 
 

@@ -20,23 +20,8 @@ Image = NDArray[np.uint8]
 SAMPLES_PX = np.array([[-0.375, 0.125], [-0.125, -0.375], [0.125, 0.375], [0.375, -0.125]])
 """Sample positions from a pixel's centre: no two in one row or column, so that edges are smooth."""
 MAX_FIELD_RAD = math.radians(95.0)
-_GAMMA = 1 / 2.2
+_BLUR_PX, _NOISE, _EXPOSURE_SPREAD, _GAMMA = 0.45, 0.008, 0.08, 1 / 2.2
 _BLOCK_PX = 2**17
-
-
-@dataclass(frozen=True, kw_only=True)
-class Imaging:
-    """Blur, noise and exposure of an image.
-
-    Attributes:
-        blur_px: standard deviation of the optical blur.
-        noise: standard deviation per pixel and channel, as a share of the value range.
-        exposure_spread: standard deviation of the logarithm of the exposure, per image.
-    """
-
-    blur_px: float = 0.45
-    noise: float = 0.008
-    exposure_spread: float = 0.08
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +68,7 @@ def pixel_directions(camera: Camera, pixels_px: Array) -> Array:
 
 
 def render(
-    world: World,
-    rays: CameraRays,
-    T_world_camera: Array,
-    rng: np.random.Generator,
-    *,
-    imaging: Imaging | None = None,
+    world: World, rays: CameraRays, T_world_camera: Array, rng: np.random.Generator
 ) -> Image:
     """Render an image.
 
@@ -97,18 +77,18 @@ def render(
         rays: of the camera.
         T_world_camera: (4, 4); camera x is right, y down, z forward.
         rng: draws exposure and noise.
-        imaging: blur and noise.
 
     Returns:
         (height, width, 3) BGR.
     """
-    imaging = imaging or Imaging()
-    linear = trace_light(world, rays, T_world_camera)
-    linear *= math.exp(rng.normal(0, imaging.exposure_spread))
-    if imaging.blur_px > 0:
-        linear = np.asarray(cv2.GaussianBlur(linear, (0, 0), imaging.blur_px))
-    image = linear**_GAMMA
-    image += np.float32(imaging.noise) * rng.standard_normal(image.shape, np.float32)
+    return develop(trace_light(world, rays, T_world_camera), rng)
+
+
+def develop(linear: Floats, rng: np.random.Generator) -> Image:
+    """The image of linear light, with an exposure, optical blur and noise."""
+    linear = linear * np.float32(math.exp(rng.normal(0, _EXPOSURE_SPREAD)))
+    image = np.asarray(cv2.GaussianBlur(linear, (0, 0), _BLUR_PX)) ** _GAMMA
+    image += np.float32(_NOISE) * rng.standard_normal(image.shape, np.float32)
     return (255 * image.clip(0, 1) + 0.5).astype(np.uint8)
 
 

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.errors import FileError
-from calibgraph.file_sets import written_together
-from calibgraph.files import require_place_for_folder, write_atomically, write_bytes
+from calibgraph.file_sets import require_own_folder, written_together
+from calibgraph.files import write_atomically, write_bytes
 from calibgraph.io.rigs import REFERENCE_FILE, RIG_FILE
 from calibgraph.model.geometry import relative_transform
 from calibgraph.model.metrics import perturb
@@ -102,7 +101,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
 
     Raises:
         ValueError: if an argument is out of range.
-        FileError: if the folder holds a recording.
+        FileError: if the folder holds files.
         CalibrationError: if Open3D is missing.
     """
     out = Path(out)
@@ -207,7 +206,4 @@ def _require_possible(out: Path, rig: Rig, frames: int, step_m: float) -> None:
                 f"camera {name!r} has {width}x{height} px: up to {MAX_SIDE_PX} a side and "
                 f"{MAX_PIXELS} in all can be simulated"
             )
-    require_place_for_folder(out)
-    for path in (out / name for name in _WRITTEN):
-        if path.exists():
-            raise FileError(path, "is there already; write into another folder, or remove it")
+    require_own_folder(out)

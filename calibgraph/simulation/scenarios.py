@@ -1,14 +1,11 @@
 """Named scenarios of correspondences: a rig, and the errors of its matcher."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-from calibgraph.errors import FileError
-from calibgraph.files import require_place_for_folder
+from calibgraph.file_sets import require_own_folder
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.metrics import perturb
-from calibgraph.model.rig import Rig
 from calibgraph.simulation.correspondences import (
     MatcherErrors,
     PoseSpread,
@@ -18,20 +15,6 @@ from calibgraph.simulation.rigs import rig_of
 
 MAX_FRAMES = 10_000
 MATCHES = 1000  # per camera and frame: the paper's grid keeps at most as many
-
-
-@dataclass(frozen=True, eq=False)
-class Scenario:
-    """A rig in a street, and a matcher."""
-
-    rig: Rig
-    errors: Mapping[str, MatcherErrors]
-
-    def draw(self, frames: int, seed: int) -> Correspondences:
-        """Draw the correspondences of a drive."""
-        return simulate_correspondences(
-            self.rig, frames=frames, matches=MATCHES, errors=self.errors, depth_m=None, seed=seed
-        )
 
 
 def simulate_table(
@@ -44,40 +27,35 @@ def simulate_table(
 
     Raises:
         ValueError: if there is no such scenario, or an argument is out of range.
-        FileError: if one of the files exists.
+        FileError: if the folder holds files.
     """
-    scenario = scenario_of(name)
+    if name not in SCENARIOS:
+        raise ValueError(f"unknown scenario {name!r}; known are street, {', '.join(SCENARIOS)}")
     if not 1 <= frames <= MAX_FRAMES:
         raise ValueError(f"{frames} frames: expected 1 to {MAX_FRAMES}")
-    guess = perturb(scenario.rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
-    require_place_for_folder(out)
-    paths = [out / name for name in ("correspondences.parquet", "reference.yaml", "rig.yaml")]
-    for path in paths:
-        if path.exists():
-            raise FileError(path, "is there already; write into another folder, or remove it")
-    scenario.draw(frames, seed).save(paths[0])
-    scenario.rig.save(paths[1])
+    truth = rig_of(name)
+    guess = perturb(truth, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
+    require_own_folder(out)
+    paths = [out / file for file in ("correspondences.parquet", "reference.yaml", "rig.yaml")]
+    draw_scenario(name, frames, seed).save(paths[0])
+    truth.save(paths[1])
     guess.save(paths[2])
     return paths
 
 
-def scenario_of(name: str) -> Scenario:
-    """A scenario by name.
+def draw_scenario(name: str, frames: int, seed: int) -> Correspondences:
+    """The correspondences of a drive along a street, of the rig of this name.
 
     ``kitti`` and ``walkley`` resemble the paper's Stage-1 results (``benchmarks/notes/paper.md``):
     errors along the axes that most frames share, and confidences that are high or informative.
-    ``surround`` and ``fisheye`` have six and four cameras and a matcher in between.
-
-    Raises:
-        ValueError: if there is no such scenario.
     """
-    if name not in SCENARIOS:
-        raise ValueError(f"unknown scenario {name!r}; known are street, {', '.join(SCENARIOS)}")
     rig, errors = rig_of(name), _ERRORS[name]
-    per_camera = {camera: errors for camera in rig.cameras}
+    per_camera = dict.fromkeys(rig.cameras, errors)
     if name == "kitti":
         per_camera["image_3"] = replace(errors, bias_pose=_KITTI_RIGHT)
-    return Scenario(rig, per_camera)
+    return simulate_correspondences(
+        rig, frames=frames, matches=MATCHES, errors=per_camera, depth_m=None, seed=seed
+    )
 
 
 _KITTI_RIGHT = PoseSpread(translation_m=(0.06, 0.005, 0.005))
@@ -106,14 +84,4 @@ _ERRORS = {
         failed_share=0.03,
     ),
 }
-_ERRORS["surround"] = replace(
-    _ERRORS["walkley"],
-    noise_px=1.0,
-    field_px=1.0,
-    frame_noise_px=0.5,
-    stuck_share=0.3,
-    stuck_pose=PoseSpread((0.2, 0.2, 0.2), (0.1, 0.1, 0.1)),
-    outlier_share=0.15,
-)
-_ERRORS["fisheye"] = _ERRORS["surround"]
 SCENARIOS = tuple(_ERRORS)

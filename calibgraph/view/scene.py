@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,12 +9,11 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.io.frame import load_entry_cloud, twist_of_entry
-from calibgraph.io.images import load_image
+from calibgraph.io.frame import Frame, frame_of_entry
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
-from calibgraph.report.point_overlay import depth_colours
+from calibgraph.report.point_overlay import depth_colours, visible_points
 
 Colours = NDArray[np.uint8]
 
@@ -73,34 +71,29 @@ def read_frames(result: Calibration) -> Iterator[ViewFrame]:
             "the result names no images and clouds, as that of a table; give those that the table "
             "was made from with --dataset"
         )
-    for number, entry in enumerate(result.frames):
-        points = load_entry_cloud(entry)[:, :3]
+    for number, frame in enumerate(map(frame_of_entry, result.frames)):
+        points = frame.load_cloud()[:, :3]
         points = np.ascontiguousarray(points[np.isfinite(points).all(axis=1)], np.float32)
         yield ViewFrame(
-            number=entry["frame"],
-            name=entry["name"],
+            number=frame.index,
+            name=frame.name,
             time_s=number * SECONDS_PER_FRAME,
             points_lidar_m=points,
             colours=_by_distance(points),
             images={
-                name: _view_image(Path(path), points, name, result, twist=twist_of_entry(entry))
-                for name, path in entry["images"].items()
+                name: _view_image(frame, points, name, result)
+                for name in frame.image_paths
                 if name in result.rig.cameras
             },
         )
 
 
 def _view_image(
-    path: Path,
-    points: NDArray[np.float32],
-    name: str,
-    result: Calibration,
-    *,
-    twist: NDArray[np.float64] | None,
+    frame: Frame, points: NDArray[np.float32], name: str, result: Calibration
 ) -> ViewImage:
     rigs = result.initial_rig, result.rig
-    guess, camera = (when_taken(rig.cameras[name], twist) for rig in rigs)
-    image = load_image(path, camera)
+    guess, camera = (when_taken(rig.cameras[name], frame.twist_per_s) for rig in rigs)
+    image = frame.load_image(name, camera)
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     before = project_cloud(guess, points)
     return ViewImage(data.tobytes(), before, project_cloud(camera, points))
@@ -108,12 +101,9 @@ def _view_image(
 
 def project_cloud(camera: Camera, points_lidar_m: NDArray[np.float32]) -> Projected:
     """The points of a cloud (n, 3) on a camera's image, an even choice of very many."""
-    T = camera.T_camera_lidar
-    points = points_lidar_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-    pixels, valid = camera.lens.project(points)
-    seen = np.flatnonzero(valid & camera.in_image(pixels))
-    seen = seen[:: max(1, -(-len(seen) // _MAX_POINTS))]
-    return Projected(pixels[seen], _by_distance(points[seen]))
+    points, pixels = visible_points(points_lidar_m.astype(np.float64), camera)
+    step = max(1, -(-len(pixels) // _MAX_POINTS))
+    return Projected(pixels[::step], _by_distance(points[::step]))
 
 
 def _by_distance(points: NDArray[np.floating]) -> Colours:

@@ -15,7 +15,7 @@ import pytest
 import calibgraph
 from calibgraph import Audit, Correspondences, Dataset, Rig, simulate_correspondences
 from calibgraph.audit.check import provenance
-from calibgraph.audit.matching import Matching, match_from_deployed
+from calibgraph.audit.matching import match_from_deployed
 from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import KeptFrame, keep_frames
 from calibgraph.matching.protocol import FullMatcher
@@ -194,8 +194,9 @@ class MatcherOfTruth:
 def rounds_from(deployed: Rig, matcher: MatcherOfTruth) -> list[int]:
     """The rounds that are run from a deployed rig."""
     data, config = calibgraph.load_dataset(SAMPLE, TRUTH), Config().changed(stage1="rig")
-    matching = Matching(data, deployed, FullMatcher(matcher), config, no_progress)
-    match_from_deployed(matching, Stopwatch())
+    match_from_deployed(
+        data, deployed, FullMatcher(matcher), config, watch=Stopwatch(), progress=no_progress
+    )
     return matcher.asked
 
 
@@ -258,15 +259,13 @@ def test_the_recording_of_a_result_is_known_by_its_content_wherever_it_lies(
     calibrated_sample: CommandRun, tmp_path: Path
 ) -> None:
     result, rig = calibrated_sample.folder, calibgraph.load_rig(SAMPLE / "rig.yaml")
-    assert provenance(result, calibgraph.load_dataset(SAMPLE, rig)).same_recording
+    assert provenance(result, calibgraph.load_dataset(SAMPLE, rig))[0]
     other = Path(shutil.copytree(SAMPLE, tmp_path / "other"))
-    assert provenance(
-        result / "calibration.yaml", calibgraph.load_dataset(other, rig)
-    ).same_recording
+    assert provenance(result / "calibration.yaml", calibgraph.load_dataset(other, rig))[0]
     for cloud in calibgraph.load_dataset(other, rig).frames:  # the same names, other clouds
         cloud.cloud_path.write_bytes(cloud.cloud_path.read_bytes()[:-32])
-    assert not provenance(result, calibgraph.load_dataset(other, rig)).same_recording
-    assert not provenance(SAMPLE / "rig.yaml", calibgraph.load_dataset(SAMPLE, rig)).same_recording
+    assert not provenance(result, calibgraph.load_dataset(other, rig))[0]
+    assert not provenance(SAMPLE / "rig.yaml", calibgraph.load_dataset(SAMPLE, rig))[0]
 
 
 def test_a_result_of_mounts_is_refused(calibrated_sample: CommandRun, tmp_path: Path) -> None:

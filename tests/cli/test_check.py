@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import re
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from calibgraph import Audit, load_rig
+from calibgraph import Audit, Dataset, load_rig
 from calibgraph.audit import check
+from calibgraph.audit.check import provenance
 from tests.audit.deployed import motion, with_camera_moved
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call, CommandRun
@@ -26,10 +29,11 @@ MEASURED: list[Audit] = []
 def measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measure a right rig in one frame once, for the tests of all that is told about it."""
 
-    def measure(*arguments: Any, **options: Any) -> Audit:
+    def measure(rig: Path, data: Dataset, **options: Any) -> Audit:
         if not MEASURED:
-            MEASURED.append(check(*arguments, **options))
-        return MEASURED[0]
+            MEASURED.append(check(rig, data, **options))
+        same_recording, verdict = provenance(rig, data)
+        return replace(MEASURED[0], same_recording=same_recording, deployed_verdict=verdict)
 
     monkeypatch.setattr("calibgraph.audit.check", measure)
 
@@ -117,7 +121,8 @@ def test_the_page_shows_the_answer(call: Call, tmp_path: Path) -> None:
 def test_a_malformed_result_is_refused_before_the_audit(
     call: Call, calibrated_sample: CommandRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("calibgraph.audit.check", lambda *_, **__: pytest.fail("was measured"))
+    module = sys.modules[check.__module__]
+    monkeypatch.setattr(module, "match_from_deployed", lambda *_, **__: pytest.fail("was measured"))
     text = (calibrated_sample.folder / "calibration.yaml").read_text()
     deployed = tmp_path / "calibration.yaml"
     deployed.write_text(re.sub(r"^verdict:\n(  .*\n)+", "verdict: PASS\n", text, flags=re.M))

@@ -7,16 +7,17 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from calibgraph.fleet.job import execute
+from calibgraph.fleet.manifest import Job
 from calibgraph.fleet.rows import read_rows
-from calibgraph.fleet.task import Outcome, Task
+from calibgraph.fleet.task import Limits, Outcome
 from tests.cli.conftest import error_line
 from tests.conftest import Call
 from tests.draws.fleets import write_fleet
 
 
-def run_here(task: Task) -> Outcome:
+def run_here(job: Job, limits: Limits, _: str) -> Outcome:
     with TemporaryDirectory() as folder:
-        return execute(task, Path(folder))
+        return execute(job, limits, Path(folder))
 
 
 def test_a_manifest_becomes_rows_and_a_page_and_a_second_call_does_nothing(
@@ -40,7 +41,7 @@ def test_a_manifest_becomes_rows_and_a_page_and_a_second_call_does_nothing(
 
 def test_failed_jobs_exit_1(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     failed = Outcome(error_kind="bad input", error="empty")
-    monkeypatch.setattr("calibgraph.fleet.run.run_job", lambda _: failed)
+    monkeypatch.setattr("calibgraph.fleet.run.run_job", lambda *_: failed)
     (tmp_path / "fleet.csv").write_text("vehicle,recording\na,drive\n")
     code, _, err = call("fleet", str(tmp_path / "fleet.csv"), "--out", str(tmp_path / "out"))
     assert code == 1

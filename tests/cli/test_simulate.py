@@ -9,7 +9,8 @@ import pytest
 
 import calibgraph
 from calibgraph import Rig, load_dataset
-from calibgraph.simulation.scenarios import SCENARIOS, scenario_of
+from calibgraph.simulation.rigs import rig_of
+from calibgraph.simulation.scenarios import SCENARIOS, draw_scenario
 from tests.conftest import Call, make_camera
 
 
@@ -35,12 +36,12 @@ def test_the_command_writes_a_table_and_a_guess_that_is_off(
     assert code == 0, text
     table = calibgraph.load_correspondences(folder / "correspondences.parquet")
     truth = calibgraph.load_rig(folder / "reference.yaml")
-    assert set(table.cameras) == set(truth.cameras) == set(scenario_of(name).rig.cameras)
+    assert set(table.cameras) == set(truth.cameras) == set(rig_of(name).cameras)
     for name_, error in calibgraph.evaluate(
         calibgraph.load_rig(folder / "rig.yaml"), truth
     ).cameras.items():
         assert error.rotation_error_deg == pytest.approx(5, abs=1e-6), name_
     code, _, text = call("simulate", name, "--frames", 3, "--out", folder)
     assert code == 2 and "holds files, but no" in text
-    again = scenario_of(name).draw(3, 0)
+    again = draw_scenario(name, 3, 0)
     np.testing.assert_array_equal(again.pixels_px, table.pixels_px)

@@ -78,9 +78,9 @@ def audit(extreme: Calibration) -> Audit:
 def drift() -> Drift:
     """Of two results with long names."""
     one = CameraAudit("CANNOT TELL", "a reason", TWIST.copy(), -TWIST, -TWIST)
-    trend = Trend(True, "a reason", TWIST.copy(), -TWIST, "result", 1.0)
+    trend = Trend(True, "a reason", TWIST.copy(), -TWIST, "result")
     results = ("recordings/2026-03-01_monday_morning", "recordings/2026-03-02_tuesday")
-    return Drift(results, np.arange(2.0), dict.fromkeys(NAMES, (one, one)),
+    return Drift(results, dict.fromkeys(NAMES, (one, one)),
                  dict.fromkeys(NAMES, trend), (None, None), 0.5, 10.0, 0.01)  # fmt: skip
 
 

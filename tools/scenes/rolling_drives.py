@@ -7,14 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph import Dataset, Rig, dataset_from_arrays
 from calibgraph.model.geometry import relative_transform
-from calibgraph.simulation.cameras import CameraRays, Imaging, camera_rays, trace_light
+from calibgraph.simulation.cameras import CameraRays, camera_rays, develop, trace_light
 from calibgraph.simulation.lidar import lidar_of, ring_gains, scan
 from calibgraph.simulation.recording import build_drive
 from calibgraph.simulation.rigs import rig_of
@@ -100,12 +99,9 @@ def render_rolling(
     world: World, rays: CameraRays, poses: Iterator[Array], rng: np.random.Generator
 ) -> NDArray[np.uint8]:
     """An image whose strips of rows are taken from poses of their own."""
-    imaging, strips = Imaging(), []
+    strips = []
     for number, T_world_camera in enumerate(poses):
         rows = slice(number * STRIP_PX, (number + 1) * STRIP_PX)
         some = CameraRays(rays.directions[rows], rays.blind[rows], rays.pixel_rad)
         strips.append(trace_light(world, some, T_world_camera))
-    linear = cv2.GaussianBlur(np.concatenate(strips), (0, 0), imaging.blur_px)
-    noise = imaging.noise * rng.standard_normal(linear.shape, np.float32)
-    image = (np.exp(rng.normal(0, imaging.exposure_spread)) * linear) ** (1 / 2.2) + noise
-    return np.asarray(255 * image.clip(0, 1) + 0.5, np.uint8)
+    return develop(np.concatenate(strips), rng)

@@ -1,10 +1,7 @@
 "use strict";
 document.documentElement.classList.add("js");
-for (const box of document.querySelectorAll(".overlays")) {
-  box.querySelector("input[type=range]")?.addEventListener("input", (event) => box.style.setProperty("--cut", event.target.value));
-  for (const radio of box.querySelectorAll("input[type=radio]"))
-    radio.addEventListener("change", () => { box.dataset.by = radio.value; });
-}
+for (const box of document.querySelectorAll(".overlays"))
+  box.querySelector("input").addEventListener("input", (event) => box.style.setProperty("--cut", event.target.value));
 for (const button of document.querySelectorAll(".copyable button"))
   button.addEventListener("click", async () => {
     const text = button.nextElementSibling;
