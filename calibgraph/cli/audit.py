@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
+from calibgraph.cli.arguments import bag_settings, checked_arguments, dataset_from, matcher_from
 from calibgraph.cli.terminal import elapsed_s, print_json, print_line, progress_bar, terminal
 
 _EXIT_CODES = {"OK": 0, "WRONG": 1, "CHANGED": 1, "CANNOT TELL": 3}
@@ -22,6 +22,9 @@ def check(
     tolerance_deg: options.ToleranceDeg = 0.5,
     tolerance_cm: options.ToleranceCm = 10.0,
     frames: options.Frames = None,
+    topic: options.Topic = None,
+    motion: options.Motion = None,
+    config: options.ReadingFile = None,
     seed: options.Seed = 0,
     out: Path | None = Option(None, metavar="FILE.html", help="The answer as a page."),
     as_json: options.JsonOption = False,
@@ -43,7 +46,8 @@ def check(
     with checked_arguments():
         Tolerance(tolerance_deg, tolerance_cm)
         matcher = matcher_from("structure", seed=seed, all_frames=frames is not None)
-    data, deployed = dataset_from(dataset, rig, frames), load_rig(rig)
+    bag = bag_settings(config, topic, motion=motion)
+    data, deployed = dataset_from(dataset, rig, frames, bag), load_rig(rig)
     origin = provenance(rig, data)
     with progress_bar() as progress:
         audit = check(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typer import Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import dataset_from
+from calibgraph.cli.arguments import bag_settings, dataset_from
 from calibgraph.cli.terminal import print_line
 from calibgraph.errors import CalibrationError, FileError, needs_extra
 
@@ -115,6 +115,9 @@ def pick(
     ),
     rig: options.RigFile = None,
     frames: options.Frames = None,
+    topic: options.Topic = None,
+    motion: options.Motion = None,
+    config: options.ReadingFile = None,
     port: int = Option(0, min=0, max=65535, help="Of this machine. (default: any that is free)"),
     show: bool = Option(True, "--show/--no-show", help="Open the page in the browser."),
 ) -> None:
@@ -132,7 +135,8 @@ def pick(
     for path in (out / REFERENCE_FILE, out / TABLE_FILE):
         if path.exists() and not (out / SESSION_FILE).exists():
             raise FileError(path, "is of no session of pick, and would be replaced; move it")
-    workspace = Workspace(dataset_from(dataset, rig, frames), out)
+    bag = bag_settings(config, topic, motion=motion)
+    workspace = Workspace(dataset_from(dataset, rig, frames, bag), out)
     try:
         server = PickServer(workspace, port)
     except OSError as error:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
+from shlex import join
 
 import numpy as np
 
@@ -53,7 +54,7 @@ def write_rig_template(
     folder = Path(folder)
     path = Path(out) if out is not None else folder / RIG_FILE
     require_new_file(path, ".yaml", ".yml", force=replace)
-    write_text(path, rig_template(folder, mountings or {}, lenses or {}, forward=forward))
+    write_text(path, rig_template(folder, out, mountings or {}, lenses or {}, forward=forward))
     return path
 
 
@@ -72,6 +73,7 @@ def cameras_of_folder(folder: Path) -> dict[str, Path]:
 
 def rig_template(
     folder: Path,
+    out: Path | str | None,
     mountings: Mapping[str, str],
     lenses: Mapping[str, str],
     *,
@@ -88,8 +90,10 @@ def rig_template(
         for name, source in sources.items()
     }
     head = (files("calibgraph.guessing") / "rig_head.txt").read_text(encoding="utf-8")
+    own = [] if out is None else [str(out)]
     head = head.format(
-        fill_in=FILL_IN, folder=folder, clouds=clouds,
+        fill_in=FILL_IN, where=join([str(folder), *("--rig" for _ in own), *own]),
+        again=join([str(folder), *("--out" for _ in own), *own, "--force"]), clouds=clouds,
         cameras=", ".join(cameras),
     )  # fmt: skip
     return head + yaml_text({"format": RIG_FORMAT, "lidar": "lidar", "cameras": cameras})

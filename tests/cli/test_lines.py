@@ -66,7 +66,7 @@ rig chain.yaml --rename front=a | no camera 'front' to rename
 rig chain.yaml --rename cam0=cam1 | two cameras one name
 rig chain.yaml --out n.txt | must end in .yaml
 rig chain.yaml --tie-deg 1 | give both
-rig chain.yaml --topic lidar=/a | --topic is for a bag alone only
+rig chain.yaml --topic lidar=/a | --topic is for bags alone only
 rig chain.yaml --lens calibration | --lens is for a folder of images and clouds
 rig chain.yaml --mount cam0=front --mount cam0=left | --mount cam0=...: given 2 times
 rig chain.yaml --mount rear=front | no camera 'rear'
@@ -78,7 +78,7 @@ rig drive --mount rear=rear | --mount rear=...: no such camera
 rig drive --lens wide | lens 'wide'; expected calibration
 rig drive --lens rear=calibration | --lens rear=...: no such camera
 rig drive --size 3x4 | --size is for files only
-rig drive --json | --json is for a bag alone or files only
+rig drive --json | --json is for bags alone or files only
 check missing.yaml {sample} | missing.yaml
 check {sample} missing | missing
 check {sample} {sample} --tolerance-deg 0 | tolerance_deg must be positive
