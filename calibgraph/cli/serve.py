@@ -3,6 +3,7 @@
 import webbrowser
 from importlib import import_module
 from pathlib import Path
+from shlex import quote
 
 from typer import Option
 
@@ -87,7 +88,10 @@ def _announce(url: str, tokens: Path | None) -> None:
     """Where the page is, and whether it asks for a token."""
     needed = "no token is needed, and no other machine can reach it"
     if tokens is not None:
-        needed = f"it asks for a token of {tokens} as the password; --new-token makes one"
+        needed = (
+            f"it asks for a token of {tokens} as the password; one is made by "
+            f"calibgraph serve --tokens {quote(str(tokens))} --new-token submit"
+        )
     print_line(f"open {url} in a browser: {needed}")
 
 

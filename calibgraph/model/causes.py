@@ -141,8 +141,8 @@ CAUSES: dict[str, Cause] = {
          "image evidence": _STRUCTURE,
          "images": "Calibrate again from images and clouds.",
          "common_error": "State the error that all frames share (0 if none): common_deg and "
-         "common_cm in the config (of solve also as options), or systematic_rotation_rad and "
-         "systematic_translation_m in the metadata.",
+         "common_cm in --config (of solve: --common-deg, --common-cm), or systematic_rotation_rad "
+         "and systematic_translation_m in the metadata of the table.",
          "start": "Keep driving: the camera starts after enough frames with matches.",
          "blind frames": "Check that the camera delivers images and sees what the LiDAR sees."},
     ),

@@ -109,7 +109,7 @@ class BagRig:
                 f"with the frame {frame!r} of camera {name!r}: "
                 f"{self.transforms.why_apart(frame, self.lidar)}. If another bag of the drive has "
                 "them, give it too; else describe the mounting with calibgraph rig BAG --mount "
-                f"{quote(name)}=WORDS --out rig.yaml, or add a URDF, as calibgraph rig BAG car.urdf "
+                f"{quote(name)}=WORDS --out rig.yaml, or add a URDF: calibgraph rig BAG car.urdf "
                 "--out rig.yaml; then calibrate with --rig rig.yaml",
                 camera=name,
             )
