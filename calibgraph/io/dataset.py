@@ -132,7 +132,7 @@ def load_dataset(
     paths = tuple(Path(folder) for folder in folders)
     _require_folders(paths, bag)
     if interval_s is not None and all(map(is_bag, paths)):
-        raise ValueError("interval_s is of folders; clouds of a bag have stamps: give --motion scans")
+        raise ValueError("interval_s is of folders; messages have stamps: give --motion scans")
     bag = replace(bag or BagOptions(), beside=tuple(path for path in paths if is_bag(path)))
     bare = {path for path in bag.beside if len(paths) > 1 and not Bag(path).of_type(*CLOUDS)}
     data = _without_frames(tuple(path for path in paths if path not in bare) or paths, rig, bag)
