@@ -44,8 +44,10 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     eye = URDF.replace("front_camera_optical_frame", "eye_optical").replace("front_link", "eye")
     two = URDF.replace("base_link", "lidar_mount")
     imu = KALIBR.replace("T_cam_lidar", "T_cam_imu")
-    four = CAMERA_INFO.replace("cols: 5", "cols: 4").replace(", 0.003]", "]").replace(
-        "distortion_model: plumb_bob\n", ""
+    four = (
+        CAMERA_INFO.replace("cols: 5", "cols: 4")
+        .replace(", 0.003]", "]")
+        .replace("distortion_model: plumb_bob\n", "")
     )
     write(folder, imu__yaml=imu, four__yaml=four)
     write(folder, info__yaml=CAMERA_INFO, chain__yaml=KALIBR, car__urdf=URDF, eye__urdf=eye,
