@@ -51,35 +51,9 @@ def write_rig_template(
             is there already.
         RigError, ValueError: if words are not understood, or name no camera of the folder.
     """
-    folder = Path(folder)
+    folder, mountings, lenses = Path(folder), mountings or {}, lenses or {}
     path = Path(out) if out is not None else folder / RIG_FILE
     require_new_file(path, ".yaml", ".yml", force=replace)
-    write_text(path, rig_template(folder, out, mountings or {}, lenses or {}, forward=forward))
-    return path
-
-
-def cameras_of_folder(folder: Path) -> dict[str, Path]:
-    """The images of each camera; arguments and errors as of :func:`write_rig_template`."""
-    _require_plain_folder(folder)
-    sources = folder_layout(folder).images
-    if not sources:
-        beside = ", ".join(sorted(path.name for path in folder.glob("*/"))) or "none"
-        raise FileError(
-            folder / "cameras", "no images; put those of each camera into cameras/NAME, named as "
-            f"the clouds in lidar, found are the folders {beside}"
-        )  # fmt: skip
-    return dict(sources)
-
-
-def rig_template(
-    folder: Path,
-    out: Path | str | None,
-    mountings: Mapping[str, str],
-    lenses: Mapping[str, str],
-    *,
-    forward: str = "+x",
-) -> str:
-    """The text of :func:`write_rig_template`."""
     sources = cameras_of_folder(folder)
     clouds = len(files_by_stem(folder / "lidar", CLOUD_SUFFIXES))
     for option, words in (("--mount", mountings), ("--lens", lenses)):
@@ -96,7 +70,22 @@ def rig_template(
         again=join([str(folder), *("--out" for _ in own), *own, "--force"]), clouds=clouds,
         cameras=", ".join(cameras),
     )  # fmt: skip
-    return head + yaml_text({"format": RIG_FORMAT, "lidar": "lidar", "cameras": cameras})
+    content = {"format": RIG_FORMAT, "lidar": "lidar", "cameras": cameras}
+    write_text(path, head + yaml_text(content))
+    return path
+
+
+def cameras_of_folder(folder: Path) -> dict[str, Path]:
+    """The images of each camera; arguments and errors as of :func:`write_rig_template`."""
+    _require_plain_folder(folder)
+    sources = folder_layout(folder).images
+    if not sources:
+        beside = ", ".join(sorted(path.name for path in folder.glob("*/"))) or "none"
+        raise FileError(
+            folder / "cameras", "no images; put those of each camera into cameras/NAME, named as "
+            f"the clouds in lidar, found are the folders {beside}"
+        )  # fmt: skip
+    return dict(sources)
 
 
 def _require_plain_folder(folder: Path) -> None:
