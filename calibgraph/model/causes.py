@@ -51,8 +51,9 @@ CAUSES: dict[str, Cause] = {
             "guess_length": "Give the translation of T_camera_lidar in metres.",
             "swapped_cameras": _SWAPPED,
             "point_distance": "Give the clouds in metres.",
-            "search": "Correct the guess, or widen --search-deg and --search-m; see with "
-            "doctor whether images and clouds of this camera belong together.",
+            "search": "Correct the guess, or calibrate with a wider search (--search-deg up to 45, "
+            "--search-m up to 5); see with doctor whether images and clouds of this camera belong "
+            "together.",
             "range_rotation": _FROM_RESULT, "range_translation": _FROM_RESULT,
         },
     ),

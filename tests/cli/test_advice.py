@@ -119,6 +119,8 @@ def save_tables(folder: Path) -> None:
     table, rig = calibgraph.load_correspondences(folder / "table.parquet"), make_pair()
     replace(table, metadata={}).save(folder / "plain.csv")
     replace(table, confidence=table.confidence * 0.05).save(folder / "doubtful.parquet")
+    lost = {**table.metadata, "missed": {"left": 3.0}}
+    replace(table, metadata=lost).save(folder / "missed.parquet")
     twist = np.tile([0, 0, 0.1, 5, 0, 0], (len(table), 1))
     replace(table, twist_per_s=twist).save(folder / "moving.parquet")
     shared = {"systematic_rotation_rad": 0.1, "systematic_translation_m": 1.0}
