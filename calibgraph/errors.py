@@ -107,6 +107,11 @@ class CorrespondenceError(CalibrationError):
         self.row = row
         self._message = message
 
+    @property
+    def without_row(self) -> str:
+        """The message for those who gave lists per camera, whose number in the table is unseen."""
+        return str(self) if self.row is None else f"camera {self.camera!r}: {self._message}"
+
     def after(self, rows: int) -> CorrespondenceError:
         """The same error in a table with this number of rows before these."""
         row = None if self.row is None else rows + self.row

@@ -30,6 +30,7 @@ from calibgraph import (
 from calibgraph.cli import app as cli
 from calibgraph.cli import terminal
 from calibgraph.report import plots
+from calibgraph.simulation.world import INSTALL_LIBRARIES
 from calibgraph.trust import assess, image_checks, inputs
 
 Call = Callable[..., tuple[int, str, str]]
@@ -242,9 +243,7 @@ def mixed_rig() -> Rig:
 def open3d() -> Any:
     """Open3D, which simulates sensors, and loads libraries of the system."""
     return pytest.importorskip(
-        "open3d",
-        reason="no libraries of Open3D: apt-get install libusb-1.0-0 libgl1 libgomp1 libx11-6",
-        exc_type=ImportError,
+        "open3d", reason=f"no libraries of Open3D: {INSTALL_LIBRARIES}", exc_type=ImportError
     )
 
 

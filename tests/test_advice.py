@@ -14,34 +14,30 @@ import pytest
 from typer.main import get_command
 
 import calibgraph
+from calibgraph import Camera, Config, Rig
 from calibgraph.cli.app import app
+from calibgraph.cli.settings import RareSettings
 from calibgraph.errors import CorrespondenceError
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.run import require_known_motion
+from calibgraph.model.causes import CAUSES
+from calibgraph.model.error_sources import _ADVICE
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import Verdict
 from calibgraph.trust import lens_checks
 from calibgraph.trust.conventions import _sentence, undo_convention_errors
 from calibgraph.trust.lens_checks import _motion_options
 from calibgraph.trust.lens_parameter import IMAGES, TIME, LensParameter, check_parameter
+from calibgraph.trust.thresholds import THRESHOLDS
 from tests.conftest import ROOT, SAMPLE, Call
 
 COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
-LIBRARY = ("model", "trust", "matching", "solver", "guessing", "audit", "graph", "io", "tracking")
-ALONE = ("doctor.py", "rounds.py", "overlaps.py", "pipeline.py")
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 COMMAND = re.compile(r"calibgraph ([a-z][a-z-]*)((?: (?:[A-Z.]+|\{\}|--[a-z-]+ \S+))*)")
 
 
 def options_of(name: str) -> set[str]:
     return {flag for option in COMMANDS[name].params for flag in option.opts}
-
-
-def sources() -> Iterator[Path]:
-    package = ROOT / "calibgraph"
-    for folder in LIBRARY:
-        yield from (package / folder).rglob("*.py")
-    yield from (package / name for name in ALONE)
 
 
 def texts_of(path: Path) -> Iterator[str]:
@@ -58,10 +54,13 @@ def texts_of(path: Path) -> Iterator[str]:
 
 def test_every_option_and_command_that_a_message_names_exists() -> None:
     of_ros = "x y z qx qy qz qw frame-id child-frame-id once ros-args qos-durability"
-    others = {f"--{name}" for name in (*of_ros.split(), "index-url", "debug")}
+    others = {
+        f"--{name}"
+        for name in (*of_ros.split(), "index-url", "debug", "help", "version", "no-show")
+    }
     known = {flag for name in COMMANDS for flag in options_of(name)} | others
     wrong = []
-    for path in sources():
+    for path in (ROOT / "calibgraph").rglob("*.py"):
         for text in texts_of(path):
             wrong += [(path.name, option) for option in OPTION.findall(text) if option not in known]
             for name, words in COMMAND.findall(text):
@@ -69,6 +68,23 @@ def test_every_option_and_command_that_a_message_names_exists() -> None:
                     wrong.append((path.name, f"{name}{words}"))
     prose = {"that", "cannot", "has", "needs", "is", "does", "graph", "wrote"}
     assert [each for each in wrong if each[1].split()[0] not in prose] == []
+
+
+KEYS = {
+    *Config.model_fields, *RareSettings.model_fields, *Rig.model_fields, *Camera.model_fields,
+    "systematic_rotation_rad", "systematic_translation_m",  # of a table
+}  # fmt: skip
+
+
+def test_what_to_do_has_options_of_calibrate_and_keys_of_rigs_and_settings() -> None:
+    actions = [text for cause in CAUSES.values() for text in (cause.action, *cause.kinds.values())]
+    of_bars = [*texts_of(ROOT / "calibgraph" / "model" / "error_sources.py")]
+    advice = " ".join([*actions, *_ADVICE.values(), *(t for t in of_bars if "Tolerate" in t),
+                       *(row.advice for row in THRESHOLDS)])  # fmt: skip
+    of_solve = {"--common-deg", "--common-cm"}
+    assert {*OPTION.findall(advice)} <= options_of("calibrate") | of_solve
+    keys = {*re.findall(r"\b(?!p_)[a-z]+(?:_[a-z0-9]+)+\b", advice)}
+    assert {"tolerance_deg", "common_cm", "relative_poses"} <= keys <= KEYS
 
 
 @pytest.mark.parametrize("error", undo_convention_errors(np.eye(4)))

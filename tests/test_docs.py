@@ -16,6 +16,7 @@ from typer.main import get_command
 import calibgraph
 from calibgraph.cli.app import app
 from calibgraph.matching.structure.schedule import LEVELS
+from calibgraph.simulation.world import INSTALL_LIBRARIES
 from docs.tables import API, PART, with_generated_parts
 from docs.transcripts import BLOCK, PAGE, run, shown
 from tests.conftest import ROOT, SAMPLE
@@ -274,3 +275,10 @@ def test_the_tutorial_has_output_for_every_command() -> None:
     blocks = [*BLOCK.finditer(PAGE.read_text("utf-8"))]
     assert len(blocks) == Path(PAGE).read_text("utf-8").count("$ calibgraph ")
     assert all(block["output"].strip() for block in blocks)
+
+
+@pytest.mark.parametrize("file", [".ci/run", ".github/workflows/ci.yml", "docs/data.md"])
+def test_libraries_of_open3d_are_the_same_everywhere(file: str) -> None:
+    lists = re.findall(r"libusb-1.0-0[a-z0-9 .-]*", (ROOT / file).read_text())
+    named = INSTALL_LIBRARIES.removeprefix("apt-get install ")
+    assert {each.removesuffix(" chromium").strip() for each in lists} == {named}

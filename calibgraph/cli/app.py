@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
+from shlex import join
 from typing import Any, TextIO
 
 import typer
@@ -166,7 +167,8 @@ def _crash(error: Exception) -> str:
         why = f" ({error})" if str(error) else ""
         return f"not enough memory{why}; give fewer frames, or smaller files"
     kind = f"{type(error).__name__}: {CalibrationError(str(error))}"
-    return f"internal error ({kind}); please report it with the output of calibgraph --debug"
+    again = join(["calibgraph", "--debug", *sys.argv[1:]])
+    return f"internal error ({kind}); please report it with the output of {again}"
 
 
 def _help_hint(error: Exception) -> str:

@@ -65,6 +65,15 @@ def bag_options_from(topic: list[str] | None, **options: Any) -> BagOptions | No
         return BagOptions(topics=topics, **given)
 
 
+def bag_settings(config: Path | None, topic: list[str] | None, **options: Any) -> BagOptions | None:
+    """See :func:`bag_options_from`; a file of settings has some of them."""
+    from calibgraph.cli.settings import read_settings
+
+    with checked_arguments():
+        _, rare = read_settings(config)
+    return bag_options_from(topic, **options, **rare.of_bags)
+
+
 def matcher_from(
     name: str,
     weights: list[Path] | None = None,

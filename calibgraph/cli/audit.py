@@ -8,7 +8,7 @@ import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import checked_arguments, dataset_from, matcher_from
+from calibgraph.cli.arguments import bag_settings, checked_arguments, dataset_from, matcher_from
 from calibgraph.cli.terminal import elapsed_s, print_json, print_line, progress_bar, terminal
 
 _EXIT_CODES = {"OK": 0, "WRONG": 1, "CHANGED": 1, "CANNOT TELL": 3}
@@ -21,6 +21,9 @@ def check(
     tolerance_deg: options.ToleranceDeg = 0.5,
     tolerance_cm: options.ToleranceCm = 10.0,
     frames: options.Frames = None,
+    topic: options.Topic = None,
+    motion: options.Motion = None,
+    config: options.ReadingFile = None,
     seed: options.Seed = 0,
     out: Path | None = Option(None, metavar="FILE.html", help="The answer as a page."),
     as_json: options.JsonOption = False,
@@ -40,7 +43,8 @@ def check(
     with checked_arguments():
         Tolerance(tolerance_deg, tolerance_cm)
         matcher = matcher_from("structure", seed=seed, all_frames=frames is not None)
-    data = dataset_from(dataset, rig, frames)
+    bag = bag_settings(config, topic, motion=motion)
+    data = dataset_from(dataset, rig, frames, bag)
     with progress_bar() as progress:
         audit = check(
             rig, data, tolerance_deg=tolerance_deg, tolerance_cm=tolerance_cm,

@@ -3,12 +3,13 @@
 import json
 import os
 from pathlib import Path
+from shlex import join
 
 import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import bag_options_from, checked_arguments
+from calibgraph.cli.arguments import bag_settings, checked_arguments
 from calibgraph.cli.terminal import print_json, print_line, progress_bar, terminal
 
 _PAGES = (".html", ".htm")
@@ -114,14 +115,13 @@ def doctor(
     every_s: options.EveryS = None,
     topic: options.Topic = None,
     motion: options.Motion = None,
-    config: options.ConfigFile = None,
+    config: options.ReadingFile = None,
     out: Path | None = Option(
         None, metavar="DIR", help="For guess_CAMERA.png, images with the guess, and doctor.json."
     ),
     as_json: options.JsonOption = False,
 ) -> None:
     """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""
-    from calibgraph.cli.settings import read_settings
     from calibgraph.doctor import diagnose
     from calibgraph.file_sets import require_own_folder
     from calibgraph.files import write_text
@@ -130,8 +130,7 @@ def doctor(
     if out is not None:
         require_own_folder(out, dataset)
     with checked_arguments(), progress_bar("reading"):
-        _, rare = read_settings(config)
-        bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
+        bag = bag_settings(config, topic, every_s=every_s, motion=motion)
         guess = load_rig(rig) if rig else None
         found = diagnose(dataset, guess, frames=frames, bag=bag, pictures=out)
     if out is not None:
@@ -142,7 +141,12 @@ def doctor(
         lines = [f"{finding.level:8} {finding.text}" for finding in found.findings]
         lines += [f"{path}: written" for path in found.pictures]
         if all(finding.level == "note" for finding in found.findings):
-            lines.append("no faults; next: calibgraph calibrate")
+            given = {"--rig": rig, "--frames": frames, "--every-s": every_s, "--motion": motion,
+                     "--config": config}  # fmt: skip
+            pairs = [pair for pair in given.items() if pair[1] is not None]
+            pairs += [("--topic", each) for each in topic or ()]
+            words = [*dataset, *(word for pair in pairs for word in pair)]
+            lines.append(f"no faults; next: calibgraph calibrate {join(map(str, words))}")
         for line in lines:
             print_line(line)
     if not found.healthy:

@@ -99,6 +99,10 @@ ConfigFile = Annotated[
     Path | None,
     Option(metavar="FILE", help="Settings of the solve, and rare ones of the rest, YAML."),
 ]
+_OF_READING = "YAML with stamps or sync_tolerance_s; its other settings change nothing here."
+ReadingFile = Annotated[
+    Path | None, Option("--config", metavar="FILE", rich_help_panel=_BAGS, help=_OF_READING)
+]
 Estimate = Annotated[
     str | None,
     Option(

@@ -6,6 +6,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from shlex import join
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -27,7 +28,7 @@ _SEARCH = "search"
 
 _TAKEN = {
     "a folder of images and clouds": {"mount", "lens"},
-    "a bag alone": {"topic", "tie_deg", "tie_m", "correct", "json"},
+    "bags alone": {"topic", "tie_deg", "tie_m", "correct", "json"},
     "files": {"mount", "dataset", "rename", "lidar_frame", "camera_frame", "size", "tie_deg",
               "tie_m", "correct", "json"},
 }  # fmt: skip
@@ -125,12 +126,12 @@ def rig(
         return
     if out is not None:
         require_new_file(out, ".yaml", ".yml", force=force)
-    is_of_bag = len(source) == 1 and is_bag(path) and not (mount or dataset)
-    _refuse_others("a bag alone" if is_of_bag else "files", given)
+    is_of_bag = not (mount or dataset) and all(map(is_bag, source))
+    _refuse_others("bags alone" if is_of_bag else "files", given)
     with checked_arguments(), progress_bar("reading") as progress:
         sigmas = _sigmas(tie_deg, tie_m)
         if is_of_bag:
-            made, notes, topics = _rig_of_bag(path, topic, sigmas)
+            made, notes, topics = _rig_of_bags([*map(Path, source)], topic, sigmas)
             guess = None
         else:
             named = [_parse_file(text) for text in source]
@@ -236,17 +237,17 @@ def _rig_of_files(
     return guess.rig, guess
 
 
-def _rig_of_bag(
-    path: Path, topic: list[str] | None, sigmas: tuple[float, float] | None
+def _rig_of_bags(
+    paths: list[Path], topic: list[str] | None, sigmas: tuple[float, float] | None
 ) -> tuple[Rig, list[str], list[dict[str, Any]]]:
-    """The rig of a bag, what is to be said of it, and its topics."""
+    """The rig of the first bag, notes on it, and its topics; the others serve where it lacks."""
     from math import radians
 
     from calibgraph.io.bags.messages import Bag
     from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
 
-    topics = sorted(Bag(path).topics.values(), key=lambda each: each.name)
-    read = read_bag_rig(path, bag_options_from(topic))
+    topics = sorted(Bag(paths[0]).topics.values(), key=lambda each: each.name)
+    read = read_bag_rig(paths[0], bag_options_from(topic, beside=tuple(paths[1:]) or None))
     made = read.to_rig(None if sigmas is None else (radians(sigmas[0]), sigmas[1]))
     listed = [{"topic": each.name, "type": each.type, "messages": each.count} for each in topics]
     return made, [*doubtful_axes(made), *read.notes], listed
@@ -276,7 +277,7 @@ def _write_template(
     if pairing:
         print_line(pairing)
     left = "FILL_IN" in path.read_text(encoding="utf-8").partition("\nformat:")[2]
-    where = f"{folder}" if out is None else f"{folder} --rig {out}"
+    where = join([str(folder), *([] if out is None else ["--rig", str(out)])])
     first = "replace every FILL_IN; then" if left else "next"
     print_line(f"{path}: written; {first}: calibgraph doctor {where}")
     if any(how != CALIBRATION for how in known.values()):

@@ -3,11 +3,12 @@
 import webbrowser
 from importlib import import_module
 from pathlib import Path
+from shlex import quote
 
 from typer import Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import dataset_from
+from calibgraph.cli.arguments import bag_settings, dataset_from
 from calibgraph.cli.terminal import print_line
 from calibgraph.errors import CalibrationError, FileError, needs_extra
 
@@ -87,7 +88,10 @@ def _announce(url: str, tokens: Path | None) -> None:
     """Where the page is, and whether it asks for a token."""
     needed = "no token is needed, and no other machine can reach it"
     if tokens is not None:
-        needed = f"it asks for a token of {tokens} as the password; --new-token makes one"
+        needed = (
+            f"it asks for a token of {tokens} as the password; one is made by "
+            f"calibgraph serve --tokens {quote(str(tokens))} --new-token submit"
+        )
     print_line(f"open {url} in a browser: {needed}")
 
 
@@ -115,6 +119,9 @@ def pick(
     ),
     rig: options.RigFile = None,
     frames: options.Frames = None,
+    topic: options.Topic = None,
+    motion: options.Motion = None,
+    config: options.ReadingFile = None,
     port: int = Option(0, min=0, max=65535, help="Of this machine. (default: any that is free)"),
     show: bool = Option(True, "--show/--no-show", help="Open the page in the browser."),
 ) -> None:
@@ -132,7 +139,8 @@ def pick(
     for path in (out / REFERENCE_FILE, out / TABLE_FILE):
         if path.exists() and not (out / SESSION_FILE).exists():
             raise FileError(path, "is of no session of pick, and would be replaced; move it")
-    workspace = Workspace(dataset_from(dataset, rig, frames), out)
+    bag = bag_settings(config, topic, motion=motion)
+    workspace = Workspace(dataset_from(dataset, rig, frames, bag), out)
     try:
         server = PickServer(workspace, port)
     except OSError as error:

@@ -27,6 +27,7 @@ def track(
     step: int = Option(1, min=1, help="Take every N-th frame only."),
     matcher: str | None = Option(None, metavar="NAME", help="Match frames: structure or cmrnext."),
     interval_s: options.IntervalS = None,
+    topic: options.Topic = None,
     motion: options.Motion = None,
     weights: options.Weights = None,
     config: options.ConfigFile = None,
@@ -55,7 +56,8 @@ def track(
         settings, rare = read_settings(config, seed=seed)
         require_poses_alone(settings)
         if matcher is None:
-            given = {"--interval-s": interval_s, "--motion": motion, "--weights": weights}
+            given = {"--interval-s": interval_s, "--topic": topic or None, "--motion": motion,
+                     "--weights": weights}  # fmt: skip
             _require_matcher_for(source, given | rare.of_cmrnext)
             chosen = None
         else:
@@ -68,7 +70,7 @@ def track(
         every=step,
         matcher=chosen,
         interval_s=interval_s,
-        bag=bag_options_from(None, motion=motion, **rare.of_bags),
+        bag=bag_options_from(topic, motion=motion, **rare.of_bags),
     )
     result, written = track(wanted, source, notify=print_line)
     print_result(terminal(), result, written, elapsed_s())
@@ -78,11 +80,11 @@ def track(
 
 def _require_matcher_for(source: list[Path], given: dict[str, object]) -> None:
     """Refuse what is for clouds and images without a matcher: tables bring their motion."""
+    from calibgraph.model.clock import OF_TABLES
+
     for name, value in given.items():
         if value is not None:
-            raise ValueError(
-                f"{name} goes with --matcher only: for the motion, tables have columns wx_rad_s to "
-                "vz_m_s, lines have twist_per_s"
-            )
+            motion = f"; give {OF_TABLES}" if name in ("--interval-s", "--motion") else ""
+            raise ValueError(f"{name} goes with --matcher only{motion}")
     if len(source) > 1:
         raise ValueError(f"{len(source)} sources given; several go with --matcher only")

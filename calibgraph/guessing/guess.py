@@ -4,6 +4,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import Any, Literal
 
 import numpy as np
@@ -140,7 +141,7 @@ def guess_rig(
     if unknown and data is None:
         raise RigError(
             f"camera {unknown[0]!r}: nothing says where it is; describe it with "
-            f"--mount {unknown[0]}=WORDS ({GRAMMAR}), add a URDF or a sensor kit, or give "
+            f"--mount {quote(unknown[0])}=WORDS ({GRAMMAR}), add a URDF or a sensor kit, or give "
             "--dataset to search over all headings",
             camera=unknown[0],
         )

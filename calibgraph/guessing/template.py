@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
+from shlex import join
 
 import numpy as np
 
@@ -50,10 +51,27 @@ def write_rig_template(
             is there already.
         RigError, ValueError: if words are not understood, or name no camera of the folder.
     """
-    folder = Path(folder)
+    folder, mountings, lenses = Path(folder), mountings or {}, lenses or {}
     path = Path(out) if out is not None else folder / RIG_FILE
     require_new_file(path, ".yaml", ".yml", force=replace)
-    write_text(path, rig_template(folder, mountings or {}, lenses or {}, forward=forward))
+    sources = cameras_of_folder(folder)
+    clouds = len(files_by_stem(folder / "lidar", CLOUD_SUFFIXES))
+    for option, words in (("--mount", mountings), ("--lens", lenses)):
+        for name in words.keys() - sources.keys():
+            raise ValueError(f"{option} {name}=...: no such camera; found are {', '.join(sources)}")
+    cameras = {
+        name: _camera(name, _size(source), (mountings.get(name), lenses.get(name)), forward)
+        for name, source in sources.items()
+    }
+    head = (files("calibgraph.guessing") / "rig_head.txt").read_text(encoding="utf-8")
+    own = [] if out is None else [str(out)]
+    head = head.format(
+        fill_in=FILL_IN, where=join([str(folder), *("--rig" for _ in own), *own]),
+        again=join([str(folder), *("--out" for _ in own), *own, "--force"]), clouds=clouds,
+        cameras=", ".join(cameras),
+    )  # fmt: skip
+    content = {"format": RIG_FORMAT, "lidar": "lidar", "cameras": cameras}
+    write_text(path, head + yaml_text(content))
     return path
 
 
@@ -68,31 +86,6 @@ def cameras_of_folder(folder: Path) -> dict[str, Path]:
             f"the clouds in lidar, found are the folders {beside}"
         )  # fmt: skip
     return dict(sources)
-
-
-def rig_template(
-    folder: Path,
-    mountings: Mapping[str, str],
-    lenses: Mapping[str, str],
-    *,
-    forward: str = "+x",
-) -> str:
-    """The text of :func:`write_rig_template`."""
-    sources = cameras_of_folder(folder)
-    clouds = len(files_by_stem(folder / "lidar", CLOUD_SUFFIXES))
-    for option, words in (("--mount", mountings), ("--lens", lenses)):
-        for name in words.keys() - sources.keys():
-            raise ValueError(f"{option} {name}=...: no such camera; found are {', '.join(sources)}")
-    cameras = {
-        name: _camera(name, _size(source), (mountings.get(name), lenses.get(name)), forward)
-        for name, source in sources.items()
-    }
-    head = (files("calibgraph.guessing") / "rig_head.txt").read_text(encoding="utf-8")
-    head = head.format(
-        fill_in=FILL_IN, folder=folder, clouds=clouds,
-        cameras=", ".join(cameras),
-    )  # fmt: skip
-    return head + yaml_text({"format": RIG_FORMAT, "lidar": "lidar", "cameras": cameras})
 
 
 def _require_plain_folder(folder: Path) -> None:

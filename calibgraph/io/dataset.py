@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
+from shlex import quote
 from typing import TypeVar
 
 import numpy as np
@@ -19,6 +20,7 @@ from calibgraph.io.bags.frames import BagFrame, frames_of_bag
 from calibgraph.io.bags.messages import CLOUDS, Bag
 from calibgraph.io.bags.options import NEAR_S
 from calibgraph.io.bags.rig import doubtful_axes
+from calibgraph.io.bags.storage import REPAIR_ROS2
 from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.clouds import read_cloud_notes
 from calibgraph.io.dataset_folders import (
@@ -130,7 +132,7 @@ def load_dataset(
     paths = tuple(Path(folder) for folder in folders)
     _require_folders(paths, bag)
     if interval_s is not None and all(map(is_bag, paths)):
-        raise ValueError("interval_s is of folders; the clouds of a bag have stamps: give motion")
+        raise ValueError("interval_s is of folders; messages have stamps: give --motion scans")
     bag = replace(bag or BagOptions(), beside=tuple(path for path in paths if is_bag(path)))
     bare = {path for path in bag.beside if len(paths) > 1 and not Bag(path).of_type(*CLOUDS)}
     data = _without_frames(tuple(path for path in paths if path not in bare) or paths, rig, bag)
@@ -303,7 +305,7 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
             raise FileError(
                 path,
                 f"has no metadata.yaml, as a ROS 2 bag that was not closed; name {recorded.name}, "
-                "or write the file with `ros2 bag reindex`",
+                f"or write the file with `{REPAIR_ROS2.format(quote(str(path)))}`",
             )
     of_bags = bag is not None and replace(bag, sync_tolerance_s=NEAR_S) != BagOptions()
     if of_bags and not any(map(is_bag, paths)):

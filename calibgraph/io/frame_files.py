@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
+from shlex import quote
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ _WAYS_OUT = {
     **dict.fromkeys(
         (".mp4", ".mkv", ".avi", ".mov"),
         "is not read: write its pictures into a folder, named as their clouds "
-        "(`ffmpeg -i {0} {1}/%06d.png`)",
+        "(`mkdir {1}; ffmpeg -i {0} {1}/%06d.png`)",
     ),
     ".drc": "is not read: write it as .ply (`draco_decoder -i {0} -o {1}.ply`)",
     ".gz": _PACKED.format("gunzip {0}"),
@@ -31,11 +32,11 @@ _WAYS_OUT = {
     ".xz": _PACKED.format("unxz {0}"),
     ".lz4": _PACKED.format("unlz4 {0}"),
     **dict.fromkeys(
-        (".zip", ".7z", ".tar", ".tgz"), "is an archive: unpack it and name its folder"
+        (".zip", ".7z", ".tar", ".tgz"), "is an archive: unpack it and name what is in it"
     ),
     ".active": "was not closed: mend it with `rosbag reindex {0}` and name it {1}",
 }
-"""Per suffix that is not read, the way out; {0} is the file's name, {1} that without the suffix."""
+"""Per suffix that is not read, the way out; {0} is the file, {1} its name without the suffix."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class FrameFiles:
 def way_out(path: Path) -> str | None:
     """What to do with a file that is not read; None if nothing is known for its suffix."""
     line = _WAYS_OUT.get(path.suffix.lower())
-    return None if line is None else line.format(path.name, path.stem)
+    return None if line is None else line.format(quote(f"{path}"), quote(f"{path.with_suffix('')}"))
 
 
 def by_number(name: str) -> list[str | int | Decimal]:

@@ -179,7 +179,7 @@ def intrinsics_of_matrix(K: ArrayLike, where: Path | str) -> Intrinsics:
         raise FileError(
             where,
             f"is no camera matrix: {found.tolist()} holds no focal length, so the camera is not "
-            "calibrated; calibrate its lens, or give a rig with it (--rig)",
+            "calibrated; calibrate its lens, or use a rig that has it (--rig)",
         )
     excess = np.abs(found - [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     excess[0, 1] = max(0.0, excess[0, 1] - _NO_SKEW * fx)

@@ -51,8 +51,9 @@ CAUSES: dict[str, Cause] = {
             "guess_length": "Give the translation of T_camera_lidar in metres.",
             "swapped_cameras": _SWAPPED,
             "point_distance": "Give the clouds in metres.",
-            "search": "Correct the guess, or widen --search-deg and --search-m; see with "
-            "doctor whether images and clouds of this camera belong together.",
+            "search": "Correct the guess, or calibrate with a wider search (--search-deg up to 45, "
+            "--search-m up to 5); see with doctor whether images and clouds of this camera belong "
+            "together.",
             "range_rotation": _FROM_RESULT, "range_translation": _FROM_RESULT,
         },
     ),
@@ -141,8 +142,8 @@ CAUSES: dict[str, Cause] = {
          "image evidence": _STRUCTURE,
          "images": "Calibrate again from images and clouds.",
          "common_error": "State the error that all frames share (0 if none): common_deg and "
-         "common_cm in the config (of solve also as options), or systematic_rotation_rad and "
-         "systematic_translation_m in the metadata.",
+         "common_cm in --config (of solve: --common-deg, --common-cm), or systematic_rotation_rad "
+         "and systematic_translation_m in the metadata of the table.",
          "start": "Keep driving: the camera starts after enough frames with matches.",
          "blind frames": "Check that the camera delivers images and sees what the LiDAR sees."},
     ),

@@ -264,7 +264,7 @@ class Correspondences:
         if not good.all():
             row = int(np.flatnonzero(~good)[0])
             camera, frame = self.cameras[self.camera_index[row]], int(self.frame[row])
-            text = f"{what} must {rule}, found {found[row].tolist()}; drop or correct the row"
+            text = f"{what} must {rule}, found {found[row].tolist()}; drop or correct it"
             error = MotionError if rule is TWIST_RULE else CorrespondenceError
             raise error(text, camera=camera, frame=frame, row=row)
 

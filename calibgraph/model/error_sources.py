@@ -112,8 +112,8 @@ class ErrorSources:
         best = self.forecast.get(MOST_TIMES, (self.rotation_deg, self.translation_cm))
         least = in_unit(best[0] if bar.unit == "deg" else best[1], bar.unit, 2)
         return (
-            "Tolerate more (--tolerance-deg, --tolerance-cm), or give measured relative_poses or "
-            f"priors: {least} of common error remain with any number of frames."
+            "Tolerate more (tolerance_deg, tolerance_cm in --config), or give measured "
+            f"relative_poses or priors: {least} of common error remain with any number of frames."
         )
 
     def _larger(self, tolerance: tuple[float, float]) -> _Bar:

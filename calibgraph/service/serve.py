@@ -26,8 +26,8 @@ def require_safe(host: str, *, has_tokens: bool) -> None:
     """Check that a server without tokens is for this machine alone."""
     if not has_tokens and not _is_loopback(host):
         raise CalibrationError(
-            f"--host {host}: others could call; give --tokens FILE (--new-token makes one), "
-            "or listen on 127.0.0.1"
+            f"--host {host}: others could call; give --tokens FILE, or listen on 127.0.0.1; a "
+            "token is added to the file by calibgraph serve --tokens FILE --new-token submit"
         )
 
 

@@ -154,12 +154,13 @@ def _to_rays(origins: Floats, directions: Floats) -> Any:
     return _open3d().core.Tensor.from_numpy(rays)
 
 
+INSTALL_LIBRARIES = "apt-get install libusb-1.0-0 libgl1 libegl1 libgomp1"
+"""What Open3D needs on Debian and Ubuntu."""
+
+
 def _open3d() -> Any:
-    with needs_extra(
-        "simulation",
-        "simulating sensors needs open3d, and on Debian or Ubuntu apt-get install libusb-1.0-0 "
-        "libgl1 libgomp1 libx11-6",
-    ):
+    what = f"simulating sensors needs open3d, and on Debian or Ubuntu {INSTALL_LIBRARIES}"
+    with needs_extra("simulation", what):
         import open3d
     return open3d
 

@@ -10,7 +10,7 @@ from operator import index
 import numpy as np
 
 from calibgraph.errors import CorrespondenceError
-from calibgraph.model.clock import unused_times
+from calibgraph.model.clock import OF_IMAGES, OF_TABLES, unused_times
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import PLACES
 from calibgraph.model.rig import Rig
@@ -106,7 +106,7 @@ def _with_motion_in_use(rig: Rig, table: Correspondences, before: bool | None) -
             "rig's time_offset_s and readout_s need it with every frame: give it or leave it out"
         )
     if before is None:
-        unused_times(rig, is_known=known)
+        unused_times(rig, is_known=known, how=f"{OF_IMAGES}, {OF_TABLES}")
     return table
 
 

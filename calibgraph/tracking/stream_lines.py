@@ -195,6 +195,6 @@ def _parse(line: bytes, where: str, header: Mapping[str, Any]) -> Item | dict[st
     except ValidationError as error:
         return refused(where, describe(error))
     except CorrespondenceError as error:
-        return refused(where, str(error), by_motion=isinstance(error, MotionError))
+        return refused(where, error.without_row, by_motion=isinstance(error, MotionError))
     except ValueError as error:
         return refused(where, f"is not JSON ({error}); send one frame a line, as JSON")

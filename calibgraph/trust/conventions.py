@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import permutations
+from shlex import quote
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -245,7 +246,8 @@ class _Trial:
 
 def _sentence(error: str, cameras: Sequence[str]) -> str:
     """What is wrong with the guess of some cameras, of all if none is named; and what undoes it."""
-    options = " ".join(f"--correct {n}={error}" for n in cameras) or f"--correct {error}"
+    named = [quote(f"{name}={error}") for name in cameras] or [error]
+    options = " ".join(f"--correct {each}" for each in named)
     images = f"the images of {' and '.join(cameras)}" if cameras else "the images"
     return (
         f"{images} fit clearly better if {in_words(error)}; undo it with "

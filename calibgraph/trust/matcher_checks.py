@@ -81,7 +81,7 @@ def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:
         text = (
             "no extrinsic within the matcher's range explains the images (best z-score "
             f"{missed:.1f} of image and cloud): check the guess, the intrinsics and the pairing, "
-            "widen --search-deg and --search-m, or give more frames from more places"
+            "search farther, or give more frames from more places"
         )
         return [Check("search", "FAIL", text, missed)]
     if found is None:

@@ -53,7 +53,11 @@ def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, call: Call) -> None
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (TypeError("in\nlines"), "internal error (TypeError: in lines); please report"),
+        (
+            TypeError("in\nlines"),
+            "(TypeError: in lines); please report it with the output of "
+            f"calibgraph --debug evaluate {SAMPLE} {SAMPLE}",
+        ),
         (MemoryError("1 TiB"), "not enough memory (1 TiB)"),
     ],
 )

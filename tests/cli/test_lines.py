@@ -35,7 +35,6 @@ calibrate {sample} --config tpu.yaml | device: Input should be 'auto', 'cpu' or 
 calibrate bag --topic lidar | give NAME=/TOPIC
 calibrate bag --topic lidar=/a --topic lidar=/b | given 2 times
 calibrate bag --config stamps.yaml | stamps: Input should be 'header' or 'record'
-calibrate bag --config sync.yaml | set stamps: record in --config if the clocks differ
 solve nothing.yaml table.parquet | no such file
 solve rig.yaml half.parquet | cannot be read as Parquet
 solve bad.yaml table.parquet | unknown key
@@ -43,7 +42,6 @@ solve rig.yaml table.parquet --config lambda.yaml | unknown key 'lambda'
 solve rig.yaml table.parquet --config negative.yaml | gate_px
 solve rig.yaml table.parquet --config preset.yaml | preset: Input should be 'kitti', 'walkley'
 solve rig.yaml table.parquet --terms all | terms: Input should be 'stage1'
-solve rig.yaml table.parquet --print-graph --json | both print; choose one
 match {sample} --out table.txt | must end in .parquet or .csv
 evaluate nothing.yaml rig.yaml | no such file or folder; name a rig file
 evaluate empty rig.yaml | name a rig file, a result
@@ -59,14 +57,12 @@ export {sample} --out never --format autoware --lidar-pose 0,0,nan,0,0,0 | not f
 export {sample} --out never --format tf2 --lidar-pose 0,0,0,0,0,0 | autoware only
 export {sample} --out never --format tf2 --camera-frame camera | two are the same
 export nothing --out never --format tf2 | no such file
-rig info.yaml --out n.yaml | describe its mounting with --mount front=WORDS
 rig chain.yaml --size 9 | --size '9': give WIDTHxHEIGHT
 rig chain.yaml --camera-frame a | --camera-frame 'a': give two names
 rig chain.yaml --rename front=a | no camera 'front' to rename
 rig chain.yaml --rename cam0=cam1 | two cameras one name
 rig chain.yaml --out n.txt | must end in .yaml
-rig chain.yaml --tie-deg 1 | give both
-rig chain.yaml --topic lidar=/a | --topic is for a bag alone only
+rig chain.yaml --topic lidar=/a | --topic is for bags alone only
 rig chain.yaml --lens calibration | --lens is for a folder of images and clouds
 rig chain.yaml --mount cam0=front --mount cam0=left | --mount cam0=...: given 2 times
 rig chain.yaml --mount rear=front | no camera 'rear'
@@ -78,7 +74,7 @@ rig drive --mount rear=rear | --mount rear=...: no such camera
 rig drive --lens wide | lens 'wide'; expected calibration
 rig drive --lens rear=calibration | --lens rear=...: no such camera
 rig drive --size 3x4 | --size is for files only
-rig drive --json | --json is for a bag alone or files only
+rig drive --json | --json is for bags alone or files only
 check missing.yaml {sample} | missing.yaml
 check {sample} missing | missing
 check {sample} {sample} --tolerance-deg 0 | tolerance_deg must be positive
@@ -100,7 +96,7 @@ weights bad.tar | bad.tar
 """
 CONFIGS = {
     "joint": "start_from: joint", "both": "start_from: both", "tpu": "device: tpu",
-    "stamps": "stamps: best", "sync": "sync_tolerance_s: 0.001", "lambda": "lambda: 3",
+    "stamps": "stamps: best", "lambda": "lambda: 3",
     "negative": "gate_px: -1", "preset": "preset: best",
 }  # fmt: skip
 

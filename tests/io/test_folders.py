@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import re
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -278,25 +280,22 @@ def test_stamps_that_are_far_apart_are_named(later_ms: float, message: str, samp
         assert len(load_dataset(sample, bag=BagOptions(sync_tolerance_s=0.1)).frames) == 6
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [("run.bag.active", "was not closed.*rosbag reindex"), ("run.mcap.zst", "unzstd run.mcap.zst"),
-     ("run.bag.gz", "gunzip run.bag.gz"), ("drive.zip", "is an archive")],
-)  # fmt: skip
-def test_a_file_that_is_not_read_is_named_with_the_way_out(
-    name: str, words: str, tmp_path: Path
-) -> None:
-    (tmp_path / name).write_bytes(b"\x28\xb5\x2f\xfd")
-    with pytest.raises(FileError, match=words):
-        load_dataset(tmp_path / name)
+def test_the_command_that_is_printed_unpacks_a_file(tmp_path: Path) -> None:
+    packed = tmp_path / "a drive.npy.gz"
+    packed.write_bytes(gzip.compress(b"content"))
+    with pytest.raises(FileError, match="is compressed from outside") as error:
+        load_dataset(packed)
+    command = str(error.value).split("`")[1]
+    assert subprocess.run(command, shell=True, check=True).returncode == 0
+    assert (tmp_path / "a drive.npy").read_bytes() == b"content"
 
 
 def test_videos_and_clouds_of_other_programs_name_what_converts_them(sample: Path) -> None:
     shutil.rmtree(sample / "cameras" / "left")
     (sample / "cameras" / "left.mp4").write_bytes(b"")
-    with pytest.raises(FileError, match=r"ffmpeg -i left.mp4 left/%06d.png"):
+    with pytest.raises(FileError, match=r"mkdir (\S+/left); ffmpeg -i \1.mp4 \1/%06d.png"):
         load_dataset(sample)
     for path in (sample / "lidar").iterdir():
         path.rename(path.with_suffix(".las"))
-    with pytest.raises(FileError, match=r"pdal translate 000000.las 000000.ply"):
+    with pytest.raises(FileError, match=r"pdal translate (\S+/000000).las \1.ply"):
         load_dataset(sample)

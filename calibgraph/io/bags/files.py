@@ -15,6 +15,7 @@ from io import BytesIO
 from itertools import accumulate, count
 from operator import itemgetter
 from pathlib import Path, PurePath
+from shlex import quote
 from struct import Struct
 from tempfile import TemporaryDirectory
 from typing import IO, Any
@@ -225,7 +226,7 @@ class McapFile:
             raise FileError(
                 self._path,
                 "its index is not whole (chunks, channels and counts at the end); write one with "
-                f"`mcap recover {self._path.name} -o whole.mcap`, and give that file",
+                f"`mcap recover {quote(str(self._path))} -o whole.mcap`, and give that file",
             )
         chunks = sorted(found.chunk_indexes, key=lambda each: each.message_start_time)
         if any(each.chunk_start_offset + each.chunk_length > size for each in chunks):
@@ -398,7 +399,7 @@ def _files_of(folder: Path, stated: Iterable[str]) -> list[Path]:
             raise FileError(
                 folder,
                 f"its {METADATA} names {file.name}, which is not there; copy it there, or write "
-                f"the metadata again with `{REPAIR_ROS2}`",
+                f"the metadata again with `{REPAIR_ROS2.format(quote(str(folder)))}`",
             )
     return files
 

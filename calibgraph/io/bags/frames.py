@@ -147,8 +147,8 @@ def _with_lens_of_rig(
         )
     if not fits.all():
         notes.append(
-            f"{np.sum(~fits)} frames with another lens than the rig's are left out; for them give "
-            "a rig with their lens (--rig)"
+            f"{np.sum(~fits)} frames with another lens than the rig's are left out; calibrate them "
+            "with a rig that has their lens (--rig)"
         )
     return fits, "; ".join(notes)
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -107,9 +108,9 @@ class BagRig:
                 f"{camera.where}: no static transforms connect the LiDAR's frame {self.lidar!r} "
                 f"with the frame {frame!r} of camera {name!r}: "
                 f"{self.transforms.why_apart(frame, self.lidar)}. If another bag of the drive has "
-                "them, give it too, or write `calibgraph rig OTHER_BAG --out rig.yaml`; else "
-                "describe the mounting with calibgraph rig BAG --mount, or give it the bag with a "
-                "URDF; then give the rig (--rig)",
+                "them, give it too; else describe the mounting with calibgraph rig BAG --mount "
+                f"{quote(name)}=WORDS --out rig.yaml, or add a URDF: calibgraph rig BAG car.urdf "
+                "--out rig.yaml; then calibrate with --rig rig.yaml",
                 camera=name,
             )
         extrinsic = {
@@ -199,8 +200,8 @@ class _CameraReader:
         """
         if topics.info is None:
             raise DatasetError(
-                f"{self._drive.bag.path}: {_why_no_info(name, topics)}, or give a rig with the "
-                f"lens of camera {name!r} (--rig)",
+                f"{self._drive.bag.path}: {_why_no_info(name, topics)}, or calibrate "
+                f"with a rig that has the lens of camera {name!r} (--rig)",
                 camera=name,
             )
         bag = next(bag for bag in self._drive if bag.has(topics.info))
@@ -255,7 +256,7 @@ def _why_no_info(name: str, topics: CameraTopics) -> str:
     also = f", which may be that of {', '.join(topics.rivals)} too" if topics.rivals else ""
     return (
         f"which camera_info is that of {topics.image}? There is {', '.join(topics.infos)}{also}; "
-        f"name both: --topic {name}={topics.image},/CAMERA_INFO"
+        f"name both: --topic {quote(name)}={topics.image},/CAMERA_INFO"
     )
 
 

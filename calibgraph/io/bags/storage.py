@@ -4,15 +4,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePath
+from shlex import quote
 
 from calibgraph.errors import CalibrationError, FileError, in_words
+from calibgraph.io.frame_files import way_out
 
-METADATA, REPAIR_ROS2 = "metadata.yaml", "ros2 bag reindex"
+METADATA, REPAIR_ROS2 = "metadata.yaml", "ros2 bag reindex {}"
 _HEAD_BYTES = 1000
 _SUFFIXES = (".bag", ".mcap", ".db3")
-_UNPACK = {".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz", ".lz4": "unlz4", ".zst": "unzstd",
-           ".zstd": "unzstd", ".zip": "unzip", ".7z": "7z x"}  # fmt: skip
-_REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover"}
+_REPAIR = {".bag": "rosbag reindex {}", ".mcap": "mcap recover {} -o whole.mcap"}
 
 
 @dataclass(frozen=True)
@@ -34,26 +34,17 @@ def is_bag(path: Path | str) -> bool:
     path = Path(path)
     if path.suffix.lower() in _SUFFIXES and path.is_file():
         return True
-    if PurePath(path.stem).suffix.lower() in _SUFFIXES and path.is_file():
-        _refuse_as_it_is(path)
+    if (
+        PurePath(path.stem).suffix.lower() in _SUFFIXES
+        and path.is_file()
+        and (way := way_out(path))
+    ):
+        raise FileError(path, way)
     metadata = path / METADATA
     if not metadata.is_file():
         return False
     with metadata.open("rb") as file:
         return b"rosbag2" in file.read(_HEAD_BYTES)
-
-
-def _refuse_as_it_is(path: Path) -> None:
-    """Refuse a file that would be a bag under its name without the last suffix."""
-    last = path.suffix.lower()
-    if last == ".active":
-        raise FileError(
-            path,
-            "was not closed by the recorder: mend it with `rosbag reindex`, then rename it to "
-            f"{path.stem}",
-        )
-    if last in _UNPACK:
-        raise FileError(path, f"is compressed: unpack it first with `{_UNPACK[last]} {path.name}`")
 
 
 def require_closed(path: Path) -> None:
@@ -63,7 +54,7 @@ def require_closed(path: Path) -> None:
             raise FileError(
                 path,
                 f"was not closed: {log.name} holds messages that are not yet in it; close it with "
-                f"`sqlite3 {log.name.removesuffix('-wal')} 'pragma wal_checkpoint(truncate)'`",
+                f"`sqlite3 {quote(f'{log}'[:-4])} 'pragma wal_checkpoint(truncate)'`",
             )
 
 
@@ -76,8 +67,9 @@ def errors_in_one_line(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         repair = _REPAIR.get(path.suffix.lower(), REPAIR_ROS2)
+        bag = path.parent if repair == REPAIR_ROS2 and path.is_file() else path
         raise FileError(
             path,
             f"is truncated, was not closed or is no ROS bag ({in_words(error)}); "
-            f"record or copy it again, or repair it with `{repair}`",
+            f"record or copy it again, or repair it with `{repair.format(quote(str(bag)))}`",
         ) from error

@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from shlex import quote
 
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags.messages import CAMERA_INFO, CLOUDS, COMPRESSED_IMAGE, IMAGE, Bag
@@ -109,7 +110,7 @@ def choose_topics(
         if not image:
             raise DatasetError(
                 f"{bag.path}: which topic has the images of camera {name!r}? {_listed(bag)}: name "
-                f"it by --topic {name}=/TOPIC",
+                f"it by --topic {quote(name)}=/TOPIC",
                 camera=name,
             )
         topics[name] = (
@@ -147,13 +148,13 @@ def _why_no_camera(bag: Bag, infos: _Infos) -> str:
             name = _short_names([_words(topic)])[_words(topic)]
             return (
                 f"{topic} is {_depth(bag, topic)}, which is taken for depth; if it is the image of "
-                f"a camera, name it by --topic {name}={topic}"
+                f"a camera, name it by --topic {quote(name)}={topic}"
             )
     if not _image_topics(bag) and (found := _not_read(bag)):
         return found
     return (
-        f"has no image topic with a camera_info beside it; {_listed(bag)}: give a rig with the "
-        "lenses (--rig)"
+        f"has no image topic with a camera_info beside it; {_listed(bag)}: calibrate with a rig "
+        "that has the lenses (--rig)"
     )
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Final
 
 from calibgraph.arrays import Array
@@ -96,9 +97,8 @@ def _require_not_failed(result: Calibration, cameras: Sequence[str]) -> None:
     if not failed:
         return
     good = [name for name in cameras if name not in failed]
-    others = (
-        f"export the others with {' '.join(f'--camera {name}' for name in good)}, " if good else ""
-    )
+    named = " ".join(f"--camera {quote(name)}" for name in good)
+    others = f"export the others with {named}, " if good else ""
     raise CalibrationError(
         f"the verdict of {', '.join(failed)} is FAIL, nothing was written; see the result's "
         f"report, {others}or export all the same with --even-if-failed"

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import Any, TypeVar
 
 import numpy as np
@@ -305,7 +306,7 @@ def _camera(
         raise RigError(
             f"camera {name!r}: no file has its T_camera_lidar{listed}; name its "
             "frame with --camera-frame, add a URDF, a sensor kit or a rig file with a guess, or "
-            f"describe its mounting with --mount {name}=WORDS{notes}",
+            f"describe its mounting with --mount {quote(name)}=WORDS{notes}",
             camera=name,
         )
     return {**replace(lens, size_px=size).fields(), "T_camera_lidar": T_camera_lidar}

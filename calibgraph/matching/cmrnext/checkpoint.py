@@ -164,9 +164,8 @@ def _read_safetensors(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         reason = getattr(error, "strerror", None) or str(error)
         raise FileError(path, f"cannot be read as safetensors: {reason}") from None
     if not isinstance(config, dict):
-        raise FileError(
-            path, "has no config in its metadata; convert the original with calibgraph weights"
-        )
+        convert = "calibgraph weights ORIGINAL.tar --out NEW.safetensors"
+        raise FileError(path, f"has no config in its metadata; convert the original by {convert}")
     return config, tensors
 
 

@@ -86,7 +86,7 @@ def test_a_sensor_that_hangs_by_a_transform_that_is_none_is_named_with_frame_and
     expected = rf"frame '{frame}' on /tf_static has .* and the quaternion \(0.0, 0.0, 0.0, 0.0\)"
     with pytest.raises(DatasetError, match=expected) as caught:
         load_rig(bag)
-    assert "calibgraph rig OTHER_BAG --out rig.yaml" in str(caught.value)
+    assert "If another bag of the drive has them, give it too; else describe" in str(caught.value)
     good = Stamped("/tf_static", TREE, START_NS, sample_messages(MAKE)[0].content)
     require_guess(write_bag(tmp_path / "mended", "mcap", [good, bad, *others]))
 

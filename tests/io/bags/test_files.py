@@ -130,7 +130,7 @@ def test_a_file_whose_index_is_not_whole_is_named_with_the_repair(
     tmp_path: Path, name: str
 ) -> None:
     path = write_mcap(tmp_path / "drive.mcap", sample_messages(MAKE), **NOT_WHOLE[name])
-    with pytest.raises(FileError, match=r"index is not whole .*; write one with `mcap recover d"):
+    with pytest.raises(FileError, match=r"index is not whole .*; write one with `mcap recover "):
         load_rig(path)
 
 

@@ -462,12 +462,12 @@ def test_an_orientation_in_a_message_is_refused(orientation: int, form: str) -> 
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("run.bag.active", r"not closed by the recorder: .*rosbag reindex.*rename it to run.bag"),
-        ("run.bag.gz", "is compressed: unpack it first with `gunzip run.bag.gz`"),
-        ("run_0.db3.zstd", "unpack it first with `unzstd run_0.db3.zstd`"),
-        ("RUN.MCAP.ZST", "unpack it first with `unzstd RUN.MCAP.ZST`"),
-        ("run.bag.bz2", "`bunzip2 run.bag.bz2`"),
-        ("run.mcap.zip", "`unzip run.mcap.zip`"),
+        ("run.bag.active", r"not closed: mend it with `rosbag reindex .*` and name it \S+run.bag"),
+        ("run.bag.gz", r"is compressed from outside: unpack it first \(`gunzip \S+run.bag.gz`"),
+        ("run_0.db3.zstd", r"`unzstd \S+run_0.db3.zstd`"),
+        ("RUN.MCAP.ZST", r"`unzstd \S+RUN.MCAP.ZST`"),
+        ("run.bag.bz2", r"`bunzip2 \S+run.bag.bz2`"),
+        ("run.mcap.zip", "is an archive: unpack it"),
     ],
 )
 def test_a_bag_that_must_be_unpacked_or_closed_is_named(
