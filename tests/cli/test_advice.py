@@ -8,6 +8,7 @@ import shlex
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -156,9 +157,10 @@ def _begins(monkeypatch: pytest.MonkeyPatch) -> None:
     def begin(*given: Any, **options: Any) -> None:
         raise CalibrationError("begun")
 
-    for work in ("pipeline.calibrate", "rounds.match_in_rounds", "audit.check",
-                 "pick.server.PickServer", "tracking.command.DatasetDrive"):  # fmt: skip
+    for work in ("pipeline.calibrate", "rounds.match_in_rounds", "pick.server.PickServer",
+                 "tracking.command.DatasetDrive"):  # fmt: skip
         monkeypatch.setattr(f"calibgraph.{work}", begin)
+    monkeypatch.setattr(import_module("calibgraph.audit.check"), "match_from_deployed", begin)
     monkeypatch.setattr("calibgraph.doctor.diagnose", lambda *_, **__: Diagnosis(()))
 
 
