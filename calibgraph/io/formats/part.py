@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,9 +17,6 @@ from calibgraph.model.rig import Mount
 
 ONLY_CAMERA = ""
 """Stands for the camera of a file that names none: the only one of all files."""
-
-IMU = "imu"
-"""The frame of the IMU in files that give poses in it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +71,7 @@ class Part:
         return not (self.lenses or self.T_camera_lidar or self.links)
 
     def rename(self, names: Mapping[str, str]) -> Part:
-        """The same with other names of some cameras; frames keep theirs, but for ONLY_CAMERA's."""
-        only = frame_id(names.get(ONLY_CAMERA, ONLY_CAMERA))
-        frames = {f"_{axes}": f"{only}_{axes}" for axes in ("optical", "optical_frame")}
+        """The same with other names of some cameras; frames keep theirs."""
         return replace(
             self,
             lenses={names.get(name, name): lens for name, lens in self.lenses.items()},
@@ -85,18 +80,7 @@ class Part:
                 replace(pair, a=names.get(pair.a, pair.a), b=names.get(pair.b, pair.b))
                 for pair in self.relative_poses
             ),
-            links=tuple(
-                replace(
-                    link,
-                    parent=frames.get(link.parent, link.parent),
-                    child=frames.get(link.child, link.child),
-                )
-                for link in self.links
-            ),
-            frame_ids={
-                names.get(name, name): frames.get(frame, frame)
-                for name, frame in self.frame_ids.items()
-            },
+            frame_ids={names.get(name, name): frame for name, frame in self.frame_ids.items()},
             mounts={names.get(name, name): mount for name, mount in self.mounts.items()},
         )
 
@@ -195,18 +179,3 @@ def find_camera_frame(tree: FrameTree, camera: str, chosen: Mapping[str, str]) -
         return chosen[camera]
     names = (pattern.format(frame_id(camera)) for pattern in _CAMERA_FRAMES)
     return next((name for name in names if name in tree.names), None)
-
-
-NO_LIDAR_IN_IMU = (
-    "poses of cameras in the IMU are not used, as no file has the LiDAR in the IMU (extrinsic_R, "
-    "extrinsic_T); write --lidar-frame imu if the two frames are one"
-)
-
-
-def tied_links(links: Sequence[FrameLink], lidar_frame: str | None) -> Sequence[FrameLink]:
-    """The links without cameras in an IMU that nothing ties to other frames."""
-    others = [each for each in links if each.child == IMU or
-              (each.parent == IMU and not is_optical(each.child))]  # fmt: skip
-    if others or lidar_frame == IMU:
-        return links
-    return [each for each in links if each.parent != IMU]

@@ -12,14 +12,9 @@ from calibgraph.files import StrictNumbers, checked_model, read_text, require_fi
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.bags.rig import read_bag_rig
-from calibgraph.io.formats.documents import (
-    YAML_SUFFIXES,
-    content_of_storage,
-    read_documents,
-    read_xml,
-)
+from calibgraph.io.formats.documents import YAML_SUFFIXES, read_documents, read_xml
 from calibgraph.io.formats.foreign_keys import read_foreign
-from calibgraph.io.formats.matrix_lines import read_lines
+from calibgraph.io.formats.matrix_file import read_matrix
 from calibgraph.io.formats.part import Part, RelativeCamera
 from calibgraph.io.formats.transforms import (
     is_autoware,
@@ -52,11 +47,11 @@ def read_part(path: Path, name: str | None) -> Part:  # noqa: PLR0911 - a line f
     if path.stat().st_size > _MAX_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes are too many for a calibration")
     if suffix in (".urdf", ".xml", ".xacro", ".launch"):
-        return _read_xml(path, name)
+        return _read_xml(path)
     if suffix in (".sh", ".bash"):
         return read_publishers(read_text(path).splitlines(), path)
     if suffix in (".txt", ".csv", ".npy"):
-        return _read_lines(path, name)
+        return _read_matrix(path, name)
     if suffix in (*YAML_SUFFIXES, ".json"):
         return _read_content(read_documents(path), path, name)
     with path.open("rb") as file:
@@ -64,19 +59,18 @@ def read_part(path: Path, name: str | None) -> Part:  # noqa: PLR0911 - a line f
     raise FileError(path, _unknown(f"a file {suffix or 'without a suffix'} is", head))
 
 
-def _read_xml(path: Path, name: str | None) -> Part:
-    """What a URDF, a launch file or OpenCV's storage holds."""
+def _read_xml(path: Path) -> Part:
+    """What a URDF or a launch file holds."""
     root = read_xml(path)
     if root.tag == "launch":
         return read_publishers(publisher_lines(root), path)
     if root.tag == "opencv_storage":
-        return _read_content([content_of_storage(root)], path, name)
+        raise FileError(path, "is OpenCV's XML, which is not read; write it to a name in .yml")
     return read_urdf(root, path)
 
 
-def _read_lines(path: Path, name: str | None) -> Part:
-    """What a text file of lines holds."""
-    found = read_lines(path, name)
+def _read_matrix(path: Path, name: str | None) -> Part:
+    found = read_matrix(path, name)
     if found is not None:
         return found
     text = read_text(path)

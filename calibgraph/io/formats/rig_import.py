@@ -12,7 +12,6 @@ from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, FileError, RigError
 from calibgraph.files import checked_model
 from calibgraph.io.formats.part import (
-    NO_LIDAR_IN_IMU,
     ONLY_CAMERA,
     FrameLink,
     FrameTree,
@@ -21,7 +20,6 @@ from calibgraph.io.formats.part import (
     find_camera_frame,
     find_lidar_frame,
     optical_axes,
-    tied_links,
 )
 from calibgraph.io.formats.read_part import read_part
 from calibgraph.io.lenses import CameraLens
@@ -147,15 +145,13 @@ def read_rig_parts(
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
     missing = sorted(lenses.keys() - T_camera_lidar.keys())
     links, notes = _later_first(parts)
-    tied = tied_links(links, lidar_frame)
-    tree = FrameTree(tied)
+    tree = FrameTree(links)
     frame_ids = {name: frame for part in parts for name, frame in part.frame_ids.items()}
     lidar = lidar_frame or next((part.lidar for part in parts if part.lidar), None)
     in_tree = {name: frame for name, frame in frame_ids.items() if frame in tree.names}
     chosen = {**in_tree, **(camera_frames or {})}
     of_tree = lidar if lidar_frame or lidar in tree.names else None
     notes += [note for part in parts for note in part.notes]
-    notes += [NO_LIDAR_IN_IMU] if missing and len(tied) < len(links) else []
     try:
         by_frames, mounts = _by_frames(tree, missing, of_tree, chosen, notes=notes)
     except CalibrationError as error:

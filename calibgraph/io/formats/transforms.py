@@ -1,4 +1,4 @@
-"""Transforms of ROS: one writer for publishers, launch files, tf2, URDF and Autoware; readers."""
+"""Transforms of ROS: one writer for launch files, URDF and Autoware; readers, also of tf2."""
 
 import shlex
 from collections.abc import Iterable, Iterator
@@ -12,7 +12,7 @@ from pydantic import ConfigDict
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
-from calibgraph.io.formats.documents import commented, commented_xml, commented_yaml
+from calibgraph.io.formats.documents import commented_xml, commented_yaml
 from calibgraph.io.formats.part import FrameLink, Part
 from calibgraph.io.formats.rig_export import RigExport, frame_id
 from calibgraph.io.rotations import (
@@ -24,7 +24,7 @@ from calibgraph.io.rotations import (
 from calibgraph.model.geometry import T_OPTICAL_LINK, invert
 from calibgraph.model.rig import Finite
 
-TRANSFORMS = ("ros1", "ros2", "ros2-launch", "tf2", "urdf", "autoware")
+TRANSFORMS = ("ros2-launch", "urdf", "autoware")
 _DIRECTION = "each transform is the pose of the child frame in its parent: p_parent = T * p_child"
 _OF_LIDAR = (
     "{camera}: the optical frame (child) in the LiDAR frame (parent): p_lidar = T * p_camera, the "
@@ -36,13 +36,11 @@ _OF_TREE = (
     "measured; it replaces this transform of the robot's description, whose others stay"
 )
 _MORE = {
-    "ros1": "numbers: x y z qx qy qz qw, then parent and child frame",
-    "tf2": "publish: ros2 topic pub --once --qos-durability transient_local /tf_static "
-    'tf2_msgs/msg/TFMessage "$(cat FILE)"',
+    "ros2-launch": "ROS 1: rosrun tf2_ros static_transform_publisher, with the numbers and frames "
+    "of args in their order, without the names before them",
     "urdf": "rpy about fixed x, y, z",
 }
 _PUBLISHER = "static_transform_publisher"
-_COMMANDS = {"ros1": ["rosrun", "tf2_ros"], "ros2": ["ros2", "run", "tf2_ros"]}
 _NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _KIT, _OPTICAL_LINK = "sensor_kit_base_link", "/camera_optical_link"
 _ANGLES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -53,12 +51,6 @@ def write_transforms(export: RigExport, format: str) -> str:
     links = _WHICH.get(format, _measured)(export)
     directions = _of_kit(export) if format == "autoware" else _of_transforms(export, format)
     statement = export.statement(*directions)
-    if format in _COMMANDS:
-        lines = (shlex.join([*_COMMANDS[format], _PUBLISHER, *_arguments(each, format)])
-                 for each in links)  # fmt: skip
-        return commented(statement) + "".join(f"{line} &\n" for line in lines) + "wait\n"
-    if format == "tf2":
-        return commented_yaml(statement, {"transforms": [*map(_stamped, links)]})
     if format == "autoware":
         poses = {each.child: dict(zip(_ANGLES, _six(each), strict=True)) for each in links}
         return commented_yaml(statement, {_KIT: poses})
@@ -72,8 +64,7 @@ def _of_transforms(export: RigExport, format: str) -> Iterator[str]:
         parent, child, _ = export.link(name)
         text = _OF_LIDAR if export.mount(name) is None else _OF_TREE
         yield text.format(camera=name, parent=parent, child=child)
-    if format in _MORE:
-        yield _MORE[format]
+    yield _MORE[format]
 
 
 def _measured(export: RigExport) -> list[FrameLink]:
@@ -81,35 +72,16 @@ def _measured(export: RigExport) -> list[FrameLink]:
     return [FrameLink(*export.link(name)) for name in export.cameras]
 
 
-def _arguments(link: FrameLink, format: str = "ros2") -> list[str]:
-    """The arguments of a publisher."""
-    values = [repr(float(value)) for value in (*link.T_parent_child[:3, 3],
-                                               *quaternion_xyzw(link.T_parent_child))]  # fmt: skip
-    if format == "ros1":
-        return [*values, link.parent, link.child]
-    named = (word for name, value in zip(_NAMES, values, strict=True)
-             for word in (f"--{name}", value))  # fmt: skip
-    return [*named, "--frame-id", link.parent, "--child-frame-id", link.child]
-
-
 def _launch(links: Iterable[FrameLink]) -> ElementTree.Element:
     root = ElementTree.Element("launch")
     for each in links:
-        attributes = {"pkg": "tf2_ros", "exec": _PUBLISHER, "args": " ".join(_arguments(each))}
+        T = each.T_parent_child
+        values = map(float, (*T[:3, 3], *quaternion_xyzw(T)))
+        named = " ".join(f"--{name} {value!r}" for name, value in zip(_NAMES, values, strict=True))
+        args = f"{named} --frame-id {each.parent} --child-frame-id {each.child}"
+        attributes = {"pkg": "tf2_ros", "exec": _PUBLISHER, "args": args}
         ElementTree.SubElement(root, "node", attributes)
     return root
-
-
-def _stamped(link: FrameLink) -> dict[str, Any]:
-    T = link.T_parent_child
-    return {
-        "header": {"frame_id": link.parent},
-        "child_frame_id": link.child,
-        "transform": {
-            "translation": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
-            "rotation": dict(zip("xyzw", quaternion_xyzw(T), strict=True)),
-        },
-    }
 
 
 def _six(link: FrameLink) -> list[float]:

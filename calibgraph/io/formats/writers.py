@@ -158,7 +158,7 @@ def write_camera_infos(export: RigExport) -> Mapping[str, str]:
         statement = (
             export.origin,
             "K and D are of the images as recorded, R is the identity, P is K",
-            "the extrinsic is not part of a camera_info: export it as tf2, ros2-launch or urdf",
+            "the extrinsic is not part of a camera_info: export it as ros2-launch or urdf",
             f"optical frame: {export.optical_frames[name]}",
         )
         files[file] = commented_yaml(statement, _of_ros(name, camera))
