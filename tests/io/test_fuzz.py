@@ -53,7 +53,7 @@ def clouds(_: Path) -> dict[str, bytes]:
         "binary.pcd": pcd(), "padded.pcd": pcd(padding=True), "ascii.pcd": pcd("ascii"),
         "packed.pcd": pcd("binary_compressed"), "little.ply": ply(), "ascii.ply": ply("ascii"),
         "big.ply": ply("binary_big_endian"),
-        "mesh.ply": ply(before=faces, body=(b"\x03" + bytes(12)) * 2 + body),
+        "mesh.ply": ply(after=faces, body=body + (b"\x03" + bytes(12)) * 2),
         "four.bin": body, "three.bin": CLOUD[:, :3].tobytes(), "array.npy": npy.getvalue(),
     }  # fmt: skip
 
