@@ -18,7 +18,6 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model, holds_truth_value
-from calibgraph.io.formats.part import ONLY_CAMERA, Part, RelativeCamera
 from calibgraph.io.formats.writers import DERIVED
 from calibgraph.io.lenses import (
     CameraLens,
@@ -29,6 +28,7 @@ from calibgraph.io.lenses import (
     stated_model,
     unified_coefficients,
 )
+from calibgraph.io.rig_parts import ONLY_CAMERA, RelativeCamera, RigParts
 from calibgraph.io.rotations import pose_of_quaternion
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Intrinsics, Size, plain_key, rigid_transform
@@ -79,7 +79,7 @@ def foreign_keys() -> ForeignKeys:
     )
 
 
-def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> Part | None:
+def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> RigParts | None:
     """The cameras and transforms of a mapping; None if it holds none."""
     content = _camchain(content, path) if "cam0" in content else content
     maps = [_Map(above, path, each) for above, each in _maps(content)]
@@ -107,7 +107,7 @@ def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> Part 
                     raise FileError(path, "two of its keys give different T_camera_lidar; keep one")
     if not extrinsics:
         notes += [note for each in maps for note in each.left_out()]
-    part = Part(path, lenses, extrinsics, tuple(pairs), notes=tuple(notes))
+    part = RigParts(path, lenses, extrinsics, tuple(pairs), notes=tuple(notes))
     if part.is_empty and notes:
         raise FileError(path, notes[0].removeprefix(f"{path}: "))
     if part.is_empty and any(each.holds_a_size for each in maps):

@@ -12,8 +12,8 @@ from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import read_text
 from calibgraph.io.clouds import read_npy
-from calibgraph.io.formats.part import ONLY_CAMERA, Part
 from calibgraph.io.kitti import NumberLines
+from calibgraph.io.rig_parts import ONLY_CAMERA, RigParts
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import rigid_transform
 
@@ -22,7 +22,7 @@ _TO_CAMERA = re.compile(r"(velo[a-z]*|lidar)_?(to|2)_?cam", re.IGNORECASE)
 _SIZES = (12, 16)
 
 
-def read_matrix(path: Path, name: str | None) -> Part | None:
+def read_matrix(path: Path, name: str | None) -> RigParts | None:
     """The extrinsic in a file of one matrix, 3 x 4 or 4 x 4; None if it is no such file."""
     M = _array(path) if path.suffix.lower() == ".npy" else _text(path)
     if M is None:
@@ -37,7 +37,7 @@ def read_matrix(path: Path, name: str | None) -> Part | None:
             path, "holds a matrix, and its name states no direction; name the file cam_to_velo.txt "
             "if p_velo = M p_cam, velo_to_cam.txt if p_cam = M p_velo"
         )  # fmt: skip
-    return Part(path, T_camera_lidar={name or ONLY_CAMERA: invert(T) if to_lidar else T})
+    return RigParts(path, T_camera_lidar={name or ONLY_CAMERA: invert(T) if to_lidar else T})
 
 
 def _array(path: Path) -> Array:

@@ -15,7 +15,6 @@ from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.formats.documents import YAML_SUFFIXES, read_documents, read_xml
 from calibgraph.io.formats.foreign_keys import read_foreign
 from calibgraph.io.formats.matrix_file import read_matrix
-from calibgraph.io.formats.part import Part, RelativeCamera
 from calibgraph.io.formats.transforms import (
     is_autoware,
     is_tf2,
@@ -27,20 +26,21 @@ from calibgraph.io.formats.transforms import (
 )
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
+from calibgraph.io.rig_parts import RelativeCamera, RigParts
 from calibgraph.io.rigs import is_exported_rig, read_rig
 from calibgraph.model.rig import KNOWLEDGE, Camera, Finite, Size
 
 _MAX_BYTES, _HEAD_BYTES = 32 * 2**20, 2**16
 
 
-def read_part(path: Path, name: str | None) -> Part:  # noqa: PLR0911 - a line for each kind
+def read_part(path: Path, name: str | None) -> RigParts:  # noqa: PLR0911 - a line for each kind
     """Read a file; ``name`` replaces the file's own name of its camera if it has a single one.
 
     Raises:
         FileError: if the format is unknown, or the file malformed.
     """
     if is_bag(path):
-        return _part_of_bag(path)
+        return read_bag_rig(path)
     if path.is_dir() or path.name == CALIBRATION_NAME:
         return _part_of_rig(path)
     suffix = require_file(path).suffix.lower()
@@ -59,7 +59,7 @@ def read_part(path: Path, name: str | None) -> Part:  # noqa: PLR0911 - a line f
     raise FileError(path, _unknown(f"a file {suffix or 'without a suffix'} is", head))
 
 
-def _read_xml(path: Path) -> Part:
+def _read_xml(path: Path) -> RigParts:
     """What a URDF or a launch file holds."""
     root = read_xml(path)
     if root.tag == "launch":
@@ -69,7 +69,7 @@ def _read_xml(path: Path) -> Part:
     return read_urdf(root, path)
 
 
-def _read_matrix(path: Path, name: str | None) -> Part:
+def _read_matrix(path: Path, name: str | None) -> RigParts:
     found = read_matrix(path, name)
     if found is not None:
         return found
@@ -94,7 +94,7 @@ def _unknown(what: str, text: str = "") -> str:
     )
 
 
-def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None) -> Part:
+def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None) -> RigParts:
     """What the mappings of a file hold."""
     content = documents[0]
     if is_tf2(content):
@@ -159,12 +159,12 @@ def _is_camera_info(content: dict[str, Any]) -> bool:
     )
 
 
-def _read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> Part:
+def _read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> RigParts:
     """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame."""
     message = checked_model(_Message, content, path)
     stated = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
     camera = name or path.stem
-    return Part(
+    return RigParts(
         path, {camera: stated.lens}, frame_ids={camera: stated.frame} if stated.frame else {}
     )
 
@@ -173,32 +173,16 @@ def _is_rig(content: dict[str, Any]) -> bool:
     return "format" in content or is_exported_rig(content)
 
 
-_READERS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[..., Part]], ...] = (
+_READERS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[..., RigParts]], ...] = (
     (_is_camera_info, _read_camera_info),
     (_is_rig, lambda _, path, __: _part_of_rig(path)),
     (is_autoware, lambda content, path, _: read_autoware(content, path)),
 )
 
 
-def _part_of_bag(path: Path) -> Part:
-    """Lenses from camera_info, and the extrinsics that /tf_static has."""
-    read = read_bag_rig(path)
-    cameras = read.cameras
-    found = {name: camera.T_camera_lidar for name, camera in cameras.items()}
-    return Part(
-        path,
-        lenses={name: camera.stated.lens for name, camera in cameras.items()},
-        T_camera_lidar={name: T for name, T in found.items() if T is not None},
-        frame_ids={name: each.frame_id for name, each in cameras.items() if each.frame_id},
-        mounts={name: each.mount for name, each in cameras.items() if each.mount},
-        lidar=read.lidar,
-        notes=tuple(read.notes),
-    )
-
-
-def _part_of_rig(path: Path) -> Part:
+def _part_of_rig(path: Path) -> RigParts:
     rig, notes = read_rig(path)
-    return Part(
+    return RigParts(
         path,
         lenses={name: _lens(camera) for name, camera in rig.cameras.items()},
         T_camera_lidar=rig.T_camera_lidar,

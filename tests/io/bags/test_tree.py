@@ -31,7 +31,7 @@ from calibgraph.io.bags.messages import Bag, Drive
 from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.topics import choose_topics
 from calibgraph.io.bags.transforms import Transforms
-from calibgraph.io.mounts import find_mounts
+from calibgraph.io.frame_tree import Link, find_mounts
 from calibgraph.model.geometry import invert
 from tests.conftest import SAMPLE, make_camera
 from tests.io.bags.writing import (
@@ -386,6 +386,7 @@ MOUNTED = {  # parents by child, and what is expected to be moved
 def test_the_link_that_moves_is_the_uppermost_of_the_camera_alone(name: str) -> None:
     parents, expected = MOUNTED[name]
     cameras = {camera: (camera.strip(), np.eye(4)) for camera in expected}
-    found = find_mounts(cameras, "velodyne", parents, lambda *_: np.eye(4))
+    links = {child: Link(parent, child, np.eye(4)) for child, parent in parents.items()}
+    found = find_mounts(cameras, "velodyne", links)
     moved = {n: (found[n].parent, found[n].child) if n in found else None for n in expected}
     assert moved == expected

@@ -121,7 +121,7 @@ def test_four_in_a_row_and_no_model_are_a_pinhole_with_a_note(
     assert camera_of(path).model == "pinhole"
     (note,) = read_rig_parts([path]).notes
     assert "four numbers and no key names the lens model" in note
-    assert read_rig_parts([as_yaml(tmp_path, lens(coefficients, model="plumb_bob"))]).notes == []
+    assert read_rig_parts([as_yaml(tmp_path, lens(coefficients, model="plumb_bob"))]).notes == ()
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_four_in_a_row_and_no_model_are_a_pinhole_with_a_note(
 def test_five_coefficients_or_zeros_are_no_question(coefficients: Any, tmp_path: Path) -> None:
     path = as_yaml(tmp_path, lens(coefficients))
     assert camera_of(path).model == "pinhole"
-    assert read_rig_parts([path]).notes == []
+    assert read_rig_parts([path]).notes == ()
 
 
 @pytest.mark.parametrize(
