@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -221,7 +221,7 @@ def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
     for place, one in enumerate(frames):
         near = [i for i in (place - 1, place + 1) if 0 <= i < len(frames)]
         beside = [(frames[i], float(times_s[i] - times_s[place])) for i in near]
-        find = partial(twist_by_scans, one, beside)
+        find = cache(partial(twist_by_scans, one, beside))
         driven.append(replace(one, find_twist=find))
     return tuple(driven)
 
@@ -242,7 +242,7 @@ def _bag_frame(found: BagFrame, start: int, prefix: str, find: MotionOf | None) 
         f"{prefix}{found.stamp_ns}",
         found.cloud,
         found.images,
-        find_motion=None if find is None else partial(find, found),
+        find_motion=None if find is None else cache(partial(find, found)),
     )
 
 
