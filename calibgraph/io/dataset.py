@@ -14,12 +14,11 @@ from typing import TypeVar
 import numpy as np
 
 from calibgraph.errors import DatasetError, FileError
+from calibgraph.io.bag_frames import frames_of_bag
 from calibgraph.io.bags import BagOptions, is_bag
-from calibgraph.io.bags.frames import BagFrame, frames_of_bag
 from calibgraph.io.bags.messages import CLOUDS, Bag
 from calibgraph.io.bags.options import NEAR_S
 from calibgraph.io.bags.rig import doubtful_axes
-from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.clouds import read_cloud_notes
 from calibgraph.io.dataset_folders import (
     FolderFrames,
@@ -228,22 +227,9 @@ def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
 
 def _with_bag(data: Dataset, path: Path, prefix: str, options: BagOptions) -> Dataset:
     """The dataset with the frames of a bag."""
-    start = _next_index(data)
-    found = frames_of_bag(path, data.rig.cameras, options)
-    find = None if options.motion == "none" else motion_finder(path, found.recorded, options)
-    recorded = tuple(_bag_frame(each, start, prefix, find) for each in found.recorded)
+    found = frames_of_bag(path, data.rig.cameras, options, start=_next_index(data), prefix=prefix)
     data = replace(data, notes=(*data.notes, f"{path}: {found.summary}"))
-    return _with(data, tuple(recorded[i] for i in found.picked), recorded)
-
-
-def _bag_frame(found: BagFrame, start: int, prefix: str, find: MotionOf | None) -> Frame:
-    return Frame(
-        start + found.number,
-        f"{prefix}{found.stamp_ns}",
-        found.cloud,
-        found.images,
-        find_motion=None if find is None else cache(partial(find, found)),
-    )
+    return _with(data, tuple(found.recorded[i] for i in found.picked), found.recorded)
 
 
 def _with(data: Dataset, frames: tuple[Frame, ...], recorded: tuple[Frame, ...]) -> Dataset:

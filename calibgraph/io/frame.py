@@ -100,6 +100,12 @@ class Frame:
         return None if self.motion is None else np.array(self.motion.twist_per_s)
 
     @property
+    def stamp_ns(self) -> int | None:
+        """The stamp that names it; None if another name does."""
+        stem = self.name.rpartition("/")[2]
+        return int(stem) if self.cloud_path.suffix == MESSAGE_SUFFIX else stamp_ns_in_name(stem)
+
+    @property
     def T_world_lidar(self) -> Array | None:
         """(4, 4) of the LiDAR in a frame fixed to the ground; None if no poses are given."""
         return None if self.motion is None else self.motion.T_world_lidar
@@ -211,21 +217,15 @@ def twist_by_scans(
     if (speed_m_s := np.linalg.norm(twist[3:])) > _MOST_M_S:
         raise DatasetError(
             f"{frame.cloud_path}: by its neighbours, the LiDAR moves at {speed_m_s:.0f} m/s, more "
-            f"than {_MOST_M_S:g}; give the seconds between clouds as --interval-s"
+            f"than {_MOST_M_S:g}; correct the stamps of the clouds, or --interval-s"
         )
     return twist
 
 
 def seconds_between(one: Frame, other: Frame) -> float | None:
     """How much later another frame was recorded, by the stamps that name both; None without."""
-    first, second = _stamp_ns(one), _stamp_ns(other)
+    first, second = one.stamp_ns, other.stamp_ns
     return None if first is None or second is None else (second - first) / 1e9
-
-
-def _stamp_ns(frame: Frame) -> int | None:
-    """The stamp that names a frame."""
-    stem = frame.name.rpartition("/")[2]
-    return int(stem) if frame.cloud_path.suffix == MESSAGE_SUFFIX else stamp_ns_in_name(stem)
 
 
 def frame_of_entry(entry: Mapping[str, Any]) -> Frame:

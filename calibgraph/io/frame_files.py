@@ -11,10 +11,10 @@ import numpy as np
 
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, is_utf8, require_file
+from calibgraph.io.bags.storage import UNPACK
 from calibgraph.model.rig import Camera, Rig
 
 _PCD = ".pcd"  # NAME.pcd.bin is a cloud of nuScenes
-_PACKED = "is compressed from outside: unpack it first (`{}`)"
 _WAYS_OUT = {
     **dict.fromkeys(
         (".las", ".laz"), "is not read: write it as .ply (`pdal translate {0} {1}.ply`)"
@@ -25,16 +25,12 @@ _WAYS_OUT = {
         "(`ffmpeg -i {0} {1}/%06d.png`)",
     ),
     ".drc": "is not read: write it as .ply (`draco_decoder -i {0} -o {1}.ply`)",
-    ".gz": _PACKED.format("gunzip {0}"),
-    **dict.fromkeys((".zst", ".zstd"), _PACKED.format("unzstd {0}")),
-    ".bz2": _PACKED.format("bunzip2 {0}"),
-    ".xz": _PACKED.format("unxz {0}"),
-    ".lz4": _PACKED.format("unlz4 {0}"),
+    **{suffix: f"is compressed: unpack it first with `{unpack} {{0}}`"
+       for suffix, unpack in UNPACK.items()},
     **dict.fromkeys(
         (".zip", ".7z", ".tar", ".tgz"), "is an archive: unpack it and name its folder"
     ),
-    ".active": "was not closed: mend it with `rosbag reindex {0}` and name it {1}",
-}
+}  # fmt: skip
 """Per suffix that is not read, the way out; {0} is the file's name, {1} that without the suffix."""
 
 

@@ -10,7 +10,7 @@ from calibgraph.errors import CalibrationError, FileError, in_words
 METADATA, REPAIR_ROS2 = "metadata.yaml", "ros2 bag reindex"
 _HEAD_BYTES = 1000
 _SUFFIXES = (".bag", ".mcap", ".db3")
-_UNPACK = {".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz", ".lz4": "unlz4", ".zst": "unzstd",
+UNPACK = {".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz", ".lz4": "unlz4", ".zst": "unzstd",
            ".zstd": "unzstd", ".zip": "unzip", ".7z": "7z x"}  # fmt: skip
 _REPAIR = {".bag": "rosbag reindex", ".mcap": "mcap recover"}
 
@@ -52,8 +52,8 @@ def _refuse_as_it_is(path: Path) -> None:
             "was not closed by the recorder: mend it with `rosbag reindex`, then rename it to "
             f"{path.stem}",
         )
-    if last in _UNPACK:
-        raise FileError(path, f"is compressed: unpack it first with `{_UNPACK[last]} {path.name}`")
+    if last in UNPACK:
+        raise FileError(path, f"is compressed: unpack it first with `{UNPACK[last]} {path.name}`")
 
 
 def require_closed(path: Path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated, Any
 
-from pydantic import AliasChoices, Field
+from pydantic import Field
 
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model, read_text, require_file
@@ -121,10 +121,8 @@ def _message(content: dict[str, Any]) -> dict[str, Any]:
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
-def _list_of(name: str, length: int | None) -> Any:
-    """A list of numbers under its name in ROS 1 or 2."""
-    return Field(validation_alias=AliasChoices(name, name.lower()), min_length=length or 0,
-                 max_length=length)  # fmt: skip
+_Nine = Annotated[list[Finite], Field(min_length=9, max_length=9)]
+_Twelve = Annotated[list[Finite], Field(min_length=12, max_length=12)]
 
 
 class _Header(StrictNumbers):
@@ -143,10 +141,10 @@ class _Message(StrictNumbers):
     height: Size
     width: Size
     distortion_model: str
-    D: Annotated[list[Finite], _list_of("D", None)]
-    K: Annotated[list[Finite], _list_of("K", 9)]
-    R: Annotated[list[Finite], _list_of("R", 9)]
-    P: Annotated[list[Finite], _list_of("P", 12)]
+    d: list[Finite]
+    k: _Nine
+    r: _Nine
+    p: _Twelve
     binning_x: _Count = 0
     binning_y: _Count = 0
     roi: _Window = _Window()
@@ -154,14 +152,13 @@ class _Message(StrictNumbers):
 
 def _is_camera_info(content: dict[str, Any]) -> bool:
     """Whether the content of a file is a CameraInfo message, as ``ros2 topic echo`` prints it."""
-    return {"height", "width", "distortion_model"} <= content.keys() and (
-        {"K", "D", "P"} <= content.keys() or {"k", "d", "p"} <= content.keys()
-    )
+    keys = {str(key).lower() for key in content}  # in capitals: K of ROS 1
+    return {"height", "width", "distortion_model", "k", "d", "p"} <= keys
 
 
 def _read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> RigParts:
     """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame."""
-    message = checked_model(_Message, content, path)
+    message = checked_model(_Message, {str(key).lower(): v for key, v in content.items()}, path)
     stated = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
     camera = name or path.stem
     return RigParts(
