@@ -133,7 +133,7 @@ def match(
 def solve(
     rig: Path = Argument(..., metavar="RIG", help="Rig with the initial guess."),
     correspondences: Path = Argument(
-        ..., metavar="CORRESPONDENCES", help="Table, .parquet or .csv, or a folder of .parquet."
+        ..., metavar="CORRESPONDENCES", help="Table, .parquet or .csv."
     ),
     out: options.ResultFolder = Path("calibration"),
     terms: str | None = Option(
