@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
@@ -85,7 +84,10 @@ def _frames(log: Path, cameras: Sequence[str]) -> list[FrameFiles]:
     sweeps = _stamped(log / _LIDAR, (".feather",))
     stamps = np.array(list(sweeps))
     images = {name: _stamped(log / _CAMERAS / name, IMAGE_SUFFIXES) for name in cameras}
-    nearest = {name: _nearest(stamps, np.array(list(found))) for name, found in images.items()}
+    nearest = {}
+    for name, found in images.items():
+        others = np.array(list(found))
+        nearest[name] = others[np.abs(np.subtract.outer(stamps, others)).argmin(axis=1)]
     frames = [
         FrameFiles(str(stamp), cloud, {n: images[n][int(nearest[n][i])] for n in cameras})
         for i, (stamp, cloud) in enumerate(sweeps.items())
@@ -125,11 +127,3 @@ def _stamped(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
         if not stem.isdecimal() or len(stem) > _MOST_DIGITS:
             raise FileError(path, "its name is no stamp in nanoseconds")
     return {int(stem): found[stem] for stem in sorted(found, key=int)}
-
-
-def _nearest(stamps: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of each stamp, the nearest of the others, which are in order."""
-    after = np.searchsorted(others, stamps).clip(1, max(1, len(others) - 1))
-    before = others[after - 1]
-    after_ns = others[np.minimum(after, len(others) - 1)]
-    return np.asarray(np.where(stamps - before <= after_ns - stamps, before, after_ns))

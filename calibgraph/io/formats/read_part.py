@@ -1,6 +1,5 @@
 """One file of another program, in the format that its name or content shows."""
 
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated, Any
@@ -103,9 +102,12 @@ def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None)
         documents = [content, *(each for each in documents if _message(each) != _message(content))]
     if len(documents) > 1:
         raise FileError(path, f"holds {len(documents)} different YAML documents; keep one of them")
-    for matches, read in _READERS:
-        if matches(content):
-            return read(content, path, name)
+    if _is_camera_info(content):
+        return _read_camera_info(content, path, name)
+    if "format" in content or is_exported_rig(content):
+        return _part_of_rig(path)
+    if is_autoware(content):
+        return read_autoware(content, path)
     found = read_foreign(content, path, name)
     if found is None:
         keys = ", ".join(str(key) for key in list(content)[:5])
@@ -164,17 +166,6 @@ def _read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> 
     return RigParts(
         path, {camera: stated.lens}, frame_ids={camera: stated.frame} if stated.frame else {}
     )
-
-
-def _is_rig(content: dict[str, Any]) -> bool:
-    return "format" in content or is_exported_rig(content)
-
-
-_READERS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[..., RigParts]], ...] = (
-    (_is_camera_info, _read_camera_info),
-    (_is_rig, lambda _, path, __: _part_of_rig(path)),
-    (is_autoware, lambda content, path, _: read_autoware(content, path)),
-)
 
 
 def _part_of_rig(path: Path) -> RigParts:
