@@ -56,6 +56,8 @@ def topics_by_name(topics: Iterable[Topic]) -> dict[str, Topic]:
 
 
 Buffer = bytes | memoryview
+Recorded = Iterator[tuple[str, int, bytes]]
+"""Topic, time of recording [ns] and bytes of messages."""
 
 _ALWAYS, _RATIO, _MOST = 2**26, 50, 2**30
 """Of one part: a black image of 20 MP is 60 MB and packs to nothing; other data of sensors shrink
@@ -143,10 +145,8 @@ class Db3File:
             self.close()
             raise
 
-    def messages(
-        self, topics: Collection[str], start_ns: int, stop_ns: int
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+    def messages(self, topics: Collection[str], start_ns: int, stop_ns: int) -> Recorded:
+        """The messages of some topics, by time."""
         query = _MESSAGES.format(", ".join("?" * len(topics)))
         yield from self._database.execute(query, [*topics, start_ns, stop_ns])
 
@@ -214,10 +214,8 @@ class McapFile:
             for number, each in found.channels.items()
         )
 
-    def messages(
-        self, topics: Collection[str], start_ns: int, stop_ns: int
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+    def messages(self, topics: Collection[str], start_ns: int, stop_ns: int) -> Recorded:
+        """The messages of some topics, by time."""
         chosen = {number: topic for number, topic in self._channels.items() if topic in topics}
         waiting: list[tuple[int, int, str, bytes]] = []
         number = count()
@@ -296,10 +294,8 @@ class Ros1File:
             for each in self._reader.connections
         )
 
-    def messages(
-        self, topics: Collection[str], start_ns: int, stop_ns: int
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+    def messages(self, topics: Collection[str], start_ns: int, stop_ns: int) -> Recorded:
+        """The messages of some topics, by time."""
         chosen = [each for each in self._reader.connections if each.topic in topics]
         if chosen:  # the library takes none for all
             part = copy(self._reader)
@@ -334,10 +330,8 @@ class BagFolder:
             self.topics = topics_by_name(t for part in self._parts for t in part.topics.values())
             self.close = opened.pop_all().close
 
-    def messages(
-        self, topics: Collection[str], start_ns: int, stop_ns: int
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+    def messages(self, topics: Collection[str], start_ns: int, stop_ns: int) -> Recorded:
+        """The messages of some topics, by time."""
         parts = (part.messages(topics, start_ns, stop_ns) for part in self._parts)
         for topic, record_ns, data in merge(*parts, key=itemgetter(1)):
             yield topic, record_ns, bytes(unpack(self._folder, self._compression, data))

@@ -24,9 +24,9 @@ from calibgraph import (
     load_dataset,
     load_rig,
 )
+from calibgraph.io.bags.pictures import image_from_message
 from calibgraph.io.bags.rig import read_bag_rig, rig_of_bag
 from calibgraph.io.frame import hash_source
-from calibgraph.io.ros_messages import image_from_message
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
     KINDS,
