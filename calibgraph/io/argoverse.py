@@ -4,7 +4,7 @@ Its clouds are of two LiDARs, in the frame of the vehicle (egovehicle), correcte
 images are undistorted.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,12 +71,12 @@ def _camera(log: Path, name: str) -> Camera:
 
 def _row(path: Path, name: str, columns: Sequence[str]) -> dict[str, Any]:
     """The row of a sensor in a table."""
-    table = read_feather(path, ("sensor_name", *columns))
-    names = [*map(str, table["sensor_name"])]
+    column = read_feather(path)[1]
+    names, table = [*map(str, column("sensor_name"))], {key: column(key) for key in columns}
     if name not in names:
         found = ", ".join(names) or "none"
         raise IncompleteCamera(path, f"has no row of {name!r}; found {found}")
-    return {column: table[column][names.index(name)].item() for column in columns}
+    return {key: values[names.index(name)].item() for key, values in table.items()}
 
 
 def _frames(log: Path, cameras: Sequence[str]) -> list[FrameFiles]:
@@ -105,17 +105,18 @@ def _motion(log: Path, cameras: Sequence[str]) -> str:
     """How far the vehicle moves between sweeps and images; empty without a trajectory."""
     if not (log / _TRAJECTORY).is_file():
         return ""
-    table = read_feather(log / _TRAJECTORY, ("timestamp_ns", *_PLACE))
-    start, order = int(table["timestamp_ns"].min()), np.argsort(table["timestamp_ns"])
-    times_s = (table["timestamp_ns"][order].astype(np.int64) - start) * 1e-9
+    column = read_feather(log / _TRAJECTORY)[1]
+    stamps_ns = column("timestamp_ns").astype(np.int64)
+    start, order = int(stamps_ns.min()), np.argsort(stamps_ns)
+    times_s, places = (stamps_ns[order] - start) * 1e-9, [column(axis)[order] for axis in _PLACE]
 
-    def place(stamps_ns: Sequence[int]) -> Array:
-        at_s = [(stamp - start) * 1e-9 for stamp in stamps_ns]
-        return np.stack([np.interp(at_s, times_s, table[axis][order]) for axis in _PLACE], axis=-1)
+    def place(stems: Iterable[str]) -> Array:
+        at_s = [(int(stem) - start) * 1e-9 for stem in stems]
+        return np.stack([np.interp(at_s, times_s, along) for along in places], axis=-1)
 
     frames = _frames(log, cameras)
-    scans = place([int(frame.stem) for frame in frames])
-    taken = (place([int(frame.images[name].stem) for frame in frames]) for name in cameras)
+    scans = place(frame.stem for frame in frames)
+    taken = (place(frame.images[name].stem for frame in frames) for name in cameras)
     moved_m = np.max([np.linalg.norm(images - scans, axis=1) for images in taken], axis=0)
     return describe_motion(log, moved_m.tolist())
 

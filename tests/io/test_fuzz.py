@@ -103,7 +103,7 @@ ORIGINALS = {"clouds": clouds, "tables": tables, "bags": bags}
 READERS: dict[str, Callable[[Path], object]] = {
     "table.parquet": load_correspondences,
     "matches.parquet": load_camera_matches,
-    "sweep.feather": lambda path: read_feather(path, ("x", "y", "z")),
+    "sweep.feather": lambda path: [*map(read_feather(path)[1], "xyz")],
 }
 
 
