@@ -19,8 +19,8 @@ def read_feather(path: Path) -> tuple[list[str], Callable[[str], NDArray[Any]]]:
     """The names of a file's columns, and a function that returns one as an array."""
     from pyarrow import feather
 
-    _require_plausible_size(require_file(path))
     with arrow_reads(path):
+        _require_plausible_size(require_file(path))
         table = feather.read_table(path, memory_map=False)
         table.validate(full=True)  # Arrow believes offsets and lengths, and would read elsewhere
 

@@ -81,15 +81,16 @@ def rig_of_bag(
 
 def tied_rig(parts: RigParts, sigmas: tuple[float, float] | None) -> Rig:
     """The rig of a bag; with sigmas, the poses of cameras in the first are measurements of it."""
-    if sigmas is None:
-        return parts.to_rig()
-    if parts.why_untied:
+    if sigmas is not None and parts.why_untied:
         raise DatasetError(
             f"{parts.path}: {parts.why_untied}, so their relative pose is not known and cannot be "
             "taken as measured; leave out --tie-deg and --tie-m, or write relative_poses into the "
             "rig file"
         )
-    first, *others = parts.T_camera_lidar.items()
+    rig = parts.to_rig()
+    if sigmas is None:
+        return rig
+    first, *others = rig.T_camera_lidar.items()
     pairs = (RelativeCamera(first[0], name, relative_transform(first[1], T), *sigmas)
              for name, T in others)  # fmt: skip
     return replace(parts, relative_poses=tuple(pairs)).to_rig()

@@ -27,8 +27,9 @@ def read_matrix(path: Path, name: str | None) -> RigParts | None:
     M = _array(path) if path.suffix.lower() == ".npy" else _text(path)
     if M is None:
         return None
+    rows = [*M.reshape(-1, 4), [0.0, 0.0, 0.0, 1.0]]
     try:
-        T = rigid_transform(np.vstack([M.ravel()[:12].reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]))
+        T = rigid_transform(np.array(rows[:4]))
     except ValueError as error:
         raise FileError(path, f"the matrix: {error}") from error
     to_lidar, to_camera = (bool(each.search(path.stem)) for each in (_TO_LIDAR, _TO_CAMERA))
@@ -48,11 +49,12 @@ def _array(path: Path) -> Array:
 
 
 def _text(path: Path) -> Array | None:
-    lines = NumberLines(path)
-    if "R" in lines and "T" in lines:
+    text = read_text(path)
+    if re.search(r"^R:", text, re.MULTILINE) and re.search(r"^T:", text, re.MULTILINE):
+        lines = NumberLines(path)
         return np.hstack([lines.array("R", 3, 3), lines.array("T", 3, 1)])
     try:
-        numbers = [float(word) for word in read_text(path).replace(",", " ").split()]
+        numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         return None
     return np.array(numbers) if len(numbers) in _SIZES else None
