@@ -1,6 +1,5 @@
 """Documents of the text formats: YAML, JSON and XML, read as mappings, written below comments."""
 
-import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -41,12 +40,6 @@ def commented(lines: Iterable[str]) -> str:
 def commented_yaml(statement: Iterable[str], content: dict[str, Any]) -> str:
     """YAML below its statement of direction."""
     return commented(statement) + yaml_text(content)
-
-
-def stated_json(statement: Iterable[str], content: dict[str, Any]) -> str:
-    """JSON, which has no comments, with the statement of direction under its first key."""
-    stated = {"calibgraph_export": list(statement), **content}
-    return json.dumps(stated, indent=2, allow_nan=False) + "\n"
 
 
 def commented_xml(statement: Iterable[str], root: ElementTree.Element) -> str:
