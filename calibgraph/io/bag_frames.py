@@ -1,9 +1,10 @@
 """The frames of a bag: each cloud with the image of every camera that is nearest by stamp."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,22 +33,21 @@ _S = 1_000_000_000
 Rows = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class BagFrames:
-    """The frames of a bag.
+class FoundFrames(NamedTuple):
+    """The frames of a bag or folder.
 
     Attributes:
+        chosen: those that ``every_s`` picks; all without it.
         recorded: all that were read and are complete, in the order of recording. Their index counts
             the clouds that were read, and goes on by one more wherever others were not: the frames
             before and after in the recording have the numbers before and after.
-        picked: positions of those that ``every_s`` picks; of all without it.
-        summary: in one line, how many there are, how far apart their stamps are, and how many
-            messages were left out, and why.
+        notes: how many there are, how far apart their stamps are, and how many messages were left
+            out, and why.
     """
 
+    chosen: tuple[Frame, ...]
     recorded: tuple[Frame, ...]
-    picked: tuple[int, ...]
-    summary: str
+    notes: tuple[str, ...]
 
 
 def frames_of_bag(
@@ -57,7 +57,7 @@ def frames_of_bag(
     *,
     start: int = 0,
     prefix: str = "",
-) -> BagFrames:
+) -> FoundFrames:
     """Pair the clouds of a bag with its images, without keeping any of them.
 
     Args:
@@ -102,10 +102,11 @@ def frames_of_bag(
             replace(frame, find_motion=cache(partial(find, frame, float(s))))
             for frame, s in zip(recorded, to_s, strict=True)
         )
-    of_cells = (np.flatnonzero(cells == cell) for cell in range(len(set(cells))))
-    picked = (int(rows[len(rows) // 2]) for rows in of_cells)  # in the middle: with neighbours
-    chosen = tuple(picked) if options.every_s else tuple(range(len(recorded)))
-    return BagFrames(recorded, chosen, summary + _note(clouds, options.motion))
+    chosen = recorded
+    if options.every_s:
+        of_cells = (np.flatnonzero(cells == cell) for cell in range(len(set(cells))))
+        chosen = tuple(recorded[rows[len(rows) // 2]] for rows in of_cells)  # with neighbours
+    return FoundFrames(chosen, recorded, (f"{path}: {summary}{_note(clouds, options.motion)}",))
 
 
 def _read(
