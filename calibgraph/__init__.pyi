@@ -31,7 +31,10 @@ from .guessing.guess import RigGuess as RigGuess
 from .guessing.guess import guess_rig as guess_rig
 from .guessing.template import write_rig_template as write_rig_template
 from .io.arrays import dataset_from_arrays as dataset_from_arrays
+from .io.bags.camera_info import camera_from_message as camera_from_message
 from .io.bags.options import BagOptions as BagOptions
+from .io.bags.pictures import image_from_message as image_from_message
+from .io.bags.point_clouds import cloud_from_message as cloud_from_message
 from .io.bags.rig import rig_of_bag as rig_of_bag
 from .io.calibrations import load_calibration as load_calibration
 from .io.camera_match_tables import load_camera_matches as load_camera_matches
@@ -43,9 +46,6 @@ from .io.formats.export import export_calibration as export_calibration
 from .io.formats.rig_import import import_rig as import_rig
 from .io.frame import Frame as Frame
 from .io.rigs import load_rig as load_rig
-from .io.ros_messages import camera_from_message as camera_from_message
-from .io.ros_messages import cloud_from_message as cloud_from_message
-from .io.ros_messages import image_from_message as image_from_message
 from .matching.camera_pairs import match_cameras as match_cameras
 from .matching.camera_pairs import with_surfaces as with_surfaces
 from .matching.protocol import Matcher as Matcher

@@ -114,9 +114,8 @@ def solve(
 
     Args:
         rig: cameras with their initial guess, and independently known relative poses.
-        table: correspondences, their points in the LiDAR frame; or their file, or a folder of
-            Parquet files, which may be larger than memory: only what the preprocessing keeps is
-            held.
+        table: correspondences, their points in the LiDAR frame; or their file, which
+            may be larger than memory: only what the preprocessing keeps is held.
         config: settings; the preset ``auto`` if None.
         terms: ``full``; ``reprojection`` (lambda = mu = 0); ``priors`` (no reprojection term);
             ``stage1`` (the aggregated per-frame PnP). The rig's ``relative_poses`` are

@@ -171,21 +171,6 @@ def test_the_checks_of_a_solution_are_those_of_its_table(guess: Rig, truth: Rig)
     assert again.verdict == first.verdict
 
 
-def test_a_folder_of_tables_is_solved_as_one(guess: Rig, truth: Rig, tmp_path: Path) -> None:
-    """Files of whole frames or of parts of them, each of which names its own places."""
-    table = table_of(truth)
-    whole = table.with_places(Places(places=((0, 1), (2, 3), (4, 5))))
-    (tmp_path / "parts").mkdir()
-    for number in range(3):
-        frames = [2 * number, 2 * number + 1]
-        part = table.select(np.isin(table.frame, frames))
-        part = part.with_places(Places(places=(tuple(frames),)))
-        part.save(tmp_path / "parts" / f"{number}.parquet")
-    found = calibgraph.solve(guess, tmp_path / "parts")
-    require_same(calibgraph.solve(guess, whole), found)
-    assert found.counts["left"]["places"] == 3
-
-
 def test_the_commands_solve_what_calibrate_saved(
     guess: Rig, truth: Rig, recordings: Sequence[Path], tmp_path: Path, call: Call
 ) -> None:

@@ -133,7 +133,7 @@ def match(
 def solve(
     rig: Path = Argument(..., metavar="RIG", help="Rig with the initial guess."),
     correspondences: Path = Argument(
-        ..., metavar="CORRESPONDENCES", help="Table, .parquet or .csv, or a folder of .parquet."
+        ..., metavar="CORRESPONDENCES", help="Table, .parquet or .csv."
     ),
     out: options.ResultFolder = Path("calibration"),
     terms: str | None = Option(
@@ -158,7 +158,6 @@ def solve(
     from calibgraph.cli.settings import read_settings
     from calibgraph.files import sha256
     from calibgraph.io.camera_match_tables import load_camera_matches
-    from calibgraph.io.correspondence_tables import table_files
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.result_files import require_result_folder
     from calibgraph.pipeline import solve
@@ -176,8 +175,7 @@ def solve(
     with progress_bar("solving"), checked_arguments():
         seen = None if camera_matches is None else load_camera_matches(camera_matches)
         result = solve(load_rig(rig), correspondences, settings, rare.terms, camera_matches=seen)
-        result = result.with_inputs({str(path): sha256(path)
-                                     for path in table_files(correspondences)})  # fmt: skip
+        result = result.with_inputs({str(correspondences): sha256(correspondences)})
         result = _warned_of_same_data(result, rig)
         written = write_result(result, out)
     if print_graph:

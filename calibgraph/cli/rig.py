@@ -20,7 +20,7 @@ from calibgraph.io.formats.names import IMPORT_FORMATS
 
 if TYPE_CHECKING:
     from calibgraph.guessing.guess import RigGuess
-    from calibgraph.io.formats.rig_import import RigParts
+    from calibgraph.io.rig_parts import RigParts
     from calibgraph.model.rig import Rig
 
 _SEARCH = "search"
@@ -215,7 +215,7 @@ def _rig_of_files(
 ) -> tuple[Rig, RigGuess | None]:
     """The rig, and how good its guess is, where cameras are described or searched for."""
     from calibgraph.guessing.guess import guess_rig
-    from calibgraph.io.formats.rig_import import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
+    from calibgraph.io.rig_parts import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
 
     tie_deg, tie_m = sigmas or (RELATIVE_SIGMA_DEG, RELATIVE_SIGMA_CM / 100.0)
     if not mountings and not dataset:
@@ -244,11 +244,11 @@ def _rig_of_bags(
     from math import radians
 
     from calibgraph.io.bags.messages import Bag
-    from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
+    from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig, tied_rig
 
     topics = sorted(Bag(paths[0]).topics.values(), key=lambda each: each.name)
     read = read_bag_rig(paths[0], bag_options_from(topic, beside=tuple(paths[1:]) or None))
-    made = read.to_rig(None if sigmas is None else (radians(sigmas[0]), sigmas[1]))
+    made = tied_rig(read, None if sigmas is None else (radians(sigmas[0]), sigmas[1]))
     listed = [{"topic": each.name, "type": each.type, "messages": each.count} for each in topics]
     return made, [*doubtful_axes(made), *read.notes], listed
 

@@ -15,7 +15,8 @@ from calibgraph.guessing.heading_search import FoundCamera, search_headings
 from calibgraph.guessing.mounting import GRAMMAR, Mounting, check_forward, parse_mounting
 from calibgraph.io.dataset import load_dataset
 from calibgraph.io.formats.describe import describe_rig
-from calibgraph.io.formats.rig_import import RigParts, read_rig_parts
+from calibgraph.io.formats.rig_import import read_rig_parts
+from calibgraph.io.rig_parts import RigParts
 from calibgraph.matching.burnt_in import hide_burnt_in
 from calibgraph.matching.same_images import require_different_images
 from calibgraph.matching.structure.matcher import MAX_SEARCH_DEG, MAX_SEARCH_M
@@ -175,7 +176,7 @@ def _tied_cameras(
     """
     tied: dict[str, tuple[str, Array]] = {}
     for to, T in said.items():
-        for name, T_camera_lidar in parts.tied_to(to, T).items():
+        for name, T_camera_lidar in parts.tied_to({to: T}).items():
             if name in names and name not in tied:
                 tied[name] = to, T_camera_lidar
     return tied

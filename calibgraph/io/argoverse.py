@@ -4,12 +4,11 @@ Its clouds are of two LiDARs, in the frame of the vehicle (egovehicle), correcte
 images are undistorted.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
@@ -72,12 +71,12 @@ def _camera(log: Path, name: str) -> Camera:
 
 def _row(path: Path, name: str, columns: Sequence[str]) -> dict[str, Any]:
     """The row of a sensor in a table."""
-    table = read_feather(path, ("sensor_name", *columns))
-    names = [*map(str, table["sensor_name"])]
+    column = read_feather(path)[1]
+    names, table = [*map(str, column("sensor_name"))], {key: column(key) for key in columns}
     if name not in names:
         found = ", ".join(names) or "none"
         raise IncompleteCamera(path, f"has no row of {name!r}; found {found}")
-    return {column: table[column][names.index(name)].item() for column in columns}
+    return {key: values[names.index(name)].item() for key, values in table.items()}
 
 
 def _frames(log: Path, cameras: Sequence[str]) -> list[FrameFiles]:
@@ -85,7 +84,10 @@ def _frames(log: Path, cameras: Sequence[str]) -> list[FrameFiles]:
     sweeps = _stamped(log / _LIDAR, (".feather",))
     stamps = np.array(list(sweeps))
     images = {name: _stamped(log / _CAMERAS / name, IMAGE_SUFFIXES) for name in cameras}
-    nearest = {name: _nearest(stamps, np.array(list(found))) for name, found in images.items()}
+    nearest = {}
+    for name, found in images.items():
+        others = np.array(list(found))
+        nearest[name] = others[np.abs(np.subtract.outer(stamps, others)).argmin(axis=1)]
     frames = [
         FrameFiles(str(stamp), cloud, {n: images[n][int(nearest[n][i])] for n in cameras})
         for i, (stamp, cloud) in enumerate(sweeps.items())
@@ -103,17 +105,18 @@ def _motion(log: Path, cameras: Sequence[str]) -> str:
     """How far the vehicle moves between sweeps and images; empty without a trajectory."""
     if not (log / _TRAJECTORY).is_file():
         return ""
-    table = read_feather(log / _TRAJECTORY, ("timestamp_ns", *_PLACE))
-    start, order = int(table["timestamp_ns"].min()), np.argsort(table["timestamp_ns"])
-    times_s = (table["timestamp_ns"][order].astype(np.int64) - start) * 1e-9
+    column = read_feather(log / _TRAJECTORY)[1]
+    stamps_ns = column("timestamp_ns").astype(np.int64)
+    start, order = int(stamps_ns.min()), np.argsort(stamps_ns)
+    times_s, places = (stamps_ns[order] - start) * 1e-9, [column(axis)[order] for axis in _PLACE]
 
-    def place(stamps_ns: Sequence[int]) -> Array:
-        at_s = [(stamp - start) * 1e-9 for stamp in stamps_ns]
-        return np.stack([np.interp(at_s, times_s, table[axis][order]) for axis in _PLACE], axis=-1)
+    def place(stems: Iterable[str]) -> Array:
+        at_s = [(int(stem) - start) * 1e-9 for stem in stems]
+        return np.stack([np.interp(at_s, times_s, along) for along in places], axis=-1)
 
     frames = _frames(log, cameras)
-    scans = place([int(frame.stem) for frame in frames])
-    taken = (place([int(frame.images[name].stem) for frame in frames]) for name in cameras)
+    scans = place(frame.stem for frame in frames)
+    taken = (place(frame.images[name].stem for frame in frames) for name in cameras)
     moved_m = np.max([np.linalg.norm(images - scans, axis=1) for images in taken], axis=0)
     return describe_motion(log, moved_m.tolist())
 
@@ -125,11 +128,3 @@ def _stamped(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
         if not stem.isdecimal() or len(stem) > _MOST_DIGITS:
             raise FileError(path, "its name is no stamp in nanoseconds")
     return {int(stem): found[stem] for stem in sorted(found, key=int)}
-
-
-def _nearest(stamps: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of each stamp, the nearest of the others, which are in order."""
-    after = np.searchsorted(others, stamps).clip(1, max(1, len(others) - 1))
-    before = others[after - 1]
-    after_ns = others[np.minimum(after, len(others) - 1)]
-    return np.asarray(np.where(stamps - before <= after_ns - stamps, before, after_ns))

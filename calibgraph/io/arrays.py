@@ -1,9 +1,7 @@
 """Datasets of arrays: images and clouds of a program that has them in memory, without files."""
 
-import hashlib
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,6 @@ from calibgraph.io.clouds import (
     check_points,
     cloud_of_array,
     describe_cloud,
-    thin_cloud,
     with_intensity,
 )
 from calibgraph.io.dataset import Dataset
@@ -25,33 +22,6 @@ from calibgraph.io.point_fields import RawCloud
 from calibgraph.model.rig import Camera, Rig
 
 _COLOURS = (3, 4)  # channels
-
-
-@dataclass(frozen=True, eq=False)
-class ArrayFrame(Frame):
-    """A frame in memory; its paths are names."""
-
-    cloud: NDArray[np.float32]
-    images: Mapping[str, NDArray[np.uint8]]
-    twist: NDArray[np.float64] | None = None
-
-    @property
-    def twist_per_s(self) -> NDArray[np.float64] | None:
-        """(6,) of the LiDAR, if it is given."""
-        return self.twist
-
-    def load_cloud(self) -> NDArray[np.float32]:
-        """(n, 4) x y z [m], intensity; thinned."""
-        return thin_cloud(self.cloud)
-
-    def _decode_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
-        return self.images[name]
-
-    def hashes(self) -> dict[str, str]:
-        """SHA-256 of the cloud and the images, by their names."""
-        arrays: dict[Path, NDArray[Any]] = {self.cloud_path: self.cloud}
-        arrays |= {self.image_paths[name]: image for name, image in self.images.items()}
-        return {str(path): hashlib.sha256(a.tobytes()).hexdigest() for path, a in arrays.items()}
 
 
 def dataset_from_arrays(
@@ -96,10 +66,7 @@ def dataset_from_arrays(
     return Dataset(
         rig=rig,
         frames=tuple(
-            replace(
-                _frame(root, number, rig, clouds=clouds, images=images),
-                twist=None if twists is None else twists[number],
-            )
+            _frame(root, number, rig, clouds=clouds, images=images, twists=twists)
             for number in range(frames)
         ),
         folders=(root,),
@@ -125,19 +92,19 @@ def _frame(
     *,
     clouds: Sequence[ArrayLike],
     images: Mapping[str, Sequence[ArrayLike]],
-) -> ArrayFrame:
+    twists: NDArray[np.float64] | None,
+) -> Frame:
     name = f"{number:06d}"
-    return ArrayFrame(
-        index=number,
-        name=name,
-        cloud_path=root / "lidar" / name,
-        image_paths={camera: root / camera / name for camera in images},
-        cloud=with_intensity(_cloud(clouds[number], number).points),
-        images={
-            camera: _image(images[camera][number], rig.cameras[camera], camera, number)
-            for camera in rig.cameras
-        },
-    )
+    cloud_path, paths = root / "lidar" / name, {camera: root / camera / name for camera in images}
+    arrays: dict[Path, NDArray[Any]] = {
+        cloud_path: with_intensity(_cloud(clouds[number], number).points)
+    }
+    arrays |= {
+        paths[camera]: _image(images[camera][number], lens, camera, number)
+        for camera, lens in rig.cameras.items()
+    }
+    twist = None if twists is None else twists[number]
+    return Frame(number, name, cloud_path, paths, twist=twist, arrays=arrays)
 
 
 def _cloud(cloud: ArrayLike, number: int) -> RawCloud:

@@ -37,9 +37,6 @@ _MEASURED = (
 )  # fmt: skip
 _ROUNDING = 1e-6  # of correlations: other programs may write fewer digits
 
-_FORMER = {"walk_time_offset_s", "relative_prior_pairs", "aggregate"}
-"""Settings of earlier versions."""
-
 
 def load_calibration(path: Path | str) -> Calibration:
     """Read a result, from its folder or its file, with the correspondences beside it.
@@ -61,7 +58,7 @@ def load_calibration(path: Path | str) -> Calibration:
     found = Calibration(
         rig=checked_model(Rig, parts.rig, path),
         initial_rig=checked_model(Rig, parts.initial_rig, path),
-        config=checked_model(Config, _without_former(parts.config), path),
+        config=checked_model(Config, parts.config, path),
         camera_verdicts={
             k: Verdict(v.checks, v.error_probability) for k, v in parts.camera_verdicts.items()
         },
@@ -307,14 +304,6 @@ def error_bars(path: Path) -> dict[str, Array | None] | None:
         name: covariance if found.error_bar_holds.get(name) else None
         for name, covariance in found.covariance.items()
     }
-
-
-def _without_former(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings without those that only earlier versions had."""
-    kept = {key: value for key, value in settings.items() if key not in _FORMER}
-    kept["tracking"] = {k: v for k, v in kept.get("tracking", {}).items() if k not in _FORMER}
-    kept["estimate"] = [part for part in kept.get("estimate", ()) if part != "aspect"]
-    return kept
 
 
 def _require_whole(content: Mapping[str, Any], path: Path) -> None:

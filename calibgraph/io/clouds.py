@@ -16,11 +16,11 @@ from calibgraph.files import require_file
 from calibgraph.io.bags import MESSAGE_SUFFIX, load_bag_cloud
 from calibgraph.io.bags.messages import read_message
 from calibgraph.io.bin_columns import read_bin
-from calibgraph.io.feather import feather_columns, read_feather
+from calibgraph.io.feather import read_feather
 from calibgraph.io.motion import ScanMotion
 from calibgraph.io.pcd import read_pcd
 from calibgraph.io.ply import read_ply
-from calibgraph.io.point_fields import RawCloud, choose_fields, make_cloud, raw_cloud
+from calibgraph.io.point_fields import RawCloud, make_cloud, raw_cloud
 from calibgraph.model.correspondences import MAX_COORDINATE
 
 MAX_CLOUD_BYTES = 2 * 2**30
@@ -200,8 +200,7 @@ def cloud_of_array(array: NDArray[Any], path: Path | str) -> RawCloud:
 
 def _read_sweep(path: Path) -> RawCloud:
     """Of Argoverse 2."""
-    names = feather_columns(path)
-    return raw_cloud(path, names, read_feather(path, choose_fields(path, names)).__getitem__)
+    return raw_cloud(path, *read_feather(path))
 
 
 _READERS: dict[str, Callable[[Path], RawCloud]] = {

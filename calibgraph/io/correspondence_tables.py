@@ -24,7 +24,6 @@ from calibgraph.model.correspondences import (
     as_confidence,
     check_schema,
 )
-from calibgraph.model.places import Places
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -52,55 +51,23 @@ def load_correspondences(path: Path | str) -> Correspondences:
         raise FileError(path, str(error)) from error
 
 
-def table_files(table: Path) -> list[Path]:
-    """The files of a table: itself, or the Parquet files of a folder, by name."""
-    if not table.is_dir():
-        return [require_file(table)]
-    paths = sorted(table.rglob("*.parquet"))
-    if not paths:
-        raise FileError(table, "holds no .parquet file; write the correspondences into some")
-    return paths
-
-
-def parts_of_table(table: Path) -> Iterator[Correspondences]:
+def parts_of_table(path: Path) -> Iterator[Correspondences]:
     """A table in parts, in order: of Parquet some rows at a time; a CSV file whole.
 
-    Of Parquet the bytes of one row group are in memory: about a million rows, by most writers. The
-    metadata comes from the first file of a folder, with the places that any of its files names.
+    Of Parquet the bytes of one row group are in memory: about a million rows, by most writers.
 
     Raises:
         FileError: as of :func:`load_correspondences`, once the wrong part is reached; rows are
             counted from the beginning of the file.
     """
-    paths = table_files(table)
-    places = _merged_places(paths) if len(paths) > 1 else None
-    for path in paths:
-        for part in _parts_of_file(path):
-            yield part if places is None else part.with_places(places)
-
-
-def _parts_of_file(path: Path) -> Iterator[Correspondences]:
     rows = 0
-    for part in _arrow_parts(path):
+    for part in _arrow_parts(require_file(path)):
         try:
             yield from_arrow(part)
         except CorrespondenceError as error:
             raise FileError(path, str(error.after(rows))) from error
         rows += len(part)
     require_rows(path, rows)
-
-
-def _merged_places(paths: Sequence[Path]) -> Places:
-    """The places that any of the files names."""
-    merged = Places()
-    for path in paths:
-        with arrow_reads(path), open_parquet(path) as file:
-            metadata = _metadata_of(file.schema_arrow)
-        try:
-            merged = merged.merge(Places.from_metadata(metadata))
-        except CorrespondenceError as error:
-            raise FileError(path, str(error)) from error
-    return merged
 
 
 def _metadata_of(schema: pa.Schema) -> Any:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from shlex import quote
 from typing import TypeVar
@@ -15,13 +15,12 @@ from typing import TypeVar
 import numpy as np
 
 from calibgraph.errors import DatasetError, FileError
+from calibgraph.io.bag_frames import FoundFrames, frames_of_bag
 from calibgraph.io.bags import BagOptions, is_bag
-from calibgraph.io.bags.frames import BagFrame, frames_of_bag
 from calibgraph.io.bags.messages import CLOUDS, Bag
 from calibgraph.io.bags.options import NEAR_S
 from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.storage import REPAIR_ROS2
-from calibgraph.io.bags.trajectory import MotionOf, motion_finder
 from calibgraph.io.clouds import read_cloud_notes
 from calibgraph.io.dataset_folders import (
     FolderFrames,
@@ -136,22 +135,34 @@ def load_dataset(
     bag = replace(bag or BagOptions(), beside=tuple(path for path in paths if is_bag(path)))
     bare = {path for path in bag.beside if len(paths) > 1 and not Bag(path).of_type(*CLOUDS)}
     data = _without_frames(tuple(path for path in paths if path not in bare) or paths, rig, bag)
-    notes = (f"{path}: has no clouds; it serves the other bags" for path in sorted(bare))
-    data = replace(data, notes=(*data.notes, *notes))
+    notes = [*data.notes, *(f"{path}: has no clouds; it serves the other bags"
+                            for path in sorted(bare))]  # fmt: skip
+    chosen, recorded = list[Frame](), list[Frame]()
     for path in data.folders:
         prefix = f"{path.name}/" if len(data.folders) > 1 else ""
-        if is_bag(path):
-            data = _with_bag(data, path, prefix, bag)
-        else:
-            found = frames_of_folder(
+        start = 1 + max((frame.index for frame in recorded), default=-1)
+        found = (
+            frames_of_bag(path, data.rig.cameras, bag, start=start, prefix=prefix)
+            if is_bag(path)
+            else _frames_of_files(
                 path,
-                list(data.rig.cameras),
-                complete=frames is None,
-                sync_tolerance_s=bag.sync_tolerance_s,
+                frames_of_folder(
+                    path,
+                    list(data.rig.cameras),
+                    complete=frames is None,
+                    sync_tolerance_s=bag.sync_tolerance_s,
+                ),
+                data.rig,
+                start=start,
+                prefix=prefix,
+                interval_s=interval_s,
             )
-            data = _with_folder(data, path, prefix, found, interval_s=interval_s)
-    if data.recorded == data.frames:
-        data = replace(data, recorded=())
+        )
+        chosen += found.chosen
+        recorded += found.recorded
+        notes += found.notes
+    others = () if recorded == chosen else tuple(recorded)
+    data = replace(data, frames=tuple(chosen), recorded=others, notes=tuple(notes))
     data = data if frames is None else _complete(data.select(frames))
     of_clouds = (
         note for each in data.frames[:1] for note in read_cloud_notes(each.cloud_path, each.columns)
@@ -183,30 +194,31 @@ def _require_memory(path: Path, rig: Rig) -> None:
         )
 
 
-def _with_folder(
-    data: Dataset, path: Path, prefix: str, of_folder: FolderFrames, *, interval_s: float | None
-) -> Dataset:
-    """The dataset with the frames of a folder; of complete ones where names are stamps."""
-    start, cameras = _next_index(data), data.rig.cameras.keys()
-    found = tuple(
+def _frames_of_files(
+    path: Path,
+    found: FolderFrames,
+    rig: Rig,
+    *,
+    start: int,
+    prefix: str,
+    interval_s: float | None,
+) -> FoundFrames:
+    """The frames of a folder; the complete ones where names are stamps."""
+    frames = tuple(
         Frame(
             start + number,
             prefix + files.stem,
             files.cloud,
             files.images,
-            columns=data.rig.cloud_columns,
+            columns=rig.cloud_columns,
         )
-        for number, files in enumerate(of_folder.files)
-        if not of_folder.pairing or cameras <= files.images.keys()
+        for number, files in enumerate(found.files)
+        if not found.pairing or rig.cameras.keys() <= files.images.keys()
     )
-    if of_folder.pairing:
-        data = replace(data, notes=(*data.notes, of_folder.pairing))
-    if interval_s is not None:
-        found = _driven(found, interval_s)
+    frames = frames if interval_s is None else _driven(frames, interval_s)
     published = published_folder(path)
-    if published is not None and (note := published.note()):
-        data = replace(data, notes=(*data.notes, note))
-    return _with(data, found, found)
+    notes = (found.pairing, published.note() if published else "")
+    return FoundFrames(frames, frames, tuple(note for note in notes if note))
 
 
 def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
@@ -223,37 +235,9 @@ def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
     for place, one in enumerate(frames):
         near = [i for i in (place - 1, place + 1) if 0 <= i < len(frames)]
         beside = [(frames[i], float(times_s[i] - times_s[place])) for i in near]
-        find = partial(twist_by_scans, one, beside)
+        find = cache(partial(twist_by_scans, one, beside))
         driven.append(replace(one, find_twist=find))
     return tuple(driven)
-
-
-def _with_bag(data: Dataset, path: Path, prefix: str, options: BagOptions) -> Dataset:
-    """The dataset with the frames of a bag."""
-    start = _next_index(data)
-    found = frames_of_bag(path, data.rig.cameras, options)
-    find = None if options.motion == "none" else motion_finder(path, found.recorded, options)
-    recorded = tuple(_bag_frame(each, start, prefix, find) for each in found.recorded)
-    data = replace(data, notes=(*data.notes, f"{path}: {found.summary}"))
-    return _with(data, tuple(recorded[i] for i in found.picked), recorded)
-
-
-def _bag_frame(found: BagFrame, start: int, prefix: str, find: MotionOf | None) -> Frame:
-    return Frame(
-        start + found.number,
-        f"{prefix}{found.stamp_ns}",
-        found.cloud,
-        found.images,
-        find_motion=None if find is None else partial(find, found),
-    )
-
-
-def _with(data: Dataset, frames: tuple[Frame, ...], recorded: tuple[Frame, ...]) -> Dataset:
-    return replace(data, frames=(*data.frames, *frames), recorded=(*data.recorded, *recorded))
-
-
-def _next_index(data: Dataset) -> int:
-    return 1 + max((frame.index for frame in data.recorded), default=-1)
 
 
 def _complete(data: Dataset) -> Dataset:

@@ -18,6 +18,7 @@ from calibgraph.io.argoverse import argoverse
 from calibgraph.io.bags.options import NEAR_S
 from calibgraph.io.bags.stamps import (
     TopicStamps,
+    after_ns,
     describe_offsets,
     describe_spans,
     nearest,
@@ -158,7 +159,7 @@ def _paired_by_stamps(
             )
         for cloud in paired:
             frames[cloud].images[name] = found.paths[rows[cloud]]
-        apart_ns = np.array(found.stamp_ns)[rows[paired]] - np.array(clouds.stamp_ns)[paired]
+        apart_ns = after_ns(clouds, found, rows, paired)
         unused = len(found.paths) - len({*rows[paired]})
         unused_text = f" ({unused} images not used)" if unused else ""
         parts.append(describe_offsets(name, apart_ns) + unused_text)

@@ -48,12 +48,25 @@ def decode_image(data: bytes, kind: int = _COLOUR) -> NDArray[Any]:
     return np.asarray(image)
 
 
+def encoded_size(data: bytes) -> tuple[int, int]:
+    """Width and height that the header of PNG or JPEG data states.
+
+    Raises:
+        ValueError: if it is damaged.
+    """
+    return _header(data).size
+
+
+def _header(data: bytes) -> PngImageFile | JpegImageFile:
+    try:
+        return (PngImageFile if is_png(data) else JpegImageFile)(io.BytesIO(data))
+    except (SyntaxError, OSError) as error:
+        raise ValueError(str(error)) from error
+
+
 def _require_plausible_size(data: bytes) -> None:
     """Check the size that a header states, before memory is taken for the pixels."""
-    if is_png(data):
-        width, height = PngImageFile(io.BytesIO(data)).size
-    else:
-        height, width, *_ = simplejpeg.decode_jpeg_header(data, strict=False)
+    width, height = encoded_size(data)
     if width * height > max(_FEW_PIXELS, _MOST_PER_BYTE * len(data)):
         raise ValueError(
             f"it states {width}x{height} px in {len(data) / 1e3:.0f} kB: no picture packs so"
@@ -71,8 +84,7 @@ def describe_turn(data: bytes) -> str:
     if is_png(data) and b"eXIf" not in data:  # Pillow decodes a PNG whole to look for it
         return ""
     try:
-        header = (PngImageFile if is_png(data) else JpegImageFile)(io.BytesIO(data))
-        found = header.getexif().get(Base.Orientation, 1)
+        found = _header(data).getexif().get(Base.Orientation, 1)
     except (SyntaxError, OSError) as error:
         raise ValueError(str(error)) from error
     return "" if found in _UPRIGHT else (

@@ -1,6 +1,6 @@
 """Feather files: tables of Arrow."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,30 +15,26 @@ _MARKS = np.array([0x184D2204, 0xFD2FB528], np.uint32)
 _FEW_BYTES, _MOST_RATIO = 2**26, 64
 
 
-def feather_columns(path: Path) -> tuple[str, ...]:
-    """The names of all columns of a file."""
-    with arrow_reads(path):
-        return tuple(_read_table(path).column_names)
-
-
-def read_feather(path: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Columns of a file, as arrays of one length."""
-    with arrow_reads(path):
-        table = _read_table(path)
-        for name in columns:
-            if name not in table.column_names:
-                found = ", ".join(table.column_names)
-                raise FileError(path, f"column {name!r} is missing; found {found}")
-        return {name: _array(path, table, name) for name in columns}
-
-
-def _read_table(path: Path) -> Any:
+def read_feather(path: Path) -> tuple[list[str], Callable[[str], NDArray[Any]]]:
+    """The names of a file's columns, and a function that returns one as an array."""
     from pyarrow import feather
 
-    _require_plausible_size(require_file(path))
-    table = feather.read_table(path, memory_map=False)
-    table.validate(full=True)  # Arrow believes offsets and lengths, and would read elsewhere
-    return table
+    with arrow_reads(path):
+        _require_plausible_size(require_file(path))
+        table = feather.read_table(path, memory_map=False)
+        table.validate(full=True)  # Arrow believes offsets and lengths, and would read elsewhere
+
+    def column(name: str) -> NDArray[Any]:
+        if name not in table.column_names:
+            found = ", ".join(table.column_names)
+            raise FileError(path, f"column {name!r} is missing; found {found}")
+        values = table.column(name)
+        if values.null_count:
+            raise FileError(path, f"column {name!r} has {values.null_count} empty values")
+        with arrow_reads(path):
+            return np.asarray(values.to_numpy())
+
+    return table.column_names, column
 
 
 def _require_plausible_size(path: Path) -> None:
@@ -55,10 +51,3 @@ def _require_plausible_size(path: Path) -> None:
             path, f"states {unpacked / 1e6:.0f} MB in {size / 1e6:.1f} MB: points do not pack so; "
             "write it again"
         )  # fmt: skip
-
-
-def _array(path: Path, table: Any, name: str) -> NDArray[Any]:
-    column = table.column(name)
-    if column.null_count:
-        raise FileError(path, f"column {name!r} has {column.null_count} empty values")
-    return np.asarray(column.to_numpy())

@@ -1,7 +1,8 @@
 """A frame: one cloud and the images taken with it; the cloud as recorded, or without motion."""
 
+import hashlib
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -57,10 +58,13 @@ class Frame:
         image_paths: the image's file or address in a bag, per camera that has one.
         find_motion: computes the motion during the scan, for which the cloud is then corrected.
         find_twist: computes (6,) the twist of the LiDAR where the cloud is as recorded.
+        twist: (6,) of the LiDAR, in place of one that is computed.
         burnt_in: per camera, what its images are filled at when they are loaded.
         columns: names of those of a .bin cloud, if the rig states them.
+        arrays: the cloud and images by their paths, which are names, if they are in memory.
 
-    The motion and the twist are computed once, when they are needed.
+    The motion and the twist are computed when they are needed, by functions that keep what they
+    found.
     """
 
     index: int
@@ -69,10 +73,14 @@ class Frame:
     image_paths: dict[str, Path]
     find_motion: Callable[[], ScanMotion] | None = field(default=None, kw_only=True)
     find_twist: Callable[[], Array] | None = field(default=None, kw_only=True)
+    twist: Array | None = field(default=None, kw_only=True, compare=False)
     burnt_in: Mapping[str, BurntIn] = field(default_factory=dict, kw_only=True, compare=False)
     columns: tuple[str, ...] | None = field(default=None, kw_only=True)
+    arrays: Mapping[Path, NDArray[Any]] = field(
+        default_factory=dict, kw_only=True, compare=False, repr=False
+    )
 
-    @cached_property
+    @property
     def motion(self) -> ScanMotion | None:
         """For which the cloud is corrected; None if it is as recorded."""
         return None if self.find_motion is None else self.find_motion()
@@ -82,12 +90,20 @@ class Frame:
         """Whether its cloud is corrected for motion."""
         return self.find_motion is not None
 
-    @cached_property
+    @property
     def twist_per_s(self) -> Array | None:
         """(6,) of the LiDAR: rotation [rad/s], translation [m/s]; None if it is unknown."""
+        if self.twist is not None:
+            return self.twist
         if self.find_twist is not None:
             return self.find_twist()
         return None if self.motion is None else np.array(self.motion.twist_per_s)
+
+    @property
+    def stamp_ns(self) -> int | None:
+        """The stamp that names it; None if another name does."""
+        stem = self.name.rpartition("/")[2]
+        return int(stem) if self.cloud_path.suffix == MESSAGE_SUFFIX else stamp_ns_in_name(stem)
 
     @property
     def T_world_lidar(self) -> Array | None:
@@ -95,20 +111,21 @@ class Frame:
         return None if self.motion is None else self.motion.T_world_lidar
 
     def with_burnt_in(self, found: Mapping[str, BurntIn]) -> "Frame":
-        """The frame whose images are filled where something is burnt in."""
-        return replace(self, burnt_in=found)
+        """The frame whose images are filled where something is burnt in; it is not kept."""
+        own = {each.name: getattr(self, each.name) for each in fields(Frame)}
+        return Frame(**{**own, "burnt_in": found})
 
     def load_cloud(self) -> NDArray[np.float32]:
         """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`; thinned."""
+        if self.cloud_path in self.arrays:
+            return thin_cloud(self.arrays[self.cloud_path])
         return thin_cloud(load_cloud(self.cloud_path, self.motion, self.columns))
 
     def load_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width, 3) image, BGR; see :func:`calibgraph.io.images.load_image`."""
-        image, burnt_in = self._decode_image(name, camera), self.burnt_in.get(name)
+        path, burnt_in = self.image_paths[name], self.burnt_in.get(name)
+        image = self.arrays[path] if path in self.arrays else load_image(path, camera)
         return image if burnt_in is None else burnt_in.fill(image)
-
-    def _decode_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
-        return load_image(self.image_paths[name], camera)
 
     def load_gray(self, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width) the same image, gray."""
@@ -125,8 +142,9 @@ class Frame:
 
     @cached_property
     def _hashes(self) -> dict[str, str]:
+        found = {path: hashlib.sha256(a.tobytes()).hexdigest() for path, a in self.arrays.items()}
         paths = (self.cloud_path, *self.image_paths.values())
-        return {str(path): hash_source(path) for path in paths}
+        return {str(path): found.get(path) or hash_source(path) for path in paths}
 
     def entry(self) -> dict[str, Any]:
         """The frame's number, files and motion if it is known, as a result keeps them."""
@@ -199,21 +217,15 @@ def twist_by_scans(
     if (speed_m_s := np.linalg.norm(twist[3:])) > _MOST_M_S:
         raise DatasetError(
             f"{frame.cloud_path}: by its neighbours, the LiDAR moves at {speed_m_s:.0f} m/s, more "
-            f"than {_MOST_M_S:g}; give the seconds between clouds as --interval-s"
+            f"than {_MOST_M_S:g}; correct the stamps of the clouds, or --interval-s"
         )
     return twist
 
 
 def seconds_between(one: Frame, other: Frame) -> float | None:
     """How much later another frame was recorded, by the stamps that name both; None without."""
-    first, second = _stamp_ns(one), _stamp_ns(other)
+    first, second = one.stamp_ns, other.stamp_ns
     return None if first is None or second is None else (second - first) / 1e9
-
-
-def _stamp_ns(frame: Frame) -> int | None:
-    """The stamp that names a frame."""
-    stem = frame.name.rpartition("/")[2]
-    return int(stem) if frame.cloud_path.suffix == MESSAGE_SUFFIX else stamp_ns_in_name(stem)
 
 
 def frame_of_entry(entry: Mapping[str, Any]) -> Frame:

@@ -15,7 +15,8 @@ from calibgraph.files import checked_model, is_utf8, require_file
 from calibgraph.model.rig import Camera, Rig
 
 _PCD = ".pcd"  # NAME.pcd.bin is a cloud of nuScenes
-_PACKED = "is compressed from outside: unpack it first (`{}`)"
+_UNPACK = {".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz", ".lz4": "unlz4", ".zst": "unzstd",
+           ".zstd": "unzstd"}  # fmt: skip
 _WAYS_OUT = {
     **dict.fromkeys(
         (".las", ".laz"), "is not read: write it as .ply (`pdal translate {0} {1}.ply`)"
@@ -26,11 +27,10 @@ _WAYS_OUT = {
         "(`mkdir {1}; ffmpeg -i {0} {1}/%06d.png`)",
     ),
     ".drc": "is not read: write it as .ply (`draco_decoder -i {0} -o {1}.ply`)",
-    ".gz": _PACKED.format("gunzip {0}"),
-    **dict.fromkeys((".zst", ".zstd"), _PACKED.format("unzstd {0}")),
-    ".bz2": _PACKED.format("bunzip2 {0}"),
-    ".xz": _PACKED.format("unxz {0}"),
-    ".lz4": _PACKED.format("unlz4 {0}"),
+    **{
+        suffix: f"is compressed: unpack it first with `{unpack} {{0}}`"
+        for suffix, unpack in _UNPACK.items()
+    },
     **dict.fromkeys(
         (".zip", ".7z", ".tar", ".tgz"), "is an archive: unpack it and name what is in it"
     ),

@@ -1,18 +1,14 @@
 """Images: PNG, JPEG and messages of bags, complete and of the rig's size."""
 
-import io
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL.ImageFile import ImageFile
-from PIL.JpegImagePlugin import JpegImageFile
-from PIL.PngImagePlugin import PngImageFile
 
 from calibgraph.errors import FileError
 from calibgraph.io.bags import MESSAGE_SUFFIX, load_bag_image
-from calibgraph.io.encoded_images import decode_image, describe_turn, is_png
+from calibgraph.io.encoded_images import decode_image, describe_turn, encoded_size
 from calibgraph.model.rig import Camera
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -34,13 +30,14 @@ def load_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
         image = load_bag_image(path)
         _require_size(path, (image.shape[1], image.shape[0]), camera)
         return image
-    data, header = _read(path)
-    _require_size(path, header.size, camera)
-    _require_upright(path, data)
+    data = _read(path)
     try:
-        image = np.asarray(decode_image(data), np.uint8)
+        _require_size(path, encoded_size(data), camera)
+        turned, image = describe_turn(data), np.asarray(decode_image(data), np.uint8)
     except ValueError as error:
         raise _damaged(path, error) from error
+    if turned:
+        raise FileError(path, turned)
     if not image.any() and np.any(cv2.imdecode(np.frombuffer(data, np.uint8), _AS_IT_IS)):
         raise FileError(path, "has 16 bits and uses only the lower 8; write it with 8")
     return image
@@ -58,28 +55,16 @@ def _require_size(path: Path, found: tuple[int, int], camera: Camera) -> None:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, from the header."""
-    return _read(path)[1].size
-
-
-def _read(path: Path) -> tuple[bytes, ImageFile]:
-    """The bytes of a file, and the header in them."""
-    if not path.is_file():
-        raise FileError(path, "no such image")
-    data = path.read_bytes()
-    kind = PngImageFile if is_png(data) else JpegImageFile
     try:
-        return data, kind(io.BytesIO(data))
-    except (SyntaxError, OSError, ValueError) as error:
-        raise _damaged(path, error) from error
-
-
-def _require_upright(path: Path, data: bytes) -> None:
-    try:
-        turned = describe_turn(data)
+        return encoded_size(_read(path))
     except ValueError as error:
         raise _damaged(path, error) from error
-    if turned:
-        raise FileError(path, turned)
+
+
+def _read(path: Path) -> bytes:
+    if not path.is_file():
+        raise FileError(path, "no such image")
+    return path.read_bytes()
 
 
 def _damaged(path: Path, why: object) -> FileError:

@@ -207,13 +207,8 @@ class NumberLines:
             found = np.array(self._words[key], dtype=np.float64)
         except ValueError:
             found = np.empty(0)
-        return matrix_of_line(self.path, key, found, shape)
-
-
-def matrix_of_line(path: Path, key: str, numbers: Array, shape: tuple[int, ...]) -> Array:
-    """The numbers of a line in this shape; as many as it holds, and finite."""
-    count = math.prod(shape)
-    if len(numbers) != count or not np.isfinite(numbers).all():
-        text = f"line {key!r} has {len(numbers)} numbers, expected {count} finite ones"
-        raise FileError(path, text)
-    return numbers.reshape(shape)
+        count = math.prod(shape)
+        if len(found) != count or not np.isfinite(found).all():
+            text = f"line {key!r} has {len(found)} numbers, expected {count} finite ones"
+            raise FileError(self.path, text)
+        return found.reshape(shape)

@@ -15,11 +15,9 @@ from calibgraph.io.point_fields import (
     RawCloud,
     binary_columns,
     choose_fields,
-    lines_of_text,
     raw_cloud,
     read_count,
     read_rows,
-    too_long,
     truncated,
 )
 from factors.compiled import compiled
@@ -81,22 +79,11 @@ def _ascii_columns(
 ) -> Iterator[NDArray[Any]]:
     """The first number of each field; padding may be left out of the lines."""
     widths = [sum(f.count for f in fields), sum(f.count for f in fields if f.name != _PADDING)]
-    lines = lines_of_text(body)
-    rows = read_rows(path, lines, count, widths)
-    if next(lines, None) is not None:
-        raise too_long(path, count)
+    rows = read_rows(path, body, count, widths)
     at, full = 0, rows.shape[1] == widths[0]
     for each in fields:
         yield rows[:, min(at, rows.shape[1] - 1)]
         at += each.count * (full or each.name != _PADDING)
-
-
-def _binary_columns(
-    path: Path, body: memoryview, count: int, fields: Sequence[Field]
-) -> Iterator[NDArray[Any]]:
-    if len(body) >= (count + 1) * sum(each.bytes for each in fields):
-        raise too_long(path, count)
-    yield from binary_columns(path, body, count, fields)
 
 
 def _compressed_columns(
@@ -121,7 +108,7 @@ def _compressed_columns(
 
 
 _READERS = {
-    b"ascii": _ascii_columns, b"binary": _binary_columns, b"binary_compressed": _compressed_columns,
+    b"ascii": _ascii_columns, b"binary": binary_columns, b"binary_compressed": _compressed_columns,
 }  # fmt: skip
 
 

@@ -45,17 +45,15 @@ class Field:
         name: in the file.
         kind: numpy's type of one number, as <f4.
         count: how many numbers it has.
-        length: the type of a list's length, if it is a list of numbers.
     """
 
     name: str
     kind: str
     count: int = 1
-    length: str | None = None
 
     @property
     def bytes(self) -> int:
-        """In each point, if it is no list."""
+        """In each point."""
         return np.dtype(self.kind).itemsize * self.count
 
 
@@ -108,7 +106,7 @@ def read_count(word: str) -> int:
     return int(word)
 
 
-def too_long(path: Path, count: int) -> FileError:
+def _too_long(path: Path, count: int) -> FileError:
     """The error of a file that has more points than its header."""
     return FileError(path, f"goes on after the {count} points of its header; write it again")
 
@@ -119,37 +117,36 @@ def truncated(path: Path, count: int) -> FileError:
 
 
 def binary_columns(
-    path: Path, body: memoryview, count: int, fields: Sequence[Field], *, start: int = 0
+    path: Path, body: memoryview, count: int, fields: Sequence[Field], *, is_all: bool = True
 ) -> Iterator[NDArray[Any]]:
     """The first number of each field of points that lie one after the other, without a copy."""
-    step = sum(each.bytes for each in fields)
-    if start + count * step > len(body):
+    start, step = 0, sum(each.bytes for each in fields)
+    if count * step > len(body):
         raise truncated(path, count)
+    if is_all and len(body) >= (count + 1) * step:
+        raise _too_long(path, count)
     for each in fields:
         yield np.ndarray((count,), each.kind, body, start, (step,))
         start += each.bytes
 
 
-def lines_of_text(body: memoryview) -> Iterator[str]:
-    """The lines of a text that are not blank, one at a time; overlong ones are cut."""
-    text = io.TextIOWrapper(io.BytesIO(body), "ascii", "replace", newline="\n")
-    return (line for line in iter(lambda: text.readline(_LONGEST_LINE), "") if not line.isspace())
-
-
 def read_rows(
-    path: Path, lines: Iterator[str], count: int, widths: Sequence[int]
+    path: Path, body: memoryview, count: int, widths: Sequence[int], *, is_all: bool = True
 ) -> NDArray[np.float64]:
-    """(count, width) numbers of the next lines.
+    """(count, width) numbers of the first lines that are not blank; overlong ones are cut.
 
     Args:
         path: of the file.
-        lines: of the points and those after them.
+        body: its text, from the points on.
         count: of points.
         widths: how many numbers a line may have, the same on all.
+        is_all: whether nothing may follow.
 
     Raises:
         FileError: if there are fewer lines, or they hold something else.
     """
+    text = io.TextIOWrapper(io.BytesIO(body), "ascii", "replace", newline="\n")
+    lines = (each for each in iter(lambda: text.readline(_LONGEST_LINE), "") if not each.isspace())
     first = next(lines, "")
     if len(first.split()) not in widths:
         raise FileError(
@@ -161,4 +158,6 @@ def read_rows(
         raise FileError(path, f"holds no points where they should be: {error}") from None
     if len(rows) != count:
         raise FileError(path, f"is truncated: {len(rows)} of its {count} points; write it again")
+    if is_all and next(lines, None) is not None:
+        raise _too_long(path, count)
     return rows

@@ -57,14 +57,6 @@ class Places:
         known = {STATIONARY: self.stationary or None, PLACES: self.places}
         return {key: [list(g) for g in groups] for key, groups in known.items() if groups}
 
-    def merge(self, other: Places) -> Places:
-        """The groups of both; a group that both name alike is one."""
-        named = [each.places for each in (self, other) if each.places is not None]
-        return Places(
-            tuple(dict.fromkeys((*self.stationary, *other.stationary))),
-            tuple(dict.fromkeys(group for groups in named for group in groups)) if named else None,
-        )
-
     def merge_stationary(self, frame: Numbers) -> Numbers:
         """(n,) frame numbers, with all frames of one stop replaced by its first."""
         for stop in self.stationary:

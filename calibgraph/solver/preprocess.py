@@ -40,7 +40,7 @@ class Preprocessed:
 def preprocess(rig: Rig, table: Correspondences | Path | str, config: Config) -> Preprocessed:
     """Depth filter, confidence filter, best match per grid cell, cap per camera and frame.
 
-    The table may be a file or a folder larger than memory, which is read in parts: memory is needed
+    The table may be a file larger than memory, which is read in parts: memory is needed
     for one row group of it and for what the grid keeps, at most one match of each cell, camera and
     frame, in whatever order the rows are. A CSV file is read whole.
 

@@ -9,13 +9,36 @@ import shutil
 import sys
 from pathlib import Path
 
-from calibgraph import import_rig
+import numpy as np
+
+from calibgraph import Rig
+
+
+def read_rig(calibration: Path) -> Rig:
+    """The rectified cameras: P = K [I | b] shifts each by b against the rectified image_00."""
+    text = (calibration / "perspective.txt").read_text(encoding="utf-8")
+    lines = (line.partition(":") for line in text.splitlines())
+    rows = {key: words.split() for key, _, words in lines}
+    T_lidar_00, T_rectified_00 = np.eye(4), np.eye(4)
+    T_lidar_00[:3] = np.loadtxt(calibration / "calib_cam_to_velo.txt").reshape(3, 4)
+    T_rectified_00[:3, :3] = np.array(rows["R_rect_00"], float).reshape(3, 3)
+    cameras = {}
+    for k in sorted(key[-2:] for key in rows if key.startswith("P_rect_")):
+        P = np.array(rows[f"P_rect_{k}"], float).reshape(3, 4)
+        shift = np.eye(4)
+        shift[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
+        width, height = map(int, map(float, rows[f"S_rect_{k}"]))
+        cameras[f"image_{k}"] = {
+            "model": "pinhole", "width_px": width, "height_px": height, "distortion": [],
+            "intrinsics_px": {"fx": P[0, 0], "fy": P[1, 1], "cx": P[0, 2], "cy": P[1, 2]},
+            "T_camera_lidar": shift @ T_rectified_00 @ np.linalg.inv(T_lidar_00),
+        }  # fmt: skip
+    return Rig.model_validate({"lidar": "velodyne", "cameras": cameras})
 
 
 def convert(root: Path, drive: str, out: Path) -> None:
     """Write rig.yaml, lidar/ and cameras/."""
-    names = ("perspective", "calib_cam_to_velo", "calib_cam_to_pose")
-    rig = import_rig([root / "calibration" / f"{name}.txt" for name in names])
+    rig = read_rig(root / "calibration")
     scans = root / "data_3d_raw" / drive / "velodyne_points" / "data"
     images = {name: root / "data_2d_raw" / drive / name / "data_rect" for name in rig.cameras}
     stems = {path.stem for path in scans.glob("*.bin")}

@@ -50,13 +50,14 @@ perturb {sample} --out n.yaml --translation-m inf | a length >= 0 m, found 20.0 
 perturb {sample} --out n.yaml --rotation-deg nan | should be greater than or equal to 0
 perturb {sample} --out {sample} | must end in .yaml
 export {sample} --out never --format ros | format 'ros'
-export {sample} --out never --format tf2 --camera rear | camera 'rear'
+export {sample} --out never --format urdf --camera rear | camera 'rear'
 export {sample} --out never --format autoware --lidar-pose 1,2 | --lidar-pose '1,2': give six
 export {sample} --out never --format autoware --lidar-pose 0,0,0,0,0,90 | yaw are 0, 0, 90 rad
 export {sample} --out never --format autoware --lidar-pose 0,0,nan,0,0,0 | not finite
-export {sample} --out never --format tf2 --lidar-pose 0,0,0,0,0,0 | autoware only
-export {sample} --out never --format tf2 --camera-frame camera | two are the same
-export nothing --out never --format tf2 | no such file
+export {sample} --out never --format urdf --lidar-pose 0,0,0,0,0,0 | autoware only
+export {sample} --out never --format urdf --camera-frame camera | two are the same
+export nothing --out never --format urdf | no such file
+rig info.yaml --out n.yaml | describe its mounting with --mount front=WORDS
 rig chain.yaml --size 9 | --size '9': give WIDTHxHEIGHT
 rig chain.yaml --camera-frame a | --camera-frame 'a': give two names
 rig chain.yaml --rename front=a | no camera 'front' to rename

@@ -21,10 +21,11 @@ def test_a_drive_becomes_a_dataset(tmp_path: Path) -> None:
     scans = scans / "velodyne_points" / "data"
     for folder in (calibration, scans):
         folder.mkdir(parents=True)
-    lens = "S_rect_00: 64 48\nR_rect_00: 1 0 0 0 1 0 0 0 1\nP_rect_00: 55 0 32 0 0 55 24 0 0 0 1 0"
-    (calibration / "perspective.txt").write_text(lens)
+    lens = (
+        "S_rect_00: 64 48\nR_rect_00: 1 0 0 0 1 0 0 0 1\nP_rect_00: 55 0 32 0 0 55 24 0 0 0 1 0\n"
+    )
+    (calibration / "perspective.txt").write_text(f"calib_time: 9\n{lens}")
     (calibration / "calib_cam_to_velo.txt").write_text(CAM_TO_VELO)
-    (calibration / "calib_cam_to_pose.txt").write_text("image_00: 1 0 0 0 0 1 0 0 0 0 1 0")
     images = tmp_path / "data_2d_raw" / DRIVE / "image_00" / "data_rect"
     images.mkdir(parents=True)
     for frame in range(3):

@@ -53,7 +53,7 @@ def clouds(_: Path) -> dict[str, bytes]:
         "binary.pcd": pcd(), "padded.pcd": pcd(padding=True), "ascii.pcd": pcd("ascii"),
         "packed.pcd": pcd("binary_compressed"), "little.ply": ply(), "ascii.ply": ply("ascii"),
         "big.ply": ply("binary_big_endian"),
-        "mesh.ply": ply(before=faces, body=(b"\x03" + bytes(12)) * 2 + body),
+        "mesh.ply": ply(after=faces, body=body + (b"\x03" + bytes(12)) * 2),
         "four.bin": body, "three.bin": CLOUD[:, :3].tobytes(), "array.npy": npy.getvalue(),
     }  # fmt: skip
 
@@ -103,7 +103,7 @@ ORIGINALS = {"clouds": clouds, "tables": tables, "bags": bags}
 READERS: dict[str, Callable[[Path], object]] = {
     "table.parquet": load_correspondences,
     "matches.parquet": load_camera_matches,
-    "sweep.feather": lambda path: read_feather(path, ("x", "y", "z")),
+    "sweep.feather": lambda path: [*map(read_feather(path)[1], "xyz")],
 }
 
 

@@ -217,8 +217,8 @@ PLY_NAMES = {"f4": "float", "f8": "double", "i1": "char", "u1": "uchar", "i2": "
 
 
 def ply_of(
-    rows: NDArray[np.void], encoding: str, *, before: bytes = b"", first: bytes = b"",
-    after: bytes = b"", last: bytes = b"",
+    rows: NDArray[np.void], encoding: str, *, before: bytes = b"", after: bytes = b"",
+    last: bytes = b"",
 ) -> bytes:  # fmt: skip
     """The .ply of a structured array, with elements before and after the vertices."""
     big = rows.astype(rows.dtype.newbyteorder(">")) if "big" in encoding else rows
@@ -227,7 +227,7 @@ def ply_of(
     properties = "".join(f"property {kind} {name}\n" for name, kind in kinds.items())
     header = f"ply\nformat {encoding} 1.0\ncomment by hand\n".encode() + before
     header += f"element vertex {len(rows)}\n{properties}".encode() + after + b"end_header\n"
-    return header + first + written + last
+    return header + written + last
 
 
 def ply(

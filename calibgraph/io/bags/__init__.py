@@ -13,8 +13,8 @@ from calibgraph.errors import FileError
 from calibgraph.io.bags.messages import MESSAGE_SUFFIX as MESSAGE_SUFFIX
 from calibgraph.io.bags.messages import read_message
 from calibgraph.io.bags.options import BagOptions as BagOptions
-from calibgraph.io.bags.pictures import picture_of
-from calibgraph.io.bags.point_clouds import points_of, time_fields, timed_points_of
+from calibgraph.io.bags.pictures import image_from_message
+from calibgraph.io.bags.point_clouds import cloud_from_message, time_fields, timed_points_of
 from calibgraph.io.bags.storage import is_bag as is_bag
 from calibgraph.io.motion import ScanMotion
 
@@ -23,7 +23,7 @@ def load_bag_cloud(path: Path, motion: ScanMotion | None = None) -> NDArray[np.f
     """(n, 4) the cloud in the message with this address, corrected for motion if it is given."""
     content = read_message(path)[1]
     if motion is None:
-        cloud = points_of(content, str(path))
+        cloud = cloud_from_message(content, str(path))
     else:
         cloud, times_s = timed_points_of(content, str(path))
         cloud[:, :3] = motion.correct(cloud[:, :3], times_s)
@@ -43,7 +43,7 @@ def scan_duration_s(path: Path) -> float | None:
 
 def load_bag_image(path: Path) -> NDArray[np.uint8]:
     """(height, width, 3) the image in the message with this address, BGR."""
-    return picture_of(read_message(path)[1], str(path))
+    return image_from_message(read_message(path)[1], str(path))
 
 
 def hash_message(path: Path) -> str:

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
+from calibgraph.files import checked_model
+from calibgraph.io.bags.messages import describe_message
 from calibgraph.io.lenses import (
     CameraLens,
     fitted_coefficients,
@@ -17,7 +19,7 @@ from calibgraph.io.lenses import (
     lens_model,
     listed_intrinsics,
 )
-from calibgraph.model.rig import Intrinsics
+from calibgraph.model.rig import Camera, Intrinsics
 from factors import LensModel
 
 _AS_NONE = ("", "inverse_brown_conrady")
@@ -141,6 +143,35 @@ def lens_of(message: Any, where: str, *, rectified: bool) -> StatedLens:
     if rectified:
         return StatedLens(frame, lens, R, baseline_m)
     return StatedLens(frame, lens, np.eye(3), R.T @ baseline_m)
+
+
+def camera_from_message(
+    message: Any,
+    T_camera_lidar: Array,
+    *,
+    rectified: bool = False,
+    frame_of_first: bool = False,
+) -> Camera:
+    """A camera with the lens of a CameraInfo.
+
+    Args:
+        message: the CameraInfo.
+        T_camera_lidar: (4, 4) the guess, to the camera's optical frame that the message names, as
+            tf2's ``lookup_transform(target=camera_optical, source=lidar)``.
+        rectified: whether the images are: by R, and of the camera matrix P.
+        frame_of_first: whether the message of a stereo pair's second camera names the frame of the
+            first, so that the baseline in P counts.
+
+    Raises:
+        FileError: if the camera is not calibrated, its lens model is unknown, a value is no lens's,
+            or the transform is none.
+    """
+    where = describe_message(message)
+    stated = lens_of(message, where, rectified=rectified)
+    T_image_frame = stated.T_image_frame(with_baseline=frame_of_first)
+    return checked_model(
+        Camera, {**stated.lens.fields(), "T_camera_lidar": T_image_frame @ T_camera_lidar}, where
+    )
 
 
 def stated_baseline(message: Any) -> Array:

@@ -17,8 +17,7 @@ from operator import itemgetter
 from pathlib import Path, PurePath
 from shlex import quote
 from struct import Struct
-from tempfile import TemporaryDirectory
-from typing import IO, Any
+from typing import Any
 from zlib import crc32
 
 import lz4.frame
@@ -58,6 +57,8 @@ def topics_by_name(topics: Iterable[Topic]) -> dict[str, Topic]:
 
 
 Buffer = bytes | memoryview
+Recorded = Iterator[tuple[str, int, bytes]]
+"""Topic, time of recording [ns] and bytes of messages."""
 
 _ALWAYS, _RATIO, _MOST = 2**26, 50, 2**30
 """Of one part: a black image of 20 MP is 60 MB and packs to nothing; other data of sensors shrink
@@ -86,11 +87,9 @@ def unpack(path: Path, kind: str, data: Buffer) -> Buffer:
         stated = zstandard.frame_content_size(data)  # -1 if it is not
         content: bytes = (
             zstandard.decompress(data) if 0 <= stated <= most
-            else _zstd_stream(data).read(most + 1)
+            else zstandard.ZstdDecompressor().stream_reader(data).read(most + 1)
         )  # fmt: skip
     elif kind == "lz4":
-        import lz4.frame
-
         content = lz4.frame.LZ4FrameDecompressor().decompress(data, most + 1)
     elif kind == "bz2":
         content = bz2.BZ2Decompressor().decompress(data, most + 1)
@@ -107,40 +106,6 @@ def unpack(path: Path, kind: str, data: Buffer) -> Buffer:
             "does; record it again, in chunks of a few MiB",
         )
     return content
-
-
-def require_plausible(path: Path, packed: int, content: int) -> None:
-    """Check what a whole file unpacks to.
-
-    Raises:
-        FileError: if it is more than a recording's can be.
-    """
-    if content > max(_ALWAYS_WHOLE, _RATIO_WHOLE * packed):
-        raise FileError(
-            path,
-            f"its {packed} bytes unpack to {content >> 20} MiB or more, which no recording does; "
-            "record it again",
-        )
-
-
-def unpack_file(path: Path, out: Path) -> None:
-    """Write the content of a file compressed by zstd.
-
-    Raises:
-        FileError: if it is more than a recording's can be.
-    """
-    packed = path.stat().st_size
-    with path.open("rb") as file, out.open("wb") as written:
-        stream = _zstd_stream(file)
-        while block := stream.read(2**20):
-            written.write(block)
-            require_plausible(path, packed, written.tell())
-
-
-def _zstd_stream(source: Buffer | IO[bytes]) -> Any:
-    import zstandard
-
-    return zstandard.ZstdDecompressor().stream_reader(source)
 
 
 _MAGIC, _HEAD, _MESSAGE = b"\x89MCAP0\r\n", Struct("<BQ"), Struct("<HIQQ")
@@ -181,10 +146,8 @@ class Db3File:
             self.close()
             raise
 
-    def messages(
-        self, topics: Collection[str], start_ns: int, stop_ns: int
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+    def messages(self, topics: Collection[str], start_ns: int, stop_ns: int) -> Recorded:
+        """The messages of some topics, by time."""
         query = _MESSAGES.format(", ".join("?" * len(topics)))
         yield from self._database.execute(query, [*topics, start_ns, stop_ns])
 
@@ -231,7 +194,13 @@ class McapFile:
         chunks = sorted(found.chunk_indexes, key=lambda each: each.message_start_time)
         if any(each.chunk_start_offset + each.chunk_length > size for each in chunks):
             raise ValueError("its index names chunks behind its end")
-        require_plausible(self._path, size, sum(each.uncompressed_size for each in chunks))
+        content = sum(each.uncompressed_size for each in chunks)
+        if content > max(_ALWAYS_WHOLE, _RATIO_WHOLE * size):
+            raise FileError(
+                self._path,
+                f"its {size} bytes unpack to {content >> 20} MiB or more, which no recording does; "
+                "record it again",
+            )
         self._channels = {number: each.topic for number, each in found.channels.items()}
         self._chunks = chunks
         self._starts_ns = [each.message_start_time for each in chunks]
@@ -246,10 +215,8 @@ class McapFile:
             for number, each in found.channels.items()
         )
 
-    def messages(
-        self, topics: Collection[str], start_ns: int, stop_ns: int
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+    def messages(self, topics: Collection[str], start_ns: int, stop_ns: int) -> Recorded:
+        """The messages of some topics, by time."""
         chosen = {number: topic for number, topic in self._channels.items() if topic in topics}
         waiting: list[tuple[int, int, str, bytes]] = []
         number = count()
@@ -315,21 +282,6 @@ class _Ros1Reader(Reader):
         kind = _KINDS.get(chunk.decompressor, "")
         return chunk._replace(decompressor=partial(unpack, Path(str(self.path)), kind))
 
-    def narrowed(self, start_ns: int, stop_ns: int) -> Any:
-        """The reader with the part of its index within these times.
-
-        The library goes through the whole index: 0.16 s for a window late in 200,000 messages.
-        """
-        part = copy(self)
-        part.current_chunk = (-1, BytesIO())  # closed when the next is read, so not the original's
-        part.indexes = {
-            connection: entries[
-                bisect_left(entries, (start_ns,)) : bisect_left(entries, (stop_ns,))
-            ]
-            for connection, entries in self.indexes.items()
-        }
-        return part
-
 
 class Ros1File:
     """A bag, open for reading."""
@@ -343,15 +295,13 @@ class Ros1File:
             for each in self._reader.connections
         )
 
-    def messages(
-        self, topics: Collection[str], start_ns: int, stop_ns: int
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+    def messages(self, topics: Collection[str], start_ns: int, stop_ns: int) -> Recorded:
+        """The messages of some topics, by time."""
         chosen = [each for each in self._reader.connections if each.topic in topics]
         if chosen:  # the library takes none for all
-            for connection, record_ns, data in self._reader.narrowed(start_ns, stop_ns).messages(
-                chosen
-            ):
+            part = copy(self._reader)
+            part.current_chunk = (-1, BytesIO())  # its own, which it closes behind each chunk
+            for connection, record_ns, data in part.messages(chosen, start_ns, stop_ns):
                 yield connection.topic, record_ns, data
 
 
@@ -364,31 +314,28 @@ class BagFolder:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         stated = read_yaml(folder / METADATA)["rosbag2_bagfile_information"]
-        self._mode = (stated.get("compression_mode") or "none").lower()
+        mode = (stated.get("compression_mode") or "none").lower()
+        files = _files_of(folder, stated["relative_file_paths"])
+        if mode == "file":
+            raise FileError(
+                folder,
+                f"its files are compressed as a whole: unpack them first with `unzstd "
+                f"{files[0].name}`, and name what comes out in place of the folder",
+            )
+        self._compression = "zstd" if mode == "message" else ""
         with ExitStack() as opened:
             self._parts: list[Recording] = []
-            for file in _files_of(folder, stated["relative_file_paths"]):
-                self._parts.append(open_file(self._unpacked(file, opened)))
+            for file in files:
+                self._parts.append(open_file(file))
                 opened.callback(self._parts[-1].close)
             self.topics = topics_by_name(t for part in self._parts for t in part.topics.values())
             self.close = opened.pop_all().close
 
-    def _unpacked(self, file: Path, opened: ExitStack) -> Path:
-        """The file or, where files are compressed, a copy that is not, until the bag is closed."""
-        if self._mode != "file":
-            return file
-        copy = Path(opened.enter_context(TemporaryDirectory())) / file.stem
-        unpack_file(file, copy)
-        return copy
-
-    def messages(
-        self, topics: Collection[str], start_ns: int, stop_ns: int
-    ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of recording [ns] and bytes of the messages of some topics, by time."""
+    def messages(self, topics: Collection[str], start_ns: int, stop_ns: int) -> Recorded:
+        """The messages of some topics, by time."""
         parts = (part.messages(topics, start_ns, stop_ns) for part in self._parts)
-        kind = "zstd" if self._mode == "message" else ""
         for topic, record_ns, data in merge(*parts, key=itemgetter(1)):
-            yield topic, record_ns, bytes(unpack(self._folder, kind, data))
+            yield topic, record_ns, bytes(unpack(self._folder, self._compression, data))
 
 
 def _files_of(folder: Path, stated: Iterable[str]) -> list[Path]:

@@ -93,6 +93,12 @@ class Message:
         return bag.joinpath(*self.topic.strip("/").split("/"), name)
 
 
+def describe_message(message: Any) -> str:
+    """A message that a program has received, for errors."""
+    stamp = message.header.stamp
+    return f"message of {message.header.frame_id} at {stamp.sec}.{stamp.nanosec:09d}"
+
+
 class Bag:
     """An open bag. It is closed when it is no longer referred to."""
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
+from calibgraph.io.bags.messages import describe_message
 from calibgraph.io.encoded_images import decode_image, describe_turn
 
 Image = NDArray[np.uint8]
@@ -44,11 +45,15 @@ def is_depth(message: Any) -> bool:
     return encoding.startswith(("16UC1", "32FC1")) or "compressedDepth" in encoding
 
 
-def picture_of(message: Any, where: str) -> Image:
-    """The image of an Image or CompressedImage message.
+def image_from_message(message: Any, where: str = "") -> Image:
+    """The image of an Image or a CompressedImage; of rclpy, rospy, rosbags or another decoder.
 
     Of images with 16 bits, 8 are kept: the upper ones of the smallest depth (8, 10, 12, 14 or 16
     bits) that holds the brightest value.
+
+    Args:
+        message: any object with the fields of the message.
+        where: for errors; frame and stamp if empty.
 
     Returns:
         (height, width, 3) uint8, BGR.
@@ -56,6 +61,7 @@ def picture_of(message: Any, where: str) -> Image:
     Raises:
         DatasetError: if its encoding is unknown, or it is incomplete.
     """
+    where = where or describe_message(message)
     if hasattr(message, "encoding"):
         return _of_pixels(message, where)
     return _of_compressed(message, where)

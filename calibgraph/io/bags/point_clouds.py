@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
+from calibgraph.io.bags.messages import describe_message
 from calibgraph.io.point_fields import find_intensity, make_cloud
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -18,8 +19,12 @@ _STAMPS, _NANOSECOND_STAMPS = 1e6, 1e15  # times since a scan's start are smalle
 _LONGEST_S = 1.0
 
 
-def points_of(message: Any, where: str) -> NDArray[np.float32]:
-    """The points of a message that are returns.
+def cloud_from_message(message: Any, where: str = "") -> NDArray[np.float32]:
+    """The points of a PointCloud2 that are returns; of rclpy, rospy, rosbags or another decoder.
+
+    Args:
+        message: any object with the fields of the message.
+        where: for errors; frame and stamp if empty.
 
     Returns:
         (n, 4) x y z [m], and the intensity as recorded, NaN where there is none. Points with a
@@ -28,7 +33,7 @@ def points_of(message: Any, where: str) -> NDArray[np.float32]:
     Raises:
         DatasetError: if it has no x y z, or less data than it declares.
     """
-    cloud, returned = _all_points(message, where)
+    cloud, returned = _all_points(message, where or describe_message(message))
     return np.asarray(cloud[returned], dtype=np.float32)
 
 
@@ -39,10 +44,11 @@ def timed_points_of(message: Any, where: str) -> tuple[NDArray[np.float32], NDAr
     (Velodyne), or float64 stamps of their own, in seconds (Hesai, RoboSense) or nanoseconds.
 
     Returns:
-        (n, 4) as :func:`points_of`; (n,) seconds after the stamp, zeros if points have no times.
+        (n, 4) as of :func:`cloud_from_message`; (n,) seconds after the stamp, zeros if points have
+        no times.
 
     Raises:
-        DatasetError: as :func:`points_of`, or if times are not within a second of the stamp.
+        DatasetError: as there, or if times are not within a second of the stamp.
     """
     cloud, returned = _all_points(message, where)
     points = np.asarray(cloud[returned], dtype=np.float32)

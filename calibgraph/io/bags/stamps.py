@@ -116,9 +116,15 @@ def describe_offsets(name: str, offsets_ns: NDArray[np.int64]) -> str:
 def offsets_of(clouds: TopicStamps, images: TopicStamps) -> NDArray[np.int64]:
     """(n,) by how much the nearest image is after each cloud within a second of one [ns]."""
     rows = nearest(clouds, images, _S)
-    found = np.flatnonzero(rows >= 0)
+    return after_ns(clouds, images, rows, np.flatnonzero(rows >= 0))
+
+
+def after_ns(
+    clouds: TopicStamps, images: TopicStamps, rows: NDArray[np.int64], chosen: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """(n,) by how much the images in ``rows`` are after the chosen ones of their clouds [ns]."""
     stamp_ns = np.array(images.stamp_ns, dtype=np.int64)
-    return stamp_ns[rows[found]] - np.array(clouds.stamp_ns, dtype=np.int64)[found]
+    return stamp_ns[rows[chosen]] - np.array(clouds.stamp_ns, dtype=np.int64)[chosen]
 
 
 def describe_spans(named: Mapping[str, TopicStamps]) -> str:

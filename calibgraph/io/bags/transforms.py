@@ -6,7 +6,7 @@ with the parent in ``header.frame_id``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -16,24 +16,17 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.io.bags.messages import TREES, Bag, Drive
-from calibgraph.model.geometry import invert, transform
+from calibgraph.io.frame_tree import Link, T_between, ancestors, links_between
+from calibgraph.model.geometry import transform
 
 STATIC, MOVING = "tf_static", "tf"
 _LEAST_LENGTH = 1e-6  # of a quaternion that is one
 _SAME = 1e-6  # of the entries of a transform that does not change
 
 
-class Link(NamedTuple):
-    """A frame's parent and (4, 4) T_parent_child; where it is from, if not from the own bag."""
-
-    parent: str
-    T_parent_child: Array
-    source: str = ""
-
-
 @dataclass
 class _Tree:
-    """Links by child frame; and by child frame, why a transform was left out."""
+    """Links, with notes on their source if it is not the own bag; and why frames are left out."""
 
     links: dict[str, Link] = field(default_factory=dict)
     invalid: dict[str, str] = field(default_factory=dict)
@@ -58,7 +51,7 @@ class Transforms:
         self._drive = drive
         self._static: list[_Tree] = []
         self._used: dict[str, set[str]] = {}
-        self.parents: dict[str, str] = {}  # of the frames, as far as trees were needed
+        self.links: dict[str, Link] = {}  # as far as trees were needed
 
     def _trees(self) -> Iterator[_Tree]:
         """Wider and wider trees: of the bag, with another bag, ..., with /tf of all."""
@@ -79,21 +72,13 @@ class Transforms:
     def between(self, target: str, source: str) -> Array | None:
         """(4, 4) T_target_source through the frame that both hang from; None if there is none."""
         for tree in self._trees():
-            T_target_source = _between(tree.links, target, source)
+            T_target_source = T_between(tree.links, target, source)
             if T_target_source is not None:
-                self.parents |= {child: link.parent for child, link in tree.links.items()}
-                ways = (_ancestors(tree.links, frame).keys() for frame in (target, source))
-                for frame in set.__xor__(*map(set, ways)):
-                    self._used.setdefault(tree.links[frame].source, set()).add(frame)
+                self.links |= tree.links
+                for link in links_between(tree.links, target, source):
+                    self._used.setdefault(link.note, set()).add(link.child)
                 return T_target_source
         return None
-
-    def known(self, target: str, source: str) -> Array:
-        """(4, 4) T_target_source of two frames that are connected."""
-        T_target_source = self.between(target, source)
-        if T_target_source is None:
-            raise ValueError(f"{target} and {source} are not connected")
-        return T_target_source
 
     @property
     def moving(self) -> set[str]:
@@ -116,7 +101,7 @@ class Transforms:
         """Why frames are not connected, and which frames there are."""
         *_, tree = self._trees()
         for frame in frames:
-            *_, top = _ancestors(tree.links, frame)
+            *_, top = ancestors(tree.links, frame)
             if top in tree.invalid:
                 return f"{tree.invalid[top]}, and {frame!r} hangs by it"
         moving = f"; {_listed(tree.moving)} move on /{MOVING}" if tree.moving else ""
@@ -134,7 +119,7 @@ def _static_tree(bag: Bag, source: str = "") -> _Tree:
         if each.T_parent_child is None:
             tree.invalid[each.child] = each.text
         else:
-            tree.links[each.child] = Link(each.parent, each.T_parent_child, source)
+            tree.links[each.child] = Link(each.parent, each.child, each.T_parent_child, source)
     return tree
 
 
@@ -146,7 +131,8 @@ def _unchanging_tree(bag: Bag) -> _Tree:
         if each.T_parent_child is None:
             tree.invalid[each.child] = each.text
             continue
-        first = tree.links.setdefault(each.child, Link(each.parent, each.T_parent_child, source))
+        link = Link(each.parent, each.child, each.T_parent_child, source)
+        first = tree.links.setdefault(each.child, link)
         change = np.abs(each.T_parent_child - first.T_parent_child).max()
         if each.parent != first.parent or change > _SAME:
             tree.moving.add(each.child)
@@ -179,27 +165,6 @@ def stamped_transforms(bag: Bag, name: str) -> Iterator[StampedTransform]:
             )  # fmt: skip
             parent = each.header.frame_id.lstrip("/")
             yield StampedTransform(parent, child, stamp_ns_of(each), T, text)
-
-
-def _between(links: Mapping[str, Link], target: str, source: str) -> Array | None:
-    """(4, 4) T_target_source through the frame that both hang from; None if there is none."""
-    above_target, above_source = _ancestors(links, target), _ancestors(links, source)
-    for frame, T_frame_target in above_target.items():
-        if frame in above_source:
-            T_target_source: Array = invert(T_frame_target) @ above_source[frame]
-            return T_target_source
-    return None
-
-
-def _ancestors(links: Mapping[str, Link], frame: str) -> dict[str, Array]:
-    """(4, 4) T_ancestor_frame of the frame itself and all above it, nearest first."""
-    found, T = {frame: np.eye(4)}, np.eye(4)
-    above = frame
-    while above in links and links[above].parent not in found:
-        above, T_parent_child, _ = links[above]
-        T = T_parent_child @ T
-        found[above] = T
-    return found
 
 
 def values_of(shift: Any, turn: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:

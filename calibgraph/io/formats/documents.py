@@ -1,6 +1,5 @@
 """Documents of the text formats: YAML, JSON and XML, read as mappings, written below comments."""
 
-import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -33,31 +32,6 @@ def read_xml(path: Path) -> ElementTree.Element:
     return root
 
 
-def content_of_storage(root: ElementTree.Element) -> dict[str, Any]:
-    """The mapping of an XML file of OpenCV's FileStorage."""
-    return {child.tag: _value(child) for child in root}
-
-
-def _value(element: ElementTree.Element) -> Any:
-    """A mapping, a number, a list of numbers, or a text."""
-    if len(element):
-        return content_of_storage(element)
-    words = [_scalar(word) for word in (element.text or "").split()]
-    is_text = any(isinstance(word, str) for word in words)
-    if is_text or not words:
-        return (element.text or "").strip().strip('"')
-    return words[0] if len(words) == 1 and element.tag != "data" else words
-
-
-def _scalar(word: str) -> int | float | str:
-    for kind in (int, float):
-        try:
-            return kind(word)
-        except ValueError:
-            continue
-    return word
-
-
 def commented(lines: Iterable[str]) -> str:
     """Lines as a comment of YAML and of shells."""
     return "".join(f"# {line}\n" for line in lines)
@@ -66,12 +40,6 @@ def commented(lines: Iterable[str]) -> str:
 def commented_yaml(statement: Iterable[str], content: dict[str, Any]) -> str:
     """YAML below its statement of direction."""
     return commented(statement) + yaml_text(content)
-
-
-def stated_json(statement: Iterable[str], content: dict[str, Any]) -> str:
-    """JSON, which has no comments, with the statement of direction under its first key."""
-    stated = {"calibgraph_export": list(statement), **content}
-    return json.dumps(stated, indent=2, allow_nan=False) + "\n"
 
 
 def commented_xml(statement: Iterable[str], root: ElementTree.Element) -> str:

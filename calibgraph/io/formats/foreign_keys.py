@@ -1,6 +1,6 @@
 """Cameras and transforms under the keys of other programs, which ``foreign_keys.yaml`` lists.
 
-A camera is any mapping that holds the numbers of a lens, at any depth of a YAML, JSON or XML file.
+A camera is any mapping that holds the numbers of a lens, at any depth of a YAML or JSON file.
 Kalibr's camchain and ROS's CameraInfo are read so, too.
 """
 
@@ -18,8 +18,6 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model, holds_truth_value
-from calibgraph.io.formats.part import IMU, ONLY_CAMERA, FrameLink, Part, RelativeCamera
-from calibgraph.io.formats.rig_export import frame_id
 from calibgraph.io.formats.writers import DERIVED
 from calibgraph.io.lenses import (
     CameraLens,
@@ -30,6 +28,7 @@ from calibgraph.io.lenses import (
     stated_model,
     unified_coefficients,
 )
+from calibgraph.io.rig_parts import ONLY_CAMERA, RelativeCamera, RigParts
 from calibgraph.io.rotations import pose_of_quaternion
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Intrinsics, Size, plain_key, rigid_transform
@@ -80,18 +79,16 @@ def foreign_keys() -> ForeignKeys:
     )
 
 
-def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> Part | None:
+def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> RigParts | None:
     """The cameras and transforms of a mapping; None if it holds none."""
-    content = _one_map_per_camera(content, path, name)
+    content = _camchain(content, path) if "cam0" in content else content
     maps = [_Map(above, path, each) for above, each in _maps(content)]
     cameras = [each for each in maps if each.holds_a_lens]
     single = len(cameras) == 1
     owner = (name or cameras[0].name or path.stem) if single else name or ONLY_CAMERA
     lenses: dict[str, CameraLens] = {}
     extrinsics: dict[str, Array] = {}
-    links: list[FrameLink] = []
     pairs: list[RelativeCamera] = []
-    frames: dict[str, str] = {}
     notes: list[str] = []
     for each in maps:
         camera = owner if single or not each.holds_a_lens else each.name or path.stem
@@ -104,64 +101,39 @@ def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> Part 
         for row, T in each.transforms():
             if row.start == "camera before":
                 pairs += [RelativeCamera(camera, before, T)] * bool(before)
-            elif IMU in (row.start, row.end):
-                of, T_imu_other = (row.start, T) if row.end == IMU else (row.end, invert(T))
-                frames[camera] = f"{frame_id(camera)}_optical_frame"
-                named = {"camera": frames[camera], "lidar": "lidar"}
-                links.append(FrameLink(IMU, named.get(of, f"{of}_optical_frame"), T_imu_other))
             else:
                 found = T if row.end == "camera" else invert(T)
                 if np.abs(extrinsics.setdefault(camera, found) - found).max() > _SAME:
                     raise FileError(path, "two of its keys give different T_camera_lidar; keep one")
-        notes += each.left_out()
-    part = Part(path, lenses, extrinsics, tuple(pairs), tuple(links), frames, notes=tuple(notes))
+    if not extrinsics:
+        notes += [note for each in maps for note in each.left_out()]
+    part = RigParts(path, lenses, extrinsics, tuple(pairs), notes=tuple(notes))
+    if part.is_empty and notes:
+        raise FileError(path, notes[0].removeprefix(f"{path}: "))
     if part.is_empty and any(each.holds_a_size for each in maps):
         raise FileError(path, "holds no camera matrix; expected the key camera_matrix, K or fx")
     return None if part.is_empty else part
 
 
-def _one_map_per_camera(content: dict[str, Any], path: Path, name: str | None) -> dict[str, Any]:
-    """Files whose numbers are no mapping per camera as such; others as they are.
-
-    Kalibr's camchain has cam0, cam1, ..., xi before the focal lengths, and what our export adds.
-    The calib.json of koide3's direct_visual_lidar_calibration has one camera, and its poses beside
-    it, of which the result comes first; behind its focal lengths comes xi.
-    """
+def _camchain(content: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Kalibr's camchain: cam0, cam1, ..., xi before the focal lengths, and what our export adds."""
+    keys = [key for key in content if re.fullmatch(r"cam\d+", str(key))]
+    in_order = sorted(keys, key=lambda key: int(key[3:]))
     try:
-        if "cam0" in content:
-            keys = [key for key in content if re.fullmatch(r"cam\d+", str(key))]
-            in_order = sorted(keys, key=lambda key: int(key[3:]))
-            return {key: _of_camchain(key, content[key], path) for key in in_order}
-        if "intrinsics" in (camera := _mapping(content, "camera")):
-            poses = _mapping(content, "results")
-            ways = ("T_lidar_camera", "init_T_lidar_camera", "init_T_lidar_camera_auto")
-            given = [("T_lidar_camera", poses[way]) for way in ways if poses.get(way)]
-            pose = dict(given[:1])
-            if stated_model(camera, path) == "omnidirectional":
-                values = camera["intrinsics"]
-                camera = {**camera, "xi": values[-1], "intrinsics": values[:-1]}
-            own = _mapping(content, "meta").get("camera", name)
-            return {"camera": {**camera, **pose, **({"name": str(own)} if own else {})}}
+        return {key: _of_camchain(key, content[key], path) for key in in_order}
     except (TypeError, IndexError, KeyError, AttributeError) as error:
-        raise FileError(path, f"is no calibration of Kalibr or koide3: {error}") from error
-    return content
+        raise FileError(path, f"is no calibration of Kalibr: {error}") from error
 
 
 def _of_camchain(key: str, camera: dict[str, Any], path: Path) -> dict[str, Any]:
     """A camera of a camchain; a T_cn_cnm1 that was computed from T_cam_lidar is no measurement."""
-    own = _mapping(camera, "calibgraph")
+    own = camera.get("calibgraph") or {}
     kept = {**camera, "name": own.get("camera", key)}
     if own.get("T_cn_cnm1") == DERIVED:
         del kept["T_cn_cnm1"]
     if stated_model(camera, path) == "omnidirectional":
         kept["xi"], *kept["intrinsics"] = camera["intrinsics"]
     return {key: value for key, value in kept.items() if key not in ("calibgraph", "rostopic")}
-
-
-def _mapping(content: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """The mapping under a key; empty if there is none."""
-    found = content.get(key)
-    return found if isinstance(found, dict) else {}
 
 
 def _maps(content: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -223,8 +195,8 @@ class _Map:
         for plain, why in foreign_keys().not_read.items():
             if plain in self._keys:
                 yield (
-                    f"{self._where}: {self._keys[plain]} is not read: {why}; give the pose of the "
-                    "camera by another file"
+                    f"{self._where}: {self._keys[plain]} is not read: {why}; give T_camera_lidar, "
+                    "or the frames of both"
                 )
 
     def _transform(self, keys: list[str]) -> Array:

@@ -5,10 +5,7 @@ from typing import Final
 
 EXPORT_FORMATS: Final[Mapping[str, str]] = {
     "kalibr": "Kalibr-style camchain YAML with T_cam_lidar and T_cn_cnm1",
-    "ros1": "lines static_transform_publisher for ROS 1, LiDAR -> optical frames",
-    "ros2": "lines static_transform_publisher for ROS 2, LiDAR -> optical frames",
     "ros2-launch": "ROS 2 launch file (.launch.xml) of static_transform_publisher nodes",
-    "tf2": "tf2_msgs/TFMessage as YAML, for /tf_static",
     "urdf": "URDF with one fixed joint per camera, LiDAR -> optical frames",
     "autoware": "Autoware's sensor_kit_calibration.yaml: camera_link, not optical",
     "kitti": "KITTI odometry's calib.txt: P0 to P3 and Tr",
@@ -20,10 +17,9 @@ EXPORT_FORMATS: Final[Mapping[str, str]] = {
 
 IMPORT_FORMATS: Final = (
     "Kalibr camchain, ROS camera_info and transforms (files, or as ros2 topic echo prints them), "
-    "OpenCV FileStorage (.yaml, .xml, .json), Autoware sensor kit, parameters of "
-    "VINS, LVI-SAM and FAST-LIVO, URDF, "
-    "static_transform_publisher in launch files (XML) and scripts (.sh), "
-    "koide3 calib.json, KITTI and KITTI-360 (calib_cam_to_velo.txt, "
-    "perspective.txt), a ROS bag, a rig file, a result or a JSON export of calibgraph"
+    "OpenCV FileStorage (.yaml, .json), Autoware sensor kit, parameters of FAST-LIVO, URDF, "
+    "static_transform_publisher in launch files (XML) and scripts (.sh), a matrix in a file named "
+    "cam_to_velo or velo_to_cam, KITTI's calib.txt, a ROS bag, a rig file, a result or a JSON "
+    "export of calibgraph"
 )
 """What ``calibgraph rig`` reads."""

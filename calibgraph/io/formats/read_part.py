@@ -1,26 +1,19 @@
 """One file of another program, in the format that its name or content shows."""
 
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated, Any
 
-from pydantic import AliasChoices, Field
+from pydantic import Field
 
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model, read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.bags.rig import read_bag_rig
-from calibgraph.io.formats.documents import (
-    YAML_SUFFIXES,
-    content_of_storage,
-    read_documents,
-    read_xml,
-)
+from calibgraph.io.formats.documents import YAML_SUFFIXES, read_documents, read_xml
 from calibgraph.io.formats.foreign_keys import read_foreign
-from calibgraph.io.formats.matrix_lines import read_lines
-from calibgraph.io.formats.part import Part, RelativeCamera
+from calibgraph.io.formats.matrix_file import read_matrix
 from calibgraph.io.formats.transforms import (
     is_autoware,
     is_tf2,
@@ -32,31 +25,32 @@ from calibgraph.io.formats.transforms import (
 )
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
+from calibgraph.io.rig_parts import RelativeCamera, RigParts
 from calibgraph.io.rigs import is_exported_rig, read_rig
 from calibgraph.model.rig import KNOWLEDGE, Camera, Finite, Size
 
 _MAX_BYTES, _HEAD_BYTES = 32 * 2**20, 2**16
 
 
-def read_part(path: Path, name: str | None) -> Part:  # noqa: PLR0911 - a line for each kind
+def read_part(path: Path, name: str | None) -> RigParts:  # noqa: PLR0911 - a line for each kind
     """Read a file; ``name`` replaces the file's own name of its camera if it has a single one.
 
     Raises:
         FileError: if the format is unknown, or the file malformed.
     """
     if is_bag(path):
-        return _part_of_bag(path)
+        return read_bag_rig(path)
     if path.is_dir() or path.name == CALIBRATION_NAME:
         return _part_of_rig(path)
     suffix = require_file(path).suffix.lower()
     if path.stat().st_size > _MAX_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes are too many for a calibration")
     if suffix in (".urdf", ".xml", ".xacro", ".launch"):
-        return _read_xml(path, name)
+        return _read_xml(path)
     if suffix in (".sh", ".bash"):
         return read_publishers(read_text(path).splitlines(), path)
     if suffix in (".txt", ".csv", ".npy"):
-        return _read_lines(path, name)
+        return _read_matrix(path, name)
     if suffix in (*YAML_SUFFIXES, ".json"):
         return _read_content(read_documents(path), path, name)
     with path.open("rb") as file:
@@ -64,19 +58,18 @@ def read_part(path: Path, name: str | None) -> Part:  # noqa: PLR0911 - a line f
     raise FileError(path, _unknown(f"a file {suffix or 'without a suffix'} is", head))
 
 
-def _read_xml(path: Path, name: str | None) -> Part:
-    """What a URDF, a launch file or OpenCV's storage holds."""
+def _read_xml(path: Path) -> RigParts:
+    """What a URDF or a launch file holds."""
     root = read_xml(path)
     if root.tag == "launch":
         return read_publishers(publisher_lines(root), path)
     if root.tag == "opencv_storage":
-        return _read_content([content_of_storage(root)], path, name)
+        raise FileError(path, "is OpenCV's XML, which is not read; write it to a name in .yml")
     return read_urdf(root, path)
 
 
-def _read_lines(path: Path, name: str | None) -> Part:
-    """What a text file of lines holds."""
-    found = read_lines(path, name)
+def _read_matrix(path: Path, name: str | None) -> RigParts:
+    found = read_matrix(path, name)
     if found is not None:
         return found
     text = read_text(path)
@@ -100,7 +93,7 @@ def _unknown(what: str, text: str = "") -> str:
     )
 
 
-def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None) -> Part:
+def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None) -> RigParts:
     """What the mappings of a file hold."""
     content = documents[0]
     if is_tf2(content):
@@ -109,9 +102,12 @@ def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None)
         documents = [content, *(each for each in documents if _message(each) != _message(content))]
     if len(documents) > 1:
         raise FileError(path, f"holds {len(documents)} different YAML documents; keep one of them")
-    for matches, read in _READERS:
-        if matches(content):
-            return read(content, path, name)
+    if _is_camera_info(content):
+        return _read_camera_info(content, path, name)
+    if "format" in content or is_exported_rig(content):
+        return _part_of_rig(path)
+    if is_autoware(content):
+        return read_autoware(content, path)
     found = read_foreign(content, path, name)
     if found is None:
         keys = ", ".join(str(key) for key in list(content)[:5])
@@ -127,10 +123,8 @@ def _message(content: dict[str, Any]) -> dict[str, Any]:
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
-def _list_of(name: str, length: int | None) -> Any:
-    """A list of numbers under its name in ROS 1 or 2."""
-    return Field(validation_alias=AliasChoices(name, name.lower()), min_length=length or 0,
-                 max_length=length)  # fmt: skip
+_Nine = Annotated[list[Finite], Field(min_length=9, max_length=9)]
+_Twelve = Annotated[list[Finite], Field(min_length=12, max_length=12)]
 
 
 class _Header(StrictNumbers):
@@ -149,10 +143,10 @@ class _Message(StrictNumbers):
     height: Size
     width: Size
     distortion_model: str
-    D: Annotated[list[Finite], _list_of("D", None)]
-    K: Annotated[list[Finite], _list_of("K", 9)]
-    R: Annotated[list[Finite], _list_of("R", 9)]
-    P: Annotated[list[Finite], _list_of("P", 12)]
+    d: list[Finite]
+    k: _Nine
+    r: _Nine
+    p: _Twelve
     binning_x: _Count = 0
     binning_y: _Count = 0
     roi: _Window = _Window()
@@ -160,51 +154,23 @@ class _Message(StrictNumbers):
 
 def _is_camera_info(content: dict[str, Any]) -> bool:
     """Whether the content of a file is a CameraInfo message, as ``ros2 topic echo`` prints it."""
-    return {"height", "width", "distortion_model"} <= content.keys() and (
-        {"K", "D", "P"} <= content.keys() or {"k", "d", "p"} <= content.keys()
-    )
+    keys = {str(key).lower() for key in content}  # in capitals: K of ROS 1
+    return {"height", "width", "distortion_model", "k", "d", "p"} <= keys
 
 
-def _read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> Part:
+def _read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> RigParts:
     """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame."""
-    message = checked_model(_Message, content, path)
+    message = checked_model(_Message, {str(key).lower(): v for key, v in content.items()}, path)
     stated = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
     camera = name or path.stem
-    return Part(
+    return RigParts(
         path, {camera: stated.lens}, frame_ids={camera: stated.frame} if stated.frame else {}
     )
 
 
-def _is_rig(content: dict[str, Any]) -> bool:
-    return "format" in content or is_exported_rig(content)
-
-
-_READERS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[..., Part]], ...] = (
-    (_is_camera_info, _read_camera_info),
-    (_is_rig, lambda _, path, __: _part_of_rig(path)),
-    (is_autoware, lambda content, path, _: read_autoware(content, path)),
-)
-
-
-def _part_of_bag(path: Path) -> Part:
-    """Lenses from camera_info, and the extrinsics that /tf_static has."""
-    read = read_bag_rig(path)
-    cameras = read.cameras
-    found = {name: camera.T_camera_lidar for name, camera in cameras.items()}
-    return Part(
-        path,
-        lenses={name: camera.stated.lens for name, camera in cameras.items()},
-        T_camera_lidar={name: T for name, T in found.items() if T is not None},
-        frame_ids={name: each.frame_id for name, each in cameras.items() if each.frame_id},
-        mounts={name: each.mount for name, each in cameras.items() if each.mount},
-        lidar=read.lidar,
-        notes=tuple(read.notes),
-    )
-
-
-def _part_of_rig(path: Path) -> Part:
+def _part_of_rig(path: Path) -> RigParts:
     rig, notes = read_rig(path)
-    return Part(
+    return RigParts(
         path,
         lenses={name: _lens(camera) for name, camera in rig.cameras.items()},
         T_camera_lidar=rig.T_camera_lidar,

@@ -1,42 +1,46 @@
 """A rig from the files of other programs."""
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from shlex import quote
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CalibrationError, FileError, RigError
-from calibgraph.files import checked_model
-from calibgraph.io.formats.part import (
-    NO_LIDAR_IN_IMU,
-    ONLY_CAMERA,
-    FrameLink,
-    FrameTree,
-    Part,
-    RelativeCamera,
-    find_camera_frame,
-    find_lidar_frame,
-    optical_axes,
-    tied_links,
-)
+from calibgraph.errors import CalibrationError, FileError
 from calibgraph.io.formats.read_part import read_part
-from calibgraph.io.lenses import CameraLens
-from calibgraph.io.mounts import find_mounts
-from calibgraph.model.geometry import invert
+from calibgraph.io.formats.rig_export import frame_id
+from calibgraph.io.frame_tree import (
+    Link,
+    Links,
+    T_between,
+    ancestors,
+    find_mounts,
+    links_between,
+)
+from calibgraph.io.rig_parts import (
+    ONLY_CAMERA,
+    RELATIVE_SIGMA_CM,
+    RELATIVE_SIGMA_DEG,
+    RigParts,
+    frame_names,
+)
+from calibgraph.model.geometry import T_OPTICAL_LINK
 from calibgraph.model.rig import Mount, Rig
 
 Value = TypeVar("Value")
 
-RELATIVE_SIGMA_DEG = 0.1
-RELATIVE_SIGMA_CM = 0.5
-"""Assumed of relative poses whose file has none: a stereo calibration with a board, generously."""
-
 _SAME = 1e-6  # of transforms that two files give: they may be rounded
+_LIDAR_WORDS = (
+    "lidar", "velodyne", "ouster", "os_sensor", "hesai", "pandar", "livox", "rslidar", "robosense",
+)  # fmt: skip
+_CAMERA_FRAMES = (
+    "{}_optical_frame", "{}_optical_link", "{}_optical", "{}/camera_optical_link",
+    "{}_camera_optical_frame", "{}_color_optical_frame", "{}/camera_link", "{}_camera_link",
+    "{}_link", "{}",
+)  # fmt: skip
+"""Frames of a camera, by its name; those that are not optical are x forward, y left, z up."""
 
 
 def import_rig(
@@ -75,61 +79,6 @@ def import_rig(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class RigParts:
-    """What files of other programs hold about a rig together; extrinsics may be missing.
-
-    Attributes:
-        lidar: name of the LiDAR.
-        lenses: by camera.
-        T_camera_lidar: (4, 4) of the cameras that have one.
-        pairs: relative poses.
-        frames: names of the frames.
-        frame_ids: of optical frames, by camera.
-        mounts: the links of a tree by which cameras hang, by camera.
-        notes: what was assumed or left out in the files, a line each.
-    """
-
-    path: Path
-    lidar: str
-    lenses: Mapping[str, CameraLens]
-    T_camera_lidar: Mapping[str, Array]
-    pairs: Sequence[RelativeCamera]
-    frames: Sequence[str]
-    frame_ids: Mapping[str, str]
-    mounts: Mapping[str, Mount]
-    notes: Sequence[str]
-
-    def tied_to(self, camera: str, T_camera_lidar: Array) -> dict[str, Array]:
-        """(4, 4) T_camera_lidar of a camera, and of those that relative poses tie to it."""
-        return _by_pairs({camera: T_camera_lidar}, self.pairs)
-
-    def to_rig(
-        self,
-        extrinsics: Mapping[str, Array] | None = None,
-        *,
-        size_px: tuple[int, int] | None = None,
-        relative_sigma_deg: float = RELATIVE_SIGMA_DEG,
-        relative_sigma_cm: float = RELATIVE_SIGMA_CM,
-    ) -> Rig:
-        """The rig, with further (4, 4) T_camera_lidar, which replace the files'."""
-        T = {**self.T_camera_lidar, **(extrinsics or {})}
-        sigmas = (math.radians(relative_sigma_deg), relative_sigma_cm / 100.0)
-        content: dict[str, Any] = {
-            "lidar": self.lidar,
-            "cameras": {
-                name: {
-                    **_camera(name, lens, T.get(name), size_px, parts=self),
-                    "frame_id": self.frame_ids.get(name),
-                    "mount": self.mounts.get(name),
-                }
-                for name, lens in self.lenses.items()
-            },
-            "relative_poses": [_relative_pose(pair, *sigmas) for pair in self.pairs],
-        }
-        return checked_model(Rig, content, self.path)
-
-
 def read_rig_parts(
     files: Iterable[Path | str],
     *,
@@ -146,40 +95,39 @@ def read_rig_parts(
     parts = _read_all(files, names or {}, rename or {})
     lenses = _merged(parts, lambda part: part.lenses, "lens", lambda one, other: one == other)
     T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
-    missing = sorted(lenses.keys() - T_camera_lidar.keys())
     links, notes = _later_first(parts)
-    tied = tied_links(links, lidar_frame)
-    tree = FrameTree(tied)
+    tree = _tree(links)
     frame_ids = {name: frame for part in parts for name, frame in part.frame_ids.items()}
     lidar = lidar_frame or next((part.lidar for part in parts if part.lidar), None)
-    in_tree = {name: frame for name, frame in frame_ids.items() if frame in tree.names}
-    chosen = {**in_tree, **(camera_frames or {})}
-    of_tree = lidar if lidar_frame or lidar in tree.names else None
+    known = frame_names(links)
+    in_tree = {name: frame for name, frame in frame_ids.items() if frame in known}
     notes += [note for part in parts for note in part.notes]
-    notes += [NO_LIDAR_IN_IMU] if missing and len(tied) < len(links) else []
     try:
-        by_frames, mounts = _by_frames(tree, missing, of_tree, chosen, notes=notes)
+        by_frames, mounts = _by_frames(
+            tree,
+            sorted(lenses.keys() - T_camera_lidar.keys()),
+            lidar if lidar_frame or lidar in known else None,
+            {**in_tree, **(camera_frames or {})},
+            notes=notes,
+        )
     except CalibrationError as error:
         raise CalibrationError("; ".join([str(error), *notes])) from error
-    T_camera_lidar |= by_frames
-    pairs = [pair for part in parts for pair in part.relative_poses]
-    T_camera_lidar |= _by_pairs(T_camera_lidar, pairs)
-    return RigParts(
-        path=parts[0].path,
-        lidar=lidar or "lidar",
-        lenses=lenses,
-        T_camera_lidar=T_camera_lidar,
-        pairs=pairs,
-        frames=tree.names,
+    found = RigParts(
+        parts[0].path,
+        lenses,
+        relative_poses=tuple(pair for part in parts for pair in part.relative_poses),
+        links=tuple(links),
         frame_ids=frame_ids,
         mounts={n: m for part in parts for n, m in part.mounts.items()} | mounts,
-        notes=notes,
+        lidar=lidar or "lidar",
+        notes=tuple(notes),
     )
+    return replace(found, T_camera_lidar=found.tied_to(T_camera_lidar | by_frames))
 
 
 def _read_all(
     files: Iterable[Path | str], names: Mapping[Path | str, str], rename: Mapping[str, str]
-) -> list[Part]:
+) -> list[RigParts]:
     """The parts; at least one has a lens."""
     chosen = {Path(file): name for file, name in names.items()}
     read = [read_part(Path(file), chosen.get(Path(file))) for file in files]
@@ -207,8 +155,8 @@ def _read_all(
 
 
 def _merged(
-    parts: Iterable[Part],
-    select: Callable[[Part], Mapping[str, Value]],
+    parts: Iterable[RigParts],
+    select: Callable[[RigParts], Mapping[str, Value]],
     what: str,
     is_same: Callable[[Value, Value], bool],
 ) -> dict[str, Value]:
@@ -228,20 +176,34 @@ def _is_same(one: Array, other: Array) -> bool:
     return bool(np.abs(one - other).max() <= _SAME)
 
 
-def _later_first(parts: Sequence[Part]) -> tuple[list[FrameLink], list[str]]:
+def _later_first(parts: Sequence[RigParts]) -> tuple[list[Link], list[str]]:
     """The links, of which a later file's replace those between the same frames; and notes."""
-    links: list[FrameLink] = []
+    links: list[Link] = []
     notes: list[str] = []
     for part in parts:
-        own = {(each.parent, each.child) for each in part.links}
-        replaced = [each for each in links if (each.parent, each.child) in own]
+        own = {each[:2] for each in part.links}
+        replaced = [each for each in links if each[:2] in own]
         notes += [f"{part.path}: {e.child} in {e.parent} is that of this file" for e in replaced]
-        links = [each for each in links if each not in replaced] + [*part.links]
+        links = [each for each in links if each[:2] not in own] + [*part.links]
     return links, notes
 
 
+def _tree(links: Iterable[Link]) -> dict[str, Link]:
+    """The links by child; each frame has one parent, and is not its own ancestor."""
+    tree: dict[str, Link] = {}
+    for link in links:
+        if link.child in tree:
+            raise CalibrationError(f"frame {link.child!r} has two parents; give one of them")
+        tree[link.child] = link
+    for frame in tree:
+        *_, top = ancestors(tree, frame)
+        if top in tree:
+            raise CalibrationError(f"frame {frame!r} is its own ancestor; correct the file")
+    return tree
+
+
 def _by_frames(
-    tree: FrameTree,
+    tree: Links,
     cameras: Iterable[str],
     lidar_frame: str | None,
     chosen: Mapping[str, str],
@@ -249,64 +211,51 @@ def _by_frames(
     notes: list[str],
 ) -> tuple[dict[str, Array], dict[str, Mount]]:
     """T_camera_lidar and mounts of the cameras that have a frame in the tree; notes on links."""
-    frames = {name: find_camera_frame(tree, name, chosen) for name in cameras}
-    found = {n: (frame, optical_axes(frame)) for n, frame in frames.items() if frame is not None}
+    names = frame_names(tree.values())
+    frames = {name: _find_camera_frame(names, name, chosen) for name in cameras}
+    found = {
+        name: (frame, np.eye(4) if "optical" in frame.lower() else T_OPTICAL_LINK)
+        for name, frame in frames.items()
+        if frame is not None
+    }
     if not found:
         return {}, {}
-    lidar = lidar_frame or find_lidar_frame(tree)
+    lidar = lidar_frame or _find_lidar_frame(names)
+    T = {name: axes @ _T_between(tree, frame, lidar) for name, (frame, axes) in found.items()}
     for frame, _ in found.values():
-        notes += [note for note in tree.notes_between(frame, lidar) if note not in notes]
-    T = {name: axes @ tree.T_between(frame, lidar) for name, (frame, axes) in found.items()}
-    return T, find_mounts(found, lidar, tree.parents, tree.T_between)
+        between = (link.note for link in links_between(tree, frame, lidar))
+        notes += [note for note in between if note and note not in notes]
+    return T, find_mounts(found, lidar, tree)
 
 
-def _by_pairs(known: Mapping[str, Array], pairs: Iterable[RelativeCamera]) -> dict[str, Array]:
-    """T_camera_lidar of the cameras that relative poses tie to one that is known."""
-    found = dict(known)
-    both_ways = [
-        step
-        for pair in pairs
-        for step in ((pair.a, pair.b, invert(pair.T_a_b)), (pair.b, pair.a, pair.T_a_b))
-    ]
-    for _ in both_ways:  # as many passes as the longest chain may need
-        for start, end, T_end_start in both_ways:
-            if start in found and end not in found:
-                found[end] = T_end_start @ found[start]
-    return found
-
-
-def _relative_pose(pair: RelativeCamera, sigma_rad: float, sigma_m: float) -> dict[str, Any]:
-    return {
-        "a": pair.a,
-        "b": pair.b,
-        "T_a_b": pair.T_a_b,
-        "rotation_sigma_rad": pair.rotation_sigma_rad or sigma_rad,
-        "translation_sigma_m": pair.translation_sigma_m or sigma_m,
-    }
-
-
-def _camera(
-    name: str,
-    lens: CameraLens,
-    T_camera_lidar: Array | None,
-    size_px: tuple[int, int] | None,
-    *,
-    parts: RigParts,
-) -> dict[str, Any]:
-    """The content of a rig file for a camera."""
-    size = lens.size_px or size_px
-    if size is None:
-        raise RigError(
-            f"camera {name!r}: its file has no image size; give it with --size WIDTHxHEIGHT",
-            camera=name,
+def _T_between(tree: Links, target: str, source: str) -> Array:
+    """(4, 4) T_target_source of two frames."""
+    names = frame_names(tree.values())
+    for frame in (target, source):
+        if frame not in names:
+            raise CalibrationError(f"no frame {frame!r}; there are {', '.join(names)}")
+    T = T_between(tree, target, source)
+    if T is None:
+        roots = " and ".join(repr([*ancestors(tree, frame)][-1]) for frame in (target, source))
+        raise CalibrationError(
+            f"frames {target!r} and {source!r} are not connected: their roots are {roots}; add "
+            "the file with the transform between them"
         )
-    if T_camera_lidar is None:
-        listed = f" (its frames are {', '.join(parts.frames)})" if parts.frames else ""
-        notes = "".join(f"; {note}" for note in parts.notes)
-        raise RigError(
-            f"camera {name!r}: no file has its T_camera_lidar{listed}; name its "
-            "frame with --camera-frame, add a URDF, a sensor kit or a rig file with a guess, or "
-            f"describe its mounting with --mount {quote(name)}=WORDS{notes}",
-            camera=name,
-        )
-    return {**replace(lens, size_px=size).fields(), "T_camera_lidar": T_camera_lidar}
+    return T
+
+
+def _find_lidar_frame(names: Sequence[str]) -> str:
+    """The one frame with the name of a LiDAR."""
+    found = [name for name in names if any(word in name.lower() for word in _LIDAR_WORDS)]
+    if len(found) != 1:
+        what = f"could be {', '.join(found)}" if found else f"is none of {', '.join(names)}"
+        raise CalibrationError(f"the frame of the LiDAR {what} by name; name it with --lidar-frame")
+    return found[0]
+
+
+def _find_camera_frame(names: Sequence[str], camera: str, chosen: Mapping[str, str]) -> str | None:
+    """The chosen frame of a camera, else one with its name; None if there is none."""
+    if camera in chosen:
+        return chosen[camera]
+    likely = (pattern.format(frame_id(camera)) for pattern in _CAMERA_FRAMES)
+    return next((name for name in likely if name in names), None)

@@ -1,4 +1,4 @@
-"""Transforms of ROS: one writer for publishers, launch files, tf2, URDF and Autoware; readers."""
+"""Transforms of ROS: one writer for launch files, URDF and Autoware; readers, also of tf2."""
 
 import shlex
 from collections.abc import Iterable, Iterator
@@ -12,9 +12,10 @@ from pydantic import ConfigDict
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model
-from calibgraph.io.formats.documents import commented, commented_xml, commented_yaml
-from calibgraph.io.formats.part import FrameLink, Part
+from calibgraph.io.formats.documents import commented_xml, commented_yaml
 from calibgraph.io.formats.rig_export import RigExport, frame_id
+from calibgraph.io.frame_tree import Link
+from calibgraph.io.rig_parts import RigParts
 from calibgraph.io.rotations import (
     pose_of_angles,
     pose_of_quaternion,
@@ -24,7 +25,7 @@ from calibgraph.io.rotations import (
 from calibgraph.model.geometry import T_OPTICAL_LINK, invert
 from calibgraph.model.rig import Finite
 
-TRANSFORMS = ("ros1", "ros2", "ros2-launch", "tf2", "urdf", "autoware")
+TRANSFORMS = ("ros2-launch", "urdf", "autoware")
 _DIRECTION = "each transform is the pose of the child frame in its parent: p_parent = T * p_child"
 _OF_LIDAR = (
     "{camera}: the optical frame (child) in the LiDAR frame (parent): p_lidar = T * p_camera, the "
@@ -36,13 +37,11 @@ _OF_TREE = (
     "measured; it replaces this transform of the robot's description, whose others stay"
 )
 _MORE = {
-    "ros1": "numbers: x y z qx qy qz qw, then parent and child frame",
-    "tf2": "publish: ros2 topic pub --once --qos-durability transient_local /tf_static "
-    'tf2_msgs/msg/TFMessage "$(cat FILE)"',
+    "ros2-launch": "ROS 1: rosrun tf2_ros static_transform_publisher, with the numbers and frames "
+    "of args in their order, without the names before them",
     "urdf": "rpy about fixed x, y, z",
 }
 _PUBLISHER = "static_transform_publisher"
-_COMMANDS = {"ros1": ["rosrun", "tf2_ros"], "ros2": ["ros2", "run", "tf2_ros"]}
 _NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _KIT, _OPTICAL_LINK = "sensor_kit_base_link", "/camera_optical_link"
 _ANGLES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -53,12 +52,6 @@ def write_transforms(export: RigExport, format: str) -> str:
     links = _WHICH.get(format, _measured)(export)
     directions = _of_kit(export) if format == "autoware" else _of_transforms(export, format)
     statement = export.statement(*directions)
-    if format in _COMMANDS:
-        lines = (shlex.join([*_COMMANDS[format], _PUBLISHER, *_arguments(each, format)])
-                 for each in links)  # fmt: skip
-        return commented(statement) + "".join(f"{line} &\n" for line in lines) + "wait\n"
-    if format == "tf2":
-        return commented_yaml(statement, {"transforms": [*map(_stamped, links)]})
     if format == "autoware":
         poses = {each.child: dict(zip(_ANGLES, _six(each), strict=True)) for each in links}
         return commented_yaml(statement, {_KIT: poses})
@@ -72,52 +65,32 @@ def _of_transforms(export: RigExport, format: str) -> Iterator[str]:
         parent, child, _ = export.link(name)
         text = _OF_LIDAR if export.mount(name) is None else _OF_TREE
         yield text.format(camera=name, parent=parent, child=child)
-    if format in _MORE:
-        yield _MORE[format]
+    yield _MORE[format]
 
 
-def _measured(export: RigExport) -> list[FrameLink]:
+def _measured(export: RigExport) -> list[Link]:
     """The transforms that the calibration changes."""
-    return [FrameLink(*export.link(name)) for name in export.cameras]
+    return [Link(*export.link(name)) for name in export.cameras]
 
 
-def _arguments(link: FrameLink, format: str = "ros2") -> list[str]:
-    """The arguments of a publisher."""
-    values = [repr(float(value)) for value in (*link.T_parent_child[:3, 3],
-                                               *quaternion_xyzw(link.T_parent_child))]  # fmt: skip
-    if format == "ros1":
-        return [*values, link.parent, link.child]
-    named = (word for name, value in zip(_NAMES, values, strict=True)
-             for word in (f"--{name}", value))  # fmt: skip
-    return [*named, "--frame-id", link.parent, "--child-frame-id", link.child]
-
-
-def _launch(links: Iterable[FrameLink]) -> ElementTree.Element:
+def _launch(links: Iterable[Link]) -> ElementTree.Element:
     root = ElementTree.Element("launch")
     for each in links:
-        attributes = {"pkg": "tf2_ros", "exec": _PUBLISHER, "args": " ".join(_arguments(each))}
+        T = each.T_parent_child
+        values = map(float, (*T[:3, 3], *quaternion_xyzw(T)))
+        named = " ".join(f"--{name} {value!r}" for name, value in zip(_NAMES, values, strict=True))
+        args = f"{named} --frame-id {each.parent} --child-frame-id {each.child}"
+        attributes = {"pkg": "tf2_ros", "exec": _PUBLISHER, "args": args}
         ElementTree.SubElement(root, "node", attributes)
     return root
 
 
-def _stamped(link: FrameLink) -> dict[str, Any]:
-    T = link.T_parent_child
-    return {
-        "header": {"frame_id": link.parent},
-        "child_frame_id": link.child,
-        "transform": {
-            "translation": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
-            "rotation": dict(zip("xyzw", quaternion_xyzw(T), strict=True)),
-        },
-    }
-
-
-def _six(link: FrameLink) -> list[float]:
+def _six(link: Link) -> list[float]:
     """Place, and roll, pitch, yaw."""
     return [*link.T_parent_child[:3, 3].tolist(), *roll_pitch_yaw(link.T_parent_child)]
 
 
-def _joints(export: RigExport) -> list[FrameLink]:
+def _joints(export: RigExport) -> list[Link]:
     """The transforms that are measured, and those between LiDAR and cameras that stay."""
     joints: dict[str, tuple[str, Array]] = {}
     for name, optical in export.optical_frames.items():
@@ -132,10 +105,10 @@ def _joints(export: RigExport) -> list[FrameLink]:
             joints[export.lidar_frame] = parent, mount.T_parent_lidar
         elif joints[export.lidar_frame][0] != parent:
             joints[parent] = export.lidar_frame, invert(mount.T_parent_lidar)
-    return [FrameLink(parent, child, T) for child, (parent, T) in joints.items()]
+    return [Link(parent, child, T) for child, (parent, T) in joints.items()]
 
 
-def _robot(export: RigExport, links: list[FrameLink]) -> ElementTree.Element:
+def _robot(export: RigExport, links: list[Link]) -> ElementTree.Element:
     root = ElementTree.Element("robot", name="calibgraph")
     frames = [export.lidar_frame, *(each.parent for each in links), *(each.child for each in links)]
     for frame in dict.fromkeys(frames):
@@ -149,15 +122,15 @@ def _robot(export: RigExport, links: list[FrameLink]) -> ElementTree.Element:
     return root
 
 
-def _sensor_kit(export: RigExport) -> list[FrameLink]:
+def _sensor_kit(export: RigExport) -> list[Link]:
     """The LiDAR and the camera_link of each camera: x forward, not optical."""
     T_base_lidar = np.eye(4) if export.T_base_lidar is None else export.T_base_lidar
-    links = [FrameLink(_KIT, export.lidar_frame, T_base_lidar)]
+    links = [Link(_KIT, export.lidar_frame, T_base_lidar)]
     for name, optical in export.optical_frames.items():
         above = optical.removesuffix(_OPTICAL_LINK)  # as Autoware names it; else by the camera
         link = f"{above if above != optical else frame_id(name)}/camera_link"
         T_base_camera = T_base_lidar @ export.T_lidar_camera(name)
-        links.append(FrameLink(_KIT, link, T_base_camera @ T_OPTICAL_LINK))
+        links.append(Link(_KIT, link, T_base_camera @ T_OPTICAL_LINK))
     return links
 
 
@@ -183,7 +156,7 @@ def publisher_lines(launch: ElementTree.Element) -> list[str]:
     return [f"{_PUBLISHER} {each.get('args', '')}" for each in nodes]
 
 
-def read_publishers(lines: Iterable[str], path: Path) -> Part:
+def read_publishers(lines: Iterable[str], path: Path) -> RigParts:
     """The frames of lines ``... static_transform_publisher ARGUMENTS``, of ROS 1 or 2."""
     links = [
         _published(line.partition(_PUBLISHER)[2].partition(" &")[0], path)
@@ -196,10 +169,10 @@ def read_publishers(lines: Iterable[str], path: Path) -> Part:
             f"has no {_PUBLISHER}; write the transforms to a file: `ros2 topic echo --once "
             "/tf_static > tf_static.yaml`",
         )
-    return Part(path, links=tuple(links))
+    return RigParts(path, links=tuple(links))
 
 
-def _published(text: str, path: Path) -> FrameLink:
+def _published(text: str, path: Path) -> Link:
     """The frame of a publisher: with names, or x y z, yaw pitch roll or a quaternion, frames."""
     wrong = FileError(
         path, f"{_PUBLISHER}{text[:80]}: expected numbers and two frames, without $()"
@@ -228,7 +201,7 @@ def _published(text: str, path: Path) -> FrameLink:
         raise wrong from error
     if not np.isfinite(T).all():
         raise wrong
-    return FrameLink(frames[0].lstrip("/"), frames[1].lstrip("/"), T)
+    return Link(frames[0].lstrip("/"), frames[1].lstrip("/"), T)
 
 
 def _is_number(word: str) -> bool:
@@ -273,12 +246,12 @@ def is_tf2(content: dict[str, Any]) -> bool:
     return "transforms" in content or {"transform", "child_frame_id"} <= content.keys()
 
 
-def read_tf2(documents: list[dict[str, Any]], path: Path) -> Part:
+def read_tf2(documents: list[dict[str, Any]], path: Path) -> RigParts:
     """The frames of TFMessages and TransformStampeds; the last of several for a child.
 
     A frame whose numbers are no transform is left out with a note: others may do without it.
     """
-    links: dict[str, FrameLink] = {}
+    links: dict[str, Link] = {}
     notes: list[str] = []
     for content in documents:
         listed = content if "transforms" in content else {"transforms": [content]}
@@ -288,17 +261,17 @@ def read_tf2(documents: list[dict[str, Any]], path: Path) -> Part:
                 links[link.child] = link
             except ValueError as error:
                 notes.append(f"{path}: frame {stamped.child_frame_id!r} is left out: {error}")
-    return Part(path, links=tuple(links.values()), notes=tuple(notes))
+    return RigParts(path, links=tuple(links.values()), notes=tuple(notes))
 
 
-def _link(stamped: _Stamped) -> FrameLink:
+def _link(stamped: _Stamped) -> Link:
     """The frame of a message."""
     t, q = stamped.transform.translation, stamped.transform.rotation
     if not np.isfinite([t.x, t.y, t.z]).all():
         raise ValueError(f"translation [{t.x}, {t.y}, {t.z}] is not finite")
     T = pose_of_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
     parent, child = (name.lstrip("/") for name in (stamped.header.frame_id, stamped.child_frame_id))
-    return FrameLink(parent, child, T)
+    return Link(parent, child, T)
 
 
 class _Pose(StrictNumbers):
@@ -323,30 +296,32 @@ def _entries(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
             yield str(parent), str(child), pose
 
 
-def read_autoware(content: dict[str, Any], path: Path) -> Part:
+def read_autoware(content: dict[str, Any], path: Path) -> RigParts:
     """The frames of a sensor kit."""
-    return Part(path, links=tuple(_kit_link(*entry, path) for entry in _entries(content)))
+    return RigParts(path, links=tuple(_kit_link(*entry, path) for entry in _entries(content)))
 
 
-def _kit_link(parent: str, child: str, pose: Any, path: Path) -> FrameLink:
+def _kit_link(parent: str, child: str, pose: Any, path: Path) -> Link:
     p = checked_model(_Pose, pose, f"{path}: {parent}: {child}")
     try:
         T = pose_of_angles((p.x, p.y, p.z), (p.roll, p.pitch, p.yaw))
     except ValueError as error:
         raise FileError(path, f"{parent}: {child}: {error}") from error
-    return FrameLink(parent, child, T)
+    return Link(parent, child, T)
 
 
-def read_urdf(root: ElementTree.Element, path: Path) -> Part:
+def read_urdf(root: ElementTree.Element, path: Path) -> RigParts:
     """The frames of a URDF: its joints at their zero position."""
     if root.tag != "robot":
         raise FileError(path, f"is not a URDF: its root is <{root.tag}>, expected <robot>")
     if "{http://www.ros.org/wiki/xacro}" in "".join(element.tag for element in root.iter()):
         raise FileError(path, "holds xacro macros; expand it: xacro FILE > robot.urdf")
-    return Part(path, links=tuple(_link_of_joint(joint, path) for joint in root.findall("joint")))
+    return RigParts(
+        path, links=tuple(_link_of_joint(joint, path) for joint in root.findall("joint"))
+    )
 
 
-def _link_of_joint(joint: ElementTree.Element, path: Path) -> FrameLink:
+def _link_of_joint(joint: ElementTree.Element, path: Path) -> Link:
     parent, child, origin = (joint.find(tag) for tag in ("parent", "child", "origin"))
     if parent is None or child is None:
         raise FileError(path, f"joint {joint.get('name')!r} has no <parent> or no <child>")
@@ -358,7 +333,7 @@ def _link_of_joint(joint: ElementTree.Element, path: Path) -> FrameLink:
     except ValueError as error:
         raise FileError(path, f"joint {joint.get('name')!r}: {error}") from error
     note = f"{path}: {_movement(joint)}" if joint.get("type") in _MOVABLE else ""
-    return FrameLink(parent.get("link", ""), child.get("link", ""), T, note)
+    return Link(parent.get("link", ""), child.get("link", ""), T, note)
 
 
 _MOVABLE = ("revolute", "continuous", "prismatic", "planar", "floating")

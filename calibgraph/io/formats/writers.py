@@ -1,5 +1,6 @@
 """Lenses and extrinsics for Kalibr, KITTI, ROS's camera_info, OpenCV, and as plain JSON."""
 
+import json
 import re
 from collections.abc import Mapping
 from typing import Any, Final
@@ -9,7 +10,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.io.formats.documents import commented_yaml, stated_json
+from calibgraph.io.formats.documents import commented_yaml
 from calibgraph.io.formats.rig_export import (
     COVARIANCE_SENTENCE,
     RigExport,
@@ -23,7 +24,6 @@ from calibgraph.model.rig import Camera
 
 DERIVED = "computed from T_cam_lidar"
 """States of a T_cn_cnm1 that it is no measurement."""
-"""Text of exported lenses alone."""
 _MODELS: Final = {"pinhole": "plumb_bob", "fisheye": "equidistant", "omnidirectional": "mei"}
 _PLUMB_BOB = 5
 _SAME = 1e-9  # of rotation matrices: rounding in double precision
@@ -158,7 +158,7 @@ def write_camera_infos(export: RigExport) -> Mapping[str, str]:
         statement = (
             export.origin,
             "K and D are of the images as recorded, R is the identity, P is K",
-            "the extrinsic is not part of a camera_info: export it as tf2, ros2-launch or urdf",
+            "the extrinsic is not part of a camera_info: export it as ros2-launch or urdf",
             f"optical frame: {export.optical_frames[name]}",
         )
         files[file] = commented_yaml(statement, _of_ros(name, camera))
@@ -193,16 +193,16 @@ def _matrix(values: Array) -> dict[str, Any]:
 def write_json(export: RigExport) -> str:
     """Per camera: lens, both directions of the extrinsic, covariance or null."""
     content = {
+        "calibgraph_export": export.statement(
+            _MAPS,
+            "T_lidar_camera is its inverse, the pose of the camera in the LiDAR frame",
+            COVARIANCE_SENTENCE,
+        ),
         "verdict": export.verdict or None,
         "lidar_frame": export.lidar_frame,
         "cameras": {name: _of_json(export, name) for name in export.cameras},
     }
-    direction = (
-        _MAPS,
-        "T_lidar_camera is its inverse, the pose of the camera in the LiDAR frame",
-        COVARIANCE_SENTENCE,
-    )
-    return stated_json(export.statement(*direction), content)
+    return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
 def _of_json(export: RigExport, name: str) -> dict[str, Any]:

@@ -332,13 +332,6 @@ def db3_bomb(folder: Path) -> Path:
     return bag
 
 
-def file_bomb(folder: Path) -> Path:
-    """A folder whose one file is a bomb."""
-    bag = write_bag(folder, "sqlite3", sample_messages(Messages("sqlite3")), compression="FILE")
-    next(bag.glob("*.zstd")).write_bytes(zstd_bomb())
-    return bag
-
-
 def computed(schema: str) -> Callable[[Path], Path]:
     """A database whose messages are not stored but computed."""
 
@@ -372,7 +365,6 @@ BOMBS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "lz4": (ros1_bomb("LZ4", lz4_bomb()), "MiB, which no recording does"),
     "bz2": (ros1_bomb("BZ2", bz2_bomb()), "MiB, which no recording does"),
     "messages": (db3_bomb, "unpack to more than 64 MiB, which no recording does"),
-    "file": (file_bomb, "MiB or more, which no recording does"),
     "endless view": (computed(ENDLESS), "it has no tables messages and topics"),
     "computed data": (computed(GENERATED), "string or blob too big"),
 }

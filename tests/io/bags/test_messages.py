@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from calibgraph import DatasetError, load_dataset
 from calibgraph.io.bags.messages import LIVOX_CLOUDS, read_custom_msg
-from calibgraph.io.bags.pictures import is_depth, picture_of
-from calibgraph.io.bags.point_clouds import has_points, points_of, time_fields
+from calibgraph.io.bags.pictures import image_from_message, is_depth
+from calibgraph.io.bags.point_clouds import cloud_from_message, has_points, time_fields
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
     KINDS,
@@ -37,7 +37,7 @@ MAKE = Messages("mcap")
 
 
 def read(pixels: NDArray[Any], encoding: str, **layout: Any) -> NDArray[np.uint8]:
-    return picture_of(MAKE.image(pixels, encoding, START_NS, **layout), "here")
+    return image_from_message(MAKE.image(pixels, encoding, START_NS, **layout), "here")
 
 
 def test_colours_are_read_in_their_order() -> None:
@@ -124,13 +124,13 @@ def test_a_gray_and_a_colour_plane_are_the_image_of_the_camera(
     message.data, message.step = np.concatenate(lines), width + padding
     if counts_both:
         message.height = len(message.data) // message.step
-    found = picture_of(message, "here")
+    found = image_from_message(message, "here")
     assert found.shape == colours.shape
     # the 8 bits of YUV are coarser than those of BGR by 255 / 219 and up to 2.02 for blue
     np.testing.assert_allclose(found.astype(int), colours, atol=4)
     message.data = message.data[: -message.step]
     with pytest.raises(DatasetError, match=f"px, encoding '{encoding}'; record it again"):
-        picture_of(message, "here")
+        image_from_message(message, "here")
 
 
 @pytest.mark.parametrize(
@@ -151,12 +151,14 @@ def test_colours_of_packed_yuv_are_in_their_places(encoding: str, order: str) ->
 )
 def test_jpeg_is_read(form: str) -> None:
     data = (SAMPLE / "cameras" / "left" / "000000.jpg").read_bytes()
-    np.testing.assert_array_equal(picture_of(MAKE.compressed(data, form, START_NS), "here"), BGR)
+    np.testing.assert_array_equal(
+        image_from_message(MAKE.compressed(data, form, START_NS), "here"), BGR
+    )
 
 
 def png(image: NDArray[Any], form: str) -> NDArray[np.uint8]:
     data = cv2.imencode(".png", image)[1].tobytes()
-    return picture_of(MAKE.compressed(data, form, START_NS), "here")
+    return image_from_message(MAKE.compressed(data, form, START_NS), "here")
 
 
 def test_png_is_read_in_the_order_in_which_it_was_stored() -> None:
@@ -177,14 +179,14 @@ def test_images_that_cannot_be_read_are_named() -> None:
     cut = MAKE.image(BGR, "bgr8", START_NS)
     cut.data = cut.data[:-1]
     with pytest.raises(DatasetError, match=r"here: has 691199 bytes for 640x360 px"):
-        picture_of(cut, "here")
+        image_from_message(cut, "here")
     with pytest.raises(DatasetError, match="here: image encoding '32FC1' is unknown; known are m"):
         read(GRAY, "32FC1")
     data = (SAMPLE / "cameras" / "left" / "000000.jpg").read_bytes()
     with pytest.raises(DatasetError, match="here: is truncated"):
-        picture_of(MAKE.compressed(data[:-100], "jpeg", START_NS), "here")
+        image_from_message(MAKE.compressed(data[:-100], "jpeg", START_NS), "here")
     with pytest.raises(DatasetError, match="its format 'h264' is neither JPEG nor PNG"):
-        picture_of(MAKE.compressed(b"\0\0\0\1g", "h264", START_NS), "here")
+        image_from_message(MAKE.compressed(b"\0\0\0\1g", "h264", START_NS), "here")
 
 
 def test_depth_is_no_image() -> None:
@@ -204,13 +206,13 @@ def test_clouds_of_any_fields_and_byte_order_are_read(
 ) -> None:
     given_rows = rows.astype(rows.dtype.newbyteorder(order))  # type: ignore[call-overload]
     message = MAKE.cloud(given_rows, START_NS, padding=padding)
-    np.testing.assert_array_equal(points_of(message, "here"), expected_of(rows))
+    np.testing.assert_array_equal(cloud_from_message(message, "here"), expected_of(rows))
 
 
 def test_organised_clouds_with_padded_rows_are_read() -> None:
     message = MAKE.cloud(structured(CLOUD), START_NS, height=6, padding=5)
     assert (message.height, message.width, message.row_step) == (6, 20, 20 * 16 + 5)
-    np.testing.assert_array_equal(points_of(message, "here"), CLOUD)
+    np.testing.assert_array_equal(cloud_from_message(message, "here"), CLOUD)
 
 
 def test_points_without_a_return_are_left_out() -> None:
@@ -219,7 +221,7 @@ def test_points_without_a_return_are_left_out() -> None:
     cloud[5, 1] = np.nan
     cloud[8, 0] = np.inf
     cloud[20, :3] = 0.0
-    found = points_of(MAKE.cloud(structured(cloud), START_NS, height=4), "here")
+    found = cloud_from_message(MAKE.cloud(structured(cloud), START_NS, height=4), "here")
     np.testing.assert_array_equal(found, np.delete(CLOUD, [3, 5, 8, 20], axis=0))
 
 
@@ -232,11 +234,11 @@ def test_a_scan_that_sees_nothing_has_no_points(value: float) -> None:
 
 def test_clouds_without_coordinates_or_cut_short_are_named() -> None:
     with pytest.raises(DatasetError, match=r"here: its fields x, y, intensity have no x y z"):
-        points_of(MAKE.cloud(structured(CLOUD, "xyi"), START_NS), "here")
+        cloud_from_message(MAKE.cloud(structured(CLOUD, "xyi"), START_NS), "here")
     message = MAKE.cloud(structured(CLOUD), START_NS)
     message.data = message.data[:-1]
     with pytest.raises(DatasetError, match=r"has 1919 bytes for 120 x 1 points of 16 bytes"):
-        points_of(message, "here")
+        cloud_from_message(message, "here")
 
 
 POINT = (
@@ -313,7 +315,7 @@ def test_any_alignment_of_the_points_is_read(frame: str, ros1: bool, little: boo
         found = read_custom_msg(data, ros1=ros1)
         assert (found.header.frame_id, found.header.stamp.sec) == (frame, 5)
         assert found.header.stamp.nanosec == 12
-        np.testing.assert_array_equal(points_of(found, "here")[:, :3], cloud[:count, :3])
+        np.testing.assert_array_equal(cloud_from_message(found, "here")[:, :3], cloud[:count, :3])
         assert time_fields(each.name for each in found.fields) == ["offset_time"]
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 from PIL import Image
 
 from calibgraph import (
@@ -23,9 +24,9 @@ from calibgraph import (
     load_dataset,
     load_rig,
 )
+from calibgraph.io.bags.pictures import image_from_message
 from calibgraph.io.bags.rig import read_bag_rig, rig_of_bag
 from calibgraph.io.frame import hash_source
-from calibgraph.io.ros_messages import image_from_message
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
     KINDS,
@@ -243,9 +244,8 @@ def test_times_of_points_are_noticed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "compression"),
-    [("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite3", "FILE"), ("sqlite3", "MESSAGE"),
-     ("mcap", "STORAGE")],
-)  # fmt: skip
+    [("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite3", "MESSAGE"), ("mcap", "STORAGE")],
+)
 def test_compressed_bags_hold_the_same(tmp_path: Path, kind: str, compression: str) -> None:
     messages = sample_messages(Messages(kind))
     data = load_dataset(write_bag(tmp_path, kind, messages, compression=compression))
@@ -255,6 +255,19 @@ def test_compressed_bags_hold_the_same(tmp_path: Path, kind: str, compression: s
             np.testing.assert_array_equal(
                 found.load_image(name, camera), expected.load_image(name, camera)
             )
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_a_folder_of_files_compressed_as_a_whole_names_what_unpacks_them(
+    tmp_path: Path, kind: str
+) -> None:
+    bag = write_bag(tmp_path, kind, sample_messages(Messages(kind)), compression="FILE")
+    with pytest.raises(FileError, match=r"unpack them first with `unzstd drive_\w+\.\w+\.zstd`"):
+        load_dataset(bag)
+    (packed,) = bag.glob("*.zstd")
+    with zstandard.open(packed, "rb") as content:
+        packed.with_suffix("").write_bytes(content.read())
+    assert len(load_dataset(packed.with_suffix("")).frames) == 6
 
 
 MAKE = Messages("mcap")

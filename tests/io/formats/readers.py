@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from math import cos, sin
 from pathlib import Path
 from xml.etree import ElementTree
@@ -65,19 +64,6 @@ def kalibr(path: Path) -> Poses:
     return poses
 
 
-def ros1(path: Path) -> Poses:
-    """tf2_ros's static_transform_publisher x y z qx qy qz qw frame_id child_frame_id."""
-    poses = {}
-    for line in path.read_text().splitlines():
-        if line.startswith("rosrun"):
-            words = shlex.split(line.removesuffix(" &"))
-            assert words[:3] == ["rosrun", "tf2_ros", "static_transform_publisher"]
-            x, y, z, *quaternion = map(float, words[3:10])
-            assert words[10] in PARENTS and len(words) == 12
-            poses[camera_of(words[11])] = inverse(quaternion_pose([x, y, z], *quaternion))
-    return poses
-
-
 def ros2_arguments(words: list[str]) -> tuple[str, np.ndarray]:
     """The child, and T_child_parent, of a ROS 2 static_transform_publisher."""
     flags = dict(zip(words[::2], words[1::2], strict=True))
@@ -85,12 +71,6 @@ def ros2_arguments(words: list[str]) -> tuple[str, np.ndarray]:
     xyz = [float(flags[f"--{axis}"]) for axis in "xyz"]
     T = quaternion_pose(xyz, *(float(flags[f"--q{axis}"]) for axis in "xyzw"))
     return camera_of(flags["--child-frame-id"]), inverse(T)
-
-
-def ros2(path: Path) -> Poses:
-    lines = [line for line in path.read_text().splitlines() if line.startswith("ros2 run")]
-    words = (shlex.split(line.removesuffix(" &")) for line in lines)
-    return dict(ros2_arguments(line[4:]) for line in words)
 
 
 def ros2_launch(path: Path) -> Poses:
@@ -101,17 +81,6 @@ def ros2_launch(path: Path) -> Poses:
         ("tf2_ros", "static_transform_publisher")
     }
     return dict(ros2_arguments((node.get("args") or "").split()) for node in nodes)
-
-
-def tf2(path: Path) -> Poses:
-    """A TransformStamped holds the pose of the child in the frame of its header."""
-    poses = {}
-    for stamped in yaml.safe_load(path.read_text())["transforms"]:
-        assert stamped["header"]["frame_id"] in PARENTS
-        t, q = stamped["transform"]["translation"], stamped["transform"]["rotation"]
-        T = quaternion_pose([t["x"], t["y"], t["z"]], **q)
-        poses[camera_of(stamped["child_frame_id"])] = inverse(T)
-    return poses
 
 
 def urdf(path: Path) -> Poses:
@@ -167,10 +136,7 @@ def plain_json(path: Path) -> Poses:
 
 READERS = {
     "kalibr": kalibr,
-    "ros1": ros1,
-    "ros2": ros2,
     "ros2-launch": ros2_launch,
-    "tf2": tf2,
     "urdf": urdf,
     "autoware": autoware,
     "kitti": kitti,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -87,35 +86,29 @@ def test_other_formats_refuse_the_lidars_mounting(tmp_path: Path) -> None:
 
 
 def test_names_of_frames_can_be_chosen(tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
+    path = tmp_path / "a.urdf"
     export_calibration(
-        make_pair(), path, "tf2", lidar_frame="velodyne", camera_frame="cam/{camera}/optical"
+        make_pair(), path, "urdf", lidar_frame="velodyne", camera_frame="cam/{camera}/optical"
     )
-    transforms = yaml.safe_load(path.read_text())["transforms"]
-    assert [t["child_frame_id"] for t in transforms] == ["cam/left/optical", "cam/right/optical"]
-    assert {t["header"]["frame_id"] for t in transforms} == {"velodyne"}
+    joints = URDF.from_xml_string(path.read_text()).joints
+    assert [joint.child for joint in joints] == ["cam/left/optical", "cam/right/optical"]
+    assert {joint.parent for joint in joints} == {"velodyne"}
     with pytest.raises(ValueError, match="two are the same"):
-        export_calibration(make_pair(), path, "tf2", camera_frame="camera")
+        export_calibration(make_pair(), path, "urdf", camera_frame="camera")
     with pytest.raises(ValueError, match="one is empty"):
-        export_calibration(make_pair(), path, "tf2", lidar_frame="")
+        export_calibration(make_pair(), path, "urdf", lidar_frame="")
 
 
 def test_strange_names_stay_one_word_and_well_formed(tmp_path: Path) -> None:
     camera = make_pair().cameras["left"]
     rig = Rig(lidar="top\nlidar", cameras={'a "b" --> <c> $(id)': camera})
     frame = "a__b__--___c____id__optical_frame"
-    for format in ("ros1", "ros2", "ros2-launch", "urdf", "tf2", "autoware", "opencv", "json"):
+    for format in ("ros2-launch", "urdf", "autoware", "opencv", "json"):
         export_calibration(rig, tmp_path / format, format)
-    for format in ("ros1", "ros2"):
-        line = (tmp_path / format).read_text().splitlines()[-2]
-        assert {"top_lidar", frame} <= set(shlex.split(line))
     (joint,) = URDF.from_xml_string((tmp_path / "urdf").read_text()).joints
     assert (joint.parent, joint.child) == ("top_lidar", frame)
     (node,) = ElementTree.parse(tmp_path / "ros2-launch").getroot()
     assert (node.get("args") or "").split()[-3:] == ["top_lidar", "--child-frame-id", frame]
-    assert (
-        yaml.safe_load((tmp_path / "tf2").read_text())["transforms"][0]["child_frame_id"] == frame
-    )
     assert len(yaml.safe_load((tmp_path / "autoware").read_text())["sensor_kit_base_link"]) == 2
     assert list(READERS["opencv"](tmp_path / "opencv")) == list(rig.cameras)
     assert list(READERS["json"](tmp_path / "json")) == list(rig.cameras)
@@ -240,7 +233,7 @@ def test_files_that_are_there_are_replaced_only_with_force(tmp_path: Path) -> No
 
 
 def test_unknown_formats_and_cameras_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="format 'ros': known are kalibr, ros1"):
+    with pytest.raises(ValueError, match="format 'ros': known are kalibr, ros2-launch"):
         export_calibration(make_pair(), tmp_path / "a", "ros")
     with pytest.raises(ValueError, match="camera 'rear': the rig has left, right"):
         export_calibration(make_pair(), tmp_path / "a", "json", cameras=["rear"])
@@ -265,9 +258,9 @@ _KEYS = [
 
 
 def with_its_lens_again(rig: Rig, folder: Path) -> Rig:
-    """Export lenses as camera_info and extrinsics as tf2, and import both."""
+    """Export lenses as camera_info and extrinsics as a URDF, and import both."""
     infos = export_calibration(rig, folder / "infos", "camera_info")
-    (tree,) = export_calibration(rig, folder / "tree.yaml", "tf2")
+    (tree,) = export_calibration(rig, folder / "tree.urdf", "urdf")
     return import_rig([*infos, tree])
 
 
@@ -307,7 +300,7 @@ def test_a_file_has_what_the_parser_of_ros_requires(tmp_path: Path) -> None:
         assert (found[key]["rows"], found[key]["cols"]) == matrix.shape
         assert found[key]["data"] == matrix.ravel().tolist()
     assert found["distortion_coefficients"] == {"rows": 1, "cols": 5, "data": [0.0] * 5}
-    assert "export it as tf2" in text
+    assert "export it as ros2-launch" in text
 
 
 def test_lenses_that_are_there_stay(tmp_path: Path) -> None:

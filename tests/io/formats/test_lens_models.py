@@ -51,20 +51,7 @@ def as_json(folder: Path, content: dict[str, Any]) -> Path:
     return folder / "a.json"
 
 
-def as_opencv_xml(folder: Path, content: dict[str, Any]) -> Path:
-    def element(key: str, value: Any) -> str:
-        if isinstance(value, dict):
-            inner = "".join(element(*each) for each in value.items())
-        else:
-            inner = " ".join(map(str, value)) if isinstance(value, list) else str(value)
-        return f"<{key}>{inner}</{key}>"
-
-    body = "".join(element(*each) for each in content.items())
-    (folder / "a.xml").write_text(f'<?xml version="1.0"?><opencv_storage>{body}</opencv_storage>')
-    return folder / "a.xml"
-
-
-LANGUAGES = [as_yaml, as_opencv_yaml, as_json, as_opencv_xml]
+LANGUAGES = [as_yaml, as_opencv_yaml, as_json]
 KEYS = ("model", "camera_model", "distortion_model", "DistModel", "dist_model", "cam_model",
         "projection_model", "model_type", "cameraModel", "type", "Camera.type", "camera_type",
         "lens_model")  # fmt: skip
@@ -134,7 +121,7 @@ def test_four_in_a_row_and_no_model_are_a_pinhole_with_a_note(
     assert camera_of(path).model == "pinhole"
     (note,) = read_rig_parts([path]).notes
     assert "four numbers and no key names the lens model" in note
-    assert read_rig_parts([as_yaml(tmp_path, lens(coefficients, model="plumb_bob"))]).notes == []
+    assert read_rig_parts([as_yaml(tmp_path, lens(coefficients, model="plumb_bob"))]).notes == ()
 
 
 @pytest.mark.parametrize(
@@ -143,7 +130,7 @@ def test_four_in_a_row_and_no_model_are_a_pinhole_with_a_note(
 def test_five_coefficients_or_zeros_are_no_question(coefficients: Any, tmp_path: Path) -> None:
     path = as_yaml(tmp_path, lens(coefficients))
     assert camera_of(path).model == "pinhole"
-    assert read_rig_parts([path]).notes == []
+    assert read_rig_parts([path]).notes == ()
 
 
 @pytest.mark.parametrize(

@@ -1,19 +1,23 @@
 """The frames of a bag: each cloud with the image of every camera that is nearest by stamp."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
+from calibgraph.io.bag_motion import motion_finder
 from calibgraph.io.bags.camera_info import LensStates, same_lens
 from calibgraph.io.bags.messages import Bag
 from calibgraph.io.bags.options import BagOptions, Motion
 from calibgraph.io.bags.point_clouds import doubtful_time_fields, time_fields
 from calibgraph.io.bags.stamps import (
     TopicStamps,
+    after_ns,
     describe_offsets,
     describe_spans,
     nearest,
@@ -21,6 +25,7 @@ from calibgraph.io.bags.stamps import (
     read_messages,
 )
 from calibgraph.io.bags.topics import RigTopics, choose_topics
+from calibgraph.io.frame import Frame
 from calibgraph.io.lenses import CameraLens
 from calibgraph.model.rig import Camera
 
@@ -28,43 +33,40 @@ _S = 1_000_000_000
 Rows = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class BagFrame:
-    """A cloud and an image of every camera.
+class FoundFrames(NamedTuple):
+    """The frames of a bag or folder.
 
     Attributes:
-        number: counts the clouds that were read, and goes on by one more wherever others were not:
-            the frames before and after in the recording have the numbers before and after.
-        cloud: its address.
-        images: the address of each camera's image.
-        to_s: the median stamp of the images, in seconds after the cloud's.
+        chosen: those that ``every_s`` picks; all without it.
+        recorded: all that were read and are complete, in the order of recording. Their index counts
+            the clouds that were read, and goes on by one more wherever others were not: the frames
+            before and after in the recording have the numbers before and after.
+        notes: how many there are, how far apart their stamps are, and how many messages were left
+            out, and why.
     """
 
-    number: int
-    stamp_ns: int
-    cloud: Path
-    images: dict[str, Path]
-    to_s: float
+    chosen: tuple[Frame, ...]
+    recorded: tuple[Frame, ...]
+    notes: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class BagFrames:
-    """The frames of a bag.
+def frames_of_bag(
+    path: Path,
+    cameras: Mapping[str, Camera],
+    options: BagOptions,
+    *,
+    start: int = 0,
+    prefix: str = "",
+) -> FoundFrames:
+    """Pair the clouds of a bag with its images, without keeping any of them.
 
-    Attributes:
-        recorded: all that were read and are complete, in the order of recording.
-        picked: positions of those that ``every_s`` picks; of all without it.
-        summary: in one line, how many there are, how far apart their stamps are, and how many
-            messages were left out, and why.
+    Args:
+        path: the bag.
+        cameras: of the rig.
+        options: of the bag.
+        start: the first index.
+        prefix: of the frames' names, which are stamps.
     """
-
-    recorded: tuple[BagFrame, ...]
-    picked: tuple[int, ...]
-    summary: str
-
-
-def frames_of_bag(path: Path, cameras: Mapping[str, Camera], options: BagOptions) -> BagFrames:
-    """Pair the clouds of a bag with its images, without keeping any of them."""
     bag = Bag(path)
     topics = choose_topics(bag, options.topics, [*cameras])
     images = {name: each.image for name, each in topics.cameras.items()}
@@ -82,27 +84,29 @@ def frames_of_bag(path: Path, cameras: Mapping[str, Camera], options: BagOptions
         complete, summary = complete[fits], summary + (note and f"; {name}: {note}")
     _, cells = np.unique(np.array(clouds.cells)[complete], return_inverse=True)
     recorded = tuple(
-        BagFrame(
-            number=int(row + cell),
-            stamp_ns=clouds.stamp_ns[row],
-            cloud=clouds.paths[row],
-            images={n: stamps[images[n]].paths[rows[row]] for n, rows in pairs.items()},
-            to_s=float(
-                np.median(
-                    [
-                        stamps[images[n]].stamp_ns[rows[row]] - clouds.stamp_ns[row]
-                        for n, rows in pairs.items()
-                    ]
-                )
-            )
-            / _S,
+        Frame(
+            start + int(row + cell),
+            f"{prefix}{clouds.stamp_ns[row]}",
+            clouds.paths[row],
+            {name: stamps[images[name]].paths[rows[row]] for name, rows in pairs.items()},
         )
         for row, cell in zip(complete, cells, strict=True)
     )
-    of_cells = (np.flatnonzero(cells == cell) for cell in range(len(set(cells))))
-    picked = (int(rows[len(rows) // 2]) for rows in of_cells)  # in the middle: with neighbours
-    chosen = tuple(picked) if options.every_s else tuple(range(len(recorded)))
-    return BagFrames(recorded, chosen, summary + _note(clouds, options.motion))
+    if options.motion != "none":
+        apart_ns = [
+            after_ns(clouds, stamps[images[n]], rows, complete) for n, rows in pairs.items()
+        ]
+        to_s = np.median(apart_ns, axis=0) / _S
+        find = motion_finder(path, recorded, options)
+        recorded = tuple(
+            replace(frame, find_motion=cache(partial(find, frame, float(s))))
+            for frame, s in zip(recorded, to_s, strict=True)
+        )
+    chosen = recorded
+    if options.every_s:
+        of_cells = (np.flatnonzero(cells == cell) for cell in range(len(set(cells))))
+        chosen = tuple(recorded[rows[len(rows) // 2]] for rows in of_cells)  # with neighbours
+    return FoundFrames(chosen, recorded, (f"{path}: {summary}{_note(clouds, options.motion)}",))
 
 
 def _read(
@@ -190,8 +194,7 @@ def _summary(
     for name, rows in pairs.items():
         images = stamps[topics.cameras[name].image]
         if len(complete):
-            ahead = np.array(images.stamp_ns)[rows] - np.array(clouds.stamp_ns)
-            ahead_ms = ahead[complete] / 1e6
+            ahead_ms = after_ns(clouds, images, rows, complete) / 1e6
             most = np.abs(ahead_ms).max()
             parts.append(f"{name} {np.median(ahead_ms):+.0f} ms (median), at most {most:.0f}")
         if np.any(rows < 0):

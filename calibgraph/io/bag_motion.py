@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -12,10 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
-from calibgraph.io.bags.frames import BagFrame
 from calibgraph.io.bags.messages import Bag, Drive, read_message
 from calibgraph.io.bags.options import ODOMETRY, BagOptions
-from calibgraph.io.bags.point_clouds import points_of
 from calibgraph.io.bags.transforms import (
     MOVING,
     Transforms,
@@ -24,10 +22,12 @@ from calibgraph.io.bags.transforms import (
     stamped_transforms,
     values_of,
 )
-from calibgraph.io.motion import ScanMotion, prepare_scan, register, twist_between
+from calibgraph.io.frame import Frame, seconds_between, twist_by_scans
+from calibgraph.io.motion import ScanMotion, twist_between
 from calibgraph.model.geometry import transform
 
-MotionOf = Callable[[BagFrame], ScanMotion]
+MotionOf = Callable[[Frame, float], ScanMotion]
+"""Of a frame, for the instant so many seconds after its stamp."""
 
 _ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 _HALF_S = 0.05  # half a turn of a LiDAR at 10 Hz: the velocity is the mean of a scan
@@ -36,8 +36,8 @@ _GAP_S = 0.5
 _NEIGHBOUR_S = 0.35  # of a scan, that is registered with it
 
 
-def motion_finder(path: Path, frames: Sequence[BagFrame], options: BagOptions) -> MotionOf:
-    """A function of a frame that returns the motion during its scan.
+def motion_finder(path: Path, frames: Sequence[Frame], options: BagOptions) -> MotionOf:
+    """A function of a frame, as recorded, that returns the motion during its scan.
 
     Raises:
         FileError, DatasetError: if the bag has no such topic or no such transforms.
@@ -45,7 +45,7 @@ def motion_finder(path: Path, frames: Sequence[BagFrame], options: BagOptions) -
     if options.motion == "scans":
         return partial(_by_scans, frames)
     bag = Bag(path)
-    lidar = read_message(frames[0].cloud)[1].header.frame_id.lstrip("/")
+    lidar = read_message(frames[0].cloud_path)[1].header.frame_id.lstrip("/")
     poses = _odometry if options.motion == "odometry" else _moving_transforms
     return partial(_by_poses, _Trajectory.of(path, poses(bag, lidar, options)))
 
@@ -91,44 +91,29 @@ class _Trajectory:
         return transform(turn(np.clip(share, 0, 1)), shift)
 
 
-def _by_poses(trajectory: _Trajectory, frame: BagFrame) -> ScanMotion:
-    stamp_s = (frame.stamp_ns - trajectory.start_ns) / 1e9
-    middle_s = stamp_s + frame.to_s / 2
-    before, after = (trajectory.at(middle_s + t) for t in (-_HALF_S, _HALF_S))
-    found = _motion(twist_between(before, after, 2 * _HALF_S), frame)
-    return replace(found, T_world_lidar=trajectory.at(stamp_s))
+def _by_poses(trajectory: _Trajectory, frame: Frame, to_s: float) -> ScanMotion:
+    stamp_s = ((frame.stamp_ns or 0) - trajectory.start_ns) / 1e9
+    before, after = (trajectory.at(stamp_s + to_s / 2 + t) for t in (-_HALF_S, _HALF_S))
+    twist = twist_between(before, after, 2 * _HALF_S)
+    return ScanMotion(tuple(twist.tolist()), to_s, trajectory.at(stamp_s))
 
 
-def _by_scans(frames: Sequence[BagFrame], frame: BagFrame) -> ScanMotion:
+def _by_scans(frames: Sequence[Frame], frame: Frame, to_s: float) -> ScanMotion:
     """The mean velocity from the scan before to this one, and to the one after.
 
     Raises:
         DatasetError: if there is neither, or they do not fit.
     """
-    place = next(k for k, other in enumerate(frames) if other.number == frame.number)
+    place = next(k for k, other in enumerate(frames) if other.index == frame.index)
     beside = [*frames[max(place - 1, 0) : place], *frames[place + 1 : place + 2]]
-    near = [f for f in beside if 0 < abs(f.stamp_ns - frame.stamp_ns) < _NEIGHBOUR_S * 1e9]
+    later_s = [(other, seconds_between(frame, other) or 0.0) for other in beside]
+    near = [(other, s) for other, s in later_s if 0 < abs(s) < _NEIGHBOUR_S]
     if not near:
         raise DatasetError(
-            f"{frame.cloud}: no scan within {_NEIGHBOUR_S} s before or after it, of which its "
+            f"{frame.cloud_path}: no scan within {_NEIGHBOUR_S} s before or after it, of which its "
             "motion could be found; choose other frames, or --motion odometry or tf"
         )
-    own = prepare_scan(_xyz(frame))
-    twists = [
-        twist_between(np.eye(4), register(own, prepare_scan(_xyz(other)), frame.cloud),
-                      (other.stamp_ns - frame.stamp_ns) / 1e9)
-        for other in near
-    ]  # fmt: skip
-    return _motion(np.mean(twists, axis=0), frame)
-
-
-def _motion(twist: Array, frame: BagFrame) -> ScanMotion:
-    return ScanMotion(tuple(float(value) for value in twist), frame.to_s)
-
-
-def _xyz(frame: BagFrame) -> Array:
-    points = points_of(read_message(frame.cloud)[1], str(frame.cloud))
-    return np.ascontiguousarray(points[:, :3], dtype=np.float64)
+    return ScanMotion(tuple(twist_by_scans(frame, near).tolist()), to_s)
 
 
 def _odometry(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, Array]]:
