@@ -44,14 +44,13 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_tables(folder)
     eye = URDF.replace("front_camera_optical_frame", "eye_optical").replace("front_link", "eye")
     two = URDF.replace("base_link", "lidar_mount")
-    imu = KALIBR.replace("T_cam_lidar", "T_cam_imu")
     four = (
         CAMERA_INFO.replace("cols: 5", "cols: 4")
         .replace(", 0.003]", "]")
         .replace("distortion_model: plumb_bob\n", "")
     )
     spaced = CAMERA_INFO.replace("camera_name: front", "camera_name: front left")
-    write(folder, imu__yaml=imu, four__yaml=four, spaced__yaml=spaced)
+    write(folder, four__yaml=four, spaced__yaml=spaced)
     write(folder, info__yaml=CAMERA_INFO, chain__yaml=KALIBR, car__urdf=URDF, eye__urdf=eye,
           two__urdf=two, calib__json=json.dumps(KOIDE))  # fmt: skip
     (folder / "pose_cam_to_velo.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")

@@ -476,7 +476,7 @@ def test_an_orientation_in_a_message_is_refused(orientation: int, form: str) -> 
     ("name", "expected"),
     [
         ("run.bag.active", r"not closed: mend it with `rosbag reindex .*` and name it \S+run.bag"),
-        ("run.bag.gz", r"is compressed from outside: unpack it first \(`gunzip \S+run.bag.gz`"),
+        ("run.bag.gz", r"is compressed: unpack it first with `gunzip \S+run.bag.gz`"),
         ("run_0.db3.zstd", r"`unzstd \S+run_0.db3.zstd`"),
         ("RUN.MCAP.ZST", r"`unzstd \S+RUN.MCAP.ZST`"),
         ("run.bag.bz2", r"`bunzip2 \S+run.bag.bz2`"),
