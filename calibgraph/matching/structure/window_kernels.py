@@ -35,9 +35,9 @@ def describe_windows(  # type: ignore[no-untyped-def]
     """Fill the rays, the silhouettes and the bases of windows, see :class:`windows.Windows`.
 
     cloud: rays (n, 3) [m] and intensity ranks (n,); members: (w, l); counts: (w,); room: see
-    :func:`make_room`. Filled are moved_m (w, l, 3), front (w, l), basis (w, l, 4), and reliability (w,),
-    the larger one of inverse range and intensity. Array expressions, np.empty, max and min compile
-    slowly, so there are loops and conditions instead.
+    :func:`make_room`. Filled are moved_m (w, l, 3), front (w, l), basis (w, l, 4), and reliability
+    (w,), the larger one of inverse range and intensity. Array expressions, np.empty, max and min
+    compile slowly, so there are loops and conditions instead.
     """
     rays_m, intensity_rank = cloud
     size = members.shape[1]
