@@ -201,6 +201,8 @@ def _select_windows(
 
 def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
     """The groups of several frames of one camera in one object."""
+    if len(scores) == 1:
+        return scores[0]
     columns = ("jacobian", "points_lidar_m", "pixels_px", "frame", "weights")
     stacked = {name: np.concatenate([getattr(s, name) for s in scores]) for name in columns}
     grids: Grids = mmap_zeros((len(stacked["weights"]), *scores[0].grids.shape[1:]), np.float32)
@@ -243,10 +245,11 @@ def group_windows(
     octaves = np.log2(np.linalg.norm(centres_camera_m, axis=1)) / OCTAVES_PER_BIN
     cells = np.column_stack([view_angles(centres_camera_m) / cell_rad, octaves])
     _, cell, sizes = np.unique(name_cells(cells), return_inverse=True, return_counts=True)
-    kept = np.flatnonzero(sizes[cell] >= MIN_GROUP_WINDOWS)
-    names, group = np.unique(cell[kept], return_inverse=True)
+    full = sizes >= MIN_GROUP_WINDOWS
+    kept = np.flatnonzero(full[cell])
+    group = (np.cumsum(full) - 1)[cell[kept]]
     order = np.argsort(group, kind="stable")
-    return kept[order], group[order].astype(np.int32), len(names)
+    return kept[order], group[order].astype(np.int32), int(np.count_nonzero(full))
 
 
 def name_cells(places: Array) -> NDArray[np.int64]:

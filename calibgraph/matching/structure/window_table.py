@@ -16,7 +16,7 @@ from calibgraph.parallel import KeyedCache
 Rows = NDArray[np.intp]
 
 MIN_RELIABILITY = 0.3  # of a window's variation (0 flat, 1 strong)
-MAX_BYTES, MAX_SELECTED_BYTES = 500_000_000, 100_000_000  # of all tables, and all selections
+MAX_BYTES, MAX_SELECTED_BYTES = 500_000_000, 220_000_000  # of all tables, and all selections
 _UNCUT, _USELESS = -1, -2
 
 
