@@ -14,6 +14,7 @@ from calibgraph.arrays import Array
 from factors.compiled import compiled
 
 _ROUNDING_RAD = 1e-6  # of azimuths in single precision
+_SIXTH = 1 / 6  # a division would take as long as all else of a ray
 _MONOTONE_RAD = math.sqrt(2.0)  # up to there x - x^3 / 6 rises; it is at most sin x
 
 
@@ -69,12 +70,13 @@ class NearestRays:
 def _find_nearest(cloud, elevation, grid, centres, order, members, counts):  # type: ignore[no-untyped-def]
     """See :meth:`NearestRays.of`. order: of the centres, by azimuth."""
     (units, rows, _, starts, _), (lowest, cell, reach) = cloud, grid
-    squares, direction = np.empty(members.shape[1]), np.empty(3)
+    squares, direction = np.empty(members.shape[1]), np.empty(4)
     for w in order:
         centre, count = centres[w], np.int64(0)  # a literal 0 has another type
         up = elevation[centre]
         direction[0], direction[1] = units[centre, 0], units[centre, 1]
         direction[2] = units[centre, 2]
+        direction[3] = math.sqrt(direction[0] ** 2 + direction[1] ** 2)  # of the elevation, cosine
         for k in range(len(squares)):  # a slice compiles slowly
             squares[k] = reach * reach
         above = math.floor(up / cell) - lowest
@@ -102,7 +104,6 @@ def _visit_row(cloud, row, centre, direction, squares, found, count):  # type: i
     first, end, own = starts[row], starts[row + 1], azimuth[centre]
     while places[row] < end and azimuth[places[row]] < own:
         places[row] += 1  # never back: centres come by azimuth
-    cosine = math.sqrt(direction[0] ** 2 + direction[1] ** 2)
     left = end - first
     for side in range(2):
         at = places[row] - side
@@ -110,7 +111,7 @@ def _visit_row(cloud, row, centre, direction, squares, found, count):  # type: i
             at = first if at == end else end - 1 if at < first else at
             away = abs(azimuth[at] - own)
             away = min(min(away, 2 * math.pi - away) - _ROUNDING_RAD, _MONOTONE_RAD)
-            if not _is_within(cosine * (away - away**3 / 6), squares[-1]):
+            if not _is_within(direction[3] * (away - away**3 * _SIXTH), squares[-1]):
                 break
             left -= 1 - side
             x, y = units[at, 0] - direction[0], units[at, 1] - direction[1]
