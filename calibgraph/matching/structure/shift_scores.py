@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,7 +31,6 @@ MIN_GROUP_WINDOWS = 4
 MIN_REACH_STEPS = 6  # with wide or small lenses a pixel is much of a level's reach
 MAX_COVERED = 0.3  # share of a window that something nearer may cover at a coarse level
 OCCLUSION_SPACINGS = 1.5  # occlusion cell in sample spacings: about one sample each
-VARIANCES = 256  # grids of which they are computed at once, in double precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +84,8 @@ class ShiftScores:
     @cached_property
     def chance_sigma(self) -> float:
         """Standard deviation of the summed score over unrelated shifts: the unit of z-scores."""
-        parts = np.split(self.grids, range(VARIANCES, len(self.grids), VARIANCES))
-        variances = [part.var(axis=(1, 2), dtype=np.float64) for part in parts]
-        return float(np.sqrt(np.concatenate(variances).sum()))
+        squares = cv2.norm(self.grids.reshape(-1, 1), cv2.NORM_L2SQR)  # in double precision
+        return float(np.sqrt(squares / self.grids[0].size)) if len(self.grids) else 0.0
 
     def with_unknowns(self, fields_px: Array) -> ShiftScores:
         """The same scores, with (k, 2, g) derivatives of the pixels by further unknowns."""
