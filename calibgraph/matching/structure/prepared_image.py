@@ -23,7 +23,7 @@ SmallImages = KeyedCache[tuple[Hashable, ...], NDArray[np.float32]]
 FINEST_RAD = np.radians(0.03)
 """Of a pixel; half the finest step. Images of 20 megapixels keep a quarter of their pixels."""
 LOG_GRAY = np.log1p(np.arange(256, dtype=np.float32))
-LEAST_PX = 1e-3
+LEAST_PX = 1e-3  # of which a mean takes notice, as OpenCV's
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +91,9 @@ def _scaled_size(camera: Camera, step_rad: float) -> tuple[int, int]:
 
 
 def _shares(pixels: int, count: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """The first of the pixels (count,) in each of as many equal parts of a line, and the shares.
+    """Equal parts of a line: the first pixel of each (count,), and the shares of its pixels.
 
-    (n, count) of the first and the next ones. A thousandth of a pixel does not count.
+    (n, count) shares, of the first pixel and of the next ones.
     """
     size = pixels / count
     start = np.arange(count) * size
