@@ -88,10 +88,10 @@ def match_features(a: Features, b: Features) -> NDArray[np.intp]:
     unit = [f.descriptors / np.linalg.norm(f.descriptors, axis=1, keepdims=True) for f in (a, b)]
     cosine = unit[0] @ unit[1].T
     rows, best = np.arange(len(cosine)), cosine.argmax(axis=1)
-    of_b = np.ascontiguousarray(cosine.T).argmax(axis=1)  # faster than along the columns
-    first = cosine[rows, best].copy()
+    first, of_b = cosine[rows, best].copy(), cosine.max(axis=0)
     cosine[rows, best] = -1.0
     second = cosine.max(axis=1)
     clear = 1.0 - first < LOWE_RATIO**2 * (1.0 - second)  # half the squares of the distances
-    kept = np.flatnonzero(clear & (of_b[best] == rows))
+    kept = np.flatnonzero(clear & (of_b[best] == first))
+    kept = kept[np.sort(np.unique(best[kept], return_index=True)[1])]  # the first of the same
     return np.column_stack([kept, best[kept]])

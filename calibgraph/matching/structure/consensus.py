@@ -62,7 +62,8 @@ def find_consensus(scores: ShiftScores, level: Level, *, seed: int) -> tuple[Arr
     priors = np.repeat([PRIOR, WEAK_PRIOR], [6, len(half_widths) - 6])
     unknowns = maximize_score(apart, half_widths, seed=seed, searches=level.searches, prior=priors)
     unknowns[:6] += follows @ unknowns[6:]
-    return unknowns, z_score(scores, unknowns)
+    highest = float(sum_scores(scores, unknowns[None])[0])
+    return unknowns, highest / (apart.chance_sigma + 1e-12)  # the same grids
 
 
 def _compensating(scores: ShiftScores) -> Array:
@@ -119,11 +120,10 @@ def _maximize_once(
     scores: ShiftScores, half_widths: Array, prior: float | Array, rng: np.random.Generator
 ) -> tuple[Array, float]:
     """One cross-entropy search: the unknowns and their penalised score."""
-    weight = 0.5 * prior * scores.chance_sigma
+    weight = np.full(len(half_widths), 0.5 * prior * scores.chance_sigma)
 
     def penalised(unknowns: Array) -> Array:
-        penalty = (weight * (unknowns / half_widths) ** 2).sum(axis=1)
-        return np.asarray(sum_scores(scores, unknowns) - penalty)
+        return np.asarray(sum_scores(scores, unknowns) - (unknowns / half_widths) ** 2 @ weight)
 
     return maximize(
         penalised,
@@ -200,15 +200,16 @@ def maximize(
         The last mean (k,), and its value.
     """
     mean, root = start, np.diag(sigmas)
-    elites = max(len(start) + 2, round(ELITE_SHARE * samples))
+    elites, least = max(len(start) + 2, round(ELITE_SHARE * samples)), (1e-4 * half_widths) ** 2
     for step in range(steps):
         count = samples * (4 if step == 0 else 1)
         points = mean + rng.standard_normal((count, len(start))) @ root.T
         points = np.clip(points, start - half_widths, start + half_widths)
         elite = points[np.argsort(-objective(points))[:elites]]
         mean = elite.mean(axis=0)
-        covariance = WIDENING * np.cov(elite.T) + np.diag((1e-4 * half_widths) ** 2)
-        root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+        centred = elite - mean
+        covariance = WIDENING * (centred.T @ centred * (1 / (elites - 1))) + np.diag(least)
+        root = np.linalg.cholesky(covariance)
     return mean, float(objective(mean[None])[0])
 
 

@@ -96,7 +96,7 @@ class StructureMatcher:
         self.estimate: tuple[LensPart, ...] = ()
         self.rounds = len(levels)
         self._cache = FrameCache()
-        self._backwards = False
+        self._backwards: dict[float, bool] = {}
 
     def with_estimate(self, parts: Sequence[LensPart]) -> "StructureMatcher":
         """The matcher that searches parts of lens and clock together with the pose."""
@@ -198,7 +198,8 @@ class StructureMatcher:
     ) -> dict[str, deque[Future[ShiftScores]]]:
         """Score every camera in every frame; frame by frame, so that cameras share its windows.
 
-        Every other round goes backwards: it begins with the frames that are still in the cache.
+        Every other round of a spacing goes backwards: it begins with the frames whose images and
+        windows are still in the cache.
         """
         per_frame = level.max_windows // min(len(frames), SHARING_FRAMES)
         max_windows = min(per_frame, FRAME_WINDOWS)
@@ -212,11 +213,11 @@ class StructureMatcher:
             return self._with_free(scores, camera, twist)
 
         waiting: dict[str, deque[Future[ShiftScores]]] = {name: deque() for name in rig.cameras}
-        add = deque.appendleft if self._backwards else deque.append
-        for frame in reversed(frames) if self._backwards else frames:
+        backwards = self._backwards[level.spacing_rad] = not self._backwards.get(level.spacing_rad)
+        add = deque.appendleft if backwards else deque.append
+        for frame in reversed(frames) if backwards else frames:
             for name, camera in rig.cameras.items():
                 add(waiting[name], cores.submit(score, frame, name, camera))
-        self._backwards = not self._backwards
         return waiting
 
     def _with_free(

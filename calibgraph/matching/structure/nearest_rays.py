@@ -14,6 +14,7 @@ from calibgraph.arrays import Array
 from factors.compiled import compiled
 
 _ROUNDING_RAD = 1e-6  # of azimuths in single precision
+_SIXTH = 1 / 6  # a division would take as long as all else of a ray
 _MONOTONE_RAD = math.sqrt(2.0)  # up to there x - x^3 / 6 rises; it is at most sin x
 
 
@@ -57,22 +58,25 @@ class NearestRays:
         """
         members = np.empty((len(centres), most), np.int32)
         counts = np.empty(len(centres), np.int32)
-        cloud = self._units, self._rows, self._azimuth, self._starts
+        order = np.argsort(self._azimuth[centres])
+        places = self._starts[:-1].copy()
+        cloud = self._units, self._rows, self._azimuth, self._starts, places
         grid = self._lowest, self._cell_rad, reach
-        _find_nearest(cloud, self._elevation, grid, centres, members, counts)
+        _find_nearest(cloud, self._elevation, grid, centres, order, members, counts)
         return members, counts
 
 
 @compiled()
-def _find_nearest(cloud, elevation, grid, centres, members, counts):  # type: ignore[no-untyped-def]
-    """See :meth:`NearestRays.of`."""
-    (units, rows, _, starts), (lowest, cell, reach) = cloud, grid
-    squares, direction = np.empty(members.shape[1]), np.empty(3)
-    for w in range(len(centres)):
+def _find_nearest(cloud, elevation, grid, centres, order, members, counts):  # type: ignore[no-untyped-def]
+    """See :meth:`NearestRays.of`. order: of the centres, by azimuth."""
+    (units, rows, _, starts, _), (lowest, cell, reach) = cloud, grid
+    squares, direction = np.empty(members.shape[1]), np.empty(4)
+    for w in order:
         centre, count = centres[w], np.int64(0)  # a literal 0 has another type
         up = elevation[centre]
         direction[0], direction[1] = units[centre, 0], units[centre, 1]
         direction[2] = units[centre, 2]
+        direction[3] = math.sqrt(direction[0] ** 2 + direction[1] ** 2)  # of the elevation, cosine
         for k in range(len(squares)):  # a slice compiles slowly
             squares[k] = reach * reach
         above = math.floor(up / cell) - lowest
@@ -93,24 +97,21 @@ def _find_nearest(cloud, elevation, grid, centres, members, counts):  # type: ig
         members[w, count:] = rows[centre]
 
 
-@compiled(part=True)
+@compiled(part=True, forceinline=True)
 def _visit_row(cloud, row, centre, direction, squares, found, count):  # type: ignore[no-untyped-def]
     """Insert the rays of a row that are nearer than the farthest; how many are found by then."""
-    units, rows, azimuth, starts = cloud
-    first, size, own = starts[row], starts[row + 1] - starts[row], azimuth[centre]
-    low, high = 0, size
-    while low < high:
-        middle = (low + high) // 2
-        low, high = (middle + 1, high) if azimuth[first + middle] < own else (low, middle)
-    cosine = math.sqrt(direction[0] ** 2 + direction[1] ** 2)
-    left = size
+    units, rows, azimuth, starts, places = cloud
+    first, end, own = starts[row], starts[row + 1], azimuth[centre]
+    while places[row] < end and azimuth[places[row]] < own:
+        places[row] += 1  # never back: centres come by azimuth
+    left = end - first
     for side in range(2):
-        for k in range(left):
-            at = low + k if side == 0 else low - 1 - k
-            at = first + (at - size if at >= size else at + size if at < 0 else at)
+        at = places[row] - side
+        for _ in range(left):
+            at = first if at == end else end - 1 if at < first else at
             away = abs(azimuth[at] - own)
             away = min(min(away, 2 * math.pi - away) - _ROUNDING_RAD, _MONOTONE_RAD)
-            if not _is_within(cosine * (away - away**3 / 6), squares[-1]):
+            if not _is_within(direction[3] * (away - away**3 * _SIXTH), squares[-1]):
                 break
             left -= 1 - side
             x, y = units[at, 0] - direction[0], units[at, 1] - direction[1]
@@ -122,10 +123,11 @@ def _visit_row(cloud, row, centre, direction, squares, found, count):  # type: i
                     squares[place], found[place] = squares[place - 1], found[place - 1]
                     place -= 1
                 squares[place], found[place] = square, rows[at]
+            at += 1 - 2 * side
     return count
 
 
-@compiled(part=True)
+@compiled(part=True, forceinline=True)
 def _is_within(distance, square):  # type: ignore[no-untyped-def]
     """Whether a lower bound of a chord is below the root of a square; a negative one is."""
     return distance < 0 or distance * distance < square

@@ -1,9 +1,10 @@
 """Pose refinement: improve a pose of the global search, level by level."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 from calibgraph.io.frame import Frame
 from calibgraph.matching.structure.bodies import Body, adjoint, lead, place
@@ -68,19 +69,19 @@ class Candidate:
     Attributes:
         body: at that pose.
         z_score: of the last level of a refinement.
-        stands_out: whether displaced poses agree far less.
+        stands_out: returns whether displaced poses agree far less; scored when it is asked for.
         chance: the probability that a search with nothing to find ends as high; None if unknown.
     """
 
     body: Body
     z_score: float
-    stands_out: bool = False
+    stands_out: Callable[[], bool] = lambda: False
     chance: float | None = None
 
     @property
     def is_beyond_doubt(self) -> bool:
         """Whether no better pose has to be looked for."""
-        return self.z_score >= CONFIDENT and self.stands_out
+        return self.z_score >= CONFIDENT and self.stands_out()
 
 
 def approach(frames: Mapping[str, CameraFrames], body: Body) -> Candidate:
@@ -99,9 +100,7 @@ def refine(frames: Mapping[str, CameraFrames], body: Body) -> Candidate:
         body = candidate.body
         if candidate.z_score < HOPELESS:
             break
-    if candidate.z_score < CONFIDENT:
-        return candidate
-    return replace(candidate, stands_out=_stands_out(frames, candidate.body))
+    return replace(candidate, stands_out=cache(partial(_stands_out, frames, body)))
 
 
 def look_again(frames: Mapping[str, CameraFrames], body: Body) -> Candidate:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,25 +92,20 @@ class PreparedCloud:
             stride_spacings: of the windows, in spacings of the points.
             fine: keep the linear parts of the variation.
         """
-
-        def make() -> WindowTable:
-            rays_m, rows = self.points_lidar_m, np.arange(len(usable))
-            if not self.seen_from_origin:
-                rays_m, rows = rays_m - self.viewpoint_lidar_m(camera), np.flatnonzero(usable)
-            return WindowTable(
-                rays_m,
-                self.intensity_rank,
-                rows,
-                self.angles if self.seen_from_origin else sphere_angles(rays_m[rows]),
-                spacing_rad=spacing_rad,
-                stride_spacings=stride_spacings,
-                keep_linear=fine,
-                is_kept=self.seen_from_origin,
+        table = partial(
+            WindowTable,
+            spacing_rad=spacing_rad,
+            stride_spacings=stride_spacings,
+            keep_linear=fine,
+        )
+        if self.seen_from_origin:
+            return self.tables.get(
+                (self.identity, spacing_rad, stride_spacings, fine),
+                lambda: table(self.points_lidar_m, self.intensity_rank, self.angles),
             )
-
-        if not self.seen_from_origin:
-            return make()
-        return self.tables.get((self.identity, spacing_rad, stride_spacings, fine), make)
+        rows = np.flatnonzero(usable)
+        rays_m = self.points_lidar_m.take(rows, axis=0) - self.viewpoint_lidar_m(camera)
+        return table(rays_m, self.intensity_rank[rows], sphere_angles(rays_m), rows)
 
     def count_windows(
         self, camera: Camera, spacing_rad: float, stride_spacings: float, *, most: int

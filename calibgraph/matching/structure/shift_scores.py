@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,7 +31,6 @@ MIN_GROUP_WINDOWS = 4
 MIN_REACH_STEPS = 6  # with wide or small lenses a pixel is much of a level's reach
 MAX_COVERED = 0.3  # share of a window that something nearer may cover at a coarse level
 OCCLUSION_SPACINGS = 1.5  # occlusion cell in sample spacings: about one sample each
-VARIANCES = 256  # grids of which they are computed at once, in double precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +84,8 @@ class ShiftScores:
     @cached_property
     def chance_sigma(self) -> float:
         """Standard deviation of the summed score over unrelated shifts: the unit of z-scores."""
-        parts = np.split(self.grids, range(VARIANCES, len(self.grids), VARIANCES))
-        variances = [part.var(axis=(1, 2), dtype=np.float64) for part in parts]
-        return float(np.sqrt(np.concatenate(variances).sum()))
+        squares = cv2.norm(self.grids.reshape(-1, 1), cv2.NORM_L2SQR)  # in double precision
+        return float(np.sqrt(squares / self.grids[0].size)) if len(self.grids) else 0.0
 
     def with_unknowns(self, fields_px: Array) -> ShiftScores:
         """The same scores, with (k, 2, g) derivatives of the pixels by further unknowns."""
@@ -201,6 +200,8 @@ def _select_windows(
 
 def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
     """The groups of several frames of one camera in one object."""
+    if len(scores) == 1:
+        return scores[0]
     columns = ("jacobian", "points_lidar_m", "pixels_px", "frame", "weights")
     stacked = {name: np.concatenate([getattr(s, name) for s in scores]) for name in columns}
     grids: Grids = mmap_zeros((len(stacked["weights"]), *scores[0].grids.shape[1:]), np.float32)
@@ -243,10 +244,11 @@ def group_windows(
     octaves = np.log2(np.linalg.norm(centres_camera_m, axis=1)) / OCTAVES_PER_BIN
     cells = np.column_stack([view_angles(centres_camera_m) / cell_rad, octaves])
     _, cell, sizes = np.unique(name_cells(cells), return_inverse=True, return_counts=True)
-    kept = np.flatnonzero(sizes[cell] >= MIN_GROUP_WINDOWS)
-    names, group = np.unique(cell[kept], return_inverse=True)
+    full = sizes >= MIN_GROUP_WINDOWS
+    kept = np.flatnonzero(full[cell])
+    group = (np.cumsum(full) - 1)[cell[kept]]
     order = np.argsort(group, kind="stable")
-    return kept[order], group[order].astype(np.int32), len(names)
+    return kept[order], group[order].astype(np.int32), int(np.count_nonzero(full))
 
 
 def name_cells(places: Array) -> NDArray[np.int64]:

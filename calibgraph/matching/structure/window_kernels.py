@@ -4,13 +4,16 @@ The features, how range and intensity vary over a window, are what its weight de
 """
 
 import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from factors.compiled import compiled
 
 INTENSITY_NOISE = 0.05  # of intensity ranks: below, a window counts as flat
 DEPTH_NOISE = 0.03  # of relative inverse range: below, a window counts as flat
 SILHOUETTE_SHARE, SILHOUETTE_RATIO = 0.5, 1.25
-ROOM = 8  # columns that the kernels work in
 SCAN_LINE = 1e-3  # ratio of variances below which a window's rays lie on one line
 FEATURES = (
     "depth varies", "intensity varies", "share of rays", "log range", "log spread of log range",
@@ -20,20 +23,25 @@ FEATURES = (
 )  # fmt: skip
 
 
+def make_room(size: int) -> tuple[NDArray[Any], ...]:
+    """Columns of so many rays, in which the kernels work; the last one is of whole numbers."""
+    return *np.empty((8, size)), np.empty(size, np.int64)
+
+
 @compiled()
 def describe_windows(  # type: ignore[no-untyped-def]
     cloud, members, counts, keep_linear, room, moved_m, front, basis, reliability
 ):
     """Fill the rays, the silhouettes and the bases of windows, see :class:`windows.Windows`.
 
-    cloud: rays (n, 3) [m] and intensity ranks (n,); members: (w, l); counts: (w,); room: ROOM
-    times (l,). Filled are moved_m (w, l, 3), front (w, l), basis (w, l, 4), and reliability (w,),
-    the larger one of inverse range and intensity. Array expressions, np.empty, max and min compile
-    slowly, so there are loops and conditions instead.
+    cloud: rays (n, 3) [m] and intensity ranks (n,); members: (w, l); counts: (w,); room: see
+    :func:`make_room`. Filled are moved_m (w, l, 3), front (w, l), basis (w, l, 4), and reliability
+    (w,), the larger one of inverse range and intensity. Array expressions, np.empty, max and min
+    compile slowly, so there are loops and conditions instead.
     """
     rays_m, intensity_rank = cloud
     size = members.shape[1]
-    inverse, intensity, ordered, trend_u, trend_v, xs, ys, zs = room
+    inverse, intensity, ordered, trend_u, trend_v, xs, ys, zs, places = room
     for i in range(size):
         trend_u[i] = trend_v[i] = 0.0
     for w in range(len(members)):
@@ -44,7 +52,7 @@ def describe_windows(  # type: ignore[no-untyped-def]
             inverse[i] = 1.0 / math.sqrt(x * x + y * y + z * z)
             intensity[i] = intensity_rank[row]
             xs[i], ys[i], zs[i] = x * inverse[i], y * inverse[i], z * inverse[i]
-        near = _find_silhouette(inverse, n, ordered)
+        near = _find_silhouette(inverse, n, ordered, places)
         for i in range(size):
             front[w, i] = inverse[i] >= near
             moved = 1.0 / (near if near > inverse[i] else inverse[i])
@@ -68,24 +76,28 @@ def describe_windows(  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True)
-def _sort(values, n, ordered):  # type: ignore[no-untyped-def]
-    """Fill ``ordered`` with the first n values, the least one first."""
+def _sort(values, n, ordered, places):  # type: ignore[no-untyped-def]
+    """Fill ``ordered`` with the first n values, the least one first.
+
+    By counting the lesser ones, without branches: half the time of an insertion.
+    """
     for i in range(n):
-        k = i
-        while k > 0 and ordered[k - 1] > values[i]:
-            ordered[k] = ordered[k - 1]
-            k -= 1
-        ordered[k] = values[i]
+        places[i] = 0
+    for k in range(n):
+        for i in range(n):
+            places[i] += (values[k] < values[i]) | ((values[k] == values[i]) & (k < i))
+    for i in range(n):
+        ordered[places[i]] = values[i]
 
 
 @compiled(part=True)
-def _find_silhouette(inverse, n, ordered):  # type: ignore[no-untyped-def]
+def _find_silhouette(inverse, n, ordered, places):  # type: ignore[no-untyped-def]
     """The inverse range of the near side of a window's silhouette; 0 if it has none.
 
     A silhouette is where the largest gap between a window's inverse ranges is most of what they
-    span: a slope has many gaps. ordered: room for as many values.
+    span: a slope has many gaps. ordered, places: room for as many values.
     """
-    _sort(inverse, n, ordered)
+    _sort(inverse, n, ordered, places)
     near, far = 0.0, 0.0
     for i in range(n - 1):
         if ordered[i + 1] - ordered[i] >= near - far:
@@ -164,7 +176,7 @@ def fill_features(cloud, members, counts, room, front, basis, out):  # type: ign
     """
     rays_m, intensity_rank = cloud
     size = members.shape[1]
-    inverse, shade, logs, u, v, ordered, _, _ = room
+    inverse, shade, logs, u, v, ordered, _, _, places = room
     for w in range(len(members)):
         n = counts[w]
         x0, y0, z0 = rays_m[members[w, 0], 0], rays_m[members[w, 0], 1], rays_m[members[w, 0], 2]
@@ -185,10 +197,10 @@ def fill_features(cloud, members, counts, room, front, basis, out):  # type: ign
             behind += 0.0 if front[w, i] else 1.0
         centre = logs[0]
         out[w, 0], out[w, 1], out[w, 2], out[w, 5] = depth, intensity, n / size, behind / n
-        out[w, 9] = _in_two_classes(inverse, n, ordered)
+        out[w, 9] = _in_two_classes(inverse, n, ordered, places)
         median = 1.0 / ordered[n // 2]
         out[w, 3], out[w, 13] = math.log(median), 1.0 - median * math.exp(-centre)
-        out[w, 12] = _in_two_classes(shade, n, ordered)
+        out[w, 12] = _in_two_classes(shade, n, ordered, places)
         out[w, 4] = math.log(1e-3 + _centre(logs, n))
         out[w, 6], out[w, 7] = math.log(1e-5 + _centre(u, n)), math.log(1e-5 + _centre(v, n))
         _centre(inverse, n)
@@ -223,10 +235,10 @@ def _beside_trend(values, u, v, n):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True)
-def _in_two_classes(values, n, ordered):  # type: ignore[no-untyped-def]
+def _in_two_classes(values, n, ordered, places):  # type: ignore[no-untyped-def]
     """The largest share of the variation that lies between two classes (Otsu); sorts the values."""
     total, squares = 0.0, 0.0
-    _sort(values, n, ordered)
+    _sort(values, n, ordered, places)
     for i in range(n):
         total, squares = total + values[i], squares + values[i] * values[i]
     variation = squares - total * total / n

@@ -16,7 +16,7 @@ from calibgraph.parallel import KeyedCache
 Rows = NDArray[np.intp]
 
 MIN_RELIABILITY = 0.3  # of a window's variation (0 flat, 1 strong)
-MAX_BYTES, MAX_SELECTED_BYTES = 500_000_000, 100_000_000  # of all tables, and all selections
+MAX_BYTES, MAX_SELECTED_BYTES = 500_000_000, 220_000_000  # of all tables, and all selections
 _UNCUT, _USELESS = -1, -2
 
 
@@ -27,38 +27,37 @@ class WindowTable:
     pose are those of the next as far as it sees them.
 
     Args:
-        rays_m: (n, 3) from the viewpoint to the cloud's points, along the axes of the LiDAR frame.
-        intensity_rank: (n,) of the points.
-        rows: (m,) the points that may be used.
+        rays_m: (m, 3) from the viewpoint to points of the cloud, along the axes of the LiDAR frame.
+        intensity_rank: (m,) of the points.
         angles: (m, 2) azimuth and elevation of their rays.
+        rows: (m,) their rows in the cloud; None: all. Windows of all are kept when they are cut,
+            for later poses and cameras.
         spacing_rad: of the points in a window.
         stride_spacings: of the windows, in spacings of the points.
         keep_linear: keep the linear parts of the variation.
-        is_kept: keep the windows that are cut, for later poses and cameras.
     """
 
     def __init__(
         self,
         rays_m: Array,
         intensity_rank: Array,
-        rows: Rows,
         angles: Array,
+        rows: Rows | None = None,
         *,
         spacing_rad: float,
         stride_spacings: float,
         keep_linear: bool,
-        is_kept: bool = True,
     ) -> None:
         kept = thin(angles, spacing_rad)
         centres = thin(angles[kept], stride_spacings * spacing_rad)
-        own_pages = mmap_copy if is_kept else np.asarray
-        self._cloud = rays_m, intensity_rank
-        self._rows = own_pages(rows[kept].astype(np.int32))
+        own_pages = mmap_copy if rows is None else np.asarray
+        self._cloud, self._cloud_rows = (rays_m, intensity_rank), rows
+        self._rows = own_pages(kept.astype(np.int32))
         self._centres = own_pages(np.random.default_rng(0).permutation(centres).astype(np.int32))
         self._centre_rows = own_pages(self._rows[self._centres])
         self._neighbours = NearestRays(rays_m, self._rows, angles[kept], spacing_rad)
         self._spacing_rad, self._keep_linear = spacing_rad, keep_linear
-        self._buffer = _Buffer(len(centres)) if is_kept else None
+        self._buffer = _Buffer(len(centres)) if rows is None else None
 
     def cut(
         self, in_view: Mask, clear: Mask, *, max_covered: float, max_windows: int, seed: int = 0
@@ -72,6 +71,8 @@ class WindowTable:
             max_windows: largest number of centres in view.
             seed: of the choice.
         """
+        if self._cloud_rows is not None:
+            in_view, clear = in_view.take(self._cloud_rows), clear.take(self._cloud_rows)
         chosen = np.flatnonzero(in_view[self._centre_rows])
         if seed:
             chosen = np.random.default_rng(seed).permutation(chosen)

@@ -20,9 +20,9 @@ from calibgraph.arrays import Array, Mask
 from calibgraph.matching.structure.nearest_rays import NearestRays
 from calibgraph.matching.structure.window_kernels import (
     FEATURES,
-    ROOM,
     describe_windows,
     fill_features,
+    make_room,
 )
 from calibgraph.matching.structure.window_weights import WindowNetwork
 
@@ -44,7 +44,7 @@ class Windows:
         rays_m: (w, WINDOW_POINTS, 3) from the viewpoint, along the axes of the LiDAR frame, to
             the points, the window's centre first. Points behind a silhouette are moved along
             their rays to its distance, which determines where the silhouette is in the image.
-        members: (w, WINDOW_POINTS) the same points, as rows of the cloud.
+        members: (w, WINDOW_POINTS) the same points, as rows of their table's rays.
         front: (w, WINDOW_POINTS) which of them are not behind a silhouette.
         counts: (w,) how many of the members are in use: the first ones.
         basis: (w, WINDOW_POINTS, 4) columns: inverse range and intensity (orthonormal, shrunk where
@@ -128,7 +128,7 @@ def cut_windows(
     even = math.sqrt(WINDOW_POINTS / math.pi) * max(spacing_rad, MIN_SPACING_RAD)
     reach = 2 * math.sin(WINDOW_STRETCH * even / 2)  # as a chord
     windows.members[:], windows.counts[:] = neighbours.of(centres, WINDOW_POINTS, reach)
-    room = tuple(np.empty((ROOM, WINDOW_POINTS)))
+    room = make_room(WINDOW_POINTS)
     describe_windows(
         cloud, windows.members, windows.counts, keep_linear, room,
         windows.rays_m, windows.front, windows.basis, reliability,

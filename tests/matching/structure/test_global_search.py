@@ -138,10 +138,10 @@ def test_near_the_guess_a_pose_that_does_not_stand_out_is_looked_around(
 
         def _best_around(self, candidate: Candidate) -> Candidate:
             looked.append(candidate)
-            return Candidate(candidate.body, 72.0, stands_out=True)
+            return Candidate(candidate.body, 72.0, stands_out=lambda: True)
 
     monkeypatch.setattr(
-        pose_search, "refine", lambda _, body: Candidate(body, z_score, stands_out=stands_out)
+        pose_search, "refine", lambda _, body: Candidate(body, z_score, lambda: stands_out)
     )
     found = Around(one, {}, SearchRange(0.3, 1.5), seed=0, out_of_time=never).near(
         dict(one.cameras)

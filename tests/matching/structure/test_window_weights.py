@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calibgraph.matching.structure.score_kernel import pad, score_windows
-from calibgraph.matching.structure.window_kernels import FEATURES, ROOM, fill_features
+from calibgraph.matching.structure.window_kernels import FEATURES, fill_features, make_room
 from calibgraph.matching.structure.window_weights import WindowNetwork, window_network
 from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows
 
@@ -33,7 +33,7 @@ def grid_of_rays() -> Array:
 def features_of(ranges_m: Array, rank: Array, rays: Array | None = None) -> dict[str, float]:
     rays = (grid_of_rays() if rays is None else rays) * ranges_m[:, None]
     basis, out = np.full((1, WINDOW_POINTS, 4), 0.2, np.float32), np.zeros((1, len(FEATURES)))
-    room = tuple(np.empty((ROOM, WINDOW_POINTS)))
+    room = make_room(WINDOW_POINTS)
     fill_features((rays, rank), MEMBERS, COUNTS, room, ALL, basis, out)
     return dict(zip(FEATURES, out[0].tolist(), strict=True))
 

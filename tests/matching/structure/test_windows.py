@@ -162,7 +162,6 @@ def test_members_behind_a_silhouette_are_moved_to_it() -> None:
     table = WindowTable(
         rays,
         np.ones(len(rays)),
-        np.arange(len(rays)),
         sphere_angles(rays),
         spacing_rad=np.radians(0.2),
         stride_spacings=2.0,
