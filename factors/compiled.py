@@ -75,12 +75,6 @@ def compiled(*, part: bool = False, **options: Any) -> Callable[[Callable[..., A
     return decorate
 
 
-def is_kept(module: str) -> bool | None:
-    """Whether code of a module's kernels was kept, by any process; None if none can be."""
-    folder = _folder(module)
-    return None if folder is None else any(folder.rglob("*.nbi"))
-
-
 def one_at_a_time(kernel: Any) -> Callable[..., Any]:
     """A kernel with ``parallel=True``, for threads: a call waits until such calls of others end.
 

@@ -48,7 +48,6 @@ def calibrate(
 ) -> None:
     """Calibrate all cameras jointly from images and clouds, with pictures and a report."""
     from calibgraph.cli.settings import read_settings
-    from calibgraph.compile_ahead import compile_ahead
     from calibgraph.memory import keep_freed_memory
     from calibgraph.model.result_files import require_result_folder
 
@@ -65,7 +64,7 @@ def calibrate(
         )  # fmt: skip
     bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
-    with compile_ahead(data.rig), progress_bar() as progress:
+    with progress_bar() as progress:
         result = calibrate(
             data, matcher=chosen, config=settings, terms=rare.terms,
             time_limit_s=time_limit_of(matcher, time_limit_s), progress=progress

@@ -239,17 +239,6 @@ def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
     return Frame(*files, find_motion=lambda: found, columns=columns)
 
 
-def load_entry_cloud(entry: Mapping[str, Any]) -> NDArray[np.float32]:
-    """(n, 4) the cloud that a result's entry of a frame names, corrected as it was."""
-    return frame_of_entry(entry).load_cloud()
-
-
-def twist_of_entry(entry: Mapping[str, Any]) -> Array | None:
-    """(6,) of the LiDAR in the frame of a result's entry; None if it is unknown."""
-    motion = entry.get(_MOTION)
-    return None if motion is None else np.array(motion["twist_per_s"], dtype=np.float64)
-
-
 def hash_source(path: Path) -> str:
     """SHA-256 of a file, or of a message in a bag."""
     return hash_message(path) if path.suffix == MESSAGE_SUFFIX else sha256(path)

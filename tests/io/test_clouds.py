@@ -20,7 +20,7 @@ from pyarrow import feather
 from calibgraph import FileError, Rig, load_dataset
 from calibgraph.io import clouds
 from calibgraph.io.clouds import load_cloud, read_cloud, read_cloud_notes
-from calibgraph.io.frame import Frame, frame_of_entry, load_entry_cloud
+from calibgraph.io.frame import Frame, frame_of_entry
 from calibgraph.io.pcd import unpack_lzf
 from tests.conftest import SAMPLE, make_camera
 from tests.io.written import CLOUD, fields_of, lzf_of_literals, padded, pcd, pcd_of, ply, ply_of
@@ -402,7 +402,7 @@ def test_the_columns_of_the_rig_count_and_stay_in_the_result(tmp_path: Path) -> 
     Rig(cameras={"front": make_camera()}, cloud_columns=columns).save(tmp_path / "rig.yaml")
     assert yaml.safe_load((tmp_path / "rig.yaml").read_text())["cloud_columns"] == [*columns]
     (frame,) = load_dataset(tmp_path).frames
-    for cloud in (frame.load_cloud(), load_entry_cloud(frame.entry())):
+    for cloud in (frame.load_cloud(), frame_of_entry(frame.entry()).load_cloud()):
         np.testing.assert_array_equal(cloud, ROWS)
     assert frame_of_entry(frame.entry()).columns == [*columns]
     Rig(cameras={"front": make_camera()}).save(tmp_path / "rig.yaml")

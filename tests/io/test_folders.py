@@ -18,7 +18,7 @@ import pytest
 from calibgraph import DatasetError, FileError, Rig, load_dataset, load_rig
 from calibgraph.io.bags import BagOptions
 from calibgraph.io.dataset_folders import describe_pairing
-from calibgraph.io.frame import twist_by_scans, twist_of_entry
+from calibgraph.io.frame import frame_of_entry, twist_by_scans
 from calibgraph.simulation.rigs import rig_of
 from tests.conftest import SAMPLE
 from tests.io.written import written_kitti
@@ -103,7 +103,7 @@ def test_neighbouring_clouds_show_the_motion(tmp_path: Path) -> None:
         assert frame.twist_per_s is not None
         np.testing.assert_allclose(frame.twist_per_s[:3], twist[:3], atol=0.01)
         np.testing.assert_allclose(frame.twist_per_s[3:], twist[3:], atol=0.05)
-        assert twist_of_entry(frame.entry()) == pytest.approx(frame.twist_per_s)
+        assert frame_of_entry(frame.entry()).twist_per_s == pytest.approx(frame.twist_per_s)
     assert load_dataset(folder, rig).frames[0].twist_per_s is None
     for wrong_s in (0.0, -0.1, 1e-300, 0.001, 100.0, np.inf, np.nan):
         with pytest.raises(ValueError, match="--interval-s .* 0.005 to 10 s apart"):

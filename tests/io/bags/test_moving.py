@@ -11,7 +11,7 @@ import pytest
 
 from calibgraph import BagOptions, DatasetError, calibrate, evaluate, load_dataset, load_rig
 from calibgraph.io.bags.point_clouds import timed_points_of
-from calibgraph.io.frame import load_entry_cloud
+from calibgraph.io.frame import frame_of_entry
 from calibgraph.io.motion import ScanMotion
 from calibgraph.matching import places
 from calibgraph.model.geometry import invert
@@ -149,7 +149,7 @@ def errors_m(bag: tuple[Path, list[np.ndarray]], motion: Any) -> list[float]:
         inverse = invert(T_world_lidar(number * PERIOD_NS / 1e9 + IMAGE_S))
         expected = points @ inverse[:3, :3].T + inverse[:3, 3]
         cloud = frame.load_cloud()
-        np.testing.assert_array_equal(cloud, load_entry_cloud(frame.entry()))
+        np.testing.assert_array_equal(cloud, frame_of_entry(frame.entry()).load_cloud())
         found.append(float(np.sqrt(np.mean((cloud[:, :3] - expected) ** 2 * 3))))
     return found
 
