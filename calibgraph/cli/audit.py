@@ -43,8 +43,7 @@ def check(
     with checked_arguments():
         Tolerance(tolerance_deg, tolerance_cm)
         matcher = matcher_from("structure", seed=seed, all_frames=frames is not None)
-    bag = bag_settings(config, topic, motion=motion)
-    data = dataset_from(dataset, rig, frames, bag)
+    data = dataset_from(dataset, rig, frames, bag_settings(config, topic, motion=motion))
     with progress_bar() as progress:
         audit = check(
             rig, data, tolerance_deg=tolerance_deg, tolerance_cm=tolerance_cm,

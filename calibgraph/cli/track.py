@@ -16,8 +16,7 @@ def track(
         ...,
         metavar="SOURCE...",
         help="Table of correspondences (.parquet, .csv), or - for standard input (a JSON line per "
-        "frame). With --matcher: dataset folders, KITTI "
-        "sequences or ROS bags of one rig, as one drive.",
+        "frame). With --matcher: datasets or ROS bags of one rig, as one drive.",
     ),
     out: Path = Option(
         Path("tracking"),
@@ -61,8 +60,7 @@ def track(
             _require_matcher_for(source, given | rare.of_cmrnext)
             chosen = None
         else:
-            rare_ones = rare.of_cmrnext
-            chosen = matcher_from(matcher, weights, seed=settings.seed, of_cmrnext=rare_ones)
+            chosen = matcher_from(matcher, weights, seed=settings.seed, of_cmrnext=rare.of_cmrnext)
     wanted = Tracking(
         rig=load_rig(rig),
         config=settings,
