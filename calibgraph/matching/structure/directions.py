@@ -57,9 +57,9 @@ def thin(angles: Array, cell_rad: float) -> Rows:
     cosine = np.cos((np.arange(highest - lowest + 1) + float(lowest) + 0.5) * cell_rad)
     cells, off = np.empty((len(angles), 2), np.intp), np.empty(len(angles))
     first, last = _find_cells(np.ascontiguousarray(angles), cell_rad, lowest, cosine, cells, off)
-    nearest = np.full((len(cosine), last - first + 1), -1, np.intp)
-    _find_nearest(cells, off, first, nearest)
-    return nearest[nearest >= 0]
+    nearest = np.full((len(cosine), last - first + 1), -1, np.int32)
+    rows = np.empty(len(angles) + 1, np.intp)
+    return rows[: _find_nearest(cells, off, first, nearest, rows)]
 
 
 @compiled()
@@ -83,10 +83,19 @@ def _find_cells(angles, cell, lowest, cosine, cells, off):  # type: ignore[no-un
 
 
 @compiled()
-def _find_nearest(cells, off, first, nearest):  # type: ignore[no-untyped-def]
-    """Fill the number of each cell's nearest direction; of equally near ones, the first."""
+def _find_nearest(cells, off, first, nearest, rows):  # type: ignore[no-untyped-def]
+    """Fill in by cell the number of its nearest direction; of equally near ones, the first.
+
+    Returns:
+        How many there are.
+    """
     for i in range(len(cells)):
         row, column = cells[i, 0], cells[i, 1] - first
         before = nearest[row, column]
         if before < 0 or off[i] < off[before]:
             nearest[row, column] = i
+    count = np.int64(0)
+    for number in nearest.ravel():  # most are empty: a branch would be mispredicted
+        rows[count] = number
+        count += number >= 0
+    return count

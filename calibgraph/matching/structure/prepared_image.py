@@ -120,10 +120,11 @@ def _reduce(gray, values, parts, out):  # type: ignore[no-untyped-def]
                 for x in range(width):
                     row[x] = values[gray[y, x]]
                 for i in range(count):
-                    line[i] = across[0, i] * row[left[i]]
+                    line[i] = across[0, i] * row[np.uint64(left[i])]  # which is not negative
                 for k in range(1, len(across)):
+                    part, after = across[k], row[k:]
                     for i in range(count):
-                        line[i] += across[k, i] * row[left[i] + k]
+                        line[i] += part[i] * after[np.uint64(left[i])]
             if t == 0:
                 for i in range(count):
                     out[j, i] = share * line[i]
