@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 from calibgraph.errors import FileError
 from calibgraph.io.point_fields import RawCloud, make_cloud, raw_cloud
@@ -55,6 +54,8 @@ def _rows(path: Path, data: bytes, columns: int) -> NDArray[np.float32]:
 
 def _count_columns(path: Path, values: NDArray[np.float32], named: int) -> int:
     """The named number of columns if it explains as much as any, or else the smallest that does."""
+    from scipy.stats import rankdata  # which takes 0.4 s
+
     if len(values) < _FEW:
         return named
     ranks = rankdata(np.abs(np.nan_to_num(values[:_MOST]))) / min(len(values), _MOST)
