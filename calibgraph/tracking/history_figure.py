@@ -32,6 +32,7 @@ _POSE = 6
 
 _WIDTH_IN, _ROW_IN, _FRAME_IN = 16.0, 2.5, 1.5
 _NAME_LETTERS = 24
+_LABELLED = 6  # events of a camera: more would hide each other; the legend has their colours
 _SIGMAS = 3.0
 _SURE = 3.0  # times the median sigma: an estimate with more does not set the scale
 _SHOWN_PERCENT = (0.5, 99.5)
@@ -154,7 +155,10 @@ def _limits(xi: Array, sigma: Array) -> tuple[float, float]:
 
 
 def _draw_events(panel: Axes, events: Sequence[Event], zero: int, newest: int) -> None:
-    """A line where each began, shaded until it was found; a blind camera's until it has matches."""
+    """A line where each began, shaded until it was found; a blind camera's until it has matches.
+
+    With a label over it where there are few.
+    """
     across = panel.get_xaxis_transform()
     for kind in {event.kind for event in events}:
         of_kind = [event for event in events if event.kind == kind]
@@ -164,6 +168,13 @@ def _draw_events(panel: Axes, events: Sequence[Event], zero: int, newest: int) -
         panel.vlines(starts, 0, 1, color=colour, linewidth=1.2, transform=across)
         shades = list(zip(starts, widths, strict=True))
         panel.broken_barh(shades, (0, 1), color=colour, alpha=0.12, linewidth=0, transform=across)
+    for event in events if len(events) <= _LABELLED else ():
+        panel.annotate(
+            event.kind if event.camera is not None else f"LiDAR {event.kind}",
+            (event.frame - zero, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
+            textcoords="offset points", ha="center", va="bottom", fontsize=9,
+            color=_EVENTS.get(event.kind, _INSTEAD),
+        )  # fmt: skip
 
 
 def _end(event: Event, events: Sequence[Event], newest: int) -> int:
