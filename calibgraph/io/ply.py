@@ -1,4 +1,4 @@
-"""Point clouds in .ply files: the vertices, which come first, before faces and others."""
+"""Point clouds in .ply files: their vertices, beside which there are no faces or others."""
 
 import re
 from pathlib import Path
@@ -31,20 +31,20 @@ def read_ply(path: Path) -> RawCloud:
     if end is None or not data.startswith(b"ply"):
         raise FileError(path, "has no complete .ply header; is it complete?")
     header = data[: end.start()].decode("ascii", "replace")
-    order, count, fields, is_all = _parse(path, header)
+    order, count, fields = _parse(path, header)
     names = [each.name for each in fields]
     choose_fields(path, names)  # before points are read as if they were right
     body = memoryview(data)[end.end() :]
     columns = (
-        binary_columns(path, body, count, fields, is_all=is_all) if order
-        else read_rows(path, body, count, [len(fields)], is_all=is_all).T
+        binary_columns(path, body, count, fields) if order
+        else read_rows(path, body, count, [len(fields)]).T
     )  # fmt: skip
     return raw_cloud(path, names, dict(zip(names, columns, strict=True)).__getitem__)
 
 
-def _parse(path: Path, header: str) -> tuple[str, int, list[Field], bool]:
-    """The byte order, "" if it is text; number and fields of the vertices; if nothing follows."""
-    order, elements, count, fields = None, list[str](), 0, list[Field]()
+def _parse(path: Path, header: str) -> tuple[str, int, list[Field]]:
+    """The byte order, "" if it is text; number and fields of the vertices."""
+    order, elements, counts, fields = None, list[str](), dict[str, int](), list[Field]()
     for line in header.split("\n"):
         try:
             match line.split():
@@ -54,7 +54,7 @@ def _parse(path: Path, header: str) -> tuple[str, int, list[Field], bool]:
                     order = _ORDERS.get(encoding)
                 case ["element", name, number]:
                     elements.append(name)
-                    count = read_count(number) if name == "vertex" else count
+                    counts[name] = read_count(number)
                 case ["property", kind, *words] if words:
                     if elements[-1] == "vertex":
                         fields.append(Field(" ".join(words), _KINDS[kind]))
@@ -66,10 +66,8 @@ def _parse(path: Path, header: str) -> tuple[str, int, list[Field], bool]:
         raise FileError(path, "has an unknown encoding in its header; write it as binary or ascii")
     if elements.count("vertex") != 1:
         raise FileError(path, "has no plain list of vertices in its PLY header")
-    if elements[0] != "vertex":
-        raise FileError(
-            path, f"has {elements[0]!r} before its vertices; write it again with the vertices first"
-        )
-    if not count:
+    if not (count := counts.pop("vertex")):
         raise FileError(path, "holds no point")
-    return order, count, [Field(f.name, order + f.kind) for f in fields], len(elements) == 1
+    for name in filter(counts.get, counts):
+        raise FileError(path, f"holds {name!r} besides its vertices; write it with these alone")
+    return order, count, [Field(f.name, order + f.kind) for f in fields]

@@ -117,13 +117,13 @@ def truncated(path: Path, count: int) -> FileError:
 
 
 def binary_columns(
-    path: Path, body: memoryview, count: int, fields: Sequence[Field], *, is_all: bool = True
+    path: Path, body: memoryview, count: int, fields: Sequence[Field]
 ) -> Iterator[NDArray[Any]]:
     """The first number of each field of points that lie one after the other, without a copy."""
     start, step = 0, sum(each.bytes for each in fields)
     if count * step > len(body):
         raise truncated(path, count)
-    if is_all and len(body) >= (count + 1) * step:
+    if len(body) >= (count + 1) * step:
         raise _too_long(path, count)
     for each in fields:
         yield np.ndarray((count,), each.kind, body, start, (step,))
@@ -131,19 +131,18 @@ def binary_columns(
 
 
 def read_rows(
-    path: Path, body: memoryview, count: int, widths: Sequence[int], *, is_all: bool = True
+    path: Path, body: memoryview, count: int, widths: Sequence[int]
 ) -> NDArray[np.float64]:
-    """(count, width) numbers of the first lines that are not blank; overlong ones are cut.
+    """(count, width) numbers of the lines that are not blank; overlong ones are cut.
 
     Args:
         path: of the file.
         body: its text, from the points on.
         count: of points.
         widths: how many numbers a line may have, the same on all.
-        is_all: whether nothing may follow.
 
     Raises:
-        FileError: if there are fewer lines, or they hold something else.
+        FileError: if there are other than as many lines, or they hold something else.
     """
     text = io.TextIOWrapper(io.BytesIO(body), "ascii", "replace", newline="\n")
     lines = (each for each in iter(lambda: text.readline(_LONGEST_LINE), "") if not each.isspace())
@@ -158,6 +157,6 @@ def read_rows(
         raise FileError(path, f"holds no points where they should be: {error}") from None
     if len(rows) != count:
         raise FileError(path, f"is truncated: {len(rows)} of its {count} points; write it again")
-    if is_all and next(lines, None) is not None:
+    if next(lines, None) is not None:
         raise _too_long(path, count)
     return rows

@@ -47,13 +47,13 @@ HEADER = 250
 def clouds(_: Path) -> dict[str, bytes]:
     npy = io.BytesIO()
     np.save(npy, CLOUD)
-    faces = b"element face 2\nproperty list uchar int vertex_indices\n"
+    faces = b"element face 0\nproperty list uchar int vertex_indices\n"
     body = CLOUD.tobytes()
     return {
         "binary.pcd": pcd(), "padded.pcd": pcd(padding=True), "ascii.pcd": pcd("ascii"),
         "packed.pcd": pcd("binary_compressed"), "little.ply": ply(), "ascii.ply": ply("ascii"),
         "big.ply": ply("binary_big_endian"),
-        "mesh.ply": ply(after=faces, body=body + (b"\x03" + bytes(12)) * 2),
+        "mesh.ply": ply(after=faces),
         "four.bin": body, "three.bin": CLOUD[:, :3].tobytes(), "array.npy": npy.getvalue(),
     }  # fmt: skip
 

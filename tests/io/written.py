@@ -216,26 +216,23 @@ PLY_NAMES = {"f4": "float", "f8": "double", "i1": "char", "u1": "uchar", "i2": "
              "u2": "ushort", "i4": "int", "u4": "uint"}  # fmt: skip
 
 
-def ply_of(
-    rows: NDArray[np.void], encoding: str, *, before: bytes = b"", after: bytes = b"",
-    last: bytes = b"",
-) -> bytes:  # fmt: skip
-    """The .ply of a structured array, with elements before and after the vertices."""
+def ply_of(rows: NDArray[np.void], encoding: str, *, after: bytes = b"") -> bytes:
+    """The .ply of a structured array, with elements after the vertices."""
     big = rows.astype(rows.dtype.newbyteorder(">")) if "big" in encoding else rows
     written = _text(rows) if encoding == "ascii" else big.tobytes()
     kinds = {name: PLY_NAMES[rows.dtype[name].str[1:]] for name in rows.dtype.names or ()}
     properties = "".join(f"property {kind} {name}\n" for name, kind in kinds.items())
-    header = f"ply\nformat {encoding} 1.0\ncomment by hand\n".encode() + before
+    header = f"ply\nformat {encoding} 1.0\ncomment by hand\n".encode()
     header += f"element vertex {len(rows)}\n{properties}".encode() + after + b"end_header\n"
-    return header + written + last
+    return header + written
 
 
 def ply(
-    encoding: str = "binary_little_endian", *, before: bytes = b"", after: bytes = b"",
+    encoding: str = "binary_little_endian", *, after: bytes = b"",
     body: bytes | None = None, names: tuple[str, ...] = ("x", "y", "z", "intensity"),
 ) -> bytes:  # fmt: skip
     """CLOUD as .ply, with a body in place of its own, and properties of these names."""
-    data = ply_of(fields_of(CLOUD), encoding, before=before, after=after)
+    data = ply_of(fields_of(CLOUD), encoding, after=after)
     header, end, own = data.partition(b"\nend_header\n")
     for old, new in zip(("x", "y", "z", "intensity"), names, strict=True):
         header = (header + b"\n").replace(f" {old}\n".encode(), f" ?{new}\n".encode(), 1)[:-1]
