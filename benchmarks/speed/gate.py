@@ -50,6 +50,7 @@ from calibgraph import (
 )
 from calibgraph.graph.objective import objective_graph, pose_key
 from calibgraph.matching.structure import correlation_maps, shift_scores
+from calibgraph.matching.structure.score_kernel import LANES, LINES
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.parallel import THREADS_VARIABLE
 from calibgraph.progress import no_progress
@@ -179,7 +180,7 @@ def multiply_adds(call: dict[str, Any]) -> int:
         call: arguments of the kernel by the names of its parameters.
     """
     size = np.array(call["grids"].shape[:0:-1])  # columns, rows
-    image = np.array(call["image"].shape[::-1])
+    image = np.array(call["padded"].shape[::-1]) - (LANES, LINES)
     low, high = call["places"].min(axis=1), call["places"].max(axis=1)
     first = np.maximum(call["origin"], -low)
     last = np.minimum(call["origin"] + size, image - high)
