@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks import tables
 from benchmarks.speed import gate
+from calibgraph.matching.structure.score_kernel import pad
 from tests.conftest import ROOT
 
 MODULES = sorted(
@@ -57,7 +58,7 @@ def test_multiply_adds_are_those_of_the_shifts_inside_the_image() -> None:
     basis = np.zeros((2, 2, 4), np.float32)
     basis[1, 0, 2] = 1.0
     call = {
-        "image": np.zeros((7, 9), np.float32), "places": places, "counts": np.array([2, 2]),
+        "padded": pad(np.zeros((7, 9), np.float32)), "places": places, "counts": np.array([2, 2]),
         "basis": basis, "origin": np.array([-3, -2]), "grids": np.zeros((1, 5, 7), np.float32),
     }  # fmt: skip
     shifts = [
