@@ -27,7 +27,7 @@ from calibgraph.io.motion import ScanMotion, twist_between
 from calibgraph.model.geometry import transform
 
 MotionOf = Callable[[Frame, float], ScanMotion]
-"""Of a frame, for the instant so many seconds after its stamp."""
+"""Finds the motion of a frame, at a time [s] after its stamp."""
 
 _ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 _HALF_S = 0.05  # half a turn of a LiDAR at 10 Hz: the velocity is the mean of a scan
@@ -110,8 +110,8 @@ def _by_scans(frames: Sequence[Frame], frame: Frame, to_s: float) -> ScanMotion:
     near = [(other, s) for other, s in later_s if 0 < abs(s) < _NEIGHBOUR_S]
     if not near:
         raise DatasetError(
-            f"{frame.cloud_path}: no scan within {_NEIGHBOUR_S} s before or after it, of which its "
-            "motion could be found; choose other frames, or --motion odometry or tf"
+            f"{frame.cloud_path}: has no scan within {_NEIGHBOUR_S} s before or after it, from which "
+            "its motion could be found; choose other frames, or --motion odometry or tf"
         )
     return ScanMotion(tuple(twist_by_scans(frame, near).tolist()), to_s)
 

@@ -57,7 +57,7 @@ def links_between(links: Links, frame: str, other: str) -> list[Link]:
 def find_mounts(
     cameras: Mapping[str, tuple[str, Array]], lidar: str, links: Links
 ) -> dict[str, Mount]:
-    """The mounts of cameras; none of those that hang from the LiDAR itself, or share all links.
+    """The mounts of cameras. A camera below the LiDAR itself, or that shares all links, has none.
 
     Args:
         cameras: by name, the frame in the tree, and (4, 4) T_camera_frame from it to the camera.

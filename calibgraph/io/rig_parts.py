@@ -18,7 +18,7 @@ from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Mount, Rig
 
 ONLY_CAMERA = ""
-"""Stands for the camera of a file that names none: the only one of all files."""
+"""The name of a camera whose file states none; there is only one such camera."""
 
 RELATIVE_SIGMA_DEG = 0.1
 RELATIVE_SIGMA_CM = 0.5
@@ -84,7 +84,7 @@ class RigParts:
         return replace(self, **named, relative_poses=tuple(pairs))
 
     def tied_to(self, known: Mapping[str, Array]) -> dict[str, Array]:
-        """(4, 4) T_camera_lidar of known cameras, and of those that relative poses tie to them."""
+        """(4, 4) T_camera_lidar per camera: known, or found from a known one by relative poses."""
         found = dict(known)
         both_ways = [
             step

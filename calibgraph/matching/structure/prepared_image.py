@@ -23,7 +23,7 @@ SmallImages = KeyedCache[tuple[Hashable, ...], NDArray[np.float32]]
 FINEST_RAD = np.radians(0.03)
 """Of a pixel; half the finest step. Images of 20 megapixels keep a quarter of their pixels."""
 LOG_GRAY = np.log1p(np.arange(256, dtype=np.float32))
-LEAST_PX = 1e-3  # of which a mean takes notice, as OpenCV's
+LEAST_PX = 1e-3  # a smaller share of a pixel counts as none, as in OpenCV
 
 
 @dataclass(frozen=True, eq=False)
