@@ -110,8 +110,8 @@ def _by_scans(frames: Sequence[Frame], frame: Frame, to_s: float) -> ScanMotion:
     near = [(other, s) for other, s in later_s if 0 < abs(s) < _NEIGHBOUR_S]
     if not near:
         raise DatasetError(
-            f"{frame.cloud_path}: has no scan within {_NEIGHBOUR_S} s before or after it, from which "
-            "its motion could be found; choose other frames, or --motion odometry or tf"
+            f"{frame.cloud_path}: has no scan within {_NEIGHBOUR_S} s before or after it, from "
+            "which its motion could be found; choose other frames, or --motion odometry or tf"
         )
     return ScanMotion(tuple(twist_by_scans(frame, near).tolist()), to_s)
 

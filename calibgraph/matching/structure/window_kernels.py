@@ -24,7 +24,7 @@ FEATURES = (
 
 
 def make_room(size: int) -> tuple[NDArray[Any], ...]:
-    """Work space of the kernels: eight columns of floats and one of integers, ``size`` rays long."""
+    """Work space of the kernels: eight columns of floats, one of integers, ``size`` rays long."""
     return *np.empty((8, size)), np.empty(size, np.int64)
 
 
