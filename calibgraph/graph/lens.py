@@ -217,6 +217,18 @@ class FreeLensByPlace:
         pairs = zip(self.places, T_camera_cloud, strict=True)
         return [self._at(int(place)).sums(T, values) for place, T in pairs]
 
+    def stacked_sums(self, T_camera_cloud: Array, values: Array) -> BlockSums:
+        """The same of all P places, (P, 6 + k, 6 + k), zero where there are no correspondences."""
+        count, size = len(T_camera_cloud), 6 + len(values)
+        found = BlockSums(
+            np.zeros((count, size, size)), np.zeros((count, size)), np.zeros(count)
+        )
+        sums = self.sums(T_camera_cloud[self.places], values)
+        for place, one in zip(self.places, sums, strict=True):
+            found.hessian[place], found.gradient[place] = one.hessian, one.gradient
+            found.cost[place] = one.cost
+        return found
+
     def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
         """The correspondences of one place, lossless, on the variables of these keys."""
         block = self._at(place)

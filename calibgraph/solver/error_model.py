@@ -20,7 +20,7 @@ from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.model.places import Places
 from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.curvature import FittedObjective
-from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
+from calibgraph.solver.places import LatentPoseFit, fit_latent_poses, start_values
 from calibgraph.solver.lens import lens_errors, lens_term, weak_information
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum
@@ -169,7 +169,7 @@ def fit_errors(at: FittedObjective, findings: MatcherFindings, places: Places) -
         model, start_values(model, at.T_camera_lidar), relative_tolerance=_COARSE_TOLERANCE
     )
     if fit is not None and np.isfinite(prior.robust_scale):  # an outlying place has no evidence
-        weight = fit.place_weights(prior.robust_scale)
+        weight = fit.linear.weights
         prior = replace(prior, distortion_weight=weight[:, :1] * weight[:, 1:])
         model = replace(model, components=prior)
     for _ in range(_ROUNDS):

@@ -7,14 +7,13 @@ the rest.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
-from calibgraph.graph.linear_data import marginal_information
+from calibgraph.graph.components import shown_distortion
+from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.error_sources import (
     COMMON,
     ELEVATION,
@@ -31,14 +30,13 @@ from calibgraph.model.error_sources import (
     ErrorSources,
 )
 from calibgraph.model.geometry import pose_rows
-from calibgraph.solver.elimination import Linearization, join_linear
 from calibgraph.solver.error_model import ErrorFit
+from calibgraph.solver.places import LatentPoseFit, invert_scaled
 
 Variances = dict[str, Array]
 
 _DISTORTIONS = ELEVATION, STRETCH, MOTION
 _NOTHING = 1e-8  # share of a variance: rounding of a difference
-_DIFFERENCE = 5e-3  # of the log of a variance
 
 
 def sources_by_camera(
@@ -101,68 +99,42 @@ def _error_bar(variances: Array) -> tuple[float, float]:
 def predict_variances(errors: ErrorFit) -> dict[int, Array]:
     """(6 N,) of all cameras, if such frames at such places were recorded several times as often.
 
-    The information of places is repeated; that of what they all share is not.
+    The information of places is repeated, and so are the residuals that show the distortion; that
+    of what they all share is not.
     """
-    linear = errors.fit.linear
-    model, found = linear.model, {}
+    linear, found = errors.fit.linear, {}
+    at = linear.model.columns_of(errors.fit.keys)
     for times in TIMES:
-        shared = _distorted_repeatedly(linear, times) if model.is_distorted else linear.shared
-        found[times] = _variances(model, shared, _repeated(linear.left_by_places, times))
-    return found
-
-
-def _variances(model: LatentPoseModel, *graphs: gtsam.GaussianFactorGraph) -> Array:
-    """(6 N,) of the reported poses, by linear factors of what all places share."""
-    information = marginal_information(join_linear(*graphs), model.shared_keys, model.reported_keys)
-    return np.diag(np.linalg.inv(information))
-
-
-def _distorted_repeatedly(linear: Linearization, times: int) -> gtsam.GaussianFactorGraph:
-    """The linear factors of what all places share; the distortion is shown so many times."""
-    parts = linear.model.components
-    shown, vector = times * parts.distortion_information, times * parts.distortion_vector
-    parts = replace(parts, distortion_information=shown, distortion_vector=vector)
-    return replace(linear.model, components=parts).shared_graph.linearize(linear.values)
-
-
-def _repeated(graph: gtsam.GaussianFactorGraph, times: int) -> gtsam.GaussianFactorGraph:
-    """The factors of a graph so many times, added up to one factor."""
-    if times == 1:
-        return graph
-    half, found = _repeated(graph, times // 2), gtsam.GaussianFactorGraph()
-    odd = [graph] if times % 2 else []
-    found.push_back(gtsam.HessianFactor(join_linear(half, half, *odd)))
+        whole = linear.hessian(times)
+        if linear.model.is_distorted:
+            own = linear.model.columns[DISTORTION]
+            whole[np.ix_(own, own)] += (times - 1) * shown_distortion(linear.model.components)[0]
+        found[times] = np.diag(invert_scaled(whole))[at]
     return found
 
 
 def variances_by_source(errors: ErrorFit) -> Variances:
     """Per source but the matches, (6 N,) of its part of the variances of all cameras."""
-    return {**_of_shared(errors.fit.linear), PLACES: _of_places(errors)}
+    return {**_of_shared(errors.fit), PLACES: _of_places(errors.fit)}
 
 
-def _of_shared(linear: Linearization) -> Variances:
+def _of_shared(fit: LatentPoseFit) -> Variances:
     """The parts of the factors that act on what all places share.
 
     A factor with the whitened Jacobian A adds C A^T A C.
     """
-    model = linear.model
-    keys = model.reported_keys + model.shared_keys[: -len(model.cameras)]
-    dims = linear.values.dims()
-    sizes = [dims[key] for key in keys]
-    ends = dict(zip(keys, np.cumsum(sizes), strict=True))
-    hessian = join_linear(linear.shared, linear.left_by_places).hessian(to_ordering(keys))[0]
-    covariance = np.linalg.inv(hessian)[: 6 * len(model.cameras)]
+    linear, factors = fit.linear, fit.linear.shared_factors
+    covariance = linear.joint_covariance[linear.model.columns_of(fit.keys)]
     found = dict.fromkeys(
         (COMMON, PAIRS, LENSES, ESTIMATED, *_DISTORTIONS, PRIORS), np.zeros(len(covariance))
     )
-    for number in range(linear.shared.size()):
-        factor = linear.shared.at(number)
+    for number in range(factors.size()):
+        factor = factors.at(number)
         if isinstance(factor, gtsam.HessianFactor):
             continue  # the residuals of the distortion, which are matches
-        letters = {chr(gtsam.symbolChr(key)) for key in factor.keys()}  # noqa: SIM118
-        size = {key: sizes[keys.index(key)] for key in factor.keys()}  # noqa: SIM118
-        columns = [np.arange(ends[key] - size[key], ends[key]) for key in size]
-        moved = covariance[:, np.concatenate(columns)] @ factor.jacobian()[0].T
+        keys = [*factor.keys()]  # noqa: SIM118
+        letters = {chr(gtsam.symbolChr(key)) for key in keys}
+        moved = covariance[:, linear.model.columns_of(keys)] @ factor.jacobian()[0].T
         if letters == {"d"}:
             for name, part in zip(_DISTORTIONS, (moved**2).T, strict=True):
                 found[name] = found[name] + part
@@ -174,26 +146,11 @@ def _of_shared(linear: Linearization) -> Variances:
     return found
 
 
-def _of_places(errors: ErrorFit) -> Array:
-    """(6 N,) the part that the frames of a place share, beyond their scatter.
-
-    The derivative of the variances by the log of its covariance, from two differences.
-    """
-    linear, model = errors.fit.linear, errors.fit.linear.model
-    parts, scale = model.components, model.components.robust_scale
-    if np.isfinite(scale):
-        parts = parts.with_fixed_weights(errors.fit.place_weights(scale))
-
-    def variances(step: float) -> Array:
-        factor = float(np.exp(step))
-        place = factor * (parts.at_place - parts.scatter_at_place) + parts.scatter_at_place
-        other = replace(parts, cloud_at_place=factor * parts.cloud_at_place, at_place=place)
-        placed = replace(model, components=other).place_graph.linearize(linear.values)
-        every = join_linear(placed, linear.data.graph)
-        left = every.eliminatePartialSequential(to_ordering(model.place_keys))[1]
-        return _variances(model, linear.shared, left)
-
-    near, far = (
-        (variances(step) - variances(-step)) / (2 * step) for step in (_DIFFERENCE, 2 * _DIFFERENCE)
-    )
-    return np.asarray((4.0 * near - far) / 3.0)
+def _of_places(fit: LatentPoseFit) -> Array:
+    """(6 N,) the part that the frames of a place share, beyond their scatter."""
+    linear, model, parts = fit.linear, fit.linear.model, fit.linear.model.components
+    across = linear.joint_covariance[model.columns_of(fit.keys), : model.touched]
+    turn, shared = linear.ties.turn[1:], parts.at_place - parts.scatter_at_place
+    part = turn @ shared.swapaxes(0, 1)[model.matched] @ turn.swapaxes(-1, -2)
+    of_cloud = linear.places.cloud.variances_by(linear.ties.covariance[0], across)
+    return of_cloud + linear.places.cameras.variances_by(part, across)

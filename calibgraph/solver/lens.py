@@ -24,7 +24,7 @@ from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.curvature import FittedObjective, positive_part
-from calibgraph.solver.elimination import LatentPoseFit
+from calibgraph.solver.places import LatentPoseFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import FreeLensBlock
 
@@ -184,7 +184,7 @@ def moved_lenses(lenses: Lenses, fit: LatentPoseFit | None) -> tuple[Lenses, flo
     for number in fit.linear.model.lenses:
         name, key = fit.linear.model.cameras[number], lens_key(number)
         values, sigmas = (
-            fit.linear.values.atVector(key),
+            fit.linear.shared.atVector(key),
             np.sqrt(np.diag(fit.linear.covariance_of([key]))),
         )
         moved[name] = lenses[name].moved_to(values)

@@ -8,7 +8,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.lens import LensEstimate
-from calibgraph.solver.elimination import LatentPoseFit
+from calibgraph.solver.places import LatentPoseFit
 from factors.free_lens import FOCAL, OFFSET, READOUT
 
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
@@ -20,7 +20,7 @@ def lens_estimates(fit: LatentPoseFit) -> dict[str, tuple[LensEstimate, ...]]:
     model, found = fit.linear.model, {}
     for number, term in model.lenses.items():
         own = [lens_key(number), model.reported_keys[number]]
-        values = fit.linear.values.atVector(own[0])
+        values = fit.linear.shared.atVector(own[0])
         estimates = estimates_of(term.variable, values, fit.linear.covariance_of(own))
         found[model.cameras[number]] = estimates
     return found

@@ -22,7 +22,7 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import data_sigmas
 from calibgraph.solver.curvature import FittedObjective
-from calibgraph.solver.elimination import LatentPoseFit
+from calibgraph.solver.places import LatentPoseFit
 from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
 from calibgraph.solver.error_shares import (
     predict_variances,

@@ -14,14 +14,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from typing import Literal, NamedTuple
 
-import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.graph.components import EXACT, VarianceComponents, least_cost_of_distortion
-from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.model.findings import MatcherFindings, error_components
-from calibgraph.solver.elimination import LatentPoseFit, Linearization, join_linear
+from calibgraph.solver.places import LatentPoseFit, Linearization
 from calibgraph.solver.pair_refinement import pair_sigmas
 from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WithinPlace
@@ -29,7 +27,6 @@ from calibgraph.solver.within_place import WithinPlace
 Component = Literal["shared", "cloud", "cameras"]
 
 _SETTLED = 0.1  # relative change of the ratios: the data leave far more open
-_DIFFERENCE = 1e-3  # of log ratios
 
 
 @dataclass(frozen=True)
@@ -87,13 +84,13 @@ def estimate_variance_ratios(fit: LatentPoseFit, present: VarianceRatios) -> Var
         fit: with the present ratios.
         present: the ratios of its model.
     """
-    evidence, places = squared_displacements(fit), fit.linear.model.places
+    evidence, places = squared_displacements(fit.linear), fit.linear.model.places
     least = ratios_by_evidence(evidence, places=places, present=present)
     without = {name: one._replace(free=0.0) for name, one in evidence.items()}
     most = ratios_by_evidence(without, places=places, present=present)
     if least.is_near(present) and most.is_near(present):  # whatever the data leave open
         return most
-    for name, t in undetermined(_with_fixed_weights(fit)).items():
+    for name, t in undetermined(fit.linear).items():
         evidence[name] = evidence[name]._replace(free=evidence[name].free - t)
     return ratios_by_evidence(evidence, places=places, present=present)
 
@@ -116,68 +113,38 @@ def ratios_by_evidence(
     )
 
 
-def squared_displacements(fit: LatentPoseFit) -> dict[Component, Evidence]:
+def squared_displacements(linear: Linearization) -> dict[Component, Evidence]:
     """Per component its weighted sum of squares, and its number n of degrees of freedom."""
-    linear = fit.linear
     model, parts = linear.model, linear.model.components
-    weight = fit.place_weights(parts.robust_scale)
-    squared = weight * linear.distances**2
-    present = np.zeros(squared.shape, dtype=np.bool_)
-    for place, number in model.matched_places:
-        present[place, 1 + number] = True
     variables, distortions, known = 1 + len(model.matched) + len(model.paired), 0, 0.0
     if model.is_distorted:  # its residuals count as a part of its prior
         distortions, known = parts.distortion_jacobian.shape[2], least_cost_of_distortion(parts)
+    weight = linear.ties.weight
+    squared = weight * linear.ties.distance**2
     return {
         "shared": Evidence(
-            2.0 * model.error_graph.error(linear.values) - known, 6.0 * variables + distortions
+            2.0 * model.error_graph.error(linear.shared) - known, 6.0 * variables + distortions
         ),
-        "cloud": Evidence(squared[:, 0].sum(), 6.0 * weight[:, 0].sum()),
-        "cameras": Evidence(squared[:, 1:].sum(), 6.0 * weight[present].sum()),
+        "cloud": Evidence(float(squared[0].sum()), 6.0 * float(weight[0].sum())),
+        "cameras": Evidence(
+            float(squared[1:].sum()), 6.0 * float(weight[1:][model.present].sum())
+        ),
     }
 
 
 def undetermined(linear: Linearization) -> dict[Component, float]:
-    """Per component t, the degrees of freedom that the data leave open.
+    """Per component t, the degrees of freedom that the data leave open: tr(S^-1 Cov(e)).
 
-    Args:
-        linear: with quadratic losses of places.
+    The losses of places count with the weights that they have.
     """
-    model, values = linear.model, linear.values
-
-    def shared(ratio: float) -> float:
-        parts = VarianceRatios(shared=ratio).scale(model.components)
-        parts = replace(parts, distortion_weight=parts.distortion_weight / ratio)
-        scaled = replace(model, components=parts)
-        graph = join_linear(scaled.shared_graph.linearize(values), linear.left_by_places)
-        return log_determinant(graph, to_ordering(model.shared_keys))
-
-    def placed(**ratio: float) -> float:
-        parts = VarianceRatios(**ratio).scale(model.components)
-        scaled = replace(model, components=parts).place_graph.linearize(values)
-        graph = join_linear(linear.shared, scaled, linear.data.graph)
-        return log_determinant(graph, model.ordering)
-
-    up, down = np.exp(_DIFFERENCE), np.exp(-_DIFFERENCE)
+    joint, places = linear.joint_covariance, linear.places
+    errors = linear.hessian_of(linear.model.error_graph.linearize(linear.shared))[0]
+    known = joint[: linear.model.touched, : linear.model.touched]
     return {
-        "shared": (shared(down) - shared(up)) / (2 * _DIFFERENCE),
-        "cloud": (placed(cloud=down) - placed(cloud=up)) / (2 * _DIFFERENCE),
-        "cameras": (placed(cameras=down) - placed(cameras=up)) / (2 * _DIFFERENCE),
+        "shared": float((errors * joint).sum()),
+        "cloud": float(places.cloud.open_freedom(known).sum()),
+        "cameras": float(places.cameras.open_freedom(known)[linear.model.present].sum()),
     }
-
-
-def log_determinant(graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> float:
-    """The log of the determinant of the graph's Hessian."""
-    return 2.0 * float(graph.eliminateSequential(ordering).logDeterminant())
-
-
-def _with_fixed_weights(fit: LatentPoseFit) -> Linearization:
-    """The graph with quadratic losses of the curvature that the robust ones have."""
-    model, scale = fit.linear.model, fit.linear.model.components.robust_scale
-    if np.isinf(scale):
-        return fit.linear
-    fixed = model.components.with_fixed_weights(fit.place_weights(scale))
-    return replace(fit.linear, model=replace(model, components=fixed))
 
 
 def variance_components(

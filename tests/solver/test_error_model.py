@@ -17,7 +17,7 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
-from calibgraph.graph.latent_poses import to_ordering
+from calibgraph.graph.latent_poses import data_graph, latent_pose_graph, to_ordering
 from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.config import Config, preset
 from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES
@@ -27,7 +27,6 @@ from calibgraph.model.verdict import COMMON_ERROR
 from calibgraph.simulation.correspondences import PoseSpread
 from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.elimination import join_linear
 from calibgraph.solver.error_model import ErrorFit, fit_errors
 from calibgraph.solver.error_shares import variances_by_source
 from calibgraph.solver.joint import solve_joint
@@ -162,23 +161,20 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
 
     From the dense covariance C: C G C, with G the information of each of these.
     """
-    linear, weight = (
-        errors.fit.linear,
-        errors.fit.place_weights(errors.model.components.robust_scale),
-    )
-    parts = errors.model.components.with_fixed_weights(weight)
+    linear = errors.fit.linear
+    parts, values = errors.model.components.with_fixed_weights(linear.weights), linear.values
     model = replace(errors.model, components=parts)
-    order = to_ordering([*model.reported_keys, *model.shared_keys[: -len(model.cameras)],
-                         *model.place_keys])  # fmt: skip
+    others = [key for key in model.shared_keys if key not in model.reported_keys]
+    order = to_ordering([*model.reported_keys, *others, *model.place_keys])
     starts, end = {}, 0
     for number in range(order.size()):
         starts[order.at(number)] = end
         end += 3 if order.at(number) == DISTORTION else 6
-    graph = join_linear(linear.shared, linear.placed)
+    graph, data = (of(model).linearize(values) for of in (latent_pose_graph, data_graph))
     moved = np.linalg.inv(graph.hessian(order)[0])[: 6 * len(model.cameras)]
     information = np.zeros((end, end))
-    for number in range(linear.data.graph.size()):
-        factor = linear.data.graph.at(number)
+    for number in range(data.size()):
+        factor = data.at(number)
         rows = np.concatenate([starts[key] + np.arange(6) for key in list(factor.keys())])
         information[np.ix_(rows, rows)] += factor.information()
     shown = np.einsum("pn,pnij->ij", parts.distortion_weight, parts.distortion_information)
@@ -187,7 +183,7 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
     for number, (place, camera) in enumerate(model.matched_places):
         edge = model.place_graph.at(model.places + number)
         root = edge.noiseModel().R()
-        whitened, _ = edge.linearize(linear.values).jacobian()
+        whitened, _ = edge.linearize(values).jacobian()
         rows = np.concatenate([starts[key] + np.arange(6) for key in list(edge.keys())])
         scatter = root @ parts.scatter_at_place[place, camera] @ root.T
         information[np.ix_(rows, rows)] += whitened.T @ scatter @ whitened
