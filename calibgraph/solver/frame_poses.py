@@ -1,8 +1,4 @@
-"""Robust poses of many frames of one camera at once, over stacked sums.
-
-:func:`fit_frames` minimizes a given loss by Levenberg-Marquardt; :func:`fit_each_frame` measures
-the spread of every frame's residuals about its own pose, and takes the loss from it.
-"""
+"""Robust poses of many frames of one camera at once, over stacked sums."""
 
 import math
 from dataclasses import dataclass
@@ -11,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
+from calibgraph.model.config import Config
 from calibgraph.model.pose_kernel import MAX_DAMPING, descend
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, CUT, robust_spreads
-from factors import ProjectionBlock, to_runs
+from calibgraph.solver.camera_block import MIN_MATCHES
+from factors import ProjectionBlock
 from factors.block_sums import unpack_sums
+from factors.conditioning import are_regular
 
 Runs = NDArray[np.int64]
 """(f, 2): the first correspondence of each frame, and the one behind its last."""
@@ -27,10 +24,9 @@ FINE, COARSE = 1e-10, 1e-3
 DAMPING = 1e-6
 """Of the diagonal, for frames that leave a direction free."""
 
-_OWN_STEPS = 6  # Gauss-Newton steps to a frame's own extrinsic
-_MAX_STEP_RAD = 0.05  # rotation of one step, 3 degrees: beyond it the linearization does not hold
-_MAX_SPREAD = 1e6  # px, in place of the infinite spread of a frame that is all behind its camera
-_MIN_MATCHES = 10  # fewer residuals about a frame's own extrinsic (6 unknowns) give no spread
+_REFINEMENTS = 2  # the first with the inliers of PnP, the second with those of the first
+_MIN_INLIER_SHARE = 0.1  # chosen, not measured
+_MIN_SCALED_EIGENVALUE = 1e-9  # below it a direction is free: points on one line, or in one place
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +36,15 @@ class FramePoses:
     Attributes:
         T_camera_lidar: (f, 4, 4).
         hessians: (f, 6, 6) there.
-        converged: (f,) whether the fit stopped by its tolerance.
+        found: (f,) whether the fit stopped by its tolerance; of :func:`refine_frames`, whether
+            enough matches agree on it, and leave no direction of it free.
+        inliers: (f,) matches that it is fitted to; of :func:`refine_frames`, within the threshold.
     """
 
     T_camera_lidar: Array
     hessians: Array
-    converged: NDArray[np.bool_]
+    found: NDArray[np.bool_]
+    inliers: NDArray[np.int64]
 
 
 def fit_frames(
@@ -69,7 +68,7 @@ def fit_frames(
         new = block.packed_run_sums(tried[:count], runs[active[:count]])
     converged = dampings < MAX_DAMPING
     converged[active[:count]] = False
-    return FramePoses(T, unpack_sums(sums).hessian, converged)
+    return FramePoses(T, unpack_sums(sums).hessian, converged, runs[:, 1] - runs[:, 0])
 
 
 def move_damped(
@@ -93,71 +92,29 @@ def move_damped(
     return moved, steps
 
 
-@dataclass(frozen=True, eq=False)
-class FrameFits:
-    """The frames of a camera, each at its own extrinsic.
-
-    Attributes:
-        T_camera_lidar: (f, 4, 4) each frame's own.
-        counts: (f,) matches.
-        spreads: (f,) of whitened residuals about the common extrinsic, from those about their own.
-        spreads_px: (f,) of unweighted ones, about their own.
-        hessians: (f, 6, 6) of whitened residuals there, in the tangent of T_lidar_camera.
-        sizes: (n,) of the residuals there, over the frame's spread, as ``CameraBlock.all_sizes``;
-            infinite where a point is not projectable.
-    """
-
-    T_camera_lidar: Array
-    counts: Array
-    spreads: Array
-    spreads_px: Array
-    hessians: Array
-    sizes: Array
-
-    @property
-    def noise(self) -> Array:
-        """(f,) mean square displacement of whitened pixels by the noise of the own extrinsic."""
-        return 6 * self.spreads**2 / self.counts
-
-
-def fit_each_frame(block: CameraBlock, own: Array, common: Array) -> FrameFits:
-    """Fit every frame alone by damped Gauss-Newton steps, its loss as wide as its residuals spread.
+def refine_frames(
+    block: ProjectionBlock, runs: Runs, T_camera_lidar: Array, config: Config
+) -> FramePoses:
+    """Re-select each frame's inliers with the full lens model and refine on them, a few times.
 
     Args:
-        block: of one camera.
-        own: (f, 4, 4) T_camera_lidar of its frames, by PnP of each.
-        common: (4, 4) T_camera_lidar that a frame starts from if its own fits worse.
+        block: of all frames, with all their matches, unweighted.
+        runs: (f, 2) those of each frame, one behind the other.
+        T_camera_lidar: (f, 4, 4) starts.
+        config: ``pnp_threshold_px``.
     """
-    runs = to_runs(block.frame_edges)
-    least, T = block.least_spreads(runs), np.broadcast_to(common, own.shape)
-    at_own, at_common = (robust_spreads(block.all_sizes(each, runs)[1], runs) for each in (own, T))
-    T = np.where((at_own <= at_common)[:, None, None], own, T)
-    for _ in range(_OWN_STEPS):
-        sizes = block.all_sizes(T, runs)[1]
-        spreads = np.minimum(np.maximum(robust_spreads(sizes, runs), least), _MAX_SPREAD)
-        sums = block.block.packed_run_sums(T, runs, CAUCHY_SCALE_SIGMAS * spreads)
-        T = move_damped(sums, T, most_rad=_MAX_STEP_RAD)[0]
-    counts = block.frame_counts.astype(np.float64)
-    inside = np.add.reduceat(sizes <= CUT * np.repeat(spreads, block.frame_counts), runs[:, 0])
-    spreads = _about_common_extrinsic(spreads, counts, inside)
-    return FrameFits(
-        T_camera_lidar=T,
-        counts=counts,
-        spreads=spreads,
-        spreads_px=robust_spreads(block.all_sizes(T, runs)[0], runs),
-        hessians=unpack_sums(sums).hessian,
-        sizes=sizes / np.repeat(spreads, block.frame_counts),
-    )
-
-
-def _about_common_extrinsic(spreads: Array, counts: Array, inside: Array) -> Array:
-    """(f,) spreads of residuals about the common extrinsic, from those about each frame's own.
-
-    Six unknowns take their share of 2 n residuals; where they take most of the ``inside``, from
-    which a spread is measured, it is at least that of a typical frame: among outliers there is
-    always a pose that fits a few matches exactly.
-    """
-    grown = spreads * np.sqrt(2 * counts / np.maximum(2 * counts - 6, 1))
-    enough = inside >= _MIN_MATCHES
-    typical = float(np.median(grown[enough] if enough.any() else grown))
-    return np.asarray(np.where(enough, grown, np.maximum(grown, typical)))
+    least = np.maximum(MIN_MATCHES, _MIN_INLIER_SHARE * (runs[:, 1] - runs[:, 0]))
+    found = np.ones(len(runs), dtype=np.bool_)
+    for _ in range(_REFINEMENTS):
+        residuals, projectable = block.run_residuals(T_camera_lidar, runs)
+        squared = residuals[:, 0] ** 2 + residuals[:, 1] ** 2
+        inlier = projectable & (squared < config.pnp_threshold_px**2)
+        places = np.concatenate([[0], np.cumsum(inlier)])[runs]
+        inliers = places[:, 1] - places[:, 0]
+        found &= inliers >= least
+        some = block.select(inlier).rescale(scale=config.pnp_threshold_px / 2)
+        places[~found] = 0
+        fit = fit_frames(some, places, T_camera_lidar)
+        T_camera_lidar = fit.T_camera_lidar
+        found &= are_regular(fit.hessians, _MIN_SCALED_EIGENVALUE)
+    return FramePoses(T_camera_lidar, fit.hessians, found, inliers)

@@ -1,11 +1,9 @@
 """One camera's extrinsic from its correspondences in single frames: robust PnP."""
 
-from dataclasses import dataclass
 from itertools import product
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
@@ -14,11 +12,9 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 from calibgraph.solver.camera_block import MIN_MATCHES
-from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
+from calibgraph.solver.frame_poses import COARSE, fit_frames, refine_frames
 from factors import ProjectionBlock, unproject
-from factors.conditioning import are_regular
 
-_REFINEMENTS = 2  # the first with the inliers of PnP, the second with those of the first
 _MAX_SAMPLE = 4000  # matches; chosen, not measured
 RANSAC_ITERATIONS = 2000
 """Samples of 4 matches: with 80 % outliers, one is clean in 19 of 20 runs."""
@@ -27,23 +23,6 @@ _CONE_RAD = np.radians(60.0)  # of a lens that sees all round: what one plane se
 _DIRECTIONS = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 _DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
 _WIDE = 10.0  # PnP thresholds: the scale of the loss of a fit from the guess
-_MIN_INLIER_SHARE = 0.1  # chosen, not measured
-_MIN_SCALED_EIGENVALUE = 1e-9  # below it a direction is free: points on one line, or in one place
-
-
-@dataclass(frozen=True, eq=False)
-class Refined:
-    """Frames refined on their inliers.
-
-    Attributes:
-        T_camera_lidar: (f, 4, 4).
-        found: (f,) whether enough matches agree on it, and leave no direction of it free.
-        inliers: (f,) matches within the PnP threshold.
-    """
-
-    T_camera_lidar: Array
-    found: NDArray[np.bool_]
-    inliers: NDArray[np.int64]
 
 
 def magsac(threshold: float, *, iterations: int, seed: int) -> cv2.UsacParams:
@@ -87,11 +66,6 @@ def frame_pose(
         return None
     refined = refine_frames(block, np.array([[0, len(block)]]), start[None], config)
     return refined.T_camera_lidar[0] if refined.found[0] else None
-
-
-def select_evenly(matches: Correspondences, most: int) -> Correspondences:
-    """Every k-th match, so that at most so many are left."""
-    return matches.select(slice(None, None, -(-len(matches) // most) or None))
 
 
 def ransac_pnp(
@@ -176,31 +150,3 @@ def view_plane(camera: Camera, pixels_px: Array) -> tuple[Array, Array]:
     usable = valid & (turned[:, 2] > np.cos(most_rad))
     with np.errstate(divide="ignore", invalid="ignore"):
         return turn, np.where(usable[:, None], turned[:, :2] / turned[:, 2:], np.nan)
-
-
-def refine_frames(
-    block: ProjectionBlock, runs: Runs, T_camera_lidar: Array, config: Config
-) -> Refined:
-    """Re-select each frame's inliers with the full lens model and refine on them, a few times.
-
-    Args:
-        block: of all frames, with all their matches, unweighted.
-        runs: (f, 2) those of each frame, one behind the other.
-        T_camera_lidar: (f, 4, 4) starts.
-        config: ``pnp_threshold_px``.
-    """
-    least = np.maximum(MIN_MATCHES, _MIN_INLIER_SHARE * (runs[:, 1] - runs[:, 0]))
-    found = np.ones(len(runs), dtype=np.bool_)
-    for _ in range(_REFINEMENTS):
-        residuals, projectable = block.run_residuals(T_camera_lidar, runs)
-        squared = residuals[:, 0] ** 2 + residuals[:, 1] ** 2
-        inlier = projectable & (squared < config.pnp_threshold_px**2)
-        places = np.concatenate([[0], np.cumsum(inlier)])[runs]
-        inliers = places[:, 1] - places[:, 0]
-        found &= inliers >= least
-        some = block.select(inlier).rescale(scale=config.pnp_threshold_px / 2)
-        places[~found] = 0
-        fit = fit_frames(some, places, T_camera_lidar)
-        T_camera_lidar = fit.T_camera_lidar
-        found &= are_regular(fit.hessians, _MIN_SCALED_EIGENVALUE)
-    return Refined(T_camera_lidar, found, inliers)
