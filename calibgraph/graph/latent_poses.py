@@ -78,6 +78,7 @@ class LatentPoseModel:
         lens_errors: by the numbers of cameras, (6, 6) covariance of ``b_c``, which is then
             reported, about the mount or alignment: of the pose that follows what is not estimated
             of lens and clock.
+        frames: the numbers of the frames of each place.
     """
 
     cameras: tuple[str, ...]
@@ -88,6 +89,7 @@ class LatentPoseModel:
     of: Reported = "alignment"
     lenses: Mapping[int, LensTerm] = field(default_factory=dict)
     lens_errors: Mapping[int, Array] = field(default_factory=dict)
+    frames: Sequence[NDArray[np.int64]] = ()
 
     @property
     def places(self) -> int:

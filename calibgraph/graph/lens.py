@@ -220,9 +220,7 @@ class FreeLensByPlace:
     def stacked_sums(self, T_camera_cloud: Array, values: Array) -> BlockSums:
         """The same of all P places, (P, 6 + k, 6 + k), zero where there are no correspondences."""
         count, size = len(T_camera_cloud), 6 + len(values)
-        found = BlockSums(
-            np.zeros((count, size, size)), np.zeros((count, size)), np.zeros(count)
-        )
+        found = BlockSums(np.zeros((count, size, size)), np.zeros((count, size)), np.zeros(count))
         sums = self.sums(T_camera_cloud[self.places], values)
         for place, one in zip(self.places, sums, strict=True):
             found.hessian[place], found.gradient[place] = one.hessian, one.gradient

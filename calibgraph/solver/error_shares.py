@@ -30,8 +30,7 @@ from calibgraph.model.error_sources import (
     ErrorSources,
 )
 from calibgraph.model.geometry import pose_rows
-from calibgraph.solver.error_model import ErrorFit
-from calibgraph.solver.places import LatentPoseFit, invert_scaled
+from calibgraph.solver.places import ErrorFit, invert_scaled
 
 Variances = dict[str, Array]
 
@@ -102,8 +101,8 @@ def predict_variances(errors: ErrorFit) -> dict[int, Array]:
     The information of places is repeated, and so are the residuals that show the distortion; that
     of what they all share is not.
     """
-    linear, found = errors.fit.linear, {}
-    at = linear.model.columns_of(errors.fit.keys)
+    linear, found = errors.linear, {}
+    at = linear.model.columns_of(errors.keys)
     for times in TIMES:
         whole = linear.hessian(times)
         if linear.model.is_distorted:
@@ -115,10 +114,10 @@ def predict_variances(errors: ErrorFit) -> dict[int, Array]:
 
 def variances_by_source(errors: ErrorFit) -> Variances:
     """Per source but the matches, (6 N,) of its part of the variances of all cameras."""
-    return {**_of_shared(errors.fit), PLACES: _of_places(errors.fit)}
+    return {**_of_shared(errors), PLACES: _of_places(errors)}
 
 
-def _of_shared(fit: LatentPoseFit) -> Variances:
+def _of_shared(fit: ErrorFit) -> Variances:
     """The parts of the factors that act on what all places share.
 
     A factor with the whitened Jacobian A adds C A^T A C.
@@ -146,7 +145,7 @@ def _of_shared(fit: LatentPoseFit) -> Variances:
     return found
 
 
-def _of_places(fit: LatentPoseFit) -> Array:
+def _of_places(fit: ErrorFit) -> Array:
     """(6 N,) the part that the frames of a place share, beyond their scatter."""
     linear, model, parts = fit.linear, fit.linear.model, fit.linear.model.components
     across = linear.joint_covariance[model.columns_of(fit.keys), : model.touched]

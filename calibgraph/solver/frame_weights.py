@@ -101,7 +101,8 @@ def fit_each_frame(block: CameraBlock, own: Array, common: Array) -> FrameFits:
     tried = np.stack([own, np.broadcast_to(common, own.shape)])
     found = [robust_spreads(block.all_sizes(T, runs)[1], runs) for T in tried]
     better = found[0] <= found[1]
-    T, spreads = np.where(better[:, None, None], *tried), bounded(np.where(better, *found))
+    T: Array = np.where(better[:, None, None], tried[0], tried[1])
+    spreads = bounded(np.where(better, found[0], found[1]))
     for _ in range(_OWN_STEPS):
         sums = block.block.packed_run_sums(T, runs, CAUCHY_SCALE_SIGMAS * spreads)
         T, steps = move_damped(sums, T, most_rad=_MAX_STEP_RAD)
@@ -114,8 +115,8 @@ def fit_each_frame(block: CameraBlock, own: Array, common: Array) -> FrameFits:
     spreads_px = spreads if sizes_px is sizes else robust_spreads(sizes_px, runs)
     each = np.repeat(spreads, counts)
     inside = np.add.reduceat(sizes <= CUT * each, runs[:, 0])
-    spreads = _about_common_extrinsic(spreads, counts, inside)
-    return FrameFits(T, counts, spreads, spreads_px, hessians, sizes / each)
+    spreads = _about_common_extrinsic(spreads, counts.astype(np.float64), inside)
+    return FrameFits(T, counts.astype(np.float64), spreads, spreads_px, hessians, sizes / each)
 
 
 def _about_common_extrinsic(spreads: Array, counts: Array, inside: Array) -> Array:

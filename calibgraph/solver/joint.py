@@ -166,8 +166,7 @@ def _solve_with_lenses(
         )
         is_known = solution.correspondences.twist_per_s is not None
         require_motion(config.estimate, is_known=is_known)
-        fit = None if solution.errors is None else solution.errors.fit
-        lenses, change = moved_lenses(lenses, fit)
+        lenses, change = moved_lenses(lenses, solution.errors)
         if change < _SETTLED:
             return solution
     return replace(solution, optimum=replace(solution.optimum, converged=False))

@@ -24,7 +24,7 @@ from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.curvature import FittedObjective, positive_part
-from calibgraph.solver.places import LatentPoseFit
+from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import FreeLensBlock
 
@@ -176,13 +176,13 @@ def _allow_for_few_frames(scatter: Array, hessian: Array, matches: float, frames
     return np.asarray(own * frames / (prior + frames - 1))
 
 
-def moved_lenses(lenses: Lenses, fit: LatentPoseFit | None) -> tuple[Lenses, float]:
+def moved_lenses(lenses: Lenses, fit: ErrorFit | None) -> tuple[Lenses, float]:
     """Lenses where a fit has them, and the largest change of a value in standard deviations."""
     if fit is None:
         return lenses, 0.0
     moved, largest = {**lenses}, 0.0
-    for number in fit.linear.model.lenses:
-        name, key = fit.linear.model.cameras[number], lens_key(number)
+    for number in fit.model.lenses:
+        name, key = fit.model.cameras[number], lens_key(number)
         values, sigmas = (
             fit.linear.shared.atVector(key),
             np.sqrt(np.diag(fit.linear.covariance_of([key]))),

@@ -8,16 +8,16 @@ from calibgraph.arrays import Array
 from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.lens import LensEstimate
-from calibgraph.solver.places import LatentPoseFit
+from calibgraph.solver.places import ErrorFit
 from factors.free_lens import FOCAL, OFFSET, READOUT
 
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
 _UNITS = {FOCAL: "px", "centre_x": "px", "centre_y": "px", OFFSET: "s", READOUT: "s"}
 
 
-def lens_estimates(fit: LatentPoseFit) -> dict[str, tuple[LensEstimate, ...]]:
+def lens_estimates(fit: ErrorFit) -> dict[str, tuple[LensEstimate, ...]]:
     """Per camera whose lens is free, its parameters with their marginal."""
-    model, found = fit.linear.model, {}
+    model, found = fit.model, {}
     for number, term in model.lenses.items():
         own = [lens_key(number), model.reported_keys[number]]
         values = fit.linear.shared.atVector(own[0])
@@ -26,13 +26,13 @@ def lens_estimates(fit: LatentPoseFit) -> dict[str, tuple[LensEstimate, ...]]:
     return found
 
 
-def lens_covariances(fit: LatentPoseFit) -> dict[str, Array]:
+def lens_covariances(fit: ErrorFit) -> dict[str, Array]:
     """Per camera whose lens is free, the (6 + k, 6 + k) joint marginal of pose, lens and clock.
 
     Of xi in T_camera_lidar = exp(xi) estimate, then of the parameters in the order and the units of
     :func:`lens_estimates`.
     """
-    model, found = fit.linear.model, {}
+    model, found = fit.model, {}
     for number, term in model.lenses.items():
         joint = fit.linear.covariance_of([model.reported_keys[number], lens_key(number)])
         units = [_unit(term.variable, row) for row in range(len(term.variable.free))]

@@ -22,14 +22,14 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import data_sigmas
 from calibgraph.solver.curvature import FittedObjective
-from calibgraph.solver.places import LatentPoseFit
-from calibgraph.solver.error_model import ErrorFit, fit_errors, fit_without_priors
+from calibgraph.solver.error_model import fit_errors, fit_without_priors
 from calibgraph.solver.error_shares import (
     predict_variances,
     sources_by_camera,
     variances_by_source,
 )
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
+from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.shared_error import shared_variance_ratio
 from factors import pose_sigmas
 
@@ -67,7 +67,7 @@ class Marginals:
     @cached_property
     def covariance(self) -> Array | None:
         """(6 N, 6 N): the marginal of the error model."""
-        return None if self.errors is None else self.errors.fit.covariance
+        return None if self.errors is None else self.errors.covariance
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -101,7 +101,7 @@ class Marginals:
         """
         if self.errors is None:
             return {}
-        total, held = np.diag(self.errors.fit.covariance), self.at.held
+        total, held = np.diag(self.errors.covariance), self.at.held
         parts, forecast = variances_by_source(self.errors), predict_variances(self.errors)
         numbers = {n: k for k, n in enumerate(self.cameras) if n not in held}
         return sources_by_camera(joint, total, parts, forecast, numbers=numbers)
@@ -115,9 +115,9 @@ class Marginals:
         return shared_variance_ratio(mount.T_camera_lidar, mount.covariance, self.alone.pair_fits)
 
     @property
-    def mount(self) -> LatentPoseFit | None:
+    def mount(self) -> ErrorFit | None:
         """The fit of the mounts, between which images and measurements show relative poses."""
-        return None if self.errors is None else self.errors.fit.of_mount
+        return None if self.errors is None else self.errors.of_mount
 
     @cached_property
     def pair_fits(self) -> list[PairFit]:
@@ -155,6 +155,6 @@ class Marginals:
         free = free or fit_without_priors(self.at, self.findings, self.table.places)
         if free is None:
             return ()
-        mount = free.fit.of_mount
-        names, T, covariance = mount.linear.model.cameras, mount.T_camera_lidar, mount.covariance
+        mount = free.of_mount
+        names, T, covariance = mount.model.cameras, mount.T_camera_lidar, mount.covariance
         return tuple(relative_pose_conflict(pair, names, T, covariance) for pair in pairs)

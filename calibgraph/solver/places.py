@@ -28,6 +28,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.graph.components import VarianceRatios
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.lens import FreeLensByPlace, start_lenses
 from calibgraph.graph.variables import (
@@ -36,8 +37,6 @@ from calibgraph.graph.variables import (
     aligned_key,
     body_key,
     camera_key,
-    cloud_at_key,
-    matched_at_key,
     matched_key,
     paired_key,
 )
@@ -89,13 +88,11 @@ class Ties(NamedTuple):
         error = -logarithms(away)
         turn, shape = _right_jacobians(error).reshape(covariance.shape), covariance.shape[:-1]
         error = error.reshape(shape)
-        squared = (error * _times(np.linalg.inv(covariance), error)).sum(axis=-1)
+        squared = (error * _times(_inverses(covariance), error)).sum(axis=-1)
         weight = (1.0 + squared / scale**2) ** -2
         turn = turn / np.sqrt(weight)[..., None, None]
         own = turn @ covariance @ _turned(turn)
-        return Ties(
-            error, np.sqrt(squared), weight, turn, own, adjoints(away).reshape(own.shape)
-        )
+        return Ties(error, np.sqrt(squared), weight, turn, own, adjoints(away).reshape(own.shape))
 
     def cost(self, scale: float) -> float:
         """Twice the error of the factors."""
@@ -370,17 +367,6 @@ class Linearization:
         left = np.linalg.eigvalsh(information / np.outer(before, before))[0]
         return bool(values[0] > SINGULAR * values[-1] and left > _ROUNDING)
 
-    @property
-    def values(self) -> gtsam.Values:
-        """Of all variables, for the graph that is printed."""
-        values, (clouds, *cameras) = gtsam.Values(self.shared), self.inverses
-        for place, T in enumerate(clouds):
-            values.insert(cloud_at_key(place), to_T_lidar_camera(T))
-        for place, number in self.model.matched_places:
-            T = cameras[self.model.matched.index(number)][place]
-            values.insert(matched_at_key(place, number), to_T_lidar_camera(T))
-        return values
-
 
 class _Softened(NamedTuple):
     """A quadratic whose pose has been set free about a tie; the module's text names all."""
@@ -396,7 +382,7 @@ class _Softened(NamedTuple):
 def _soften(hessian: Array, gradient: Array, covariance: Array, error: Array) -> _Softened:
     """Of (..., k, k) and (..., k), the pose in front, S and e; in the step of c + e."""
     rows = hessian[..., :6, :]
-    left = np.linalg.inv(np.eye(6) + rows[..., :6] @ covariance)
+    left = _inverses(np.eye(6) + rows[..., :6] @ covariance)
     free = covariance @ left
     free = (free + _turned(free)) / 2
     pull = gradient[..., :6] - _times(rows[..., :6], error)
@@ -410,7 +396,7 @@ def _soften(hessian: Array, gradient: Array, covariance: Array, error: Array) ->
 
 
 @dataclass(frozen=True, eq=False)
-class LatentPoseFit:
+class ErrorFit:
     """The optimum of the error model.
 
     Attributes:
@@ -418,12 +404,22 @@ class LatentPoseFit:
         iterations: number of Gauss-Newton steps.
         converged: whether it stopped by its tolerance.
         keys: of the poses that are reported.
+        ratios: of its variance components.
+        without_priors: the optimum without measured relative poses and priors, where some are
+            measured.
     """
 
     linear: Linearization
     iterations: int
     converged: bool
     keys: Sequence[int]
+    ratios: VarianceRatios = VarianceRatios()
+    without_priors: ErrorFit | None = None
+
+    @property
+    def model(self) -> LatentPoseModel:
+        """The graph."""
+        return self.linear.model
 
     @property
     def cost(self) -> float:
@@ -444,44 +440,53 @@ class LatentPoseFit:
     def T_camera_lidar(self) -> dict[str, Array]:
         """Per camera, (4, 4) as reported."""
         poses = map(to_T_camera_lidar, self.T_lidar_camera)
-        return dict(zip(self.linear.model.cameras, poses, strict=True))
+        return dict(zip(self.model.cameras, poses, strict=True))
 
     @property
-    def of_mount(self) -> LatentPoseFit:
+    def of_mount(self) -> ErrorFit:
         """The same optimum; the mounts are reported, with the lenses as the rig has them."""
-        return replace(self, keys=self.linear.model.camera_keys)
+        return replace(self, keys=self.model.camera_keys)
 
     @property
     def distortion(self) -> tuple[Array, Array]:
         """(B,) scan distortion in prior standard deviations, and its (B, B) marginal covariance."""
-        if not self.linear.model.is_distorted:
-            size = self.linear.model.components.distortion_jacobian.shape[2]
+        if not self.model.is_distorted:
+            size = self.model.components.distortion_jacobian.shape[2]
             return np.zeros(size), np.eye(size)
         return self.linear.shared.atVector(DISTORTION), self.linear.covariance_of([DISTORTION])
 
-    def with_model(self, model: LatentPoseModel) -> LatentPoseFit:
-        """The marginals of another model of the same data, at the same values."""
-        return replace(self, linear=self.linear.with_model(model))
+    def with_shared_ratio(self, least: float) -> ErrorFit:
+        """The same optimum; the covariances of what all places share have at least this ratio."""
+        factor = least / self.ratios.shared
+        if factor <= 1.0:
+            return self
+        parts = self.model.components
+        components = replace(
+            parts,
+            cloud=factor * parts.cloud,
+            camera=factor * parts.camera,
+            distortion_size=factor * parts.distortion_size,
+        )
+        linear = self.linear.with_model(replace(self.model, components=components))
+        return replace(self, linear=linear, ratios=replace(self.ratios, shared=least))
 
 
 def fit_latent_poses(
     model: LatentPoseModel,
-    start: Linearization | LatentPoseFit,
+    start: Linearization,
     *,
     relative_tolerance: float = TOLERANCE,
     is_determined: bool = False,
-) -> LatentPoseFit | None:
+) -> ErrorFit | None:
     """Minimize by Gauss-Newton with steps that descend; None if a direction is not determined.
 
     Args:
         model: the graph.
-        start: at some values, or a fit of the same data, which is continued.
+        start: at some values, of a model of the same data.
         relative_tolerance: relative change of the cost at which it stops.
         is_determined: whether all directions are known to be; else that is tested.
     """
-    present = start.linear if isinstance(start, LatentPoseFit) else start
-    is_determined = is_determined or (isinstance(start, LatentPoseFit) and present.model is model)
-    present = present if present.model is model else present.with_model(model)
+    present = start if start.model is model else start.with_model(model)
     if not (is_determined or present.is_determined()):
         return None
     iterations, converged = 0, False
@@ -491,10 +496,10 @@ def fit_latent_poses(
         except np.linalg.LinAlgError:
             return None
         if found is None:  # this is the minimum, to rounding
-            return LatentPoseFit(present, iterations, True, model.reported_keys)
+            return ErrorFit(present, iterations, True, model.reported_keys)
         converged = present.cost - found.cost <= relative_tolerance * present.cost
         present, iterations = found, iterations + 1
-    return LatentPoseFit(present, iterations, converged, model.reported_keys)
+    return ErrorFit(present, iterations, converged, model.reported_keys)
 
 
 def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> Linearization:
@@ -542,6 +547,10 @@ def _poses(values: gtsam.Values, keys: Iterable[int]) -> Array:
 
 def _turned(matrices: Array) -> Array:
     return matrices.swapaxes(-1, -2)
+
+
+def _inverses(matrices: Array) -> Array:
+    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
 
 
 def _times(matrices: Array, vectors: Array) -> Array:

@@ -15,12 +15,12 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.solver.curvature import FittedObjective
-from calibgraph.solver.error_model import ErrorFit
 from calibgraph.solver.lens import moved_lenses, put_into
 from calibgraph.solver.lens_estimates import lens_covariances, lens_estimates
 from calibgraph.solver.marginals import Marginals
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import Optimum
+from calibgraph.solver.places import ErrorFit
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,19 +85,18 @@ class Solution:
     @cached_property
     def solved_rig(self) -> Rig:
         """The rig with the estimated extrinsics, and lenses if these are estimated."""
-        fit = None if self.errors is None else self.errors.fit
-        lenses, _ = moved_lenses(self.inliers.lenses, fit)
+        lenses, _ = moved_lenses(self.inliers.lenses, self.errors)
         return put_into(self.rig.moved_to(self.T_camera_lidar), lenses)
 
     @property
     def lens(self) -> dict[str, tuple[LensEstimate, ...]]:
         """Per camera whose lens is estimated, its parameters."""
-        return {} if self.errors is None else lens_estimates(self.errors.fit)
+        return {} if self.errors is None else lens_estimates(self.errors)
 
     @property
     def lens_covariance(self) -> dict[str, Array]:
         """Per camera whose lens is estimated, (6 + k, 6 + k) of pose, lens and clock."""
-        return {} if self.errors is None else lens_covariances(self.errors.fit)
+        return {} if self.errors is None else lens_covariances(self.errors)
 
     @cached_property
     def marginals(self) -> Marginals:

@@ -11,55 +11,25 @@ is the prior one.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.components import EXACT, VarianceComponents, least_cost_of_distortion
+from calibgraph.graph.components import (
+    EXACT,
+    VarianceComponents,
+    VarianceRatios,
+    least_cost_of_distortion,
+)
 from calibgraph.model.findings import MatcherFindings, error_components
-from calibgraph.solver.places import LatentPoseFit, Linearization
 from calibgraph.solver.pair_refinement import pair_sigmas
+from calibgraph.solver.places import Linearization
 from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WithinPlace
 
 Component = Literal["shared", "cloud", "cameras"]
-
-_SETTLED = 0.1  # relative change of the ratios: the data leave far more open
-
-
-@dataclass(frozen=True)
-class VarianceRatios:
-    """Variances over their priors.
-
-    Attributes:
-        shared: of what all places share: the cloud, its distortion, the cameras' matches and pairs.
-        cloud: of the cloud at one place.
-        cameras: of a camera's matches at one place.
-    """
-
-    shared: float = 1.0
-    cloud: float = 1.0
-    cameras: float = 1.0
-
-    def scale(self, prior: VarianceComponents) -> VarianceComponents:
-        """Components of these ratios."""
-        return replace(
-            prior,
-            cloud=self.shared * prior.cloud,
-            camera=self.shared * prior.camera,
-            pairs=self.shared * prior.pairs,
-            distortion_size=self.shared * prior.distortion_size,
-            cloud_at_place=self.cloud * prior.cloud_at_place,
-            at_place=self.cameras * prior.at_place,
-            scatter_at_place=self.cameras * prior.scatter_at_place,
-        )
-
-    def is_near(self, other: VarianceRatios) -> bool:
-        """Whether all are the same to some percent."""
-        pairs = zip(astuple(self), astuple(other), strict=True)
-        return all(abs(one - two) <= _SETTLED * abs(two) for one, two in pairs)
 
 
 class Evidence(NamedTuple):
@@ -74,23 +44,23 @@ class Evidence(NamedTuple):
     free: float
 
 
-def estimate_variance_ratios(fit: LatentPoseFit, present: VarianceRatios) -> VarianceRatios:
+def estimate_variance_ratios(linear: Linearization, present: VarianceRatios) -> VarianceRatios:
     """One step of the fixed point.
 
     The shared ratio is never below its prior: a displacement of all cameras alike is not observed.
     Neither are those of places, where there are few of them.
 
     Args:
-        fit: with the present ratios.
+        linear: with the present ratios.
         present: the ratios of its model.
     """
-    evidence, places = squared_displacements(fit.linear), fit.linear.model.places
+    evidence, places = squared_displacements(linear), linear.model.places
     least = ratios_by_evidence(evidence, places=places, present=present)
     without = {name: one._replace(free=0.0) for name, one in evidence.items()}
     most = ratios_by_evidence(without, places=places, present=present)
     if least.is_near(present) and most.is_near(present):  # whatever the data leave open
         return most
-    for name, t in undetermined(fit.linear).items():
+    for name, t in undetermined(linear).items():
         evidence[name] = evidence[name]._replace(free=evidence[name].free - t)
     return ratios_by_evidence(evidence, places=places, present=present)
 
@@ -126,9 +96,7 @@ def squared_displacements(linear: Linearization) -> dict[Component, Evidence]:
             2.0 * model.error_graph.error(linear.shared) - known, 6.0 * variables + distortions
         ),
         "cloud": Evidence(float(squared[0].sum()), 6.0 * float(weight[0].sum())),
-        "cameras": Evidence(
-            float(squared[1:].sum()), 6.0 * float(weight[1:][model.present].sum())
-        ),
+        "cameras": Evidence(float(squared[1:].sum()), 6.0 * float(weight[1:][model.present].sum())),
     }
 
 

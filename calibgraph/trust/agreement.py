@@ -22,7 +22,7 @@ from calibgraph.model.geometry import (
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Threshold
 from calibgraph.solver.camera_block import CameraBlock, camera_block
-from calibgraph.solver.error_model import ErrorFit
+from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
 from calibgraph.solver.solution import Solution
@@ -190,7 +190,7 @@ def _ransac_iterations(fewest: float, matches: int) -> int:
 def place_checks(evidence: Evidence) -> Checks:
     """Whether any place contradicts the others, where there are enough to tell which."""
     errors = evidence.solution.marginals.errors
-    if errors is None or len(errors.places) < error_components().robust_places:
+    if errors is None or len(errors.model.frames) < error_components().robust_places:
         return {}
     return {name: _check_places(evidence, errors, name) for name in errors.model.blocks}
 
@@ -203,8 +203,8 @@ def _check_places(evidence: Evidence, errors: ErrorFit, camera: str) -> list[Che
     """
     before, after = evidence.fitted_blocks[camera], evidence.solution.inliers.blocks[camera]
     cameras = tuple(errors.model.cameras)
-    distances = errors.fit.linear.distances[:, [0, 1 + cameras.index(camera)]].max(axis=1)
-    kept, given = (_count(block, errors.places) for block in (after, before))
+    distances = errors.linear.distances[:, [0, 1 + cameras.index(camera)]].max(axis=1)
+    kept, given = (_count(block, errors.model.frames) for block in (after, before))
     seen = np.flatnonzero(given)
     if len(seen) < 2:  # noqa: PLR2004
         return []
@@ -215,7 +215,9 @@ def _check_places(evidence: Evidence, errors: ErrorFit, camera: str) -> list[Che
         ("place_inliers", int(np.argmin(shares / others)), shares / others),
     )
     return [
-        _check_place(threshold(key), float(values[at]), int(seen[at]), errors.places[seen[at]])
+        _check_place(
+            threshold(key), float(values[at]), int(seen[at]), errors.model.frames[seen[at]]
+        )
         for key, at, values in worst
     ]
 

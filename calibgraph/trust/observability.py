@@ -87,7 +87,7 @@ def prior_shares(solution: Solution) -> dict[str, float]:
     T_camera_lidar, errors = solution.T_camera_lidar, solution.marginals.errors
     cameras = list(T_camera_lidar)
     priors = pose_hessian(solution.inliers.pose_graph, cameras, T_camera_lidar)
-    known = None if errors is None else errors.fit.of_mount.covariance
+    known = None if errors is None else errors.of_mount.covariance
     if known is None:
         hessian = priors.copy()
         for name, of_camera in solution.fitted.robust_hessians.items():

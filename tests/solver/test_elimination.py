@@ -22,23 +22,18 @@ from calibgraph.graph.variables import (
     DISTORTION,
     aligned_key,
     camera_key,
-    cloud_at_key,
     matched_at_key,
     matched_key,
     paired_key,
 )
-from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.camera_pairs import pair_terms
-from calibgraph.solver.error_model import ErrorFit, fit_errors
+from calibgraph.solver.error_model import fit_errors
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.places import (
-    LatentPoseFit,
-    Linearization,
-    fit_latent_poses,
-    start_values,
-)
+from calibgraph.solver.places import ErrorFit, fit_latent_poses, start_values
 from factors import ProjectionBlock, pair_sums, placed_pair_factor
 from tests.conftest import stereo_relative_pose
+from tests.solver.latent import all_values, linearized
 from tests.solver.test_camera_pairs import simulated_pairs
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
@@ -65,7 +60,7 @@ CASES = [
 
 
 def require_optimum(
-    found: LatentPoseFit,
+    found: ErrorFit,
     graph: gtsam.NonlinearFactorGraph,
     optimum: tuple[gtsam.Values, gtsam.Marginals],
 ) -> None:
@@ -96,7 +91,7 @@ def test_the_estimate_is_the_optimum_and_the_marginal_of_the_graph_that_is_print
     rig = tie(rig) if tied else rig
     errors = solve_model(rig, table_of(rig, frames, silent, PLACES[places]), pairs=pairs)
     model = with_correlations(errors.model)
-    start, graph = start_values(model, errors.T_camera_lidar).values, latent_pose_graph(model)
+    start, graph = all_values(start_values(model, errors.T_camera_lidar)), latent_pose_graph(model)
     values = minimize(graph, displaced(model, start, 0.01))
     marginals = gtsam.Marginals(graph, values)
     for degrees in (0.01, 5.0):
@@ -105,19 +100,6 @@ def test_the_estimate_is_the_optimum_and_the_marginal_of_the_graph_that_is_print
         )
         assert found is not None and found.converged
         require_optimum(found, graph, (values, marginals))
-
-
-def linearized(model: LatentPoseModel, values: gtsam.Values) -> Linearization:
-    """At values of all variables."""
-    none, places = gtsam.Pose3(), range(model.places)
-    keys = [[*map(cloud_at_key, places)]]
-    keys += [[matched_at_key(place, number) for place in places] for number in model.matched]
-    poses = [[values.atPose3(k) if values.exists(k) else none for k in row] for row in keys]
-    shared = gtsam.Values(values)
-    for key in model.place_keys:
-        shared.erase(key)
-    inverses = np.array([[to_T_camera_lidar(pose) for pose in row] for row in poses])
-    return Linearization(model, shared, inverses)
 
 
 def displaced(model: LatentPoseModel, values: gtsam.Values, degrees: float) -> gtsam.Values:
@@ -207,7 +189,7 @@ def test_a_pair_of_which_the_gate_has_left_nothing_takes_no_part(pair: Rig) -> N
         fit_errors(replace(solution.fitted, objective=inliers), table.findings, table.places)
         for inliers in (more, solution.inliers)
     )
-    np.testing.assert_array_equal(found.fit.covariance, expected.fit.covariance)
+    np.testing.assert_array_equal(found.covariance, expected.covariance)
 
 
 def test_the_factor_of_a_pair_and_its_cloud_is_that_of_the_moved_cameras(pair: Rig) -> None:
@@ -252,7 +234,7 @@ def test_a_continued_fit_is_that_of_its_start(pair: Rig) -> None:
     errors = solve_model(tie(pair), table_of(pair, 8, False, PLACES["four"]), pairs=True)
     other = replace(with_correlations(errors.model), pose_graph=gtsam.NonlinearFactorGraph())
     for model in (errors.model, other):
-        starts = errors.fit, linearized(model, errors.fit.linear.values)
+        starts = errors.linear, linearized(model, all_values(errors.linear))
         found, expected = (fit_latent_poses(model, start) for start in starts)
         for name, T in found.T_camera_lidar.items():
             np.testing.assert_allclose(T, expected.T_camera_lidar[name], rtol=0, atol=1e-12)
@@ -271,7 +253,7 @@ def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Ri
     hessian = block.sums(errors.T_camera_lidar["left"][None]).hessian[0]
     aligned = parts.camera + Ad @ cloud @ Ad.T + parts.at_place[0, 0] + np.linalg.inv(hessian)
     mount = aligned + with_distortion(parts)
-    for fit, expected in ((errors.fit, aligned), (errors.fit.of_mount, mount)):
+    for fit, expected in ((errors, aligned), (errors.of_mount, mount)):
         sigmas = np.sqrt(np.diag(expected))
         difference = (fit.covariance[:6, :6] - expected) / np.outer(sigmas, sigmas)
         # The paper's priors of a metre take (3 cm / 1 m)^2 off.
@@ -292,5 +274,5 @@ def test_data_that_determine_far_less_than_exact_ties_have_an_error_bar(pair: Ri
     assert table.metadata["systematic_translation_m"] == 0.0
     solution = solve_joint(pair, table, Config(learnt_weights=False))
     errors = fit_errors(solution.fitted, table.findings, table.places)
-    assert errors is not None and errors.fit.converged
-    assert np.isfinite(errors.fit.covariance).all()
+    assert errors is not None and errors.converged
+    assert np.isfinite(errors.covariance).all()

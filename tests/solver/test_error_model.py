@@ -17,6 +17,7 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
+from calibgraph.graph.components import VarianceRatios
 from calibgraph.graph.latent_poses import data_graph, latent_pose_graph, to_ordering
 from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.config import Config, preset
@@ -27,17 +28,18 @@ from calibgraph.model.verdict import COMMON_ERROR
 from calibgraph.simulation.correspondences import PoseSpread
 from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.error_model import ErrorFit, fit_errors
+from calibgraph.solver.error_model import fit_errors
 from calibgraph.solver.error_shares import variances_by_source
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs
+from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.residual_scale import ResidualScale
 from calibgraph.solver.shared_error import shared_variance_ratio
-from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.solver.within_place import block_by_place
 from calibgraph.trust.evidence import Evidence
 from factors import pose_sigmas
 from tests.draws.places import displaced
+from tests.solver.latent import all_values
 from tests.solver.test_camera_pairs import simulated_pairs
 
 ZERO = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
@@ -152,7 +154,7 @@ def test_the_shares_are_those_of_independent_errors_and_add_up(pair: Rig) -> Non
     """The part that is left to the matches is the one that their own equations give."""
     errors = evidence(pair, table_of_places(pair, 3, OF_A_SENSOR)).solution.marginals.errors
     parts = variances_by_source(errors)
-    whole = np.diag(errors.fit.covariance)  # of which the matches are 3e-4 to 7e-3
+    whole = np.diag(errors.covariance)  # of which the matches are 3e-4 to 7e-3
     np.testing.assert_allclose((sum(parts.values()) + of_matches(errors)) / whole, 1, atol=1e-8)
 
 
@@ -161,8 +163,16 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
 
     From the dense covariance C: C G C, with G the information of each of these.
     """
-    linear = errors.fit.linear
-    parts, values = errors.model.components.with_fixed_weights(linear.weights), linear.values
+    linear = errors.linear
+    weight, values, parts = linear.weights, all_values(linear), errors.model.components
+    cameras = weight[:, 1:, None, None]
+    parts = replace(
+        parts,
+        cloud_at_place=parts.cloud_at_place / weight[:, 0, None, None],
+        at_place=parts.at_place / cameras,
+        scatter_at_place=parts.scatter_at_place / cameras,
+        robust_scale=np.inf,
+    )
     model = replace(errors.model, components=parts)
     others = [key for key in model.shared_keys if key not in model.reported_keys]
     order = to_ordering([*model.reported_keys, *others, *model.place_keys])

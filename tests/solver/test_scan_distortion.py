@@ -102,10 +102,10 @@ def test_what_the_cameras_show_of_the_bends_moves_them_back() -> None:
     config = Config(learnt_weights=False, prior_weight=0.0, relative_prior_weight=0.0)
     without = solve_joint(rig, replace(bent, metadata=table.metadata), config)
     solution = solve_joint(rig, bent, config)
-    values, covariance = solution.errors.fit.distortion
+    values, covariance = solution.errors.distortion
     unit = bent.findings.bend_sigmas[2]
     assert abs(unit * values[2] - 0.1) < 3 * unit * np.sqrt(covariance[2, 2]) < 0.06
-    mounts = solution.errors.fit.of_mount.T_camera_lidar
+    mounts = solution.errors.of_mount.T_camera_lidar
     for name, T in rig.T_camera_lidar.items():
         before, after = (
             np.abs(twist_between(of[name], T)).max() for of in (without.T_camera_lidar, mounts)
