@@ -36,7 +36,7 @@ from calibgraph.report.kit import page_template
 from calibgraph.report.page_overlays import depth_scale, draw_overlays, width_on_page
 from calibgraph.report.point_overlay import write_overlays
 from calibgraph.report.reprojection_errors import reprojection_errors
-from calibgraph.solver.camera_pairs import match_errors_px
+from calibgraph.solver.pairs import match_errors_px
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:

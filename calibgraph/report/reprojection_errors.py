@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import to_T_lidar_camera
-from calibgraph.solver.camera_block import CameraBlock, camera_blocks
+from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 
 

@@ -31,7 +31,7 @@ from calibgraph.graph.variables import (
 )
 from calibgraph.model.geometry import invert_each, to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.pose_kernel import logarithms
-from calibgraph.solver.optimizer import MAX_ITERATIONS
+from calibgraph.solver.two_pass import MAX_ITERATIONS
 from factors.conditioning import SINGULAR, unit_diagonal
 
 TOLERANCE = 1e-6

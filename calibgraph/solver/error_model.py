@@ -19,18 +19,17 @@ from calibgraph.graph.variables import seen_lens_key
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.model.places import Places
-from calibgraph.solver.conflicts import relative_pose_conflict
-from calibgraph.solver.curvature import FittedObjective
-from calibgraph.solver.lens import lens_errors, lens_term, weak_information
-from calibgraph.solver.objective import Objective
-from calibgraph.solver.optimizer import Optimum
-from calibgraph.solver.places import ErrorFit, fit_latent_poses, start_values
-from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
-from calibgraph.solver.variance_components import (
+from calibgraph.solver.components import (
     common_error,
     estimate_variance_ratios,
     variance_components,
 )
+from calibgraph.solver.conflicts import relative_pose_conflict
+from calibgraph.solver.covariance import FittedObjective
+from calibgraph.solver.lens import lens_errors, lens_term, weak_information
+from calibgraph.solver.places import ErrorFit, fit_latent_poses, start_values
+from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
+from calibgraph.solver.two_pass import Objective, Optimum
 from calibgraph.solver.within_place import block_by_place, pairs_by_place, within_place
 
 Numbers = NDArray[np.int64]

@@ -21,9 +21,9 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert, local_coordinates
 from calibgraph.parallel import map_on_cores
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.frame_poses import move_damped
-from calibgraph.solver.residual_scale import (
+from calibgraph.solver.matches import CameraBlock
+from calibgraph.solver.pnp import move_damped
+from calibgraph.solver.robust import (
     CAUCHY_SCALE_SIGMAS,
     CUT,
     robust_spread,

@@ -15,18 +15,24 @@ from calibgraph.model.correspondences import MAX_COORDINATE, Correspondences
 from calibgraph.model.places import Places
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
-from calibgraph.solver.camera_block import CameraBlock, camera_blocks
-from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
-from calibgraph.solver.curvature import FittedObjective
+from calibgraph.solver.covariance import FittedObjective
 from calibgraph.solver.error_model import refine_with_error_model
 from calibgraph.solver.frame_weights import weigh_all_frames
 from calibgraph.solver.lens import Lenses, moved_lenses, put_into
-from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective, Transforms
+from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.pair_refinement import refine_with_pairs
+from calibgraph.solver.pairs import PairTerm, tying_pairs
 from calibgraph.solver.preprocess import Preprocessed, preprocess
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
-from calibgraph.solver.start import best_start, require_determined, require_known
+from calibgraph.solver.two_pass import (
+    USING_CORRESPONDENCES,
+    Objective,
+    Transforms,
+    best_start,
+    require_determined,
+    require_known,
+)
 
 _MOST_ROUNDS = 8  # of solves, each from the lenses of the last
 _SETTLED = 0.1  # standard deviations: a smaller change of a lens ends the rounds

@@ -23,7 +23,7 @@ from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.curvature import FittedObjective, positive_part
+from calibgraph.solver.covariance import FittedObjective, positive_part
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import FreeLensBlock

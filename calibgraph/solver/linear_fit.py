@@ -16,11 +16,10 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera
-from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.camera_twist import fill_twist_columns
 from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.residual_scale import quantile
-from calibgraph.solver.whitening import upper_root
+from calibgraph.solver.matches import CameraBlock
+from calibgraph.solver.robust import quantile, upper_root
 from calibgraph.solver.within_place import WEAK
 from factors import ProjectionBlock
 from factors.block_arrays import whiten

@@ -20,17 +20,15 @@ from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
-from calibgraph.solver.covariance import data_sigmas
-from calibgraph.solver.curvature import FittedObjective
+from calibgraph.solver.covariance import FittedObjective, data_sigmas
 from calibgraph.solver.error_model import fit_errors, fit_without_priors
-from calibgraph.solver.error_shares import (
+from calibgraph.solver.pair_refinement import PairFit, fit_pairs, shared_variance_ratio
+from calibgraph.solver.places import ErrorFit
+from calibgraph.solver.sources import (
     predict_variances,
     sources_by_camera,
     variances_by_source,
 )
-from calibgraph.solver.pair_refinement import PairFit, fit_pairs
-from calibgraph.solver.places import ErrorFit
-from calibgraph.solver.shared_error import shared_variance_ratio
 from factors import pose_sigmas
 
 _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unknown

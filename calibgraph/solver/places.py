@@ -48,7 +48,7 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
 )
 from calibgraph.model.pose_kernel import logarithms
-from calibgraph.solver.optimizer import MAX_ITERATIONS
+from calibgraph.solver.two_pass import MAX_ITERATIONS
 from factors import BlockSums, pair_run_sums
 from factors.conditioning import SINGULAR, unit_diagonal
 

@@ -11,10 +11,10 @@ from calibgraph.errors import CorrespondenceError
 from calibgraph.io.correspondence_tables import parts_of_table
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate, rows_where
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Rig
 from calibgraph.solver.grid import best_in_cell, frame_edges
 from calibgraph.solver.repeats import number_repeats
-from calibgraph.solver.shared_error import with_common_error
 
 FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped")
 """The stages at which a camera's correspondences are counted, in order."""
@@ -35,6 +35,29 @@ class Preprocessed:
     table: Correspondences
     counts: dict[str, dict[str, int]]
     repeated_frames: dict[str, int]
+
+
+def with_common_error(table: Correspondences, config: Config) -> Correspondences:
+    """The table with the common error of the settings in its metadata, if they have one.
+
+    Raises:
+        CorrespondenceError: if the table states another one.
+    """
+    if (config.common_deg, config.common_cm) == (None, None):
+        return table
+    rotation_rad, translation_m = np.radians(config.common_deg or 0), (config.common_cm or 0) / 100
+    wanted, found = (float(rotation_rad), translation_m), table.findings
+    if not found.states_common_error:
+        return table.with_findings(
+            MatcherFindings(systematic_rotation_rad=wanted[0], systematic_translation_m=wanted[1])
+        )
+    if found.systematic_sigmas != wanted:
+        rotation_rad, translation_m = found.systematic_sigmas
+        raise CorrespondenceError(
+            f"the table states that its frames share {np.degrees(rotation_rad):.3g} deg and "
+            f"{100 * translation_m:.3g} cm; leave common_deg and common_cm out"
+        )
+    return table
 
 
 def preprocess(rig: Rig, table: Correspondences | Path | str, config: Config) -> Preprocessed:

@@ -22,8 +22,8 @@ from calibgraph.graph.by_place import place_of
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import adjoints, to_T_camera_lidar
 from calibgraph.model.rig import Camera
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.matches import CameraBlock
+from calibgraph.solver.robust import ResidualScale
 from factors import FreeLensBlock, ProjectionBlock
 from factors.block_arrays import whiten
 

@@ -14,13 +14,12 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
-from calibgraph.solver.curvature import FittedObjective
+from calibgraph.solver.covariance import FittedObjective
 from calibgraph.solver.lens import moved_lenses, put_into
 from calibgraph.solver.lens_estimates import lens_covariances, lens_estimates
 from calibgraph.solver.marginals import Marginals
-from calibgraph.solver.objective import Objective, Scales, Transforms
-from calibgraph.solver.optimizer import Optimum
 from calibgraph.solver.places import ErrorFit
+from calibgraph.solver.two_pass import Objective, Optimum, Scales, Transforms
 
 
 @dataclass(frozen=True, eq=False)

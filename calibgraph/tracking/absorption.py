@@ -8,11 +8,11 @@ import numpy as np
 
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.solver.camera_block import (
+from calibgraph.solver.elimination import Linearization
+from calibgraph.solver.matches import (
     CameraBlock,
     camera_blocks,
 )
-from calibgraph.solver.elimination import Linearization
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.assessment import rig_at
 from calibgraph.tracking.cause import chance_limit

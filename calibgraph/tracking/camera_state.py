@@ -8,7 +8,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.robust import ResidualScale
 from calibgraph.tracking.epoch_summary import EpochSummary
 from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import OutlierFrame

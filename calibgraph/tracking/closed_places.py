@@ -15,8 +15,8 @@ import numpy as np
 
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import join
+from calibgraph.solver.components import estimate_variance_ratios
 from calibgraph.solver.elimination import LatentPoseFit, Linearization, start_values
-from calibgraph.solver.variance_components import estimate_variance_ratios
 from calibgraph.tracking.contradictions import (
     Conflicts,
     Rows,

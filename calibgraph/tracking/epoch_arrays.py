@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.matches import CameraBlock
 from calibgraph.tracking.live_frames import Epoch, LiveFrame
 from calibgraph.tracking.sums import Sums
 from factors import ProjectionBlock

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
-from calibgraph.solver.camera_block import merge
+from calibgraph.solver.matches import merge
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.drift import follow_drift, report_drift
 from calibgraph.tracking.epoch_summary import STRENGTHS

@@ -15,7 +15,7 @@ import numpy as np
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences, concatenate
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, camera_blocks
+from calibgraph.solver.matches import MIN_MATCHES, CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.assessment import rig_at
 from calibgraph.tracking.frame_order import (

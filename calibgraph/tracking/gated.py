@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.solver.block_residuals import BlockResiduals
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
-from calibgraph.solver.curvature import robust_hessians
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.covariance import robust_hessians
+from calibgraph.solver.matches import MIN_MATCHES, BlockResiduals, CameraBlock
+from calibgraph.solver.robust import ResidualScale
 from calibgraph.tracking.sums import Sums, step_between
 
 

@@ -10,8 +10,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.matches import MIN_MATCHES, CameraBlock, merge
+from calibgraph.solver.robust import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.frozen import changed

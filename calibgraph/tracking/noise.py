@@ -16,8 +16,8 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.config import Config
-from calibgraph.solver.block_residuals import BlockResiduals
-from calibgraph.solver.residual_scale import ResidualScale, iterate_spread, scale_from
+from calibgraph.solver.matches import BlockResiduals
+from calibgraph.solver.robust import ResidualScale, iterate_spread, scale_from
 from calibgraph.tracking.cause import squared_sigmas
 
 _EDGES = np.concatenate([[0.0], np.geomspace(1e-5, 1e5, 2304)])  # 1 % wide

@@ -12,10 +12,10 @@ from calibgraph.graph.objective import projection_graph
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.rig import Camera
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
-from calibgraph.solver.optimizer import optimize
+from calibgraph.solver.matches import MIN_MATCHES, CameraBlock
 from calibgraph.solver.pnp import frame_pose
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.robust import ResidualScale
+from calibgraph.solver.two_pass import optimize
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.live_frames import OutlierFrame
 

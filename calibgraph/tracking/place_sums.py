@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.solver.curvature import positive_part
+from calibgraph.solver.covariance import positive_part
 from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import LiveFrame
 from calibgraph.tracking.sums import Sums

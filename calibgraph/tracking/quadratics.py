@@ -16,7 +16,7 @@ from calibgraph.graph.by_place import (
 from calibgraph.graph.linear_data import poses_of
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.geometry import invert_each, to_T_lidar_camera
-from calibgraph.solver.curvature import convex_hessian
+from calibgraph.solver.covariance import convex_hessian
 from calibgraph.solver.elimination import LatentPoseFit
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.place_sums import PlaceSums

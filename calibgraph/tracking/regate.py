@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import to_T_camera_lidar
-from calibgraph.solver.block_residuals import BlockResiduals
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
-from calibgraph.solver.curvature import convex_hessian, robust_hessian
+from calibgraph.solver.covariance import convex_hessian, robust_hessian
+from calibgraph.solver.matches import MIN_MATCHES, BlockResiduals, CameraBlock, merge
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.live_frames import LiveFrame

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.solver.camera_block import CameraBlock, merge
+from calibgraph.solver.matches import CameraBlock, merge
 from calibgraph.tracking.cause import Cause, Steps, find_cause
 from calibgraph.tracking.drift import follow_drift
 from calibgraph.tracking.epoch_summary import EpochSummary

@@ -7,7 +7,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.solver.error_model import ErrorFit
-from calibgraph.solver.error_shares import (
+from calibgraph.solver.sources import (
     predict_variances,
     sources_by_camera,
     variances_by_source,

@@ -15,8 +15,7 @@ from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
-from calibgraph.solver.block_residuals import BlockResiduals
-from calibgraph.solver.camera_block import CameraBlock, camera_blocks
+from calibgraph.solver.matches import BlockResiduals, CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.events import Event

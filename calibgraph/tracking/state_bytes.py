@@ -25,10 +25,10 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.components import VarianceRatios
+from calibgraph.solver.matches import CameraBlock
+from calibgraph.solver.robust import ResidualScale
 from calibgraph.solver.scan_distortion import DistortionEvidence
-from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.epoch_arrays import from_arrays, to_arrays
 from calibgraph.tracking.epoch_summary import EpochSummary

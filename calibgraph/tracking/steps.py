@@ -13,7 +13,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import adjoint_camera_lidar, pose_rows
-from calibgraph.solver.variance_components import pose_covariance
+from calibgraph.solver.components import pose_covariance
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.cause import Steps, alarm_limit
 from calibgraph.tracking.live_frames import LiveFrame

@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import camera_key
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.curvature import convex_hessian
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.covariance import convex_hessian
+from calibgraph.solver.matches import CameraBlock
+from calibgraph.solver.robust import ResidualScale
 from factors import smallest_scaled_eigenvalue, smallest_scaled_eigenvalues
 
 _POSE = 6

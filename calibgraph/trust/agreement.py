@@ -21,9 +21,9 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check, Threshold
-from calibgraph.solver.camera_block import CameraBlock, camera_block
-from calibgraph.solver.places import ErrorFit
+from calibgraph.solver.matches import CameraBlock, camera_block
 from calibgraph.solver.pair_refinement import PairFit
+from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Evidence

@@ -19,10 +19,9 @@ from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.progress import Progress, no_progress
-from calibgraph.solver.block_residuals import BlockResiduals
-from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import bootstrap_covariances
+from calibgraph.solver.matches import BlockResiduals, CameraBlock
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.observability import prior_shares

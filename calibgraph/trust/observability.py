@@ -7,9 +7,9 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import camera_center, pose_rows
 from calibgraph.model.rig import Camera
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.curvature import pose_hessian
-from calibgraph.solver.residual_scale import quantile
+from calibgraph.solver.covariance import pose_hessian
+from calibgraph.solver.matches import CameraBlock
+from calibgraph.solver.robust import quantile
 from calibgraph.solver.solution import Solution
 from factors.conditioning import invert_or_none
 

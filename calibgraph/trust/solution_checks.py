@@ -10,7 +10,7 @@ from calibgraph.arrays import Array
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.verdict import COMMON_ERROR, Check
 from calibgraph.solver.conflicts import Conflict
-from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
+from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS
 from calibgraph.trust.evidence import Checks, Estimate, Evidence
 from calibgraph.trust.thresholds import threshold
 from factors.free_lens import CLOCK

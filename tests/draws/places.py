@@ -14,8 +14,8 @@ from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
 from calibgraph.model.places import Places, as_groups
 from calibgraph.model.rig import Camera, Intrinsics, RelativePose, Rig
 from calibgraph.simulation.correspondences import MatcherErrors, simulate_correspondences
-from calibgraph.solver.optimizer import optimize
 from calibgraph.solver.scan_distortion import distortions_at
+from calibgraph.solver.two_pass import optimize
 from factors import ProjectionBlock, block_factor
 
 Rng = np.random.Generator

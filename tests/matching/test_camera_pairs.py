@@ -21,8 +21,8 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import inverse_ranges, invert, planes_in_lidar
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.solver.camera_pairs import pair_terms
 from calibgraph.solver.pair_refinement import fit_pair
+from calibgraph.solver.pairs import pair_terms
 from factors import pose_sigmas, unproject
 from tests.conftest import FORWARD, SAMPLE, make_camera
 

@@ -27,9 +27,9 @@ from calibgraph.graph.variables import (
     paired_key,
 )
 from calibgraph.model.geometry import to_T_lidar_camera
-from calibgraph.solver.camera_pairs import pair_terms
 from calibgraph.solver.error_model import fit_errors
 from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.pairs import pair_terms
 from calibgraph.solver.places import ErrorFit, fit_latent_poses, start_values
 from factors import ProjectionBlock, pair_sums, placed_pair_factor
 from tests.conftest import stereo_relative_pose

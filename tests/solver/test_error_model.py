@@ -26,15 +26,14 @@ from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.verdict import COMMON_ERROR
 from calibgraph.simulation.correspondences import PoseSpread
-from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.error_model import fit_errors
-from calibgraph.solver.error_shares import variances_by_source
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.pair_refinement import PairFit, fit_pairs
+from calibgraph.solver.matches import camera_blocks
+from calibgraph.solver.pair_refinement import PairFit, fit_pairs, shared_variance_ratio
 from calibgraph.solver.places import ErrorFit
-from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.solver.shared_error import shared_variance_ratio
+from calibgraph.solver.robust import ResidualScale
+from calibgraph.solver.sources import variances_by_source
 from calibgraph.solver.within_place import block_by_place
 from calibgraph.trust.evidence import Evidence
 from factors import pose_sigmas

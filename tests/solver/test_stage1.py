@@ -25,18 +25,12 @@ from calibgraph.model.geometry import pose_difference
 from calibgraph.simulation.correspondences import PoseSpread
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver import stage1
-from calibgraph.solver.camera_block import camera_blocks
-from calibgraph.solver.frame_poses import fit_frames, move_damped
 from calibgraph.solver.frame_weights import confidence_sigmas, fit_each_frame
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.optimizer import optimize
-from calibgraph.solver.pnp import frame_pose, view_plane
-from calibgraph.solver.stage1 import (
-    T_hat,
-    are_near_median,
-    estimate_stage1,
-    median_pose,
-)
+from calibgraph.solver.matches import camera_blocks
+from calibgraph.solver.pnp import fit_frames, frame_pose, move_damped, view_plane
+from calibgraph.solver.stage1 import T_hat, are_near_median, estimate_stage1, median_pose
+from calibgraph.solver.two_pass import optimize
 from factors import ProjectionBlock, to_runs
 
 Array = np.ndarray

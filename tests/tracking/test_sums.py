@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from calibgraph import Config, Correspondences, MatcherErrors, Rig, simulate_correspondences
-from calibgraph.solver.block_residuals import BlockResiduals
-from calibgraph.solver.camera_block import CameraBlock, camera_blocks
+from calibgraph.solver.matches import BlockResiduals, CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.epoch_summary import STRENGTHS, EpochSummary
 from calibgraph.tracking.noise import ResidualHistogram

@@ -17,13 +17,13 @@ from calibgraph.model.config import Config
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import inverse_ranges, to_T_lidar_camera
 from calibgraph.model.rig import Rig
-from calibgraph.solver.residual_scale import (
+from calibgraph.solver.robust import (
     CAUCHY_SCALE_SIGMAS,
     GATE_SIGMAS,
+    MEDIAN_NORM,
     MIN_SIGMA_PX,
     robust_spread,
 )
-from calibgraph.solver.whitening import MEDIAN_NORM
 from factors import (
     BlockSums,
     EpipolarBlock,
@@ -125,6 +125,12 @@ class PairTerm:
             to_T_lidar_camera(T_camera_lidar[self.a]),
             to_T_lidar_camera(T_camera_lidar[self.b]),
         )
+
+
+def rows_of_pair(cameras: Sequence[str], pair: PairTerm) -> NDArray[np.intp]:
+    """(12,) rows of A's pose, then of B's."""
+    first = [6 * cameras.index(name) for name in (pair.a, pair.b)]
+    return np.add.outer(first, np.arange(6)).ravel()
 
 
 def usual_excess(terms: Sequence[PairTerm]) -> float:

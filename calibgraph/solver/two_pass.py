@@ -1,27 +1,96 @@
-"""Eq. 5 with the matches of a solve: its minimum, its outliers; see ``graph.objective``."""
+"""Eq. 5 with the matches of a solve: start, minimum, outliers; see ``graph.objective``."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.objective import join, objective_graph, pose_key, projection_graph
 from calibgraph.model.config import Config, Terms
+from calibgraph.model.geometry import (
+    invert,
+    relative_transform,
+    to_T_camera_lidar,
+    to_T_lidar_camera,
+)
 from calibgraph.model.rig import Rig
-from calibgraph.solver.block_residuals import BlockResiduals
-from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock
-from calibgraph.solver.camera_pairs import PairTerm, pair_graph
-from calibgraph.solver.optimizer import Optimum, optimize
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.matches import MIN_MATCHES, BlockResiduals, CameraBlock
+from calibgraph.solver.pairs import PairTerm, pair_graph
+from calibgraph.solver.preprocess import FILTERS
+from calibgraph.solver.robust import ResidualScale
+from calibgraph.solver.stage1 import CameraStage1, Stage1
+
+MAX_ITERATIONS = 200
+"""Of Levenberg-Marquardt."""
+
+RELATIVE_TOLERANCE = 1e-10
+"""Relative change of the error at which it stops."""
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The result of Levenberg-Marquardt.
+
+    Attributes:
+        T_camera_lidar: per camera, (4, 4).
+        cost: the paper's objective there (twice GTSAM's error).
+        iterations: of LM.
+        converged: whether it stopped by its tolerance.
+    """
+
+    T_camera_lidar: dict[str, Array]
+    cost: float
+    iterations: int
+    converged: bool
+
+
+def to_values(cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]) -> gtsam.Values:
+    """GTSAM values of the extrinsics, (4, 4) T_camera_lidar of every camera."""
+    values = gtsam.Values()
+    for name in cameras:
+        values.insert(pose_key(cameras, name), to_T_lidar_camera(T_camera_lidar[name]))
+    return values
+
+
+def optimize(
+    graph: gtsam.NonlinearFactorGraph,
+    cameras: Sequence[str],
+    T_camera_lidar: Mapping[str, Array],
+) -> Optimum:
+    """Minimize a graph by Levenberg-Marquardt.
+
+    Args:
+        graph: over the variables of the cameras.
+        cameras: their names, in the order of the variables.
+        T_camera_lidar: (4, 4) per camera, the start.
+    """
+    start = to_values(cameras, T_camera_lidar)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, _parameters())
+    values = optimizer.optimize()
+    found = {name: to_T_camera_lidar(values.atPose3(pose_key(cameras, name))) for name in cameras}
+    iterations = int(optimizer.iterations())
+    return Optimum(found, 2.0 * optimizer.error(), iterations, iterations < MAX_ITERATIONS)
+
+
+@cache
+def _parameters() -> gtsam.LevenbergMarquardtParams:
+    """Of Levenberg-Marquardt, which copies them."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(MAX_ITERATIONS)
+    parameters.setRelativeErrorTol(RELATIVE_TOLERANCE)
+    parameters.setAbsoluteErrorTol(0.0)
+    return parameters
+
 
 Transforms = dict[str, Array]
 """Per camera, (4, 4) T_camera_lidar."""
@@ -206,3 +275,140 @@ class Objective:
                 )
         gated = {n: (block, T_camera_lidar[n], scales[n]) for n, block in self.blocks.items()}
         return self.with_blocks(inliers)._with(gated=gated)
+
+
+def best_start(
+    rig: Rig,
+    blocks: Mapping[str, CameraBlock],
+    stage1: Stage1,
+    config: Config,
+    *,
+    terms: Terms,
+    tied: Sequence[tuple[str, str]] = (),
+) -> Transforms:
+    """Per camera, (4, 4) T_camera_lidar from which the first pass starts.
+
+    The best of Stage 1, the PnP of single frames and the rig's guess, by the mean Cauchy loss of
+    all frames' correspondences at half the PnP threshold; with the terms ``stage1``, Stage 1
+    itself. Cameras without correspondences start from a relative pose to one that has them: a
+    measured one, or that of the guess to a camera that sees the same; else from their guess.
+
+    Raises:
+        CorrespondenceError: with the terms ``stage1``, if PnP failed in every frame of a camera.
+    """
+    start = {}
+    for name, block in blocks.items():
+        candidates = _candidates(name, rig, stage1.get(name), terms)
+        start[name] = candidates[block.best_candidate(candidates, config.pnp_threshold_px / 2)]
+    for _ in rig.cameras:  # the longest chain of relative poses
+        for pair in rig.relative_poses:
+            if pair.b in start:
+                start.setdefault(pair.a, pair.T_a_b @ start[pair.b])
+            if pair.a in start:
+                start.setdefault(pair.b, invert(pair.T_a_b) @ start[pair.a])
+        for one, other in (*tied, *((b, a) for a, b in tied)):
+            if one in start:
+                start.setdefault(other, _by_guess(rig, other, one) @ start[one])
+    return {name: start.get(name, camera.T_camera_lidar) for name, camera in rig.cameras.items()}
+
+
+def _by_guess(rig: Rig, to: str, of: str) -> Array:
+    """(4, 4) T_to_of between two cameras by their guesses."""
+    return relative_transform(rig.cameras[to].T_camera_lidar, rig.cameras[of].T_camera_lidar)
+
+
+def _candidates(
+    name: str, rig: Rig, estimate: CameraStage1 | None, terms: Terms
+) -> list[NDArray[np.float64]]:
+    """(4, 4) each: T_camera_lidar of Stage 1, of the rig, and of single frames."""
+    T_hat = estimate.T_camera_lidar if estimate else None
+    if terms == "stage1":
+        if T_hat is None:
+            raise CorrespondenceError(
+                f"camera {name!r}: PnP failed in every frame, so there is no Stage-1 estimate; "
+                "solve with other terms, or give more matches per frame",
+                camera=name,
+            )
+        return [T_hat]
+    stage1 = [] if T_hat is None else [T_hat]
+    single = estimate.by_frame.values() if estimate else ()
+    return [*stage1, rig.cameras[name].T_camera_lidar, *single]
+
+
+def require_determined(
+    rig: Rig,
+    counts: Mapping[str, Mapping[str, int]],
+    tied_by_images: Sequence[tuple[str, str]] = (),
+    excluded: Sequence[str] = (),
+) -> tuple[str, ...]:
+    """Check that every camera has correspondences, or is tied to one that has.
+
+    Args:
+        rig: with its relative poses.
+        counts: per camera, correspondences left after each filter.
+        tied_by_images: the pairs of cameras that see enough in common.
+        excluded: cameras that may have neither, as long as there are others.
+
+    Returns:
+        The cameras that have neither.
+
+    Raises:
+        CorrespondenceError: naming the first of them that may not.
+    """
+    tied = {name for name, count in counts.items() if count["capped"] >= MIN_MATCHES}
+    for _ in rig.cameras:
+        tied |= {p.a for p in rig.relative_poses if p.b in tied}
+        tied |= {p.b for p in rig.relative_poses if p.a in tied}
+        tied |= {name for pair in tied_by_images if tied & set(pair) for name in pair}
+    held = tuple(name for name in counts if name not in tied)
+    for name in held:
+        if name in excluded and tied:
+            continue
+        count = counts[name]
+        left = ", ".join(f"{count[filter]} {filter}" for filter in FILTERS)
+        raise CorrespondenceError(
+            f"camera {name!r} has {count['capped']} usable correspondences, at least "
+            f"{MIN_MATCHES} are needed, or a relative pose to a camera that has them "
+            f"(left after each filter: {left}): {_advice(count)}{_advice_for_others(tied)}",
+            camera=name,
+        )
+    return held
+
+
+def require_known(rig: Rig, names: Sequence[str]) -> None:
+    """Check the cameras that the settings exclude.
+
+    Raises:
+        ValueError: if the rig lacks one.
+    """
+    for name in names:
+        if name not in rig.cameras:
+            known = ", ".join(rig.cameras)
+            raise ValueError(f"excluded_cameras names {name!r}; the rig has {known}")
+
+
+def _advice_for_others(tied: set[str]) -> str:
+    """How to calibrate the cameras that have enough."""
+    if not tied:
+        return ""
+    return (
+        f"; to calibrate {', '.join(sorted(tied))} without it, take it out of the rig file, or "
+        "name it in excluded_cameras of the settings"
+    )
+
+
+def _advice(count: Mapping[str, int]) -> str:
+    """What to do about too few correspondences, by the filter that removed them."""
+    if count["given"] < MIN_MATCHES:
+        return (
+            "none or few were found; check that its images show something, that the cloud lies "
+            "where T_camera_lidar looks (p_camera = T_camera_lidar * p_lidar), and its name"
+        )
+    if count["projectable"] < MIN_MATCHES:
+        return (
+            "the points are not in front of it; check the direction of T_camera_lidar "
+            "(p_camera = T_camera_lidar * p_lidar), its axes and its units"
+        )
+    if count["confident"] < MIN_MATCHES:
+        return "their confidence is below confidence_min; lower it if they can be trusted"
+    return "they crowd in few cells of the image; match more of it"

@@ -1,12 +1,4 @@
-"""The variance components: their priors, and REML estimates by Schall's fixed point.
-
-With e the displacements of a component at the optimum and S their prior covariance, a component of
-variance ratio s has  sum e^T S^-1 e = s (n - t)  in the mean, where n is the number of its degrees
-of freedom and  t = -d log det H / d log s  the part of these that the data leave open; H is the
-Hessian of the whole graph. The prior ratio takes part as further degrees of freedom. Where nothing
-is measured twice (one place, no pairs of cameras, no relative poses) e is 0, t is n, and the ratio
-is the prior one.
-"""
+"""The variance components: their priors, and REML estimates by Schall's fixed point."""
 
 from __future__ import annotations
 
