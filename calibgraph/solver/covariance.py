@@ -38,18 +38,19 @@ def _is_positive_definite(hessian: Array) -> bool:
     return True
 
 
-def pose_hessian(
+def pose_equations(
     graph: gtsam.NonlinearFactorGraph, cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]
-) -> Array:
-    """(6 N, 6 N) Gauss-Newton Hessian of the factors between poses."""
-    hessian, present = np.zeros((6 * len(cameras), 6 * len(cameras))), {*graph.keyVector()}
-    numbers = [k for k, name in enumerate(cameras) if pose_key(cameras, name) in present]
+) -> tuple[Array, Array]:
+    """(6 N, 6 N) Gauss-Newton Hessian and (6 N,) gradient of the factors between poses."""
+    hessian, gradient = np.zeros((6 * len(cameras), 6 * len(cameras))), np.zeros(6 * len(cameras))
+    keys, present = [pose_key(cameras, name) for name in cameras], {*graph.keyVector()}
+    numbers = [number for number, key in enumerate(keys) if key in present]
     if numbers:
         linear = graph.linearize(to_values(cameras, T_camera_lidar))
-        order = gtsam.Ordering([pose_key(cameras, cameras[number]) for number in numbers])
+        own = linear.hessian(gtsam.Ordering([keys[number] for number in numbers]))
         rows = np.concatenate([np.r_[pose_rows(number)] for number in numbers])
-        hessian[np.ix_(rows, rows)] = linear.hessian(order)[0]
-    return hessian
+        hessian[np.ix_(rows, rows)], gradient[rows] = own[0], -own[1]
+    return hessian, gradient
 
 
 def robust_hessians(sums: BlockSums) -> Array:
@@ -152,7 +153,7 @@ def bootstrap_covariances(at: FittedObjective, draws: int, seed: int) -> dict[st
     if not draws or not at.objective.uses_correspondences:
         return {}
     gradients, hessians = _by_frame(at)
-    priors = pose_hessian(at.objective.pose_graph, at.cameras, at.T_camera_lidar)
+    priors = pose_equations(at.objective.pose_graph, at.cameras, at.T_camera_lidar)[0]
     priors += np.diag(np.repeat(np.isin(at.cameras, at.held), 6).astype(np.float64))
     rng, frames = np.random.default_rng(seed), len(gradients)
     times = rng.multinomial(frames, np.full(frames, 1 / frames), draws).astype(np.float64)
@@ -231,7 +232,7 @@ def data_sigmas(at: FittedObjective) -> Array:
     """
     objective, cameras, T_camera_lidar = at.objective, at.cameras, at.T_camera_lidar
     measured = relative_pose_graph(objective.cameras, objective.rig.relative_poses)
-    hessian = pose_hessian(measured, cameras, T_camera_lidar)
+    hessian = pose_equations(measured, cameras, T_camera_lidar)[0]
     for name, sums in at.frame_sums.items():
         rows = pose_rows(cameras.index(name))
         hessian[rows, rows] += sums.hessian.sum(axis=0)

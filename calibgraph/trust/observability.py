@@ -7,7 +7,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import camera_center, pose_rows
 from calibgraph.model.rig import Camera
-from calibgraph.solver.covariance import pose_hessian
+from calibgraph.solver.covariance import pose_equations
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.robust import quantile
 from calibgraph.solver.solution import Solution
@@ -86,7 +86,7 @@ def prior_shares(solution: Solution) -> dict[str, float]:
     """
     T_camera_lidar, errors = solution.T_camera_lidar, solution.marginals.errors
     cameras = list(T_camera_lidar)
-    priors = pose_hessian(solution.inliers.pose_graph, cameras, T_camera_lidar)
+    priors = pose_equations(solution.inliers.pose_graph, cameras, T_camera_lidar)[0]
     known = None if errors is None else errors.of_mount.covariance
     if known is None:
         hessian = priors.copy()
