@@ -25,10 +25,12 @@ from factors import (
 
 # fmt: off
 __all__ = [  # with the factors that calibgraph re-exports
-    "block_factor", "camera_prior_factor", "join", "objective_graph", "pose_key", "projection_factor",
-    "projection_graph", "relative_pose_factor", "relative_pose_graph", "relative_prior_factor",
+    "block_factor", "camera_prior_factor", "join", "objective_graph", "pose_key",
+    "projection_factor", "projection_graph", "relative_pose_factor", "relative_pose_graph",
+    "relative_prior_factor",
 ]
 # fmt: on
+
 
 def pose_key(cameras: Sequence[str], name: str) -> int:
     """GTSAM key of a camera's variable ``T_lidar_camera``."""
