@@ -30,6 +30,7 @@ from calibgraph.solver.robust import (
     robust_spreads,
 )
 from calibgraph.solver.stage1 import Stage1
+from calibgraph.solver.two_pass import USING_CORRESPONDENCES
 from factors import to_runs
 from factors.block_sums import unpack_sums
 
@@ -132,21 +133,6 @@ def _about_common_extrinsic(spreads: Array, counts: Array, inside: Array) -> Arr
     return np.asarray(np.where(enough, grown, np.maximum(grown, typical)))
 
 
-@dataclass(frozen=True, eq=False)
-class WeighedFrames:
-    """The correspondences of all cameras, weighted by their residuals.
-
-    Attributes:
-        blocks: per camera, without the correspondences of outlier frames.
-        T_camera_lidar: per camera, (4, 4) where the frames are densest; a start for the solve.
-        outlier_frames: per camera, how many frames have weight zero.
-    """
-
-    blocks: Mapping[str, CameraBlock]
-    T_camera_lidar: dict[str, Array]
-    outlier_frames: Mapping[str, int]
-
-
 def weigh_all_frames(
     table: Correspondences,
     blocks: Mapping[str, CameraBlock],
@@ -155,8 +141,8 @@ def weigh_all_frames(
     *,
     config: Config,
     terms: Terms,
-) -> WeighedFrames:
-    """The correspondences of every camera, weighted by their residuals.
+) -> dict[str, tuple[CameraBlock, Array, int]]:
+    """Per camera, as of :func:`weigh_frames`; its correspondences, weighted by their residuals.
 
     Unchanged if ``learnt_weights`` is off, Stage 1 is not PnP, or ``terms`` has no reprojection
     term.
@@ -169,9 +155,8 @@ def weigh_all_frames(
         config: ``learnt_weights``, ``stage1``.
         terms: of the objective.
     """
-    uses_correspondences = terms in ("full", "reprojection")
-    if not (config.learnt_weights and config.stage1 == "pnp" and uses_correspondences and blocks):
-        return WeighedFrames(blocks, dict(start), {})
+    if not (config.learnt_weights and config.stage1 == "pnp" and terms in USING_CORRESPONDENCES):
+        return {name: (block, start[name], 0) for name, block in blocks.items()}
 
     def weigh(name: str) -> tuple[CameraBlock, Array, int]:
         return weigh_frames(
@@ -181,12 +166,7 @@ def weigh_all_frames(
             stage1[name].by_frame if name in stage1 else {},
         )
 
-    kept, centers, outliers = zip(*map_on_cores(weigh, [*blocks]), strict=True)
-    return WeighedFrames(
-        blocks=dict(zip(blocks, kept, strict=True)),
-        T_camera_lidar={**start, **dict(zip(blocks, centers, strict=True))},
-        outlier_frames=dict(zip(blocks, outliers, strict=True)),
-    )
+    return dict(zip(blocks, map_on_cores(weigh, [*blocks]), strict=True))
 
 
 def weigh_frames(

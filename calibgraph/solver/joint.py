@@ -89,13 +89,15 @@ def solve_joint(
         start = best_start(rig, blocks, pairwise, config, terms=terms, tied=tied)     # x_0
 
     with watch("weights"):                                                 # ours: frame weights
-        frames = weigh_all_frames(kept.table, blocks, pairwise, start, config=config, terms=terms)
+        weighed = weigh_all_frames(kept.table, blocks, pairwise, start, config=config, terms=terms)
+        blocks = {name: block for name, (block, *_) in weighed.items()}
+        start |= {name: densest for name, (_, densest, _) in weighed.items()}
 
     objective = Objective(                                                 # Eq. 5
-        rig, frames.blocks, T_hat(pairwise), config, terms, lenses=lenses or {})
+        rig, blocks, T_hat(pairwise), config, terms, lenses=lenses or {})
 
     with watch("pass1"):                                                   # Two-Pass Solver
-        rough, scales = objective.minimize_with_scale(frames.T_camera_lidar)   # 1. fit
+        rough, scales = objective.minimize_with_scale(start)           # 1. fit
     with watch("pass2"):
         inliers = objective.without_outliers(rough, scales)                # 2. gate tau
         optimum = inliers.minimize(rough, scales)                          # 3. fit again
@@ -106,7 +108,7 @@ def solve_joint(
             optimum, kept.table.findings, kept.table.places)
 
     require_in_reach(optimum.T_camera_lidar)
-    outlier_frames = frames.outlier_frames
+    outlier_frames = {name: outliers for name, (*_, outliers) in weighed.items()}
     counts = count_correspondences(
         kept, objective, inliers, pairwise, outlier_frames=outlier_frames
     )

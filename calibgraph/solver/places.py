@@ -354,7 +354,7 @@ class Linearization:
         scaled, units = unit_diagonal(whole)
         if not (np.isfinite(scaled).all() and (np.diag(whole) > 0).all()):
             return False
-        others = np.setdiff1d(np.arange(len(whole)), at)
+        others = np.delete(np.arange(len(whole)), at)
         try:
             across = np.linalg.solve(scaled[np.ix_(others, others)], scaled[np.ix_(others, at)])
         except np.linalg.LinAlgError:
