@@ -54,20 +54,18 @@ class PairAgreement:
 
 def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
     """Whether the correspondences place the cameras relative to each other as the images do."""
-    own = evidence.of_correspondences
-    if evidence.solution.camera_matches is None or evidence.solution.before_pairs is None:
+    solution, alone = evidence.solution, evidence.solution.without_pairs().marginals
+    if solution.camera_matches is None or solution.before_pairs is None or alone.mount is None:
         return {}
-    if (mount := own.solution.marginals.mount) is None:  # they determine no pose
-        return {}
-    rig, covariance = own.solution.rig.moved_to(mount.T_camera_lidar), mount.covariance
+    rig, covariance = solution.rig.moved_to(alone.mount.T_camera_lidar), alone.mount.covariance
     found = [
         pair_agreement(rig, fit, covariance)
-        for fit in own.pair_fits
-        if own.fitted_blocks.keys() >= {fit.a, fit.b}
+        for fit in alone.pair_fits
+        if evidence.fitted_blocks.keys() >= {fit.a, fit.b}
     ]
     return {
         name: [check_agreement(one, name, found) for one in found if name in (one.a, one.b)]
-        for name in own.cameras
+        for name in evidence.cameras
     }
 
 
@@ -146,7 +144,7 @@ _MISSED = 1e-6  # probability that no sample of a competing solution large enoug
 
 def competing_solution_checks(evidence: Evidence) -> Checks:
     """Whether the matches that a solution leaves out agree on another extrinsic."""
-    solution = evidence.of_correspondences.solution
+    solution = evidence.solution.without_pairs()
     return {name: [check_competing_solution(solution, name)] for name in evidence.fitted_blocks}
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
+from calibgraph.matching.run import MatchingRun
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import (
     angle_deg,
@@ -21,7 +22,7 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.verdict import Check
 from calibgraph.trust.conventions import convention_error_between, in_words
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
+from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import limit, threshold
 
 
@@ -140,10 +141,10 @@ def describe_other_frame(guess: Mapping[str, Array], results: Mapping[str, Array
     )
 
 
-def range_checks(evidence: RunEvidence) -> Checks:
+def range_checks(run: MatchingRun) -> Checks:
     """Whether a result lies within the matcher's range around the guess."""
-    findings, guess = evidence.run.correspondences.findings, evidence.run.guess.T_camera_lidar
-    results = evidence.run.solution.T_camera_lidar
+    findings, guess = run.correspondences.findings, run.guess.T_camera_lidar
+    results = run.solution.T_camera_lidar
     found = {name: T for name, T in results.items() if name not in findings.missed}
     frame = describe_other_frame(guess, found)
     return {

@@ -7,17 +7,18 @@ from collections.abc import Mapping, Sequence
 
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
+from calibgraph.matching.run import MatchingRun
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.progress import Progress
-from calibgraph.trust.evidence import Checks, RunEvidence
+from calibgraph.trust.evidence import Checks, grade_by_images
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
 from calibgraph.trust.lens_parameter import IMAGES, check_parameter
 from calibgraph.trust.thresholds import limit, threshold
 
 
-def image_checks(evidence: RunEvidence) -> Checks:
+def image_checks(run: MatchingRun) -> Checks:
     """Whether the images agree with a result; nothing if there is no time left for them.
 
     They are scored as by the matcher ``structure``, which does not use all that other matchers use:
@@ -25,19 +26,18 @@ def image_checks(evidence: RunEvidence) -> Checks:
     camera pairs, the one without them is checked: next to a camera with a wrong lens, a right one
     is moved, and at the wrong one's place the lens cannot be measured.
     """
-    run = evidence.run
     if run.out_of_time:
         return {}
     rig, config = run.solution.without_pairs().solved_rig, run.solution.config
     try:
         checks = check_images(
             run.dataset, rig, run.correspondences,
-            tolerance=config.tolerance, seed=config.seed, progress=evidence.progress,
+            tolerance=config.tolerance, seed=config.seed, progress=run.progress,
         )  # fmt: skip
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
         text = f"the images could not be checked: {error}"
         return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
-    return evidence.grade_by_images(checks)
+    return grade_by_images(run, checks)
 
 
 def check_images(

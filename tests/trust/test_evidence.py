@@ -27,7 +27,7 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pair_refinement import fit_pairs
 from calibgraph.trust.agreement import PairAgreement, check_agreement, pair_agreement
-from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.evidence import gather
 from factors import pose_sigmas
 from tests.conftest import stereo_relative_pose
 from tests.solver.test_camera_pairs import simulated_pairs
@@ -90,8 +90,7 @@ def test_an_error_shared_by_all_frames_moves_a_camera_without_correspondences_wi
     table = simulated(pair, frames=10).of_camera("left")
     findings = table.metadata | {"systematic_rotation_rad": 0.01, "systematic_translation_m": 0.1}
     table = table.with_metadata(findings)
-    evidence = Evidence(solve_joint(rig, table), guess=rig)
-    covariance = evidence.joint_covariance
+    covariance = gather(solve_joint(rig, table), rig).joint_covariance
     sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 6)
     assert sigmas[1, :3] == pytest.approx([0.01] * 3, rel=0.05)  # not more: the pair is rigid
     assert sigmas[1, 3:] == pytest.approx([0.1] * 3, rel=0.05)
@@ -111,8 +110,7 @@ def test_a_relative_pose_ties_cameras_unless_matches_contradict_it(
         seen.append(found)
         return {}
 
-    evidence = Evidence(solve_joint(rig, simulated(rig, frames=10), Config()), rig, measure)
-    assert not evidence.posteriors
+    assert not gather(solve_joint(rig, simulated(rig, frames=10)), rig, measure).posteriors
     assert seen == [groups or [("left",), ("right",)]]
 
 
