@@ -134,10 +134,14 @@ def solve(
     """
     solution = solve_joint(rig, table, config, terms, camera_matches=camera_matches)
     record = ImageRecord.from_metadata(solution.correspondences.metadata)
-    posteriors = record.posteriors_of(solution.solved_rig.cameras)
     watch = Stopwatch()
     with watch("checks"):
-        evidence = gather(solution, rig, posteriors, excluded=solution.config.excluded_cameras)
+        evidence = gather(
+            solution,
+            rig,
+            lambda _, groups: record.posteriors_of(solution.solved_rig.cameras, groups),
+            excluded=solution.config.excluded_cameras,
+        )
         checks = record.checks(evidence, assess(evidence))
     result = to_calibration(evidence, checks)
     motion = solution.correspondences

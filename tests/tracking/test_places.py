@@ -32,7 +32,7 @@ from calibgraph.tracking.contradictions import pose_priors
 from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model
 from calibgraph.tracking.place_sums import sums_by_place
 from calibgraph.tracking.quadratics import quadratics_of
-from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.evidence import gather
 from tests.conftest import stereo_relative_pose
 from tests.draws.lenses import with_known_lenses
 from tests.draws.places import Drawn, draw_places, tied
@@ -53,7 +53,7 @@ STATED = {
 
 def batch_of(drawn: Drawn, **config: object) -> tuple[dict[str, Array], Array]:
     solved = solve_joint(drawn.rig, drawn.table, Config(learnt_weights=False, **config))
-    joint = Evidence(solved, guess=drawn.rig).joint_covariance
+    joint = gather(solved, drawn.rig).joint_covariance
     return solved.T_camera_lidar, joint
 
 

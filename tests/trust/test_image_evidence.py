@@ -18,7 +18,7 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust import image_checks, image_evidence
 from calibgraph.trust.assess import assess
-from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.evidence import gather
 from calibgraph.trust.image_checks import check_images, evidence_checks, pairing_checks
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
 from calibgraph.trust.image_record import RunChecks, to_metadata
@@ -177,7 +177,7 @@ def left_by_run(pair: Rig) -> Run:
     """The result of a run that saw flat evidence of one camera, and a fault; and its table."""
     solution = solve_joint(pair, simulated(pair, frames=20))
     posterior = PosePosterior(0.1 * FLAT, FLAT, 0.3)
-    evidence = Evidence(solution, pair, lambda *_: {CAMERA: posterior})
+    evidence = gather(solution, pair, lambda *_: {CAMERA: posterior})
     checks = RunChecks(assess(evidence), {CAMERA: [FAILED]}, {CAMERA: [CAUSE]})
     table = solution.correspondences
     seen = table.with_metadata({**table.metadata, **to_metadata(evidence, checks)})
