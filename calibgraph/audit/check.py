@@ -43,7 +43,7 @@ from calibgraph.trust.inputs import describe_copies
 from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
-from calibgraph.trust.thresholds import threshold
+from calibgraph.trust.thresholds import limit, threshold
 
 _log = logging.getLogger(__name__)
 
@@ -177,7 +177,7 @@ def _doubts_by_frames(
     """
     if not run.matcher.image_checks_can_fail or not cameras:
         return {}
-    rig, row = run.solution.without_pairs().solved_rig, threshold("frames_best")
+    rig = run.solution.without_pairs().solved_rig
     rig = rig.model_copy(update={"cameras": {name: rig.cameras[name] for name in cameras}})
     found = measure_image_evidence(run.dataset, rig, extrinsics_only=True, progress=progress)
     names = {frame.index: frame.name for frame in run.dataset.frames}
@@ -188,7 +188,7 @@ def _doubts_by_frames(
             "do their images and clouds not belong together?"
         ]
         for camera, of_camera in found.items()
-        if row.grade(of_camera.frames_best) != "PASS"
+        if of_camera.frames_best < limit("frames_best")
     }
 
 

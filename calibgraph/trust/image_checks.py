@@ -100,23 +100,14 @@ def evidence_checks(
             "image and cloud"
         )
         return (Check("image evidence", "WARN", text, found.groups),)
-    displaced = threshold("displaced_z_score").check(found.displaced_z_score)
-    frames = _check_frames(found, names)
-    mispaired = found.frames_best <= threshold("frames_best").fail
+    row, advice, lost = threshold("displaced_z_score"), "", found.frames_lost
+    if found.frames_best < limit("frames_best"):
+        advice = f"{row.advice}; frames {', '.join(names[n] for n in lost[:5])} fit another better"
+    displaced = row.check(found.displaced_z_score, advice=advice)
+    mispaired = found.frames_best <= limit("lens_frames_best")
     if found.displaced_z_score < limit("lens_z_score") or mispaired:
-        return displaced, frames  # at a wrong extrinsic the lens cannot be measured
-    lens = (check_parameter(each, IMAGES, tolerance) for each in found.lens)
-    return displaced, frames, *lens
-
-
-def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
-    numbers = found.frames_lost
-    lost = ", ".join(f"{n} ({names[n]})" for n in numbers[:5]) + (", ..." if numbers[5:] else "")
-    advice = (
-        f"frames {lost} have higher scores at displaced extrinsics; do their images and clouds "
-        "belong together?"
-    )
-    return threshold("frames_best").check(found.frames_best, advice=advice)
+        return (displaced,)  # at a wrong extrinsic the lens cannot be measured
+    return displaced, *(check_parameter(each, IMAGES, tolerance) for each in found.lens)
 
 
 def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:
