@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -31,19 +32,18 @@ from calibgraph.model.config import Config, Reported
 from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Status
-from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.parallel import with_own_threads
 from calibgraph.progress import Progress, Stopwatch, no_progress
-from calibgraph.rounds import AnyMatcher, Datasets, assign_places
+from calibgraph.rounds import AnyMatcher, Datasets, assign_places, refine_with_camera_pairs
 from calibgraph.trust.agreement import competing_solution_checks, pair_agreement_checks
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence, concatenate
+from calibgraph.trust.evidence import Checks, Evidence, concatenate, gather_of_run
 from calibgraph.trust.guess import point_distance_checks
 from calibgraph.trust.image_evidence import measure_image_evidence
 from calibgraph.trust.inputs import describe_copies
 from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
-from calibgraph.trust.thresholds import threshold
+from calibgraph.trust.thresholds import limit, threshold
 
 _log = logging.getLogger(__name__)
 
@@ -107,7 +107,7 @@ def check(
         )
         with watch("places"):
             run = assign_places(run)
-        run = refine_with_camera_pairs(run, report)
+        run = refine_with_camera_pairs(replace(run, progress=report))
         with watch("checks"):
             cameras, lidar = _judge(run, tolerance, report)
     except CorrespondenceError as error:
@@ -144,7 +144,7 @@ def _judge(
     run: MatchingRun, tolerance: Tolerance, progress: Progress
 ) -> tuple[dict[str, CameraAudit], LidarAudit | None]:
     """The audits of all cameras, and of the LiDAR where every measurement can be trusted."""
-    evidence = RunEvidence(run, {}, asks_guess=True).solution
+    evidence = gather_of_run(run, asks_guess=True)
     doubts = _doubts(run, evidence, progress)
     cameras = {
         name: judge_camera(evidence, name, doubts[name], tolerance) for name in run.guess.cameras
@@ -155,7 +155,7 @@ def _judge(
 
 def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[str, str]:
     """Per camera, why its measurement cannot be trusted; empty if it can."""
-    parts = [check(evidence) for check in DOUBTS] + [last_round_checks(RunEvidence(run, {}))]
+    parts = [check(evidence) for check in DOUBTS] + [last_round_checks(run)]
     z_scores = evidence.findings.z_score
     disagree = {name: _doubt_by_z_score(z_scores.get(name)) for name in evidence.cameras}
     open_ = [n for n, doubt in disagree.items() if not (doubt or has_too_few_frames(evidence, n))]
@@ -177,7 +177,7 @@ def _doubts_by_frames(
     """
     if not run.matcher.image_checks_can_fail or not cameras:
         return {}
-    rig, row = run.solution.without_pairs().solved_rig, threshold("frames_best")
+    rig = run.solution.without_pairs().solved_rig
     rig = rig.model_copy(update={"cameras": {name: rig.cameras[name] for name in cameras}})
     found = measure_image_evidence(run.dataset, rig, extrinsics_only=True, progress=progress)
     names = {frame.index: frame.name for frame in run.dataset.frames}
@@ -188,7 +188,7 @@ def _doubts_by_frames(
             "do their images and clouds not belong together?"
         ]
         for camera, of_camera in found.items()
-        if row.grade(of_camera.frames_best) != "PASS"
+        if of_camera.frames_best < limit("frames_best")
     }
 
 

@@ -108,7 +108,7 @@ CAUSES: dict[str, Cause] = {
         "image and cloud that agree too little", _STRUCTURE,
         {"z_score": "Check the guess, the intrinsics, and that images and clouds belong together.",
          "chance": "",
-         "displaced_z_score": "", "frames_best": "", "rematch_rotation": "",
+         "displaced_z_score": "", "rematch_rotation": "",
          "rematch_translation": "", "matching again": "", "last_round_rotation": _FROM_RESULT,
          "last_round_translation": _FROM_RESULT},
     ),

@@ -19,11 +19,7 @@ from calibgraph.graph.variables import seen_lens_key
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.model.places import Places
-from calibgraph.solver.components import (
-    common_error,
-    estimate_variance_ratios,
-    variance_components,
-)
+from calibgraph.solver.components import common_error, estimate_variance_ratios, variance_components
 from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.covariance import FittedObjective
 from calibgraph.solver.lens import lens_errors, lens_term, weak_information

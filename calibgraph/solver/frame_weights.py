@@ -23,12 +23,7 @@ from calibgraph.model.geometry import invert, local_coordinates
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.pnp import move_damped
-from calibgraph.solver.robust import (
-    CAUCHY_SCALE_SIGMAS,
-    CUT,
-    robust_spread,
-    robust_spreads,
-)
+from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS, CUT, robust_spread, robust_spreads
 from calibgraph.solver.stage1 import Stage1
 from calibgraph.solver.two_pass import USING_CORRESPONDENCES
 from factors import to_runs

@@ -24,11 +24,7 @@ from calibgraph.solver.covariance import FittedObjective, data_sigmas
 from calibgraph.solver.error_model import fit_errors, fit_without_priors
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs, shared_variance_ratio
 from calibgraph.solver.places import ErrorFit
-from calibgraph.solver.sources import (
-    predict_variances,
-    sources_by_camera,
-    variances_by_source,
-)
+from calibgraph.solver.sources import predict_variances, sources_by_camera, variances_by_source
 from factors import pose_sigmas
 
 _HELD_RAD, _HELD_M = np.radians(0.1), 0.02  # a camera, if its covariance is unknown

@@ -29,7 +29,7 @@ from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.camera_twist import free_fields_px
 from calibgraph.solver.linear_fit import Freed, LinearFit, block_of, fit_camera
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
+from calibgraph.trust.evidence import Checks, Evidence, grade_by_images
 from calibgraph.trust.inputs import INTERVAL_S, MAX_FRAMES, registered_twists
 from calibgraph.trust.lens_parameter import (
     IMAGES,
@@ -66,12 +66,12 @@ def asks_offset(run: MatchingRun) -> bool:
     return bool(run.matcher.tracking_rounds) and not (run.out_of_time or is_free)
 
 
-def image_offset_checks(evidence: RunEvidence) -> Checks:
+def image_offset_checks(run: MatchingRun) -> Checks:
     """The offset of each camera by matches that are made for it, unless it is estimated.
 
     By a matcher made for them, since that of the run has been released.
     """
-    run, config = evidence.run, evidence.run.solution.config
+    config = run.solution.config
     if not asks_offset(run):
         return {}
     rig, moved, registered = run.solution.without_pairs().solved_rig, None, False
@@ -85,7 +85,7 @@ def image_offset_checks(evidence: RunEvidence) -> Checks:
         cameras = {name: each.model_copy(update=none) for name, each in rig.cameras.items()}
         rig = rig.model_copy(update={"cameras": cameras})
     table = matcher.match(
-        moved, rig, round_index=matcher.tracking_rounds[-1], progress=evidence.progress
+        moved, rig, round_index=matcher.tracking_rounds[-1], progress=run.progress
     )
     matcher.release()
     table = with_motion(table, moved).with_places(run.correspondences.places)
@@ -95,7 +95,7 @@ def image_offset_checks(evidence: RunEvidence) -> Checks:
     if registered and seconds_between(*moved.frames[:2]) is None:
         taken = f"; successive clouds are taken to be {INTERVAL_S:g} s apart"
         checks = {n: [replace(c, text=c.text + taken) for c in of] for n, of in checks.items()}
-    return evidence.grade_by_images(checks)
+    return grade_by_images(run, checks)
 
 
 def _motion_options(dataset: Dataset) -> str:
@@ -178,15 +178,14 @@ def intrinsics_checks(evidence: Evidence) -> Checks:
     is taken for at least that of a small share of each match. Of a panorama the format determines
     the lens.
     """
-    evidence = evidence.of_correspondences
-    cameras = evidence.solution.solved_rig.cameras
+    cameras = evidence.solution.without_pairs().solved_rig.cameras
     names = [n for n in evidence.fitted_blocks if cameras[n].model != "equirectangular"]
     checks = map_on_cores(lambda name: _check_camera(evidence, name), names)
     return dict(zip(names, checks, strict=True))
 
 
 def _check_camera(evidence: Evidence, name: str) -> list[Check]:
-    solution, block = evidence.solution, evidence.fitted_blocks[name]
+    solution, block = evidence.solution.without_pairs(), evidence.fitted_blocks[name]
     camera, places = solution.solved_rig.cameras[name], solution.correspondences.places
     of_place = places.frames_per_place(block.frame_numbers) * evidence.findings.place_variance
     some = block.select_evenly(_MAX_MATCHES)

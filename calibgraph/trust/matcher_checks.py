@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from calibgraph.io.dataset import Dataset
-from calibgraph.matching.run import Rematch
+from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.structure.acceptance import FEW_FRAMES, SEARCH, probability_by_chance
 from calibgraph.matching.structure.global_search import ALONE
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.verdict import FAIL_ABOVE, TOLERANCE, WENT_ON, Check
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
+from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.inputs import describe_copies, describe_repeats
 from calibgraph.trust.solution_checks import check_sigmas
 from calibgraph.trust.thresholds import threshold
@@ -124,22 +124,18 @@ REMATCH_DEG, REMATCH_M = 0.5, 0.08
 """How far the start of matching again is displaced from the result."""
 
 
-def last_round_checks(evidence: RunEvidence) -> Checks:
+def last_round_checks(run: MatchingRun) -> Checks:
     """How far the last of several rounds of matching still moved the cameras."""
-    rounds, tolerance = evidence.run.rounds, evidence.run.solution.config.tolerance
-    if len(rounds) == 1:
+    if len(run.rounds) == 1:
         return {}
     keys = ("last_round_rotation", "moved_deg"), ("last_round_translation", "moved_cm")
-    return {
-        name: [threshold(key, tolerance).check(moved[of]) for key, of in keys]
-        for name, moved in rounds[-1].items()
-    }
+    rows = [(threshold(key, run.solution.config.tolerance), of) for key, of in keys]
+    return {n: [row.check(moved[of]) for row, of in rows] for n, moved in run.rounds[-1].items()}
 
 
-def repeated_file_checks(evidence: RunEvidence) -> Checks:
+def repeated_file_checks(run: MatchingRun) -> Checks:
     """Which frames were copies, and whether others have the same cloud or image of a camera."""
-    run, cameras = evidence.run, evidence.solution.cameras
-    checks = check_repeated_files(run.dataset, evidence.hashes, cameras)
+    checks = check_repeated_files(run.dataset, run.hashes, tuple(run.guess.cameras))
     if run.copies:
         check = Check("copies", "WARN", describe_copies(run.copies), len(run.copies))
         checks = {name: [check, *each] for name, each in checks.items()}
@@ -160,29 +156,27 @@ def check_repeated_files(
     return checks
 
 
-def rematch_checks(evidence: RunEvidence) -> Checks:
+def rematch_checks(run: MatchingRun) -> Checks:
     """Whether matching again from a displaced start ended at the same result."""
-    return compare_ends(evidence.run.rematch, evidence.run.solution.config.tolerance)
+    return compare_ends(run, run.solution.config.tolerance)
 
 
-def compare_ends(rematch: Rematch | None, tolerance: tuple[float, float] = TOLERANCE) -> Checks:
+def compare_ends(run: MatchingRun, tolerance: tuple[float, float] = TOLERANCE) -> Checks:
     """Per camera, the difference between both ends, for a tolerance [deg, cm]."""
-    if rematch is None:
-        return {}
     start = f"matching again from a start {REMATCH_DEG:g} deg, {100 * REMATCH_M:g} cm off"
-    if rematch.again is None:
-        check = Check("matching again", "FAIL", f"{start} failed: {rematch.failure}")
-        return {name: [check] for name in rematch.first.cameras}
-    again, words = rematch.again.T_camera_lidar, f"{start}: difference"
+    if run.rematch_failure:
+        check = Check("matching again", "FAIL", f"{start} failed: {run.rematch_failure}")
+        return {name: [check] for name in run.rematch}
+    words = f"{start}: difference"
     rows = [threshold(f"rematch_{part}", tolerance) for part in ("rotation", "translation")]
-    apart = {n: pose_difference(T, again[n]) for n, T in rematch.first.T_camera_lidar.items()}
+    apart = {name: pose_difference(*ends) for name, ends in run.rematch.items()}
     return {
         name: [row.check(value, name=words) for row, value in zip(rows, values, strict=True)]
         for name, values in apart.items()
     }
 
 
-def going_on_checks(evidence: RunEvidence) -> Checks:
+def going_on_checks(run: MatchingRun) -> Checks:
     """Which rounds ended elsewhere than the images allow, and went on from there."""
     text = (
         "rounds of matching ended {:.2g} deg, {:.2g} cm away, where the images agree less, and "
@@ -190,16 +184,15 @@ def going_on_checks(evidence: RunEvidence) -> Checks:
     )
     return {
         name: [Check("rounds that went on", "WARN", text.format(*moved), moved[0], kind=WENT_ON)]
-        for name, moved in evidence.run.went_on.items()
+        for name, moved in run.went_on.items()
     }
 
 
-def time_limit_checks(evidence: RunEvidence) -> Checks:
+def time_limit_checks(run: MatchingRun) -> Checks:
     """Whether the time limit left something out."""
-    run = evidence.run
     if not run.out_of_time:
         return {}
     missed = f"{run.missed_rounds} rounds of matching and " if run.missed_rounds else ""
     text = f"partial: there was no time for {missed}the checks against the images"
     check = Check("time limit", "WARN", text, run.missed_rounds)
-    return {name: [check] for name in evidence.solution.cameras}
+    return {name: [check] for name in run.guess.cameras}

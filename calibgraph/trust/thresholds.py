@@ -8,9 +8,9 @@ check: a row here, a function that looks the row up by its key, and that functio
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
 from statistics import NormalDist
-from typing import NamedTuple
 
 from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Threshold, ratio_of
@@ -163,13 +163,10 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("displaced_z_score", "z-score against displaced extrinsics", "at least", 4.0, 2.5, "",
               "Does the result explain the images better than displaced extrinsics do?",
               f"KITTI 01, {_RECORDED}: right 4.9 and more, wrong ones from a start too far away "
-              "up to 3.8, mostly below 2.5; mispaired images up to 5.1 (see the next row). A "
-              "16-beam LiDAR at one place: 2.9 at 0.4 deg.",
+              "up to 3.8, mostly below 2.5; mispaired images up to 5.1. A 16-beam LiDAR at one "
+              "place: 2.9 at 0.4 deg.",
               "extrinsics a degree or 40 cm away explain the images nearly as well; check the "
               "guess, or record where there is more structure"),
-    Threshold("frames_best", "frames whose score is highest at the result", "at least", 0.8, 0.5,
-              "share", "In how many frames is no displaced extrinsic better?",
-              f"{_RECORDED}: right 100 %, mispaired images up to 67 %, mostly 50 %."),
     Threshold("own_clouds", "score with the own clouds above that with neighbouring ones",
               "at least", -0.05, -0.2, "share", "Do images and clouds belong together?",
               "KITTI 00: own clouds +0.4 and more, clouds one frame off -0.4 and less; about zero "
@@ -187,49 +184,41 @@ THRESHOLDS: tuple[Threshold, ...] = (
 # fmt: on
 
 
-class Limit(NamedTuple):
-    """A number that decides whether a check counts, or that it is compared with.
-
-    One that is ``of_tolerance`` grows with a tolerance above the default.
-    """
-
-    key: str
-    value: float
-    unit: str
-    meaning: str
-    of_tolerance: bool = False
-
-
-# fmt: off
-LIMITS: tuple[Limit, ...] = (
-    Limit("lens_wrong", _WRONG_SIGMAS, "sigma", "The error of a wrong lens parameter, in standard "
-          "deviations of a calibrated one: 0.2 % of the focal length and of fx / fy, "
-          "0.002 focal lengths of the principal point, 0.002 of k1, 2 ms of the time of "
-          "an image, or as the rig states."),
-    Limit("lens_wrong_share", _WRONG_SHARE, "share", "So many are taken for wrong."),
-    Limit("lens_match_share", MATCH_SHARE, "share", "So much of a match's variance is taken to be "
-          "shared by all: less cannot be told from a wrong lens."),
-    Limit("lens_z_score", 3.0, "", "The lens is checked by the images only above this z-score "
-          "against displaced extrinsics: at a wrong extrinsic it cannot be measured. KITTI 00 and "
-          "the sample: wrong lenses left 3.2 and more."),
-    Limit("competing_rotation", 0.3, "deg", "A competing solution this near, and as near as the "
-          "next row, is the same solution: nearer ones differ in the matches at the gate alone.",
-          of_tolerance=True),
-    Limit("competing_translation", 10.0, "cm", "See the row above.", of_tolerance=True),
-    Limit("guess_rotation", 30.0, "deg", "A result that is turned farther from its guess, and "
-          "beyond sqrt(3) times the matcher's range, is compared with its convention errors."),
-    Limit("swap_slack", 0.05, "m, rad", "Added in quadrature to the distances of swapped cameras: "
-          "the usual error of a result is no evidence of a swap."),
-    Limit("convention_rotation", 30.0, "deg", "A convention error explains a guess if, undone, it "
-          "is this near to the result, and as near as the next row."),
-    Limit("convention_translation", 2.5, "m", "See the row above."),
-    Limit("convention_gain", 1.3, "times", "A convention error explains a failed guess if, undone, "
-          "the z-score exceeds the guess's by this factor, and what chance gives."),
-)
-# fmt: on
+LIMITS: Mapping[str, float] = {
+    # The error of a wrong lens parameter, in standard deviations of a calibrated one: 0.2 % of the
+    # focal length and of fx / fy, 0.002 focal lengths of the principal point, 0.002 of k1, 2 ms of
+    # the time of an image, or as the rig states; and the share of those that are wrong.
+    "lens_wrong": _WRONG_SIGMAS,
+    "lens_wrong_share": _WRONG_SHARE,
+    # Share of a match's variance that all share: less cannot be told from a wrong lens.
+    "lens_match_share": MATCH_SHARE,
+    # Above this z-score against displaced extrinsics alone the lens is checked by the images: at a
+    # wrong extrinsic it cannot be measured. KITTI 00, the sample: wrong lenses left 3.2 and more.
+    "lens_z_score": 3.0,
+    # Share of the frames whose score is highest at the result: right 100 %, mispaired images up to
+    # 67 %, mostly 50 % (KITTI 00, the sample). Under the first something has moved, or images and
+    # clouds do not belong together; at the second and less the lens is not checked.
+    "frames_best": 0.8,
+    "lens_frames_best": 0.5,
+    # A competing solution nearer than both is the same one: it differs in matches at the gate.
+    "competing_rotation": 0.3,  # deg, at the default tolerance
+    "competing_translation": 10.0,  # cm, likewise
+    # A result that is turned farther [deg] from its guess, and beyond sqrt(3) times the matcher's
+    # range, is compared with its convention errors.
+    "guess_rotation": 30.0,
+    # Added [m, rad] in quadrature to the distances of swapped cameras: the usual error of a result
+    # is no evidence of a swap.
+    "swap_slack": 0.05,
+    # A convention error explains a guess if, undone, it is nearer to the result than both.
+    "convention_rotation": 30.0,  # deg
+    "convention_translation": 2.5,  # m
+    # It explains a failed guess if the z-score exceeds the guess's by this factor, and chance.
+    "convention_gain": 1.3,
+}
+"""Numbers that decide whether a check counts, or that something is compared with."""
 
 _ROWS = {row.key: row for row in THRESHOLDS}
-_LIMITS = {row.key: row for row in LIMITS}
+_OF_TOLERANCE = {"competing_rotation": "deg", "competing_translation": "cm"}
 
 
 @lru_cache
@@ -239,6 +228,6 @@ def threshold(key: str, tolerance: tuple[float, float] = TOLERANCE) -> Threshold
 
 
 def limit(key: str, tolerance: tuple[float, float] = TOLERANCE) -> float:
-    """The value of a limit, for a tolerance [deg, cm]."""
-    row = _LIMITS[key]
-    return row.value * (max(ratio_of(row.unit, tolerance), 1.0) if row.of_tolerance else 1.0)
+    """One of ``LIMITS``; some grow with a tolerance [deg, cm] above the default."""
+    unit = _OF_TOLERANCE.get(key)
+    return LIMITS[key] * (max(ratio_of(unit, tolerance), 1.0) if unit else 1.0)
