@@ -192,7 +192,7 @@ def solve_streets(streets: Streets) -> Iterator[tuple[str, Record]]:
     evidence = gather(solved, streets.start)
     checks = RunChecks(assess(evidence), unseen=evidence.cameras)
     verdicts = to_calibration(evidence, checks).camera_verdicts
-    joint, mount = solved.covariance, solved.marginals.mount
+    joint, mount = solved.covariance, solved.mount
     assert joint is not None and mount.covariance is not None
     errors, T = [], mount.T_camera_lidar
     for place, name in enumerate(T):

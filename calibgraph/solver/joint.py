@@ -208,7 +208,7 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
     Returns:
         The same optimum where no pair of cameras has enough in common.
     """
-    alone, watch = solution.without_pairs(), Stopwatch()
+    alone, watch = replace(solution.without_pairs(), camera_matches=matches), Stopwatch()
     stops = solution.correspondences.places
     by_stop = replace(matches, frame=stops.merge_stationary(matches.frame))
     with watch("camera_pairs"):
@@ -224,10 +224,8 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
         optimum=optimum,
         counts=count_common_features(alone.counts, inliers.pairs),
         timings_s={**solution.timings_s, **watch.seconds},
-        camera_matches=matches,
-        before_pairs=alone.optimum if inliers.pairs else None,
         errors=errors,
-        errors_before_pairs=alone.errors if inliers.pairs else None,
+        alone=alone if inliers.pairs else None,
     )
 
 

@@ -51,8 +51,8 @@ class PairAgreement(NamedTuple):
 
 def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
     """Whether the correspondences place the cameras relative to each other as the images do."""
-    solution, alone = evidence.solution, evidence.solution.without_pairs().marginals
-    if solution.camera_matches is None or solution.before_pairs is None or alone.mount is None:
+    solution, alone = evidence.solution, evidence.solution.without_pairs()
+    if solution.camera_matches is None or solution.alone is None or alone.mount is None:
         return {}
     rig, covariance = solution.rig.moved_to(alone.mount.T_camera_lidar), alone.mount.covariance
     found = [
@@ -177,7 +177,7 @@ def place_checks(evidence: Evidence) -> Checks:
     where they are elsewhere; and by its inliers: the share of the matches within the gate over its
     median at the other places.
     """
-    errors, checks = evidence.solution.marginals.errors, dict[str, list[Check]]()
+    errors, checks = evidence.solution.error_fit, dict[str, list[Check]]()
     if errors is None or len(errors.model.frames) < error_components().robust_places:
         return {}
     cameras, of_place = tuple(errors.model.cameras), errors.linear.distances

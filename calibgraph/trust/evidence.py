@@ -121,7 +121,7 @@ class Evidence:
     def error_sources(self) -> dict[str, ErrorSources]:
         """Per camera with an error bar, the shares of its sources."""
         joint = self.joint_covariance
-        return {} if joint is None else self.solution.marginals.error_sources(joint)
+        return {} if joint is None else self.solution.error_sources(joint)
 
     def probability_beyond(self, camera: str) -> float:
         """The probability that its error is beyond the tolerance, by its posterior."""
@@ -145,7 +145,7 @@ class Evidence:
 
     def mount_covariance(self) -> Array | None:
         """(6 N, 6 N) second moments of the mounts about the solution, widened alike."""
-        mount = self.solution.marginals.mount
+        mount = self.solution.mount
         if mount is None or self.bars is None:
             return None
         of, T = mount.T_camera_lidar, self.solution.T_camera_lidar
@@ -169,7 +169,7 @@ def gather(
         excluded: cameras that the user excluded.
     """
     cameras, config = tuple(solution.T_camera_lidar), solution.config
-    tied, known = _tied(solution), solution.marginals.covariance
+    tied, known = _tied(solution), solution.covariance
     bars, joint = None, None
     if known is not None:
         rows = {name: pose_rows(number) for number, name in enumerate(cameras)}
@@ -183,7 +183,7 @@ def gather(
 def _tied(solution: Solution) -> list[tuple[str, ...]]:
     """The free cameras in groups; a measured pose that contradicts the matches ties nothing."""
     free = [name for name in solution.T_camera_lidar if name not in solution.held]
-    limit, known = error_components().contradiction_sigmas, solution.marginals
+    limit, known = error_components().contradiction_sigmas, solution
     wrong = {(one.pair.a, one.pair.b) for one in known.conflicts if one.largest > limit}
     poses = solution.inliers.rig.relative_poses
     right = [one for one in poses if (one.a, one.b) not in wrong]

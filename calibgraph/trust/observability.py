@@ -84,7 +84,7 @@ def prior_shares(solution: Solution) -> dict[str, float]:
     C H_prior: 0 if the matches decide alone, 1 if there are none. C is the (6 N, 6 N) marginal of
     the error model; without one, of independent matches.
     """
-    T_camera_lidar, errors = solution.T_camera_lidar, solution.marginals.errors
+    T_camera_lidar, errors = solution.T_camera_lidar, solution.error_fit
     cameras = list(T_camera_lidar)
     priors = pose_equations(solution.inliers.pose_graph, cameras, T_camera_lidar)[0]
     known = None if errors is None else errors.of_mount.covariance

@@ -27,7 +27,7 @@ def estimate_checks(evidence: Evidence) -> Checks:
 def _estimate_of(evidence: Evidence, camera: str) -> Estimate:
     """By the matches alone: flat images widen the error bar, and fail no check."""
     solution, block = evidence.solution, evidence.solution.inliers.blocks.get(camera)
-    sigmas, conflicts = solution.marginals.data_sigmas, solution.marginals.conflicts
+    sigmas, conflicts = solution.data_sigmas, solution.conflicts
     return Estimate(
         has_matches=camera in solution.objective.blocks,
         used=0 if block is None else len(block.frame),

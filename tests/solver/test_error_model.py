@@ -151,7 +151,7 @@ def test_what_all_frames_share_is_the_share_that_its_size_has(pair: Rig, config:
 
 def test_the_shares_are_those_of_independent_errors_and_add_up(pair: Rig) -> None:
     """The part that is left to the matches is the one that their own equations give."""
-    errors = evidence(pair, table_of_places(pair, 3, OF_A_SENSOR)).solution.marginals.errors
+    errors = evidence(pair, table_of_places(pair, 3, OF_A_SENSOR)).solution.error_fit
     parts = variances_by_source(errors)
     whole = np.diag(errors.covariance)  # of which the matches are 3e-4 to 7e-3
     np.testing.assert_allclose((sum(parts.values()) + of_matches(errors)) / whole, 1, atol=1e-8)

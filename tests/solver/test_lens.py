@@ -122,7 +122,7 @@ def test_an_uncertain_lens_widens_the_error_bar(drawn: Drawn) -> None:
         ahead = 6 * number + 5
         assert unknown.covariance[ahead, ahead] > 1.1 * known.covariance[ahead, ahead]
         assert known.lens[name][0].describe().startswith("not determined by these data")
-        assert known.marginals.error_sources(known.covariance)[name]
+        assert known.error_sources(known.covariance)[name]
 
 
 def test_the_lens_is_part_of_an_alignment_and_an_error_of_a_mount(drawn: Drawn) -> None:
@@ -141,14 +141,14 @@ def test_the_lens_is_part_of_an_alignment_and_an_error_of_a_mount(drawn: Drawn) 
         np.testing.assert_allclose(
             mounts[1].T_camera_lidar[name], alignments[1].T_camera_lidar[name]
         )
-        shares = mounts[1].marginals.error_sources(mounts[1].covariance)[name].translation
+        shares = mounts[1].error_sources(mounts[1].covariance)[name].translation
         assert shares["uncertain lenses and clocks"] > 0.9
 
 
 def test_the_covariance_of_a_mount_is_that_of_its_graph(drawn: Drawn) -> None:
     truth, table = drawn
     found = solve_joint(truth, table, Config(of="mount"))
-    fit = found.marginals.errors
+    fit = found.error_fit
     marginals = gtsam.Marginals(found.graph(), all_values(fit.linear))
     for number in range(len(truth.cameras)):
         own = found.covariance[6 * number : 6 * number + 6, 6 * number : 6 * number + 6]
