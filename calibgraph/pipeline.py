@@ -22,7 +22,6 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import pair_covariances
 from calibgraph.model.lens import with_sigmas
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import Threads, with_own_threads
@@ -151,12 +150,7 @@ def solve(
 
 
 def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
-    """A solution with its error bar and its verdict.
-
-    Args:
-        evidence: the solution, and what its checks computed.
-        checks: all of them.
-    """
+    """A solution with its error bar, and its verdict by all checks."""
     solution, cameras = evidence.solution, evidence.cameras
     model, tolerance = model_of(solution.correspondences.matcher), solution.config.tolerance
     models = dict.fromkeys(cameras, model) | dict.fromkeys(checks.unseen, TABLES)
@@ -169,11 +163,7 @@ def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
         initial_rig=evidence.guess,
         covariance={name: evidence.covariance_of(name) for name in cameras},
         joint_covariance=evidence.joint_covariance,
-        pair_covariance=Later(
-            lambda: pair_covariances(
-                evidence.mount_covariance(), solution.T_camera_lidar, solution.held
-            )
-        ),
+        pair_covariance=Later(evidence.pair_covariances),
         camera_verdicts=verdicts,
         residuals=Later(lambda: residuals_of(solution)),
         counts={name: dict(counts) for name, counts in solution.counts.items()},

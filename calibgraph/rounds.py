@@ -37,7 +37,6 @@ from calibgraph.matching.run import (
 )
 from calibgraph.matching.same_images import require_different_images
 from calibgraph.matching.standstill import find_stationary_frames
-from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.lens import LensEstimate, change_of_lens, unsettled
@@ -274,25 +273,20 @@ def assign_places(run: MatchingRun) -> MatchingRun:
     Where the matcher's error has a part that frames of one place share. The camera with the highest
     z-score shows where the places are.
     """
-    findings, rig = run.correspondences.findings, run.solution.solved_rig
+    findings, solution = run.correspondences.findings, run.solution
     found = {name: z for name, z in findings.z_score.items() if name not in findings.missed}
     if not findings.place_variance or not found:
         return run
-    camera, config = max(found, key=lambda name: found[name]), run.solution.config
+    camera, rig, config = max(found, key=lambda n: found[n]), solution.solved_rig, solution.config
     try:
         groups = find_places(run.dataset, rig, camera, seed=config.seed)
         up = find_up(run.dataset.frames[0].load_cloud(), rig.T_camera_lidar.values())
     except (CalibrationError, OSError):  # the checks on images report it
         return run
     places = replace(run.correspondences.places, places=as_groups(groups))
-    table = run.correspondences.with_places(places)
-    solution = solve_joint(
-        run.solution.rig.with_lenses_of(run.guess),
-        table,
-        config,
-        run.solution.terms,
-        camera_matches=run.solution.camera_matches,
-    )
+    table, start = run.correspondences.with_places(places), solution.rig.with_lenses_of(run.guess)
+    pairs = solution.camera_matches
+    solution = solve_joint(start, table, config, solution.terms, camera_matches=pairs)
     warnings = run.warnings if up is not None else (*run.warnings, UNKNOWN_UP)
     return replace(run, correspondences=table, solution=solution, warnings=warnings)
 
@@ -307,44 +301,31 @@ def refine_with_camera_pairs(run: MatchingRun) -> MatchingRun:
         The run itself where no two cameras can overlap, there is no time left, the terms do not use
         the correspondences, or the files, which its matcher may not have needed, cannot be read.
     """
-    if run.out_of_time or not run.solution.objective.uses_correspondences:
+    solution, findings = run.solution, run.correspondences.findings
+    if run.out_of_time or not solution.objective.uses_correspondences:
         return run
     try:
-        matches = _match_cameras(run)
-        return run if matches is None else _with_pairs(run, matches)
+        with run.watch("match_cameras"):
+            near = overlapping_pairs(solution.solved_rig, run.dataset.frames[0].load_cloud())
+            other, missed = findings.contradicted, findings.missed.keys()
+            pairs = [(a, b) for a, b in near if missed.isdisjoint((a, b)) and other.get(a) != b]
+            if not pairs:
+                return run
+            matches = match_cameras(
+                run.dataset,
+                run.guess.with_lenses_of(solution.solved_rig),  # as far as they are estimated
+                pairs,
+                most_frames=PAIR_FRAMES,
+                seed=solution.config.seed,
+                progress=run.progress,
+            )
+        with run.watch("solve_pairs"):
+            # Surfaces show where cameras are when they take an image; two cameras each other alone.
+            if {*CLOCK}.isdisjoint(solution.config.estimate):
+                matches = with_surfaces(matches, run.dataset, solution.solved_rig)
+            return replace(run, solution=add_camera_pairs(solution, matches))
     except (CalibrationError, OSError):  # the checks on images report it
         return run
-
-
-def _match_cameras(run: MatchingRun) -> CameraMatches | None:
-    """The matches of the cameras that can overlap; None if there are none."""
-    with run.watch("match_cameras"):
-        findings = run.correspondences.findings
-        missed, other = findings.missed.keys(), findings.contradicted
-        cloud = run.dataset.frames[0].load_cloud()
-        near = overlapping_pairs(run.solution.solved_rig, cloud)
-        pairs = [(a, b) for a, b in near if missed.isdisjoint((a, b)) and other.get(a) != b]
-        if not pairs:
-            return None
-        rig = run.guess.with_lenses_of(run.solution.solved_rig)  # as far as they are estimated
-        seed = run.solution.config.seed
-        return match_cameras(
-            run.dataset, rig, pairs, most_frames=PAIR_FRAMES, seed=seed, progress=run.progress
-        )
-
-
-def _with_pairs(run: MatchingRun, matches: CameraMatches) -> MatchingRun:
-    """The run with the solution of correspondences and camera matches.
-
-    Surfaces show where cameras are when they take an image. Where that is to be estimated they are
-    left out: two cameras show each other alone.
-    """
-    solution = run.solution
-    clock_is_free = not {*CLOCK}.isdisjoint(solution.config.estimate)
-    with run.watch("solve_pairs"):
-        if not clock_is_free:
-            matches = with_surfaces(matches, run.dataset, solution.solved_rig)
-        return replace(run, solution=add_camera_pairs(solution, matches))
 
 
 def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[FrameChoice, Rig]:

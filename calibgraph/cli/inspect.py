@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import asdict
 from pathlib import Path
 from shlex import join
 
@@ -78,7 +79,7 @@ def evaluate(
     path = rig_file(estimate)
     errors = evaluate(load_rig(estimate), load_rig(reference), error_bars(path))
     if as_json:
-        print_json(errors.to_mapping())
+        print_json(asdict(errors))
     else:
         from calibgraph.report.tables import print_evaluation
 

@@ -13,7 +13,7 @@ from calibgraph.matching.run import MatchingRun
 from calibgraph.model.config import Terms
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import MatcherFindings, error_components
-from calibgraph.model.geometry import pose_rows, twist_between
+from calibgraph.model.geometry import pair_covariances, pose_rows, twist_between
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import TOLERANCE, Check
@@ -143,14 +143,14 @@ class Evidence:
         rows = pose_rows(self.cameras.index(camera))
         return joint[rows, rows]
 
-    def mount_covariance(self) -> Array | None:
-        """(6 N, 6 N) second moments of the mounts about the solution, widened alike."""
-        mount = self.solution.mount
+    def pair_covariances(self) -> dict[str, Array]:
+        """Per pair "A->B", (6, 6): by second moments of the mounts about the solution, widened."""
+        mount, T = self.solution.mount, self.solution.T_camera_lidar
         if mount is None or self.bars is None:
-            return None
-        of, T = mount.T_camera_lidar, self.solution.T_camera_lidar
-        away = np.concatenate([twist_between(of[name], T[name]) for name in T])
-        return self.bars.widen(mount.covariance + np.outer(away, away))
+            return {}
+        away = np.concatenate([twist_between(mount.T_camera_lidar[name], T[name]) for name in T])
+        joint = self.bars.widen(mount.covariance + np.outer(away, away))
+        return pair_covariances(joint, T, self.solution.held)
 
 
 def gather(

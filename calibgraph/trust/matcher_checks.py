@@ -24,52 +24,45 @@ _OF_FEW_FRAMES = replace(SEARCH, sigma=0.0)  # in which the search has measured 
 
 
 def matcher_checks(evidence: Evidence) -> Checks:
-    """The checks of every camera's matches.
+    """The checks of every camera's matches, by what its matcher states.
 
     The error that all frames share is part of the error bar, with which it is checked; where there
     is no error bar it is checked alone.
     """
     table, findings = evidence.solution.correspondences, evidence.findings
-    few = {  # in more frames no search measures what is found by chance
-        name: chance
-        for name, chance in findings.chance.items()
-        if len(np.unique(table.of_camera(name).frame)) <= FEW_FRAMES
-    }
-    findings = replace(findings, chance=few)
     known = evidence.joint_covariance is not None
     sigmas = None if known else np.repeat(findings.systematic_sigmas, 3)
     what, tolerance = "error that the matcher's frames share", evidence.solution.config.tolerance
-    return {
-        name: [
-            *_search_checks(findings, name),
+    checks = {}
+    for name in evidence.cameras:
+        few = len(np.unique(table.of_camera(name).frame)) <= FEW_FRAMES
+        chance = findings.chance.get(name) if few else None  # of more no search measures it
+        checks[name] = [
+            *_search_checks(findings, name, chance),
             *_share_checks(findings, name),
             *check_sigmas(what, sigmas, tolerance),
-            *_agreement_checks(findings, name),
+            *_agreement_checks(findings, name, chance),
         ]
-        for name in evidence.cameras
-    }
+    return checks
 
 
-def _agreement_checks(findings: MatcherFindings, camera: str) -> list[Check]:
+def _agreement_checks(findings: MatcherFindings, camera: str, chance: float | None) -> list[Check]:
     """Whether image and cloud agree better than by chance.
 
     A search in few frames measures that; its finding stands unless the rounds have lost the pose.
     """
-    z_score, chance = findings.z_score.get(camera), findings.chance.get(camera)
-    if chance is not None and camera in findings.missed:
+    z_score = findings.z_score.get(camera)
+    if z_score is None or (chance is not None and camera in findings.missed):
         return []  # the check of the search has it
-    if z_score is None:
-        return []
     is_lost = probability_by_chance(z_score, ALONE, _OF_FEW_FRAMES) > FAIL_ABOVE
     if chance is not None and not is_lost:
         return [threshold("chance").check(chance)]
     return [threshold("z_score").check(z_score)]
 
 
-def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:
+def _search_checks(findings: MatcherFindings, camera: str, chance: float | None) -> list[Check]:
     """Whether the matcher's global search found the camera, and what it has in common agrees."""
     missed, found = findings.missed.get(camera), findings.found.get(camera)
-    chance = findings.chance.get(camera)
     if missed is not None and chance is not None:
         text = (
             f"not found: where image and cloud agree best (z-score {missed:.1f}), a search with "
@@ -87,18 +80,17 @@ def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:
     if found is None:
         return []
     text = f"z-score {found:.1f} of image and cloud where the rounds began"
-    search, other = Check("search", "PASS", text, found), findings.contradicted.get(camera)
-    if other is None:
-        return [search]
-    text = (
-        f"its image and cloud agree at its pose, but features that it has in common with {other} "
-        "place the two cameras elsewhere: do both images show the same thing that is no part of "
-        "the scene, as a text, a logo or a part of the vehicle? Else one of the two is wrong"
-    )
-    return [
-        search,
-        Check(f"features in common with {other}", "WARN", text, kind="contradiction"),
-    ]
+    checks = [Check("search", "PASS", text, found)]
+    if (other := findings.contradicted.get(camera)) is not None:
+        text = (
+            "its image and cloud agree at its pose, but features that it has in common with "
+            f"{other} place the two cameras elsewhere: do both images show the same thing that is "
+            "no part of the scene, as a text, a logo or a part of the vehicle? Else one of the two "
+            "is wrong"
+        )
+        name = f"features in common with {other}"
+        checks.append(Check(name, "WARN", text, kind="contradiction"))
+    return checks
 
 
 def _share_checks(findings: MatcherFindings, camera: str) -> list[Check]:
