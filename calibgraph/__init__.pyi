@@ -9,7 +9,7 @@ from .audit import check as check
 from .audit import drift as drift
 from .audit.fleet_model import FleetModel as FleetModel
 from .audit.fleet_model import fit_fleet as fit_fleet
-from .audit.observations import observe as observe
+from .audit.fleet_model import observe as observe
 from .audit.page import write_audit_report as write_audit_report
 from .doctor import Diagnosis as Diagnosis
 from .doctor import diagnose as diagnose

@@ -10,13 +10,16 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from calibgraph.errors import CalibrationError
 from calibgraph.parallel import THREADS_VARIABLE
 
 Process = subprocess.Popen[bytes]
@@ -28,6 +31,32 @@ _ONE_THREAD = dict.fromkeys(
      "NUMBA_NUM_THREADS"), "1",
 )  # fmt: skip
 """The requests share the cores, so that each needs one thread only."""
+
+ErrorKind = Literal["bad input", "io", "out of memory", "timeout", "worker died", "internal error"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended: its result, or why it failed, in one line; its time and what it printed."""
+
+    result: Any = None
+    error_kind: ErrorKind | None = None
+    error: str | None = None
+    seconds: float = 0.0
+    log: str = ""
+
+
+def describe_failure(error: Exception) -> tuple[ErrorKind, str]:
+    """The kind of a job's failure, and its text: wrong data are no fault of the machine's."""
+    if isinstance(error, MemoryError):
+        why = f" ({error})" if str(error) else ""
+        return "out of memory", f"not enough memory{why}; give fewer frames, or more --memory-gb"
+    if isinstance(error, (CalibrationError, ValueError)):
+        return "bad input", str(error)
+    traceback.print_exception(error)
+    if isinstance(error, OSError):
+        return "io", str(error)
+    return "internal error", f"{type(error).__name__}: {error}"
 
 
 class ChildEndedError(Exception):

@@ -27,7 +27,7 @@ from calibgraph.matching.structure.matcher import MOST_FRAMES
 from calibgraph.model.places import as_groups, describe_places
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores
-from calibgraph.report.point_overlay import write_guess_overlays
+from calibgraph.report.page_overlays import write_guess_overlays
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.trust.inputs import (
     Finding,

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from calibgraph.audit.drift_result import Drift
+from calibgraph.audit.drift import Drift
 from calibgraph.audit.result import Audit, twist_cells
 from calibgraph.report.tables import make_table
 

@@ -93,25 +93,20 @@ def matcher_from(
         of_cmrnext: its settings.
         search: the search_deg and search_m of structure; None if not given, 0 for no search.
     """
-    given: dict[str, Any] = {key: value for key, value in search.items() if value is not None}
-    for option in given if name != "structure" else ():
-        raise ValueError(f"--{option.replace('_', '-')} is for --matcher structure only")
+    for option in search if name != "structure" else ():
+        if search[option] is not None:
+            raise ValueError(f"--{option.replace('_', '-')} is for --matcher structure only")
     for option in [*(["--weights"] if weights else []), *(of_cmrnext or {})]:
         if name != "cmrnext":
             raise ValueError(f"{option} is for --matcher cmrnext only")
-    if name == "structure":
-        from calibgraph.matching.structure import StructureMatcher
+    from calibgraph.matching.named import find_matcher, structure_matcher
 
-        if given and not any(given.values()):
-            given = dict.fromkeys(search)
-        frames: dict[str, Any] = {"most_frames": None} if all_frames else {}
-        return StructureMatcher(seed=seed, **given, **frames)
+    if name == "structure":
+        return structure_matcher(seed=seed, all_frames=all_frames, **search)
     if name == "cmrnext" and weights:
         from calibgraph.matching.cmrnext import CmrNextMatcher
 
         return CmrNextMatcher(weights, seed=seed, **of_cmrnext or {})
-    from calibgraph.matching.named import find_matcher
-
     return find_matcher(name, seed=seed)
 
 

@@ -35,13 +35,13 @@ def check(
     but the page, if one is wanted.
     """
     from calibgraph.audit import check
-    from calibgraph.audit.significance import Tolerance
+    from calibgraph.audit.judgement import tolerance_twist
     from calibgraph.files import require_new_file
 
     if out is not None:
         require_new_file(out, ".html", ".htm", force=force)
     with checked_arguments():
-        Tolerance(tolerance_deg, tolerance_cm)
+        tolerance_twist(tolerance_deg, tolerance_cm)
         matcher = matcher_from("structure", seed=seed, all_frames=frames is not None)
     data = dataset_from(dataset, rig, frames, bag_settings(config, topic, motion=motion))
     with progress_bar() as progress:

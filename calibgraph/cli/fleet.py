@@ -52,9 +52,9 @@ def fleet(
     goes on. Exit 1 if a job failed or a camera's verdict is FAIL.
     """
     from calibgraph.errors import CalibrationError
+    from calibgraph.fleet.job import Limits
     from calibgraph.fleet.page import write_fleet_report
     from calibgraph.fleet.run import dask_executor, run_fleet, thread_executor
-    from calibgraph.fleet.task import Limits
 
     if dask is not None and jobs is not None:
         raise CalibrationError("--jobs is of this machine: with --dask the cluster's threads count")

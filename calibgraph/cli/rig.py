@@ -263,7 +263,7 @@ def _write_template(
     force: bool,
 ) -> None:
     """Write the rig of a folder, with what is left to fill in, and say what comes next."""
-    from calibgraph.guessing.lens_words import CALIBRATION
+    from calibgraph.guessing.mounting import CALIBRATION
     from calibgraph.guessing.template import cameras_of_folder, write_rig_template
     from calibgraph.io.dataset_folders import describe_pairing
 
@@ -289,7 +289,7 @@ def _write_template(
 
 def _lenses(given: list[str] | None, cameras: list[str]) -> dict[str, str]:
     """How the lens of each camera is known, as given for all or one, or asked for."""
-    from calibgraph.guessing.lens_words import CALIBRATION, LENS_GRAMMAR
+    from calibgraph.guessing.mounting import CALIBRATION, LENS_GRAMMAR
 
     for_all = [how for how in given or () if "=" not in how]
     if not given and sys.stdin.isatty() and sys.stderr.isatty():

@@ -57,9 +57,8 @@ def serve(
     with needs_extra("service", "the server needs fastapi, hypercorn and others"):
         for package in ("fastapi", "hypercorn", "python_multipart", "sqlalchemy"):
             import_module(package)
-    from calibgraph.service.app import create_app
-    from calibgraph.service.serve import require_safe
-    from calibgraph.service.serve import serve as serve_app
+    from calibgraph.service.app import create_app, require_safe
+    from calibgraph.service.app import serve as serve_app
     from calibgraph.service.settings import Settings
 
     if new_token is not None:
@@ -97,7 +96,7 @@ def _announce(url: str, tokens: Path | None) -> None:
 
 def _add_token(path: Path | None, scope: str) -> None:
     """Make a token and print it: the file keeps its hash only."""
-    from calibgraph.service.access import SCOPES, add_token
+    from calibgraph.service.request_guard import SCOPES, add_token
 
     if path is None:
         raise CalibrationError("--new-token: give --tokens FILE, the file that it is added to")
@@ -131,8 +130,8 @@ def pick(
     """
     from calibgraph.file_sets import require_own_folder
     from calibgraph.io.rigs import REFERENCE_FILE
+    from calibgraph.pick.estimate import SESSION_FILE
     from calibgraph.pick.server import PickServer
-    from calibgraph.pick.session import SESSION_FILE
     from calibgraph.pick.workspace import TABLE_FILE, Workspace
 
     require_own_folder(out, dataset)

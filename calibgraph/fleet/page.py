@@ -11,8 +11,15 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from calibgraph.audit.findings import Finding, describe_size, find_changes, moved_lidars
-from calibgraph.audit.fleet_model import FleetModel, Mount, fit_fleet
-from calibgraph.audit.observations import NAMES, newest_rows, observe, words
+from calibgraph.audit.fleet_model import (
+    NAMES,
+    FleetModel,
+    Mount,
+    fit_fleet,
+    newest_rows,
+    observe,
+    words,
+)
 from calibgraph.audit.result import twist_cells
 from calibgraph.fleet.rows import Store, read_rows
 from calibgraph.report.kit import page_template

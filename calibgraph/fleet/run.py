@@ -13,11 +13,11 @@ from typing import Any
 
 import pyarrow as pa
 
+from calibgraph.child_process import Outcome
 from calibgraph.errors import CalibrationError, FileError, needs_extra
-from calibgraph.fleet.job import end_children, interrupt_jobs, run_job
+from calibgraph.fleet.job import Limits, end_children, interrupt_jobs, release, run_job
 from calibgraph.fleet.manifest import Job, Key, load_manifest
 from calibgraph.fleet.rows import ROWS, SCHEMA, Store, read_rows
-from calibgraph.fleet.task import Limits, Outcome, release
 from calibgraph.model.calibration import package_versions
 from calibgraph.parallel import count_cores
 from calibgraph.progress import Progress, no_progress
@@ -151,7 +151,7 @@ def _rows_of(job: Job, outcome: Outcome, input_hash: str) -> list[dict[str, Any]
         "input_hash": input_hash, "versions": json.dumps(package_versions()),
     }  # fmt: skip
     if outcome.error_kind is None:
-        return [{**common, "status": "done", **cells} for cells in outcome.cameras]
+        return [{**common, "status": "done", **cells} for cells in outcome.result]
     error = {"error_kind": outcome.error_kind, "error": outcome.error}
     return [{**common, "camera": "", "status": "failed", **error}]
 

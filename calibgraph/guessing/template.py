@@ -9,8 +9,7 @@ import numpy as np
 
 from calibgraph.errors import FileError
 from calibgraph.files import require_new_file, write_text
-from calibgraph.guessing.lens_words import parse_lens
-from calibgraph.guessing.mounting import check_forward, parse_mounting
+from calibgraph.guessing.mounting import check_forward, parse_lens, parse_mounting
 from calibgraph.io.bags import is_bag
 from calibgraph.io.clouds import CLOUD_SUFFIXES
 from calibgraph.io.dataset_folders import folder_layout, published_folder

@@ -11,7 +11,7 @@ from urllib.parse import unquote
 from pydantic import TypeAdapter, ValidationError
 
 from calibgraph.errors import CalibrationError
-from calibgraph.pick.session import Pair
+from calibgraph.pick.estimate import Pair
 from calibgraph.pick.workspace import Workspace
 
 MAX_BODY_BYTES = 2**20

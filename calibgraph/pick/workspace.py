@@ -20,11 +20,13 @@ from calibgraph.io.rigs import REFERENCE_FILE
 from calibgraph.matching.structure.visibility import find_in_view, find_visible
 from calibgraph.model.geometry import degrees_and_centimetres
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.pick.estimate import Estimate, estimate_from_pairs, reference_rig
-from calibgraph.pick.session import (
+from calibgraph.pick.estimate import (
     SESSION_FILE,
+    Estimate,
     Pair,
+    estimate_from_pairs,
     open_session,
+    reference_rig,
     to_table,
 )
 

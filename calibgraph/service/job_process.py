@@ -9,14 +9,20 @@ from typing import Any
 
 from calibgraph.audit import audit_summary, check
 from calibgraph.audit.page import write_audit_report
-from calibgraph.child_process import Note, answer_requests, memory_limit, output_to
+from calibgraph.child_process import (
+    Note,
+    Outcome,
+    answer_requests,
+    describe_failure,
+    memory_limit,
+    output_to,
+)
 from calibgraph.errors import CalibrationError
 from calibgraph.files import sha256, write_text
-from calibgraph.fleet.task import describe_failure
 from calibgraph.fleet.uris import fetch
 from calibgraph.io.dataset import load_dataset
 from calibgraph.io.rigs import load_rig
-from calibgraph.matching.structure import StructureMatcher
+from calibgraph.matching.named import structure_matcher
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.pipeline import calibrate, solve
@@ -24,25 +30,32 @@ from calibgraph.progress import Progress
 from calibgraph.report.as_json import finite, result_summary
 from calibgraph.report.html import write_result
 from calibgraph.service.archives import open_upload, table_suffix
-from calibgraph.service.data_folder import ARCHIVE, FILES, INPUT, LOG, SCRATCH, SUMMARY, WORK
+from calibgraph.service.folders import (
+    ARCHIVE,
+    FILES,
+    INPUT,
+    LOG,
+    SCRATCH,
+    SUMMARY,
+    WORK,
+    require_inside,
+)  # fmt: skip
 from calibgraph.service.job_requests import (
     RIG,
     TABLE,
     CalibrationSettings,
     CheckSettings,
-    JobOutcome,
     JobProgress,
     JobTask,
     SolveSettings,
     recording_name,
 )
-from calibgraph.service.places import require_inside
 
 _NOTE_EVERY_S = 0.1
 _KNOWN_SUFFIXES = (".bag", ".mcap", ".db3", ".parquet", ".csv", ".yaml", ".yml", ".txt")
 
 
-def run_job(task: JobTask, note: Note) -> JobOutcome:
+def run_job(task: JobTask, note: Note) -> Outcome:
     """Run a job; what is wrong with its data is part of the outcome.
 
     Its paths are relative, so that no answer has one of the server's.
@@ -60,7 +73,7 @@ def run_job(task: JobTask, note: Note) -> JobOutcome:
         if isinstance(error, OSError):  # whose text may name the server's files
             text = error.strerror or type(error).__name__
     text = text.replace(f"{task.folder}/{SCRATCH}/", "").replace(str(task.folder), "")
-    return JobOutcome(error_kind=kind, error=str(CalibrationError(text)))
+    return Outcome(error_kind=kind, error=str(CalibrationError(text)))
 
 
 def _input(task: JobTask, name: str) -> Path | None:
@@ -85,7 +98,7 @@ def _room(task: JobTask) -> int:
 
 def _fetched(task: JobTask, uri: str, name: str) -> Path:
     """A link to what is at a URI, or to the copy of what is remote."""
-    require_inside(uri, task.roots)
+    require_inside(uri, task.settings.roots)
     copies = Path(f"{name}_copy")
     copies.mkdir()
     try:
@@ -104,7 +117,7 @@ def _recordings(task: JobTask) -> list[Path]:
     return [path for name in names if (path := _input(task, name)) is not None]
 
 
-def _solve(task: JobTask, progress: Progress) -> JobOutcome:
+def _solve(task: JobTask, progress: Progress) -> Outcome:
     settings = SolveSettings.model_validate(task.job.settings)
     rig, table = _input(task, RIG), _input(task, TABLE)
     assert rig is not None and table is not None  # of each job
@@ -114,20 +127,21 @@ def _solve(task: JobTask, progress: Progress) -> JobOutcome:
     return _write(task, result, None, with_report=settings.report)
 
 
-def _calibrate(task: JobTask, progress: Progress) -> JobOutcome:
+def _calibrate(task: JobTask, progress: Progress) -> Outcome:
     settings = CalibrationSettings.model_validate(task.job.settings)
     rig = _input(task, RIG)
     guess = None if rig is None else load_rig(rig)
     data = load_dataset(_recordings(task), guess, frames=settings.frames)
-    options: dict[str, Any] = {"search_deg": settings.search_deg, "search_m": settings.search_m}
-    if settings.search:
-        options = {name: value for name, value in options.items() if value is not None}
-    if settings.frames is not None:
-        options["most_frames"] = None
+    most = {"search_deg": settings.search_deg, "search_m": settings.search_m}
+    matcher = structure_matcher(
+        seed=settings.config.seed,
+        all_frames=settings.frames is not None,
+        **(most if settings.search else dict.fromkeys(most, 0.0)),
+    )
     most_s = task.settings.job_timeout_s / 2  # the rest is for the checks and the report
     result = calibrate(
         data,
-        matcher=_input(task, TABLE) or StructureMatcher(seed=settings.config.seed, **options),
+        matcher=_input(task, TABLE) or matcher,
         config=settings.config,
         terms=settings.terms,
         time_limit_s=min(settings.time_limit_s or most_s, most_s),
@@ -137,31 +151,30 @@ def _calibrate(task: JobTask, progress: Progress) -> JobOutcome:
     return _write(task, result, data, with_report=settings.report)
 
 
-def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) -> JobOutcome:
+def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) -> Outcome:
     written = write_result(result, task.folder / WORK / FILES, data, with_report=with_report)
     _write_summary(task, result_summary(result, [Path(path.name) for path in written]))
-    return JobOutcome(result.verdict.status, result.verdict.cannot_tell)
+    return Outcome((result.verdict.status, result.verdict.cannot_tell))
 
 
-def _check(task: JobTask, progress: Progress) -> JobOutcome:
+def _check(task: JobTask, progress: Progress) -> Outcome:
     settings = CheckSettings.model_validate(task.job.settings)
     rig = _input(task, RIG)
     assert rig is not None  # of each job
-    options: dict[str, Any] = {} if settings.frames is None else {"most_frames": None}
     data = load_dataset(_recordings(task), load_rig(rig), frames=settings.frames)
     audit = check(
         rig,
         data,
         tolerance_deg=settings.tolerance_deg,
         tolerance_cm=settings.tolerance_cm,
-        matcher=StructureMatcher(seed=settings.seed, **options),
+        matcher=structure_matcher(seed=settings.seed, all_frames=settings.frames is not None),
         seed=settings.seed,
         progress=progress,
     )
     progress("writing", 0, 1)
     write_audit_report(audit, task.folder / WORK / FILES / REPORT_FILE)
     _write_summary(task, audit_summary(audit))
-    return JobOutcome(audit.status, audit.status == "CANNOT TELL")
+    return Outcome((audit.status, audit.status == "CANNOT TELL"))
 
 
 def _write_summary(task: JobTask, summary: dict[str, Any]) -> None:
@@ -188,7 +201,7 @@ def _progress(note: Note) -> Progress:
     return progress
 
 
-def _answer(task: JobTask, note: Note) -> JobOutcome:
+def _answer(task: JobTask, note: Note) -> Outcome:
     with output_to(task.folder / LOG), memory_limit(task.settings.memory_bytes):
         return run_job(task, note)
 

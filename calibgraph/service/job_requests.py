@@ -7,9 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
-from calibgraph.fleet.task import ErrorKind
 from calibgraph.model.config import Config, Terms, config_from
-from calibgraph.service.places import Root
 from calibgraph.service.settings import Settings
 
 JobKind = Literal["calibrate", "solve", "check"]
@@ -119,18 +117,7 @@ class JobTask:
 
     job: Job
     folder: Path
-    roots: tuple[Root, ...]
     settings: Settings
-
-
-@dataclass(frozen=True)
-class JobOutcome:
-    """How a job ended: the verdict of its result, or why it failed, in one line."""
-
-    verdict: str | None = None
-    cannot_tell: bool | None = None
-    error_kind: ErrorKind | None = None
-    error: str | None = None
 
 
 class JobProgress(BaseModel):

@@ -6,9 +6,8 @@ import shutil
 import sys
 from pathlib import Path
 
-from calibgraph.child_process import answer_requests, memory_limit
+from calibgraph.child_process import answer_requests, describe_failure, memory_limit
 from calibgraph.files import sync_folder, write_bytes, write_text
-from calibgraph.fleet.task import describe_failure
 from calibgraph.io.rigs import load_rig
 from calibgraph.model.config import config_from
 from calibgraph.report.as_json import finite, result_summary

@@ -25,7 +25,14 @@ from calibgraph.solver.pairs import PairTerm, tying_pairs
 from calibgraph.solver.preprocess import Preprocessed, preprocess
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
-from calibgraph.solver.two_pass import USING_CORRESPONDENCES, Objective, Transforms, best_start, require_determined, require_known
+from calibgraph.solver.two_pass import (
+    USING_CORRESPONDENCES,
+    Objective,
+    Transforms,
+    best_start,
+    require_determined,
+    require_known,
+)
 
 _MOST_ROUNDS = 8  # of solves, each from the lenses of the last
 _SETTLED = 0.1  # standard deviations: a smaller change of a lens ends the rounds

@@ -20,7 +20,21 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.repeats import hash_numbers
-from calibgraph.solver.robust import IDENTITY, MIN_SIGMA_PX, ResidualScale, constrained_error_px, constrained_root, error_gradient, median_norm, quantile, quantiles, robust_spread, scale_from, sqrt_information, whitened_norm
+from calibgraph.solver.robust import (
+    IDENTITY,
+    MIN_SIGMA_PX,
+    ResidualScale,
+    constrained_error_px,
+    constrained_root,
+    error_gradient,
+    median_norm,
+    quantile,
+    quantiles,
+    robust_spread,
+    scale_from,
+    sqrt_information,
+    whitened_norm,
+)
 from factors import ProjectionBlock, to_runs
 
 MIN_MATCHES = 6

@@ -21,7 +21,13 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.rig import Rig
 from calibgraph.solver.covariance import FittedObjective
-from calibgraph.solver.pairs import ENOUGH_SURFACES, PairTerm, pair_terms, rows_of_pair, usual_excess
+from calibgraph.solver.pairs import (
+    ENOUGH_SURFACES,
+    PairTerm,
+    pair_terms,
+    rows_of_pair,
+    usual_excess,
+)
 from calibgraph.solver.pnp import DAMPING
 from calibgraph.solver.two_pass import Objective, Optimum
 from factors import EpipolarBlock, pose_sigmas

@@ -17,7 +17,13 @@ from calibgraph.model.config import Config
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import inverse_ranges, to_T_lidar_camera
 from calibgraph.model.rig import Rig
-from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS, GATE_SIGMAS, MEDIAN_NORM, MIN_SIGMA_PX, robust_spread
+from calibgraph.solver.robust import (
+    CAUCHY_SCALE_SIGMAS,
+    GATE_SIGMAS,
+    MEDIAN_NORM,
+    MIN_SIGMA_PX,
+    robust_spread,
+)
 from factors import (
     BlockSums,
     EpipolarBlock,

@@ -19,7 +19,15 @@ from calibgraph.model.pose_kernel import logarithms
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.grid import frame_edges
-from calibgraph.solver.pnp import COARSE, Runs, fit_frames, frame_pose, pose_near_guess, ransac_pnp, refine_frames
+from calibgraph.solver.pnp import (
+    COARSE,
+    Runs,
+    fit_frames,
+    frame_pose,
+    pose_near_guess,
+    ransac_pnp,
+    refine_frames,
+)
 from factors import ProjectionBlock, to_runs
 
 _OUTLIER = 6.0  # median distances, 9 sigma of a Gaussian in three dimensions

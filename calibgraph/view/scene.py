@@ -13,7 +13,7 @@ from calibgraph.io.frame import Frame, frame_of_entry
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
-from calibgraph.report.point_overlay import depth_colours, visible_points
+from calibgraph.report.page_overlays import depth_colours, visible_points
 
 Colours = NDArray[np.uint8]
 

@@ -14,8 +14,7 @@ import pytest
 
 import calibgraph
 from calibgraph import Audit, Correspondences, Dataset, Rig, simulate_correspondences
-from calibgraph.audit.check import provenance
-from calibgraph.audit.matching import match_from_deployed
+from calibgraph.audit.check import match_from_deployed, provenance
 from calibgraph.io.frame import Frame
 from calibgraph.io.kept_frames import KeptFrame, keep_frames
 from calibgraph.matching.protocol import FullMatcher

@@ -10,9 +10,15 @@ import pyarrow as pa
 import pytest
 
 from calibgraph.audit.findings import Finding, find_changes, moved_lidars
-from calibgraph.audit.fleet_model import FleetModel, Mount, fit_fleet, solve_centers
+from calibgraph.audit.fleet_model import (
+    FleetModel,
+    Mount,
+    fit_fleet,
+    newest_rows,
+    observe,
+    solve_centers,
+)
 from calibgraph.audit.model import Limits, compare, poses_of, weigh, weighted_mean
-from calibgraph.audit.observations import newest_rows, observe
 from calibgraph.errors import CalibrationError
 from calibgraph.fleet.page import STATES, report_of
 from calibgraph.fleet.rows import SCHEMA

@@ -21,11 +21,10 @@ import pytest
 
 from calibgraph import load_correspondences, load_rig, solve
 from calibgraph.errors import CalibrationError, FileError
-from calibgraph.fleet.job import run_job
+from calibgraph.fleet.job import Limits, release, run_job
 from calibgraph.fleet.manifest import load_manifest
 from calibgraph.fleet.rows import Store, read_rows
 from calibgraph.fleet.run import Summary, dask_executor, run_fleet, thread_executor
-from calibgraph.fleet.task import Limits, release
 from tests.draws.fleets import write_fleet
 
 POISON = Path(__file__).parent / "poison"

@@ -19,9 +19,8 @@ import pytest
 
 from calibgraph import CalibrationError, Rig, evaluate, load_dataset, load_rig
 from calibgraph.model.geometry import twist_between
-from calibgraph.pick.estimate import MIN_PAIRS, estimate_from_pairs, reference_rig
+from calibgraph.pick.estimate import MIN_PAIRS, Pair, estimate_from_pairs, reference_rig
 from calibgraph.pick.server import PickServer
-from calibgraph.pick.session import Pair
 from calibgraph.pick.workspace import Workspace, visible_points
 from calibgraph.simulation.rigs import rig_of
 from tests.cli.conftest import error_line

@@ -24,7 +24,15 @@ from calibgraph import (
 from calibgraph.io import correspondence_tables
 from calibgraph.solver import preprocess
 from calibgraph.solver.preprocess import Preprocessed
-from calibgraph.solver.robust import constrained_error_px, iterate_spread, quantile, quantiles, robust_spread, robust_spreads, sqrt_information
+from calibgraph.solver.robust import (
+    constrained_error_px,
+    iterate_spread,
+    quantile,
+    quantiles,
+    robust_spread,
+    robust_spreads,
+    sqrt_information,
+)
 from tests.model.tables import table as small_table
 
 to_arrow = Correspondences.to_arrow

@@ -14,7 +14,12 @@ from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.linear_fit import LinearFit, block_of, fit_camera
-from calibgraph.solver.scan_distortion import distortion_evidence, distortion_fields_px, distortions_at, pair_jacobians
+from calibgraph.solver.scan_distortion import (
+    distortion_evidence,
+    distortion_fields_px,
+    distortions_at,
+    pair_jacobians,
+)
 from tests.conftest import KANNALA, RADTAN5, make_camera, points_in_front
 
 STEP = np.array([2e-4, 2e-3, 4e-3])  # far below the scale of the loss

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calibgraph import Dataset, Rig, load_dataset, load_rig
-from calibgraph.audit.judgement import Tolerance, judge_camera
+from calibgraph.audit.judgement import judge_camera, tolerance_twist
 from calibgraph.model.error_sources import FLAT
 from calibgraph.model.geometry import twist_between
 from calibgraph.model.metrics import perturb
@@ -139,7 +139,7 @@ def test_no_deployed_pose_is_wrong_that_the_images_alone_allow(pair: Rig) -> Non
     for elsewhere, status in ((WIDE, "CANNOT TELL"), (1e-3 * WIDE, "WRONG")):
         found = replace(certain(1e-3 * WIDE), elsewhere=certain(elsewhere).near)
         evidence = gather(solution, deployed, lambda *_, found=found: {"left": found})
-        audit = judge_camera(evidence, "left", "", Tolerance(0.5, 10.0))
+        audit = judge_camera(evidence, "left", "", tolerance_twist(0.5, 10.0))
         assert audit.status == status
         assert audit.sigma is not None and np.degrees(audit.sigma[:3].max()) < 0.1
 

@@ -1,25 +1,30 @@
 """Checkpoints: a network's weights, checked against their config, with the file's hash."""
 
+from __future__ import annotations
+
 import json
 import math
+import re
+import warnings
+import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 from pydantic import BaseModel, Field, StrictBool
 from torch import Tensor
 
-from calibgraph.errors import FileError
+from calibgraph.errors import FileError, in_words
 from calibgraph.files import checked_model, sha256, write_atomically
-from calibgraph.matching.cmrnext.architecture import (
-    Architecture,
-    recognize_architecture,
-    require_config_agrees,
-)
-from calibgraph.matching.cmrnext.network import CmrNext
-from calibgraph.matching.cmrnext.torch_file import MAX_BYTES, read_torch_file
+from calibgraph.matching.cmrnext.network import RGB_CHANNELS, Architecture, CmrNext
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+_UNCERTAINTY_OF_OUTPUTS = {2: "none", 4: "nll"}
+_DER_OUTPUTS = (6, 8)
 
 SAFETENSORS = ".safetensors"
 
@@ -215,3 +220,163 @@ def _copy(name: str, tensor: Tensor, like: Tensor) -> Tensor:
     if name.endswith("running_var") and (copy < 0).any():
         raise ValueError(f"{name!r} holds variances below zero")
     return copy
+
+
+MAX_BYTES = 2 * 2**30
+
+_ADVICE = "download it again, or save its config and state_dict anew where it was made"
+
+
+class _Foreign:
+    """Stands for an object of any class but those of plain data; it has no content."""
+
+    def __new__(cls, *_: object) -> _Foreign:
+        return super().__new__(cls)
+
+    def __setstate__(self, _: object) -> None:
+        """Drop the state."""
+
+
+class _NumberType:
+    """Stands for numpy's number types."""
+
+    def __init__(self, name: object, *_: object) -> None:
+        if not isinstance(name, str) or not re.fullmatch(r"[fiub][1248]", name):
+            raise ValueError("a numpy number of an unknown type")
+        self.dtype = np.dtype(name).newbyteorder("<")
+
+    def __setstate__(self, _: object) -> None:
+        """Drop the state: the byte order is little."""
+
+
+def _to_number(kind: _NumberType, data: bytes) -> float:
+    """A numpy number as a plain one."""
+    value: float = np.frombuffer(data, kind.dtype, count=1)[0].item()
+    return value
+
+
+_STAND_INS: dict[str, Any] = {
+    "numpy.dtype": _NumberType,
+    "numpy.core.multiarray.scalar": _to_number,
+    "numpy._core.multiarray.scalar": _to_number,
+}
+
+
+def read_torch_file(path: Path) -> dict[Any, Any]:
+    """Read the mapping that ``torch.save`` wrote; its tensors are on the CPU.
+
+    Objects of classes beyond plain data become inert.
+
+    Raises:
+        FileError: if it is not such a file, is damaged, too large, or claims more than it holds.
+    """
+    try:
+        content = _load(path)
+    except zipfile.BadZipFile:
+        raise FileError(
+            path, f"is not a checkpoint of torch 1.6 or newer, or is damaged; {_ADVICE}"
+        ) from None
+    except Exception as error:  # torch raises anything on damaged files
+        raise FileError(
+            path, f"cannot be read as a checkpoint: {_reason(error)}; {_ADVICE}"
+        ) from None
+    if not isinstance(content, dict):
+        raise FileError(path, "holds no mapping, expected a checkpoint's")
+    return content
+
+
+def _reason(error: Exception) -> str:
+    """The cause alone: torch surrounds it with advice to load the file unsafely."""
+    text = in_words(error)
+    cause = re.search(r"(?:WeightsUnpickler error:|\n\n)\s*(?!\n)(\S[^\n]*)", text)
+    return (cause[1] if cause else text.splitlines()[0]).rstrip(". ")
+
+
+def _load(path: Path) -> object:
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise ValueError(f"{size} bytes, expected at most {MAX_BYTES}")
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+        raise ValueError("its entries are packed, which torch does not do")
+    if sum(entry.file_size for entry in entries) > size:
+        raise ValueError("its entries claim more bytes than the file has")
+    foreign = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+    stand_ins: list[Any] = [(_STAND_INS.get(name, _Foreign), name) for name in foreign]
+    with torch.serialization.safe_globals(stand_ins), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of pickle protocols: what cannot be read is an error
+        return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def recognize_architecture(shapes: Shapes, *, reflectance: bool) -> Architecture:
+    """The architecture that a state dict's shapes belong to.
+
+    Raises:
+        ValueError: if they belong to no supported architecture.
+    """
+    lidar = _dimension(shapes, "fnet_lidar.conv1.weight", 1)
+    context = _dimension(shapes, "cnet.conv1.weight", 1)
+    uncertainty = _recognize_uncertainty(shapes)
+    if context not in (RGB_CHANNELS, lidar):
+        raise ValueError(f"its context encoder reads {context} channels, expected 3 or {lidar}")
+    encoding = lidar - reflectance
+    if encoding < 1 or encoding % 2 == 0:
+        raise ValueError(
+            f"its LiDAR encoder reads {lidar} channels, which does not fit its config's "
+            f"use_reflectance {reflectance}"
+        )
+    return Architecture(
+        fourier_levels=(encoding - 1) // 2 or -1,
+        reflectance=reflectance,
+        context="lidar" if context == lidar else "rgb",
+        uncertainty=uncertainty,  # type: ignore[arg-type]
+        width=_dimension(shapes, "fnet_img.conv1.weight", 0),
+    )
+
+
+def _recognize_uncertainty(shapes: Shapes) -> str:
+    outputs = _dimension(shapes, "update_block.flow_head.conv2.weight", 0)
+    if any(name.startswith("update_block_unc.") for name in shapes):
+        head = _dimension(shapes, "update_block_unc.flow_head.conv2.weight", 0)
+        uncertainty = "nll_frozen" if (outputs, head) == (2, 2) else None
+        outputs = head if outputs == 2 else outputs  # noqa: PLR2004 - the plain head
+    else:
+        uncertainty = _UNCERTAINTY_OF_OUTPUTS.get(outputs)
+    if uncertainty is None:
+        kind = "an evidential (DER)" if outputs in _DER_OUTPUTS else "an unknown"
+        raise ValueError(
+            f"has {kind} uncertainty head of {outputs} outputs, which is not supported"
+        )
+    return uncertainty
+
+
+def require_config_agrees(architecture: Architecture, config: Mapping[str, Any]) -> None:
+    """Compare a checkpoint's config with the architecture of its weights.
+
+    Raises:
+        ValueError: on the first disagreement.
+    """
+    head = {"none": False, "nll": True, "nll_frozen": True}[architecture.uncertainty]
+    of_weights = {
+        "fourier_levels": architecture.fourier_levels,
+        "context_encoder": architecture.context,
+        "uncertainty": head,
+        "unc_freeze": architecture.uncertainty == "nll_frozen",
+        "al_contrario": False,
+    }
+    defaults = {"fourier_levels": -1, "context_encoder": "rgb"}
+    for key, actual in of_weights.items():
+        given = config.get(key, defaults.get(key, False))
+        if key == "unc_freeze" and not head:
+            continue
+        if given != actual:
+            raise ValueError(f"its config has {key} = {given!r}, its weights have {actual!r}")
+
+
+def _dimension(shapes: Shapes, name: str, axis: int) -> int:
+    if name not in shapes:
+        raise ValueError(f"lacks {name!r}: these are not the weights of a CMRNext network")
+    if len(shapes[name]) != 4:  # noqa: PLR2004 - a convolution
+        raise ValueError(f"{name!r} has shape {shapes[name]}, expected a convolution's")
+    return shapes[name][axis]

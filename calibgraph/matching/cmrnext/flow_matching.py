@@ -220,7 +220,7 @@ class ImageResult:
         matches: of the last network.
         T_camera_lidar: (4, 4) estimated from them by PnP; None if that failed.
         failed: whether a network gave no pose, or one beyond its range of training.
-        start_dependence: see :mod:`calibgraph.matching.cmrnext.probe`; None if not measured.
+        start_dependence: see :mod:`calibgraph.matching.cmrnext.matcher`; None if not measured.
         memorization: see the same module; None if not measured.
     """
 

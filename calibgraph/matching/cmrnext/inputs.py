@@ -16,8 +16,7 @@ from torch import Tensor
 
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
-from calibgraph.matching.cmrnext.architecture import Architecture
-from calibgraph.matching.cmrnext.network import SIZE_MIN, SIZE_MULTIPLE
+from calibgraph.matching.cmrnext.network import SIZE_MIN, SIZE_MULTIPLE, Architecture
 from calibgraph.model.rig import Camera
 from factors import Lens
 

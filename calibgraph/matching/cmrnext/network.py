@@ -6,12 +6,12 @@ shaped as in the published checkpoints.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.correlation import (
     CHANNELS,
     WINDOW,
@@ -21,6 +21,11 @@ from calibgraph.matching.cmrnext.correlation import (
     volume_bytes,
 )
 
+FULL_WIDTH = 64
+"""Channels of the published networks' first layer; every other width follows it in proportion."""
+
+RGB_CHANNELS = 3
+_MAX_WIDTH = 256
 SIZE_MULTIPLE, SIZE_MIN = 64, 128
 VOLUME_BYTES_MAX = 2**30
 """Above this, correlations are computed on the fly."""
@@ -40,6 +45,48 @@ def torch_device(name: str) -> torch.device:
         raise ValueError("device 'cuda': torch finds no GPU; use device: cpu in --config")
     use_gpu = name == "cuda" or (name == "auto" and torch.cuda.is_available())
     return torch.device("cuda" if use_gpu else "cpu")
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """The dimensions that differ between CMRNext networks.
+
+    Attributes:
+        fourier_levels: of the depth encoding; -1: plain depth.
+        reflectance: whether the LiDAR image has a channel of intensities.
+        context: which image the context encoder reads.
+        uncertainty: ``nll``: the flow head also predicts standard deviations; ``nll_frozen``: a
+            second update block does.
+        width: channels of the first layer, a multiple of 8; published networks have 64.
+    """
+
+    fourier_levels: int = 12
+    reflectance: bool = False
+    context: Literal["lidar", "rgb"] = "lidar"
+    uncertainty: Literal["none", "nll", "nll_frozen"] = "none"
+    width: int = FULL_WIDTH
+
+    def __post_init__(self) -> None:
+        if not 8 <= self.width <= _MAX_WIDTH or self.width % 8:  # noqa: PLR2004 - all parts whole
+            raise ValueError(
+                f"network width {self.width}: expected a multiple of 8 up to {_MAX_WIDTH}"
+            )
+        if not (self.fourier_levels == -1 or 1 <= self.fourier_levels <= 20):  # noqa: PLR2004
+            raise ValueError(f"fourier_levels {self.fourier_levels}: expected 1 to 20, or -1")
+
+    @property
+    def lidar_channels(self) -> int:
+        """Channels of the LiDAR input: 2L + 1, or 1 without encoding; 1 more with reflectance."""
+        return 2 * max(self.fourier_levels, 0) + 1 + self.reflectance
+
+    @property
+    def context_channels(self) -> int:
+        """Channels of the context encoder's input."""
+        return self.lidar_channels if self.context == "lidar" else RGB_CHANNELS
+
+    def scale(self, channels: int) -> int:
+        """A layer's channels, scaled from the published width."""
+        return channels * self.width // FULL_WIDTH
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,9 @@ import pytest
 import torch
 
 from calibgraph import FileError
-from calibgraph.matching.cmrnext import load_checkpoint, torch_file
-from calibgraph.matching.cmrnext.architecture import Architecture
+from calibgraph.matching.cmrnext import checkpoint as checkpoints
+from calibgraph.matching.cmrnext import load_checkpoint
+from calibgraph.matching.cmrnext.network import Architecture
 from tests.matching.cmrnext.builders import CONFIG, good_content, saved
 
 
@@ -194,7 +195,7 @@ def test_wrapped_half_and_strided_weights_are_read(tmp_path: Path) -> None:
 
 def test_sizes_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = saved(tmp_path / "a.tar", good_content())
-    monkeypatch.setattr(torch_file, "MAX_BYTES", 50)
+    monkeypatch.setattr(checkpoints, "MAX_BYTES", 50)
     with pytest.raises(FileError, match="bytes, expected at most"):
         load_checkpoint(path)
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.correlation import OnTheFly, Volume
-from calibgraph.matching.cmrnext.network import CmrNext
+from calibgraph.matching.cmrnext.network import Architecture, CmrNext
 from tests.matching.cmrnext import reference_network
 
 
