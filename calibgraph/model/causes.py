@@ -48,7 +48,6 @@ CAUSES: dict[str, Cause] = {
             "convention of the guess": "Undo the named mistake, and "
             "calibrate again.",
             "guess_translation": "",
-            "guess_length": "Give the translation of T_camera_lidar in metres.",
             "swapped_cameras": _SWAPPED,
             "point_distance": "Give the clouds in metres.",
             "search": "Correct the guess, or calibrate with a wider search (--search-deg up to 45, "

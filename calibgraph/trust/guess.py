@@ -48,8 +48,7 @@ def guess_checks(evidence: Evidence) -> Checks:
         if error is not None and check.status == "PASS":
             text = f"{check.text} and {degrees:.3g} deg: {advice}"
             check = replace(check, status="WARN", text=text)
-        length = threshold("guess_length").check(float(np.linalg.norm(guess[:3, 3])))
-        checks[name] = [check, length]
+        checks[name] = [check]
     return checks
 
 
@@ -71,7 +70,9 @@ def compare_with_other_guesses(
 
     A check per result, by (4, 4) T_camera_lidar; none for a single camera.
     """
-    names, row, checks = [*guesses], threshold("swapped_cameras"), {}
+    names, row, checks = [*guesses], threshold("swapped_cameras"), dict[str, list[Check]]()
+    if len(names) == 1 or not results:
+        return checks
     squared = np.full((len(names), len(names)), np.nan)  # from a guess to a result, if there is one
     squared[:, [name in results for name in names]] = _squared_distances(
         guesses, {name: results[name] for name in names if name in results}
@@ -80,7 +81,7 @@ def compare_with_other_guesses(
     ratios = np.sqrt((squared + squared.T) / (own + own[:, None]))
     ratios = np.where(np.isnan(own)[:, None], (squared / own) ** 0.25, ratios)
     np.fill_diagonal(ratios, np.inf)
-    for name in results if len(names) > 1 else ():
+    for name in results:
         of = ratios[:, names.index(name)]
         other = names[int(of.argmin())]
         what = f"distance of this camera and {other} to each other's guess over that to their own"

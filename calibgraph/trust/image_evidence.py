@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import cv2
 import numpy as np
@@ -157,12 +156,19 @@ def measure_image_evidence(
             scores = concatenate_scores([one for one in each if one is not None])
             if len(scores.weights) < MIN_GROUPS:
                 return ImageEvidence(len(scores.weights))
-            found = ImageEvidence(len(scores.weights), **_compare_with_displaced(scores))
+            numbers, per_frame = score_displaced(scores)  # over the same windows
+            best = per_frame[:, 0] > per_frame[:, 1:].max(axis=1)
+            found = ImageEvidence(
+                len(scores.weights),
+                displaced_z_score=displaced_z_score(per_frame),
+                frames_best=float(best.mean()),
+                frames_lost=tuple(numbers[~best].tolist()),
+            )
             if extrinsics_only:
                 return found
             lens = measure_lens(scorer, images, camera, scores, seed=seed, places=places)
-            with_neighbours = _compare_with_neighbours(scorer, images, camera, each)
-            return replace(found, lens=lens, **with_neighbours)
+            offset, margin = _compare_with_neighbours(scorer, images, camera, each)
+            return replace(found, lens=lens, pair_offset=offset, pair_margin=margin)
 
         measured = pool.map(measure, rig.cameras, rig.cameras.values())
         for index, name in enumerate(rig.cameras):
@@ -171,21 +177,10 @@ def measure_image_evidence(
     return evidence
 
 
-def _compare_with_displaced(scores: ShiftScores) -> dict[str, Any]:
-    """Compare the score at the result with displaced poses, over the same windows."""
-    frames, per_frame = score_displaced(scores)
-    best = per_frame[:, 0] > per_frame[:, 1:].max(axis=1)
-    return {
-        "displaced_z_score": displaced_z_score(per_frame),
-        "frames_best": float(best.mean()),
-        "frames_lost": tuple(frames[~best].tolist()),
-    }
-
-
 def _compare_with_neighbours(
     scorer: FrameScorer, images: Images, camera: Camera, wide: Sequence[ShiftScores | None]
-) -> dict[str, Any]:
-    """Compare each image's agreement with its own cloud, at ``WIDE``, and its neighbours'."""
+) -> tuple[int, float]:
+    """Offset and margin of each image's agreement with its own cloud, at ``WIDE``, and others'."""
     before, after = (scorer.score(images, camera, PAIR_LEVEL, offset=offset) for offset in (-1, 1))
     own = [one and crop_grids(one, camera, PAIR_LEVEL) for one in wide]
     values = np.array([  # (3, frames) z-scores at the result; NaN where there is no such cloud
@@ -194,16 +189,14 @@ def _compare_with_neighbours(
     ])  # fmt: skip
     comparable = np.isfinite(values[1]) & np.isfinite(values[[0, 2]]).any(axis=0)
     if not comparable.any():
-        return {}
+        return 0, math.nan
     before_z, own_z, after_z = values[:, comparable]
     margins = [own_z - before_z, own_z - after_z]
     worse = int(np.argmin([np.nanmean(m) if np.isfinite(m).any() else np.inf for m in margins]))
     there = np.isfinite(margins[worse])
-    sums = own_z[there].sum(), (before_z, after_z)[worse][there].sum()
-    return {
-        "pair_offset": 0 if sums[0] >= sums[1] else (-1, 1)[worse],
-        "pair_margin": float((sums[0] - sums[1]) / (max(abs(sums[0]), abs(sums[1])) + 1e-12)),
-    }
+    own_sum, other = own_z[there].sum(), (before_z, after_z)[worse][there].sum()
+    margin = float((own_sum - other) / (max(abs(own_sum), abs(other)) + 1e-12))
+    return 0 if own_sum >= other else (-1, 1)[worse], margin
 
 
 SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)

@@ -170,7 +170,7 @@ def group_tied(
     return [*dict.fromkeys(named)]
 
 
-def no_posteriors(*_: object) -> dict[str, PosePosterior]:
+def no_posteriors(*_: object, **__: object) -> dict[str, PosePosterior]:
     """Of no camera: where there are no images."""
     return {}
 

@@ -30,9 +30,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "How far is the result from the guess?",
               "Farther, and beyond sqrt(3) times the matcher's range, the guess follows another "
               "convention.", "is T_camera_lidar inverted, or of other axes?"),
-    Threshold("guess_length", "translation of the guess", "at most", 20.0, 100.0, "m",
-              "Can the translation of the guess be in metres?", "Vehicles are shorter.",
-              "is the translation of T_camera_lidar in millimetres?"),
     Threshold("swapped_cameras", "distance of two cameras to each other's guess over that to "
               "their own", "at least", 0.7, 0.6, "", "Are the images of two cameras swapped?",
               "Likelihood ratios of 72 and 460 for a swap. Of 20,000 drawn guesses each of cameras "

@@ -121,7 +121,7 @@ def test_a_near_guess_passes(pair: Rig) -> None:
     guess = calibgraph.perturb(pair, rotation_deg=10, translation_m=1, seed=1)
     evidence = gather(solve_joint(pair, simulated(pair)), guess)
     for checks in guess_checks(evidence).values():
-        assert [check.status for check in checks] == ["PASS", "PASS"]
+        assert [check.status for check in checks] == ["PASS"]
 
 
 def test_swapped_cameras_are_named(pair: Rig) -> None:
@@ -143,7 +143,8 @@ def test_swapped_cameras_are_named(pair: Rig) -> None:
     for results in (near, dict(zip(near, reversed(near.values()), strict=True))):
         (check,) = compare_with_other_guesses(near, results)["left"]
         assert check.status == "PASS"
-    assert compare_with_other_guesses({"left": guess["left"]}, {"left": right["left"]}) == {}
+    for guesses, results in (({"left": guess["left"]}, {"left": right["left"]}), (guess, {})):
+        assert compare_with_other_guesses(guesses, results) == {}
 
 
 @pytest.mark.parametrize(
