@@ -20,7 +20,6 @@ poses of a camera are equal, and the graph is that of Eq. 5 of the paper.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -34,7 +33,6 @@ from calibgraph.graph.by_place import (
     BlockByPlace,
     PairByPlace,
     QuadraticByPlace,
-    SummarizedByPlace,
 )
 from calibgraph.graph.components import EXACT, VarianceComponents, shown_distortion
 from calibgraph.graph.lens import FreeLensByPlace, LensTerm, lens_graph
@@ -59,7 +57,7 @@ from factors import (
     robust_noise,
 )
 
-Data = BlockByPlace | QuadraticByPlace | SummarizedByPlace | FreeLensByPlace
+Data = BlockByPlace | QuadraticByPlace | FreeLensByPlace
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +93,6 @@ class LatentPoseModel:
     def places(self) -> int:
         """Number of places."""
         return len(self.components.at_place)
-
-    def with_blocks(self, blocks: Mapping[str, Data]) -> LatentPoseModel:
-        """The same graph with other data of the same cameras at the same places."""
-        model = copy.copy(self)  # with the graphs that are made, since data are in none of them
-        object.__setattr__(model, "blocks", blocks)
-        return model
 
     @property
     def camera_keys(self) -> list[int]:

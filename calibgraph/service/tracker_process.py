@@ -12,11 +12,9 @@ from calibgraph.io.rigs import load_rig
 from calibgraph.model.config import config_from
 from calibgraph.report.as_json import finite, result_summary
 from calibgraph.tracking import DurableCalibrator, Update, update_all, warm_up_tracker
-from calibgraph.tracking.frame_group import in_groups
+from calibgraph.tracking.assessment import json_lines
 from calibgraph.tracking.state import require_poses_alone
-from calibgraph.tracking.stream_lines import frames_of_lines
-from calibgraph.tracking.streams import Refused
-from calibgraph.tracking.update import json_lines
+from calibgraph.tracking.streams import Refused, frames_of_lines, in_groups
 
 Held = dict[Path, DurableCalibrator]
 

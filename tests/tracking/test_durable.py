@@ -23,9 +23,9 @@ from calibgraph import (
     perturb,
 )
 from calibgraph.tracking import durable, tracker
+from calibgraph.tracking.assessment import json_lines
 from calibgraph.tracking.state_bytes import Kind, encode
 from calibgraph.tracking.state_database import DATABASE, StateDatabase
-from calibgraph.tracking.update import json_lines
 from tests.conftest import KANNALA, Call
 from tests.tracking.drives import (
     World,

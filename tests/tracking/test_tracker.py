@@ -23,8 +23,8 @@ from calibgraph import (
     solve,
 )
 from calibgraph.tracking import tracker as tracker_module
+from calibgraph.tracking.assessment import json_lines
 from calibgraph.tracking.cause import Steps, find_cause
-from calibgraph.tracking.update import json_lines
 from tests.conftest import KANNALA, make_camera, stereo_relative_pose
 from tests.tracking.drives import ERRORS, drive, drive_at, moved, pair_of, step_of
 
