@@ -28,10 +28,11 @@ from calibgraph.model.geometry import (
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.places import start_values
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
-from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.evidence import gather
 from tests.conftest import stereo_relative_pose
 from tests.draws.lenses import with_known_lenses
 from tests.draws.places import Drawn, draw_places, tied
+from tests.solver.latent import all_values
 from tests.tracking.drives import drive, pair_of, track_draw
 
 Array = np.ndarray
@@ -49,7 +50,7 @@ STATED = {
 
 def batch_of(drawn: Drawn, **config: object) -> tuple[dict[str, Array], Array]:
     solved = solve_joint(drawn.rig, drawn.table, Config(learnt_weights=False, **config))
-    joint = Evidence(solved, guess=drawn.rig).joint_covariance
+    joint = gather(solved, drawn.rig).joint_covariance
     return solved.T_camera_lidar, joint
 
 
@@ -170,7 +171,7 @@ def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:
     """
     tracker, update = tracked_at_three_places(24)
     model, graph = tracker._graph.whole_model(tracker._state), tracker.graph
-    start = start_values(model, update.T_camera_lidar)
+    start = all_values(start_values(model, update.T_camera_lidar))
     values = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     marginals = gtsam.Marginals(graph, values)
     for key, name in zip(model.reported_keys, ("left", "right"), strict=True):
