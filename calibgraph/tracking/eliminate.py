@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibgraph.arrays import Array, Mask
+from calibgraph.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,6 @@ class Eliminated:
         weight: (P, n, 6, 6) W.
         root: (P, 6 n, 6) X.
         cloud: (P, 6, 6) O^-1.
-        at_place: (P, n, 6, 6) S.
         adjoint: (n, 6, 6) Ad.
     """
 
@@ -43,18 +42,17 @@ class Eliminated:
     weight: Array
     root: Array
     cloud: Array
-    at_place: Array
     adjoint: Array
 
-    def displacements(self, shown: Array) -> tuple[Array, Array]:
-        """(P, 6) u and (P, n, 6) v at (n, 6) r."""
+    def displacements(self, shown: Array, at_place: Array) -> tuple[Array, Array]:
+        """(P, 6) u and (P, n, 6) v at (n, 6) r, for (P, n, 6, 6) S."""
         apart = self.minimum - shown
         flat = apart.reshape(*self.root.shape[:2], 1)
         u = -(self.cloud @ (self.root.swapaxes(1, 2) @ flat))[..., 0]
         left = apart + (self.adjoint @ u[:, None, :, None])[..., 0]
-        return u, (self.at_place @ (self.weight @ left[..., None]))[..., 0]
+        return u, (at_place @ (self.weight @ left[..., None]))[..., 0]
 
-    def covariances(self, shown: Array) -> tuple[Array, Array]:
+    def covariances(self, shown: Array, at_place: Array) -> tuple[Array, Array]:
         """(P, 6, 6) of u and (P, n, 6, 6) of v, with the (6 n, 6 n) covariance of r."""
         gain = self.cloud @ self.root.swapaxes(1, 2)
         of_u = self.cloud + gain @ shown @ gain.swapaxes(1, 2)
@@ -62,48 +60,35 @@ class Eliminated:
         moved = (self.adjoint @ gain[:, None]).reshape(places, cameras, 6, cameras, 6)
         each = np.arange(cameras)
         moved[:, each, :, each] -= np.eye(6)
-        moved = moved.reshape(places, cameras, 6, -1)
+        moved = moved.reshape(places, cameras, 6, 6 * cameras)
         by_cloud = self.adjoint @ self.cloud[:, None] @ self.adjoint.swapaxes(1, 2)
         apart = moved @ shown @ moved.swapaxes(2, 3) + by_cloud
         known = self.weight - self.weight @ apart @ self.weight
-        return of_u, self.at_place - self.at_place @ known @ self.at_place
+        return of_u, at_place - at_place @ known @ at_place
 
 
 def eliminate(
-    information: Array,
-    minimum: Array,
-    at_place: Array,
-    cloud_at_place: Array,
-    *,
-    adjoint: Array,
-    seen: Mask,
+    weight: Array, minimum: Array, cloud_information: Array, adjoint: Array
 ) -> Eliminated:
     """Eliminate the poses of places.
 
     Args:
-        information: (P, n, 6, 6) A, positive definite.
+        weight: (P, n, 6, 6) W, symmetric; zero where a camera has no matches.
         minimum: (P, n, 6) s.
-        at_place: (P, n, 6, 6) S.
-        cloud_at_place: (P, 6, 6) C.
+        cloud_information: (P, 6, 6) C^-1.
         adjoint: (n, 6, 6) Ad.
-        seen: (P, n) which cameras have matches at which places.
     """
-    places, cameras = seen.shape
-    found = np.linalg.inv(np.linalg.inv(information) + at_place)
-    weight: Array = (found + found.swapaxes(2, 3)) * (0.5 * seen[..., None, None])
-    root = np.asarray(weight @ adjoint)
-    full = np.linalg.inv(cloud_at_place) + (adjoint.swapaxes(1, 2) @ root).sum(axis=1)
-    cloud = np.asarray(np.linalg.inv(full))
+    places, cameras = weight.shape[:2]
+    root = weight @ adjoint
+    cloud = np.linalg.inv(cloud_information + (adjoint.swapaxes(1, 2) @ root).sum(axis=1))
+    pull = (weight @ minimum[..., None]).reshape(places, 6 * cameras, 1)
     root = root.reshape(places, 6 * cameras, 6)
     by_cloud = root @ cloud
-    whole = block_diagonal(weight.sum(axis=0))
-    whole -= np.tensordot(by_cloud, root, axes=((0, 2), (0, 2)))
-    pull = (weight @ minimum[..., None]).reshape(places, 6 * cameras, 1)
     flat = minimum.reshape(places, 6 * cameras, 1)
     vector = (pull - by_cloud @ (root.swapaxes(1, 2) @ flat)).sum(axis=0)[:, 0]
-    return Eliminated(
-        (whole + whole.T) / 2, vector, minimum, weight, root, cloud, at_place, adjoint
-    )
+    shared = (by_cloud @ root.swapaxes(1, 2)).sum(axis=0)
+    information = block_diagonal(weight.sum(axis=0)) - (shared + shared.T) / 2
+    return Eliminated(information, vector, minimum, weight, root, np.asarray(cloud), adjoint)
 
 
 def block_diagonal(blocks: Array) -> Array:

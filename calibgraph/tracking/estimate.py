@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -106,18 +107,20 @@ class Terms:
     Attributes:
         names: of the places.
         seen: (P, n) which cameras have matches there.
-        information: (P, n, 6, 6) of the matches, as if independent.
-        minimum: (P, n, 6) theirs, from the references.
-        at_place: (P, n, 6, 6) covariance of a camera's matches about its mean.
-        cloud: (P, 6, 6) of the cloud.
+        root: (P, n, 6, 6) Cholesky roots of the Hessians by weights.
+        least: (n,) k of ``calibgraph.solver.within_place``.
+        excess: (P, n, 6, 6) K - k, with what the matcher states of places.
+        minimum: (P, n, 6) of the matches, from the references.
+        cloud: (P, 6, 6) information of the cloud's displacement.
         robust_scale: tuning constant of the loss; infinite: none.
     """
 
     names: tuple[str, ...]
     seen: Mask
-    information: Array
+    root: Array
+    least: Array
+    excess: Array
     minimum: Array
-    at_place: Array
     cloud: Array
     robust_scale: float
 
@@ -137,38 +140,44 @@ class Terms:
         own, frames, findings = sums.rows[rows], sums.frames[rows], state.findings
         seen, places, prior = frames > 0, sums.places[rows], error_components()
         names, weighted = tuple(sums.names[row] for row in rows), own.reweighted + WEAK
-        excess = spread.excess
-        if findings.place_variance and not by_scatter:
-            stated = spread.efficiency * findings.place_variance * frames / places
-            excess = excess + stated[..., None, None] * np.eye(6)
-        inverse = np.linalg.inv(np.linalg.cholesky(weighted))
-        at_place = inverse.swapaxes(2, 3) @ excess @ inverse + _ROUNDING**2 * np.eye(6)
+        stated = (0.0 if by_scatter else findings.place_variance) * spread.efficiency
+        excess = spread.excess + (stated * frames / places)[..., None, None] * np.eye(6)
         of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
         alike = np.where(seen, places, np.inf).min(axis=1)
+        cloud = np.linalg.inv(state.ratios.cloud * pose_covariance(*of_place))
         return Terms(
             names,
             seen,
-            weighted / spread.least[:, None, None],
+            np.asarray(np.linalg.cholesky(weighted)),
+            spread.least,
+            state.ratios.cameras * excess,
             _minimum(state, own, names, weighted),
-            state.ratios.cameras * at_place,
-            state.ratios.cloud * pose_covariance(*of_place) / alike[:, None, None],
+            alike[:, None, None] * cloud,
             prior.robust_sigmas if sums.count >= prior.robust_places else np.inf,
         )
 
     def eliminate(self, weights: Array, adjoint: Array) -> Eliminated:
         """The places without their poses, for (P, 1 + n) weights in the loss."""
-        return eliminate(
-            self.information,
-            self.minimum,
-            self.at_place / weights[:, 1:, None, None],
-            self.cloud / weights[:, 0, None, None],
-            adjoint=adjoint,
-            seen=self.seen,
-        )
+        noise = self.excess / weights[:, 1:, None, None]
+        noise = noise + self.least[:, None, None] * np.eye(6)
+        weight = self.root @ np.linalg.inv(noise) @ self.root.swapaxes(2, 3)
+        weight = (weight + weight.swapaxes(2, 3)) * (0.5 * self.seen[..., None, None])
+        return eliminate(weight, self.minimum, self.cloud * weights[:, :1, None], adjoint)
+
+    @cached_property
+    def at_place(self) -> Array:
+        """(P, n, 6, 6) covariance of a camera's matches about its mean."""
+        inverse = np.linalg.inv(self.root)
+        exact = _ROUNDING**2 * np.eye(6)
+        return np.asarray(inverse.swapaxes(2, 3) @ self.excess @ inverse + exact)
+
+    def weighted_at_place(self, weights: Array) -> Array:
+        """The same, for (P, 1 + n) weights in the loss."""
+        return np.asarray(self.at_place / weights[:, 1:, None, None])
 
     def squared(self, u: Array, v: Array) -> Array:
         """(P, 1 + n) squared sigmas of the displacements of the clouds and of the cameras."""
-        of_u = (u * np.linalg.solve(self.cloud, u[..., None])[..., 0]).sum(axis=-1)
+        of_u = (u * (self.cloud @ u[..., None])[..., 0]).sum(axis=-1)
         of_v = (v * np.linalg.solve(self.at_place, v[..., None])[..., 0]).sum(axis=-1)
         return np.column_stack([of_u, np.where(self.seen, of_v, 0.0)])
 
@@ -190,7 +199,8 @@ class Terms:
         """(P, 1 + n) weights while an epoch is open: of new places, from a non-robust start."""
         weights, new = self.known_weights(state)
         for _ in range(_OPEN_WEIGHINGS if np.isfinite(self.robust_scale) and new.any() else 0):
-            apart = self.eliminate(weights, adjoint).displacements(state.shared)
+            found, at_place = self.eliminate(weights, adjoint), self.weighted_at_place(weights)
+            apart = found.displacements(state.shared, at_place)
             weights[new] = self.weigh(self.squared(*apart))[new]
         return weights
 
@@ -327,7 +337,8 @@ class EpochGraph:
         own = self.open_places(state, every_place(state, self.places, estimate.sums))
         row, shown = own.names.index(state.at[-1]), self.window.shown
         weights = own.open_weights(state, self.window.adjoint)
-        u, v = own.eliminate(weights, self.window.adjoint).displacements(shown)
+        found = own.eliminate(weights, self.window.adjoint)
+        u, v = found.displacements(shown, own.weighted_at_place(weights))
         steps = shown + v[row] - (self.window.adjoint @ u[row])
         return own.squared(u, v)[row], retract_all(state.references, steps)
 
@@ -385,12 +396,13 @@ class EpochGraph:
             at = np.zeros(0, np.int64) if terms is None else np.flatnonzero(terms.seen[:, camera])
             reference = to_T_lidar_camera(state.references[camera])
             minima = [] if terms is None else [*map(reference.retract, terms.minimum[at, camera])]
-            information = none if terms is None else terms.information[at, camera]
+            root = none if terms is None else terms.root[at, camera]
+            information = root @ root.swapaxes(1, 2) / spread.least[camera]
             blocks[name] = QuadraticByPlace(at, minima, information)
         each = np.tile(np.eye(6), (places, len(cameras), 1, 1))
         components = VarianceComponents(
             cloud=np.eye(6),
-            cloud_at_place=np.eye(6) if terms is None else terms.cloud,
+            cloud_at_place=np.asarray(np.linalg.inv(np.eye(6) if terms is None else terms.cloud)),
             camera=np.eye(6),
             pairs=np.eye(6),
             at_place=each if terms is None else terms.at_place,
@@ -520,12 +532,11 @@ def _fit(state: State, terms: Terms, window: Window) -> Eliminated:
         found = terms.eliminate(weights, window.adjoint)
         window.exchange(found.information, found.vector)
         shown = window.shown
-        u, v = found.displacements(shown)
-        if np.isinf(terms.robust_scale):
+        u, v = found.displacements(shown, terms.weighted_at_place(weights))
+        new = terms.weigh(terms.squared(u, v))  # 1 in a loss that is not robust
+        if not new.size or np.abs(new - weights).max() < _SAME_WEIGHT:
             break
-        before, weights = weights, terms.weigh(terms.squared(u, v))
-        if np.abs(weights - before).max() < _SAME_WEIGHT:
-            break
+        weights = new
     state.settled, state.weights, state.shared = terms.names, weights, shown
     state.steps = shown + v - (found.adjoint @ u[:, None, :, None])[..., 0]
     return found
@@ -535,11 +546,11 @@ def _evidence(
     state: State, terms: Terms, found: Eliminated, window: Window
 ) -> dict[Component, Evidence]:
     """Per component its weighted sum of squares, and what of its freedom the data determine."""
-    weights, (u, v) = state.weights, found.displacements(state.shared)
-    squared = weights * terms.squared(u, v)
-    of_u, of_v = found.covariances(window.covariance_of_shown)
-    open_u = np.trace(np.linalg.solve(terms.cloud, of_u), axis1=1, axis2=2) * weights[:, 0]
-    open_v = np.trace(np.linalg.solve(terms.at_place, of_v), axis1=2, axis2=3) * weights[:, 1:]
+    weights, at_place = state.weights, terms.weighted_at_place(state.weights)
+    squared = weights * terms.squared(*found.displacements(state.shared, at_place))
+    of_u, of_v = found.covariances(window.covariance_of_shown, at_place)
+    open_u = np.trace(terms.cloud @ of_u, axis1=1, axis2=2) * weights[:, 0]
+    open_v = np.trace(np.linalg.solve(at_place, of_v), axis1=2, axis2=3)
     present, parts = weights[:, 1:][terms.seen], window.model.components
     model, known, distortions = window.model, 0.0, 0
     if model.is_distorted:  # its residuals count as a part of its prior

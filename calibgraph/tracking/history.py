@@ -15,12 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.files import write_bytes
 from calibgraph.model.geometry import twist_between
 from calibgraph.report.figure import new_picture, save_picture
 from calibgraph.tracking.assessment import Update, shared_parts
 from calibgraph.tracking.events import Event, Kind
-from calibgraph.tracking.state_bytes import StateError, decode, encode
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -230,7 +228,6 @@ _LEGEND_TEXTS: dict[Kind, str] = {
 
 _MOST_EVENTS = 1000
 _POSE = 6
-_SAVED = "most", "stride", "updates", "origins", "begun", "frames", "entries", "events"
 
 
 class History:
@@ -346,39 +343,9 @@ class History:
         """
         save_picture(self.figure(), path)
 
-    def save(self, path: Path) -> None:
-        """Write the history to a file, atomically; see :meth:`load`."""
-        content = {name: getattr(self, f"_{name}") for name in _SAVED}
-        held = {name: content[name][: self._held] for name in ("frames", "entries")}
-        write_bytes(path, encode({**content, **held, "begun": [*self._begun]}, "history"))
-
-    @staticmethod
-    def load(path: Path) -> History:
-        """The history of a file that :meth:`save` wrote; an empty one if there is none.
-
-        A file that is damaged or of another version gives an empty history too: it is for the eye
-        alone.
-        """
-        history = History()
-        try:
-            saved = decode(path.read_bytes(), "history")
-            rooms = {name: _room(saved[name], saved["most"]) for name in ("frames", "entries")}
-            content = {**saved, **rooms, "begun": {*saved["begun"]}, "held": len(saved["frames"])}
-        except (OSError, StateError, AttributeError, KeyError, TypeError, ValueError):
-            return history
-        vars(history).update({f"_{name}": value for name, value in content.items()})
-        return history
-
     def figure(self) -> Figure:
         """Make the picture, to be changed or shown by the caller."""
         if len(self) < 2:  # noqa: PLR2004 - a curve has two ends
             return text_figure(f"Nothing to draw: {len(self)} frames so far.")
         first, newest = int(self._frames[0]), int(self._frames[self._held - 1])
         return history_figure(self.curves(), self.events, first, newest)
-
-
-def _room(held: Array, most: int) -> Array:
-    """An array with room for more rows, the first of which are those that are held."""
-    room = np.empty((most, *held.shape[1:]), held.dtype)
-    room[: len(held)] = held
-    return room

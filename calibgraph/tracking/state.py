@@ -333,7 +333,9 @@ class State:
     def matches_of(self, camera: int) -> tuple[CameraBlock, Mask] | None:
         """A camera's matches in all frames, and which are within the gate; None if it has none."""
         own = self.blocks[camera]
-        return (merge(own), np.concatenate(self.inliers[camera])) if own else None
+        if not own:
+            return None
+        return own[0] if len(own) == 1 else merge(own), np.concatenate(self.inliers[camera])
 
     def first_row(self, number: int) -> int:
         """The first of the frames that is not before a number."""

@@ -32,7 +32,7 @@ from calibgraph.tracking.state import DriftWatch, OutlierFrame, Spread, State
 from calibgraph.tracking.sums import PlaceSums, Sums
 from factors import Lens, ProjectionBlock
 
-Kind = Literal["state", "input", "history"]
+Kind = Literal["state", "input"]
 
 _VERSION = 13
 """Earlier ones held other sums, or were of another encoding."""
@@ -43,7 +43,6 @@ _TREES: dict[Kind, TypeAdapter[Any]] = {
     "input": TypeAdapter(
         Annotated[tuple[tuple[int | None, InstanceOf[Correspondences]], ...], Field(min_length=1)]
     ),
-    "history": TypeAdapter(dict[str, Any]),
 }
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
 
@@ -68,7 +67,7 @@ def encode(content: Any, kind: Kind) -> bytes:
 
 
 def decode(data: bytes, kind: Kind) -> Any:
-    """The tree that :func:`encode` has written: of a state, an input or a history.
+    """The tree that :func:`encode` has written: of a state or an input.
 
     Raises:
         StateError: if the bytes are damaged, of another format or of another kind.

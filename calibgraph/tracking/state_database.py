@@ -166,7 +166,6 @@ def _damaged(path: Path, why: object) -> FileError:
 DATABASE = "state.sqlite"
 _PAGE_BYTES = 32768  # a snapshot takes half the time of SQLite's 4096
 _LOG_PAGES = 128  # in the log, before they are copied to the database: 4 MB, as by default
-_EARLIEST = ("snapshot-*.state", "journal-*.log")
 _TABLES = f"""
     PRAGMA page_size={_PAGE_BYTES};
     BEGIN;
@@ -192,7 +191,7 @@ class StateDatabase:
 
     Raises:
         FileError: if another process uses the folder, or its state is damaged, foreign, of the
-            earliest layout or of a newer one. The folder is left as it was.
+            another layout. The folder is left as it was.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -310,10 +309,6 @@ def _create(path: Path) -> None:
 
     It is written before it has a log, whose copy at the end would not report a full disk.
     """
-    for pattern in _EARLIEST:
-        for found in path.parent.glob(pattern):
-            message = "is state of the earliest layout; choose another folder"
-            raise FileError(found, f"{message}, or continue with the calibgraph that wrote it")
     if log_of(path).exists():
         raise FileError(path, "is missing, and its log is there; restore it from a copy")
     for leftover in path.parent.glob(f".writing-*{path.suffix}*"):

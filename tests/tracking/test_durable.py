@@ -204,7 +204,7 @@ def test_a_saved_tracker_continues_with_the_same_numbers(pair: Rig, tmp_path: Pa
 
 def sealed(body: bytes, kind: Kind = "state") -> bytes:
     """With the mark and the checksum of a whole file of this version."""
-    mark = encode({}, "history").partition(b"\n")[0].replace(b"history", kind.encode())
+    mark = encode((), kind).partition(b"\n")[0]
     return mark + b"\n" + sha256(body).digest() + body
 
 

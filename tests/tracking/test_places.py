@@ -118,6 +118,23 @@ def test_standing_for_long_moves_the_estimate_no_more_than_passing() -> None:
     assert 0.25 < turned[:3] @ whole[:3] / (whole[:3] @ whole[:3]) < 0.5
 
 
+def test_a_wrong_place_among_many_hardly_counts() -> None:
+    """The cloud turned by six sigmas at one of ten places, which a tenth of the way would follow."""
+    rig, tables = pair_of(), []
+    for place in range(10):
+        shown = cloud_turned(rig, 0.0042 if place == 4 else 0.0)
+        for table in drive(shown, 4, seed=place, matches=100):
+            frame = np.full(len(table), 4 * place) + table.frame
+            tables.append(states(replace(table, frame=frame)))
+    tracker = IncrementalCalibrator(rig)
+    for frame, table in enumerate(tables):
+        update = tracker.update(table, place=frame // 4)
+    turned = twist_between(update.T_camera_lidar["left"], rig.T_camera_lidar["left"])
+    assert np.linalg.norm(turned[:3]) < 0.04 * 0.0042 + 3 * 0.0007 / np.sqrt(9)
+    weights = dict(zip(tracker._state.settled, tracker._state.weights[:, 0], strict=True))
+    assert weights["4"] < 0.3 < 0.6 < min(weights[str(n)] for n in range(10) if n != 4)
+
+
 def test_relative_poses_share_the_error_of_the_cloud() -> None:
     """Of 0.0015 rad, 60 % of the variance is the cameras' own: twice that is left of the pair."""
     tables = [states(table) for table in drive(pair_of(), 40)]
@@ -165,7 +182,7 @@ def tracked_at_three_places(frames: int, **config: object) -> tuple[IncrementalC
 
 
 def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:
-    """By GTSAM's LM and Marginals: within 0.02 sigma, and a thousandth of the covariance.
+    """By GTSAM's LM and Marginals: within 0.02 sigma, and half a percent of the covariance.
 
     Places have the weights in their robust loss that they had at the end of the last epoch.
     """
@@ -177,8 +194,8 @@ def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:
     for key, name in zip(model.reported_keys, ("left", "right"), strict=True):
         reported = update.covariance[name]
         found = marginals.marginalCovariance(key)
-        atol = 1e-3 * np.diag(reported).max()
-        np.testing.assert_allclose(found, reported, atol=atol)
+        units = np.sqrt(np.outer(np.diag(reported), np.diag(reported)))
+        np.testing.assert_allclose(found / units, reported / units, atol=5e-3)
         T = to_T_camera_lidar(values.atPose3(key))
         apart = twist_between(update.T_camera_lidar[name], T) / np.sqrt(np.diag(reported))
         assert np.abs(apart).max() < 0.02

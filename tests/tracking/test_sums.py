@@ -123,7 +123,8 @@ def test_places_are_eliminated_as_by_one_system_of_all_poses() -> None:
     minimum, adjoint = rng.standard_normal((P, n, 6)), rng.standard_normal((n, 6, 6))
     seen = np.ones((P, n), dtype=np.bool_)
     seen[1, 2] = False
-    found = eliminate(known, minimum, at_place, cloud, adjoint=adjoint, seen=seen)
+    weight = np.linalg.inv(np.linalg.inv(known) + at_place) * seen[..., None, None]
+    found = eliminate(weight, minimum, np.linalg.inv(cloud), adjoint)
     size = 6 * (n + P + P * n)
     hessian, vector = np.zeros((size, size)), np.zeros(size)
 
@@ -150,9 +151,9 @@ def test_places_are_eliminated_as_by_one_system_of_all_poses() -> None:
         rows = slice(6 * camera, 6 * camera + 6)
         hessian[rows, rows] += shared[camera]
     optimum, covariance = np.linalg.solve(hessian, vector), np.linalg.inv(hessian)
-    u, v = found.displacements(optimum[:k].reshape(n, 6))
+    u, v = found.displacements(optimum[:k].reshape(n, 6), at_place)
     np.testing.assert_allclose(np.concatenate([u.ravel(), v.ravel()]), optimum[k:])
-    of_u, of_v = found.covariances(covariance[:k, :k])
+    of_u, of_v = found.covariances(covariance[:k, :k], at_place)
     blocks = np.concatenate([of_u, of_v.reshape(-1, 6, 6)])
     for index, block in enumerate(blocks):
         rows = slice(k + 6 * index, k + 6 * index + 6)
