@@ -71,6 +71,7 @@ def _go_on(
             run = with_cameras_of(run, again, better)
             T = run.solution.T_camera_lidar
             moved = {name: pose_difference(T_first[name], T[name]) for name in better}
+            _log.info("rounds went on, by deg, cm: %s", moved)
             # Of these the test from a displaced start was of a pose that is no longer the result.
             kept = {name: ends for name, ends in run.rematch.items() if name not in better}
             run = replace(run, went_on={**run.went_on, **moved}, rematch=kept)

@@ -154,20 +154,10 @@ class ImageRecord(BaseModel):
         same_lens, same_clock = _same_lens(seen, camera), _same_clock(seen, camera)
         away = twist_between(camera.T_camera_lidar, seen.T_camera_lidar)
         degrees, cm = pose_difference(camera.T_camera_lidar, seen.T_camera_lidar)
-        near, apart = (
-            degrees <= tolerance[0] and cm <= tolerance[1],
-            f"{degrees:.2g} deg, {cm:.2g} cm",
-        )
+        apart = f"{degrees:.2g} deg, {cm:.2g} cm"
+        near = degrees <= tolerance[0] and cm <= tolerance[1]
         if (covariance := evidence.covariance_by_matches(name)) is not None:
             near = bool((np.abs(away) <= _SAME_SIGMAS * np.sqrt(np.diag(covariance))).all())
-            if of.posterior and same_lens and same_clock:
-                total = of.posterior.about(seen, seen).moments + covariance
-                if away @ np.linalg.solve(total, away) >= _EXCLUDED_SIGMAS**2:
-                    text = (
-                        f"its images exclude this pose: with them it was {apart} away; the table "
-                        "was changed since, or is of another rig"
-                    )
-                    return Check("images", "FAIL", text)
         wider = tolerance[0] > self.tolerance[0] or tolerance[1] > self.tolerance[1]
         differences = (
             (wider, self._judged),
@@ -175,7 +165,16 @@ class ImageRecord(BaseModel):
             (not same_clock, "another time of its images was compared"),
             (not near, f"a pose {apart} from this one was compared with its images"),
         )
-        return next((_not_compared(text) for differs, text in differences if differs), None)
+        why = next((text for differs, text in differences if differs), "")
+        if why and of.posterior and same_lens and same_clock and covariance is not None:
+            total = of.posterior.about(seen, seen).moments + covariance
+            if away @ np.linalg.solve(total, away) >= _EXCLUDED_SIGMAS**2:
+                text = (
+                    f"its images exclude this pose: with them it was {apart} away; the table was "
+                    "changed since, or is of another rig"
+                )
+                return Check("images", "FAIL", text)
+        return _not_compared(why) if why else None
 
 
 def to_metadata(evidence: Evidence, checks: RunChecks) -> dict[str, Any]:

@@ -35,8 +35,9 @@ def matcher_checks(evidence: Evidence) -> Checks:
     what, tolerance = "error that the matcher's frames share", evidence.solution.config.tolerance
     checks = {}
     for name in evidence.cameras:
-        few = len(np.unique(table.of_camera(name).frame)) <= FEW_FRAMES
-        chance = findings.chance.get(name) if few else None  # of more no search measures it
+        chance = findings.chance.get(name)
+        if chance is not None and len(np.unique(table.of_camera(name).frame)) > FEW_FRAMES:
+            chance = None  # in so many no search measures what is found by chance
         checks[name] = [
             *_search_checks(findings, name, chance),
             *_share_checks(findings, name),
