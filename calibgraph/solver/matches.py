@@ -19,7 +19,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.repeats import hash_numbers
+from calibgraph.solver.preprocess import hash_numbers
 from calibgraph.solver.robust import (
     IDENTITY,
     MIN_SIGMA_PX,

@@ -22,9 +22,13 @@ from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.geometry import pose_rows
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
-from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import FittedObjective, data_sigmas
-from calibgraph.solver.error_model import fit_errors, fit_without_priors
+from calibgraph.solver.error_model import (
+    Conflict,
+    fit_errors,
+    fit_without_priors,
+    relative_pose_conflict,
+)
 from calibgraph.solver.lens import moved_lenses, put_into
 from calibgraph.solver.lens_estimates import lens_covariances, lens_estimates
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs, shared_variance_ratio

@@ -18,7 +18,6 @@ from calibgraph.model.geometry import retract_all, twists_between
 from calibgraph.model.pose_kernel import logarithms
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import map_on_cores
-from calibgraph.solver.grid import frame_edges
 from calibgraph.solver.pnp import (
     COARSE,
     Runs,
@@ -28,6 +27,7 @@ from calibgraph.solver.pnp import (
     ransac_pnp,
     refine_frames,
 )
+from calibgraph.solver.preprocess import frame_edges
 from factors import ProjectionBlock, to_runs
 
 _OUTLIER = 6.0  # median distances, 9 sigma of a Gaussian in three dimensions

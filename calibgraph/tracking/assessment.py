@@ -17,7 +17,7 @@ from calibgraph.model.rig import RelativePose
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Status, Verdict
 from calibgraph.report.as_json import finite
-from calibgraph.solver.conflicts import Conflict
+from calibgraph.solver.error_model import Conflict
 from calibgraph.tracking.estimate import EpochGraph, Estimate, error_sources, pairs_that_count
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import Incoming

@@ -31,8 +31,8 @@ from calibgraph.solver.components import (
     pose_covariance,
     ratios_by_evidence,
 )
-from calibgraph.solver.conflicts import Conflict, relative_pose_conflict
 from calibgraph.solver.covariance import ENOUGH_FRAMES, pose_equations
+from calibgraph.solver.error_model import Conflict, relative_pose_conflict
 from calibgraph.solver.places import fit_latent_poses, start_values
 from calibgraph.solver.sources import (
     predict_variances,

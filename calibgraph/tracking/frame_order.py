@@ -14,8 +14,13 @@ from calibgraph.model.clock import OF_IMAGES, OF_TABLES, unused_times
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import PLACES
 from calibgraph.model.rig import Rig
-from calibgraph.solver.preprocess import with_common_error
-from calibgraph.solver.repeats import REPEATED_SHARE, Hashes, hash_numbers, point_hashes
+from calibgraph.solver.preprocess import (
+    REPEATED_SHARE,
+    Hashes,
+    hash_numbers,
+    point_hashes,
+    with_common_error,
+)
 from calibgraph.tracking.state import State
 
 _LAST = 2**63 - 1  # other programs write it for "none"

@@ -17,8 +17,8 @@ from calibgraph.model.geometry import pair_covariances, pose_rows, twist_between
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import TOLERANCE, Check
-from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import bootstrap_covariances
+from calibgraph.solver.error_model import Conflict
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.observability import prior_shares

@@ -10,7 +10,7 @@ from calibgraph.arrays import Array
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.verdict import COMMON_ERROR, Check
-from calibgraph.solver.conflicts import Conflict
+from calibgraph.solver.error_model import Conflict
 from calibgraph.solver.matches import BlockResiduals
 from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS
 from calibgraph.solver.solution import Solution
