@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from calibgraph.io.dataset import Dataset
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.structure.acceptance import FEW_FRAMES, SEARCH, probability_by_chance
 from calibgraph.matching.structure.global_search import ALONE
@@ -127,25 +125,16 @@ def last_round_checks(run: MatchingRun) -> Checks:
 
 
 def repeated_file_checks(run: MatchingRun) -> Checks:
-    """Which frames were copies, and whether others have the same cloud or image of a camera."""
-    checks = check_repeated_files(run.dataset, run.hashes, tuple(run.guess.cameras))
-    if run.copies:
-        check = Check("copies", "WARN", describe_copies(run.copies), len(run.copies))
-        checks = {name: [check, *each] for name, each in checks.items()}
-    return checks
-
-
-def check_repeated_files(
-    dataset: Dataset, hashes: Mapping[str, str], cameras: Sequence[str]
-) -> dict[str, list[Check]]:
-    """Per camera, a check of the first kind of file that frames have in common, if any."""
-    frames = [(f.name, f.image_paths, hashes[str(f.cloud_path)]) for f in dataset.frames]
+    """Which frames were copies, and the first kind of file that others have in common, if any."""
+    frames = [(f.name, f.image_paths, run.hashes[str(f.cloud_path)]) for f in run.dataset.frames]
     of_clouds = describe_repeats("cloud", [(name, digest) for name, _, digest in frames])
-    checks: dict[str, list[Check]] = {}
-    for camera in cameras:
-        images = [(n, hashes[str(paths[camera])]) for n, paths, _ in frames if camera in paths]
+    copied = Check("copies", "WARN", describe_copies(run.copies), len(run.copies))
+    checks = {}
+    for camera in run.guess.cameras:
+        images = [(n, run.hashes[str(paths[camera])]) for n, paths, _ in frames if camera in paths]
         text = describe_repeats(f"image of {camera}", images) or of_clouds
-        checks[camera] = [Check("equal files", "WARN", text)] if text else []
+        repeated = [Check("equal files", "WARN", text)] if text else []
+        checks[camera] = [copied, *repeated] if run.copies else repeated
     return checks
 
 
