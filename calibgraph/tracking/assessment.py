@@ -13,7 +13,6 @@ from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.geometry import invert_each, pair_covariances, pose_rows
 from calibgraph.model.pose_kernel import logarithms
-from calibgraph.model.rig import RelativePose
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Status, Verdict
 from calibgraph.report.as_json import finite
@@ -23,7 +22,6 @@ from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import Incoming
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.state import State
-from calibgraph.tracking.window import Window
 from calibgraph.trust.evidence import Estimate as Checked
 from calibgraph.trust.pose_posterior import (
     MAX_FRAMES,
@@ -44,58 +42,32 @@ MeasureOnFrames = Callable[
 NOT_COMPARED = "its images were not compared with the clouds: no frame that is at hand shows it"
 
 
-@dataclass(frozen=True, eq=False)
-class Assessment:
-    """All estimates, their covariance and verdicts.
-
-    Attributes:
-        T_camera_lidar: (n, 4, 4).
-        joint_covariance: (6 n, 6 n) of xi in T_camera_lidar = exp(xi) estimate; NaN for cameras
-            with too few frames.
-        verdicts: per camera.
-        window: the graph at its optimum, until the next frame.
-        pairs: the relative poses that take part.
-    """
-
-    T_camera_lidar: Array
-    joint_covariance: Array
-    verdicts: dict[str, Verdict]
-    window: Window
-    pairs: tuple[RelativePose, ...] = ()
-
-
-def assess(state: State, estimate: Estimate) -> Assessment:
-    """Assess the present estimates."""
+def assess(state: State, estimate: Estimate) -> Estimate:
+    """The present estimates with their verdicts."""
     verdicts = {}
     for camera, name in enumerate(state.names):
         own = tuple(c for c in estimate.conflicts.values() if name in (c.pair.a, c.pair.b))
         verdicts[name] = _verdict(state, estimate, camera, conflicts=own)
-    return Assessment(
-        estimate.T_camera_lidar,
-        estimate.covariance,
-        verdicts,
-        estimate.window,
-        pairs_that_count(state),
-    )
+    return replace(estimate, verdicts=verdicts)
 
 
 def with_images(
-    state: State, assessment: Assessment, measure: MeasureOnFrames | None
-) -> tuple[Assessment, ImagePosteriors]:
-    """The assessment with error bars and verdicts by the posteriors of cameras with error bars.
+    state: State, estimate: Estimate, measure: MeasureOnFrames | None
+) -> tuple[Estimate, ImagePosteriors]:
+    """Error bars and verdicts by the posteriors of cameras with error bars, too.
 
-    Without ``measure`` it stays as it is.
+    Without ``measure`` they stay as they are.
     """
-    own = covariance_by_camera(assessment, state.names)
+    own = covariance_by_camera(estimate, state.names)
     known = {name: covariance for name, covariance in own.items() if covariance is not None}
-    groups = group_tied(tuple(known), measured_pairs(assessment.pairs))
+    groups = group_tied(tuple(known), measured_pairs(pairs_that_count(state)))
     posteriors: dict[str, PosePosterior] = {}
     if measure is not None:
         for frames, of_frames in groups_by_frames(state, groups).items():
             posteriors |= measure(frames, known, of_frames)
-    images = ImagePosteriors(state.names, assessment.joint_covariance, posteriors)
+    images = ImagePosteriors(state.names, estimate.covariance, posteriors)
     row, flatness, verdicts = threshold("beyond_tolerance"), images.check_flatness(), {}
-    for name, verdict in assessment.verdicts.items():
+    for name, verdict in estimate.verdicts.items():
         more = []
         if name in flatness:
             beyond = images.probability_beyond(name, state.config.tolerance)
@@ -103,8 +75,8 @@ def with_images(
         elif measure is not None and name in known:
             more = [Check("image evidence", "WARN", NOT_COMPARED)]
         verdicts[name] = Verdict((*verdict.checks, *more))
-    joint = images.widen(assessment.joint_covariance)
-    return replace(assessment, joint_covariance=joint, verdicts=verdicts), images
+    covariance = images.widen(estimate.covariance)
+    return replace(estimate, covariance=covariance, verdicts=verdicts), images
 
 
 def _verdict(
@@ -173,12 +145,12 @@ def recent_residuals(state: State, camera: int) -> Residuals:
     )
 
 
-def covariance_by_camera(assessment: Assessment, names: tuple[str, ...]) -> dict[str, Array | None]:
+def covariance_by_camera(estimate: Estimate, names: tuple[str, ...]) -> dict[str, Array | None]:
     """Per camera (6, 6); None with too few frames."""
     covariance: dict[str, Array | None] = {}
     for camera, name in enumerate(names):
         rows = pose_rows(camera)
-        own = assessment.joint_covariance[rows, rows]
+        own = estimate.covariance[rows, rows]
         covariance[name] = None if np.isnan(own).any() else own
     return covariance
 
@@ -191,10 +163,10 @@ def _counts(state: State, camera: int) -> dict[str, int]:
     return {**counts, "frames": frames, "frames_used": used, "frames_waiting": waiting}
 
 
-def second_moments(assessment: Assessment) -> Array:
+def second_moments(estimate: Estimate) -> Array:
     """(6 n, 6 n) of the mounts about the estimates."""
-    window, keys = assessment.window, assessment.window.model.camera_keys
-    away = logarithms(assessment.T_camera_lidar @ invert_each(window.T_camera_lidar(keys))).ravel()
+    window, keys = estimate.window, estimate.window.model.camera_keys
+    away = logarithms(estimate.T_camera_lidar @ invert_each(window.T_camera_lidar(keys))).ravel()
     return np.asarray(window.covariance(keys) + np.outer(away, away))
 
 
@@ -230,24 +202,24 @@ def groups_by_frames(
 def to_calibration(
     state: State,
     graph: EpochGraph,
-    assessment: Assessment,
+    estimate: Estimate,
     measure: MeasureOnFrames | None = None,
     *,
     sources: bool = False,
 ) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
-    assessment, images = with_images(state, assessment, measure)
-    joint = assessment.joint_covariance
+    estimate, images = with_images(state, estimate, measure)
+    joint = estimate.covariance
     known = None if np.isnan(joint).any() else joint
-    mounts = None if known is None else images.widen(second_moments(assessment))
-    rig, cameras = state.rig_at(assessment.T_camera_lidar), [*enumerate(state.names)]
+    mounts = None if known is None else images.widen(second_moments(estimate))
+    rig, cameras = state.rig_at(estimate.T_camera_lidar), [*enumerate(state.names)]
     return Calibration(
         rig=rig,
         initial_rig=state.rig,
-        covariance=covariance_by_camera(assessment, state.names),
+        covariance=covariance_by_camera(estimate, state.names),
         joint_covariance=known,
         pair_covariance=pair_covariances(mounts, rig.T_camera_lidar),
-        camera_verdicts=assessment.verdicts,
+        camera_verdicts=dict(estimate.verdicts),
         residuals={n: recent_residuals(state, c) for c, n in cameras if state.started[c]},
         counts={name: _counts(state, camera) for camera, name in cameras},
         timings_s={},
@@ -289,20 +261,20 @@ class Update:
 
 def make_updates(
     state: State,
-    assessment: Assessment,
+    estimate: Estimate,
     taken: Sequence[tuple[Incoming, Sequence[Event], Mapping[int, int]]],
 ) -> list[Update]:
     """The updates after the last frames of a state.
 
     Args:
         state: after the frames.
-        assessment: of its estimates.
+        estimate: with its verdicts.
         taken: the frames that were taken in at once; the events detected with each, and per camera,
             by its place in the rig, how many of its matches were absorbed.
     """
     names = state.names
-    poses = dict(zip(names, assessment.T_camera_lidar, strict=True))
-    covariance = covariance_by_camera(assessment, names)
+    poses = dict(zip(names, estimate.T_camera_lidar, strict=True))
+    covariance = covariance_by_camera(estimate, names)
     for array in (*poses.values(), *covariance.values()):
         if array is not None:
             array.setflags(write=False)  # the updates share them
@@ -313,7 +285,7 @@ def make_updates(
             stamp_ns=one.stamp_ns,
             T_camera_lidar=dict(poses),
             covariance=dict(covariance),
-            verdicts=dict(assessment.verdicts),
+            verdicts=dict(estimate.verdicts),
             events=tuple(events),
             used={names[camera]: count for camera, count in used.items()},
             left_out=tuple(n for n in names if last[n] == ((one.number, False),)),

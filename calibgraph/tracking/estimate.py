@@ -8,7 +8,7 @@ update eliminates the places of the open epoch and exchanges one factor of that 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import gtsam
@@ -24,6 +24,18 @@ from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import pose_rows, retract_all, to_T_lidar_camera
 from calibgraph.model.rig import RelativePose
+from calibgraph.solver.components import (
+from calibgraph.model.verdict import Verdict
+from calibgraph.solver.error_model import Conflict, relative_pose_conflict
+from calibgraph.solver.covariance import ENOUGH_FRAMES
+from calibgraph.solver.covariance import pose_equations
+from calibgraph.solver.places import fit_latent_poses, start_values
+from calibgraph.solver.error_model import ErrorFit
+from calibgraph.solver.sources import (
+    predict_variances,
+    sources_by_camera,
+    variances_by_source,
+)
 from calibgraph.solver.components import (
     Component,
     Evidence,
@@ -231,6 +243,7 @@ class Estimate:
         sums: (n,) over all frames.
         conflicts: of relative poses with the correspondences, by their places in the rig.
         window: the graph of what all places share.
+        verdicts: per camera, once it is assessed.
     """
 
     T_camera_lidar: Array
@@ -238,6 +251,7 @@ class Estimate:
     sums: Sums
     conflicts: Mapping[int, Conflict]
     window: Window
+    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
 
 
 class EpochGraph:

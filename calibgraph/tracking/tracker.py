@@ -29,7 +29,6 @@ from calibgraph.tracking.absorption import (
     start_cameras,
 )
 from calibgraph.tracking.assessment import (
-    Assessment,
     MeasureOnFrames,
     Update,
     assess,
@@ -117,9 +116,8 @@ class IncrementalCalibrator:
         self, measure: MeasureOnFrames | None = None, *, sources: bool = False
     ) -> Calibration:
         """The present estimate as a batch's result; posteriors by images widen its error bars."""
-        assessment, state = self._assess(), self._state
-        graph = self._graph_of(state)
-        return to_calibration(state, graph, assessment, measure, sources=sources)
+        graph = self._graph_of(self._state)
+        return to_calibration(self._state, graph, self._assess(), measure, sources=sources)
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -207,36 +205,30 @@ class IncrementalCalibrator:
     def _take_in(self, state: State, group: Sequence[Incoming]) -> tuple[EpochGraph, Taken]:
         """Absorb the matches that agree, set aside the others, detect events."""
         group, table, blocks = _preprocessed(state, group, self._graph_of(state).rig)
-        gated = {
-            camera: Gated.at(state.references[camera], block, state.scales[camera])
-            for camera, block in blocks.items()
-            if state.started[camera]
-        }
+        gated = _gate(state, blocks)
         usual = _count_usual(state, group, blocks, gated)
         if usual < len(group):
             group = group[: max(usual, 1)]
-            last = group[-1].number
-            table = table.select(table.frame <= last)
-            gated = {c: one.select(one.raw.frame_numbers <= last) for c, one in gated.items()}
-            blocks = {c: block.select(block.frame <= last) for c, block in blocks.items()}
-        gated = {camera: one for camera, one in gated.items() if len(one.raw)}
-        seen = {camera: block for camera, block in blocks.items() if len(block)}
+            table = table.select(table.frame <= group[-1].number)
+            blocks = {c: raw.select(raw.frame <= group[-1].number) for c, raw in blocks.items()}
+            blocks = {camera: raw for camera, raw in blocks.items() if len(raw)}
+            gated = _gate(state, blocks)
         begin_frames(state, group)
         graph, events = self._graph_of(state), list[Event]()
         if not usual:
             gated = select_agreeing(state, graph, gated)
         used = absorb(state, gated)[-len(group) :]
         if not usual:
-            events = start_cameras(state, table, seen)
+            events = start_cameras(state, table, blocks)
         taken: Taken = []
         for one, own in zip(group, used, strict=True):
             count_repeats(state, one.table, table if len(group) == 1 else one.table)
-            taken.append((one, events + count_absent(state, own, one), own))
+            events += count_absent(state, own, one)
+            taken.append((one, events, own))
             events = []
-        if not usual:
-            detected = detect_step(state)
-            if detected is not None:  # moved so far that frames disagree with the estimate
-                taken[-1][1].extend(restart_after_step(state, detected))
+        detected = None if usual else detect_step(state)
+        if detected is not None:  # moved so far that frames disagree with the estimate
+            taken[-1][1].extend(restart_after_step(state, detected))
         if state.references is not graph.references:
             every = every_place(state, closed_places(state), state.all_sums())
             state.spread = spread_of(state, every)
@@ -258,7 +250,7 @@ class IncrementalCalibrator:
             self._graph = EpochGraph(state)
         return self._graph
 
-    def _assess(self) -> Assessment:
+    def _assess(self) -> Estimate:
         """Assess the present estimates."""
         if self._estimate is None:
             self._estimate = self._graph_of(self._state).solve(self._state)
@@ -348,6 +340,15 @@ def _preprocessed(
 def _with_enough(block: CameraBlock) -> CameraBlock:
     enough = block.frame_counts >= MIN_MATCHES
     return block if enough.all() else block.select(np.repeat(enough, block.frame_counts))
+
+
+def _gate(state: State, blocks: Mapping[int, CameraBlock]) -> dict[int, Gated]:
+    """The matches of cameras that have started, gated at their estimates."""
+    return {
+        camera: Gated.at(state.references[camera], block, state.scales[camera])
+        for camera, block in blocks.items()
+        if state.started[camera]
+    }
 
 
 def _count_usual(
