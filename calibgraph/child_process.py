@@ -116,12 +116,14 @@ class ChildProcess:
                 return
             self.stop()
         ours, theirs = Pipe()
+        # It finds modules where this one does, not in the folder it is started in.
+        folders = os.pathsep.join([os.environ.get("PYTHONPATH", ""), *sys.path]).strip(os.pathsep)
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", self._module, str(theirs.fileno()), *self._arguments],
             stdin=subprocess.PIPE,  # it ends with this process
             stdout=subprocess.DEVNULL,
             pass_fds=[theirs.fileno()],
-            env={**os.environ, **_ONE_THREAD, "PYTHONPATH": _module_folders()},
+            env={**os.environ, **_ONE_THREAD, "PYTHONPATH": folders},
             start_new_session=True,  # Ctrl-C is for the command
         )
         theirs.close()
@@ -159,11 +161,6 @@ class ChildProcess:
         self.stop()
 
 
-def _module_folders() -> str:
-    """Where the process finds modules: where this one does, not in the folder it is started in."""
-    return os.pathsep.join([os.environ.get("PYTHONPATH", ""), *sys.path]).strip(os.pathsep)
-
-
 def _how_it_ended(code: int) -> str:
     """An exit code of a process in words."""
     if code >= 0:
@@ -182,7 +179,13 @@ def answer_requests(
         answer: called with a request, and the function for notes before the answer.
         at_end: called when the parent is gone, in another thread than a request that runs.
     """
-    threading.Thread(target=_end_with_parent, args=(at_end,), daemon=True).start()
+
+    def end_with_parent() -> None:
+        os.read(0, 1)  # not sys.stdin, whose lock would make the exit of Python fail
+        at_end()
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
     connection = Connection(int(sys.argv[1]))
     with suppress(BrokenPipeError, ConnectionResetError):  # the parent has gone
         connection.send("ready")
@@ -192,13 +195,6 @@ def answer_requests(
             except EOFError:
                 return
             connection.send((True, answer(request, lambda note: connection.send((False, note)))))
-
-
-def _end_with_parent(at_end: Callable[[], None]) -> None:
-    """End this process when the parent is gone."""
-    os.read(0, 1)  # not sys.stdin, whose lock would make the exit of Python fail
-    at_end()
-    os._exit(1)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ Model = TypeVar("Model", bound=BaseModel)
 MAX_YAML_BYTES = 8 * 2**20
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Write a temporary file beside ``path`` with ``write``, then rename it in one step.
 
     A crash leaves the old file or the new one, never half of one.
@@ -115,16 +115,12 @@ def sync_folder(folder: Path) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
-    write_atomically(path, lambda temporary: _discard(temporary.write_text(text, "utf-8")))
+    write_atomically(path, lambda temporary: temporary.write_text(text, "utf-8"))
 
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a binary file atomically."""
-    write_atomically(path, lambda temporary: _discard(temporary.write_bytes(data)))
-
-
-def _discard(_: object) -> None:
-    return None
+    write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
 def sha256(path: Path) -> str:

@@ -23,7 +23,12 @@ from calibgraph.matching.camera_pairs import (
     with_surfaces,
 )
 from calibgraph.matching.cloud_similarity import find_up
-from calibgraph.matching.frame_choice import FrameChoice, choose_frames, without_copies
+from calibgraph.matching.frame_choice import (
+    FrameChoice,
+    choose_frames,
+    find_stationary_frames,
+    without_copies,
+)
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.places import UNKNOWN_UP, find_places
 from calibgraph.matching.protocol import Matcher
@@ -36,7 +41,6 @@ from calibgraph.matching.run import (
     with_motion,
 )
 from calibgraph.matching.same_images import require_different_images
-from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.lens import LensEstimate, change_of_lens, unsettled

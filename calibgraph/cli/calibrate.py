@@ -11,7 +11,7 @@ import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import (
+from calibgraph.cli.options import (
     bag_options_from,
     checked_arguments,
     dataset_from,
@@ -268,7 +268,6 @@ def track(
     from calibgraph.cli.settings import read_settings
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.result_files import require_result_folder
-    from calibgraph.report.tables import print_result
     from calibgraph.tracking.command import Tracking, track
     from calibgraph.tracking.state import require_poses_alone
 
@@ -293,9 +292,7 @@ def track(
         bag=bag_options_from(topic, motion=motion, **rare.of_bags),
     )
     result, written = track(wanted, source, notify=print_line)
-    print_result(terminal(), result, written, elapsed_s())
-    if result.verdict.status == "FAIL":
-        raise typer.Exit(1)
+    _print_and_exit(result, written, as_json=False)
 
 
 def _require_matcher_for(source: list[Path], given: dict[str, object]) -> None:

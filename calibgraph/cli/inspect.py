@@ -14,7 +14,7 @@ import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import bag_settings, checked_arguments
+from calibgraph.cli.options import bag_settings, checked_arguments
 from calibgraph.cli.terminal import print_json, print_line, progress_bar, terminal
 from calibgraph.io.formats.names import EXPORT_FORMATS
 

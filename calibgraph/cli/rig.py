@@ -13,7 +13,7 @@ import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import bag_options_from, checked_arguments, parse_names
+from calibgraph.cli.options import bag_options_from, checked_arguments, parse_names
 from calibgraph.cli.terminal import print_json, print_line, progress_bar
 from calibgraph.errors import CalibrationError
 from calibgraph.io.formats.names import IMPORT_FORMATS
@@ -129,7 +129,9 @@ def rig(
     is_of_bag = not (mount or dataset) and all(map(is_bag, source))
     _refuse_others("bags alone" if is_of_bag else "files", given)
     with checked_arguments(), progress_bar("reading") as progress:
-        sigmas = _sigmas(tie_deg, tie_m)
+        if (tie_deg is None) != (tie_m is None):
+            raise ValueError("--tie-deg and --tie-m: give both")
+        sigmas = None if tie_deg is None or tie_m is None else (tie_deg, tie_m)
         if is_of_bag:
             made, notes, topics = _rig_of_bags([*map(Path, source)], topic, sigmas)
             guess = None
@@ -186,21 +188,10 @@ def _parse_file(text: str) -> tuple[str, Path]:
 
 def _size_px(size: str | None) -> tuple[int, int] | None:
     """Width and height of images whose file has none."""
-    if size is None:
-        return None
-    match = re.fullmatch(r"(\d+)x(\d+)", size)
-    if match is None:
+    match = re.fullmatch(r"(\d+)x(\d+)", size or "")
+    if size is not None and match is None:
         raise ValueError(f"--size {size!r}: give WIDTHxHEIGHT, as 1920x1200")
-    return int(match[1]), int(match[2])
-
-
-def _sigmas(tie_deg: float | None, tie_m: float | None) -> tuple[float, float] | None:
-    """The sigmas of relative poses, [deg] and [m]."""
-    if tie_deg is None and tie_m is None:
-        return None
-    if tie_deg is None or tie_m is None:
-        raise ValueError("--tie-deg and --tie-m: give both")
-    return tie_deg, tie_m
+    return match and (int(match[1]), int(match[2]))
 
 
 def _rig_of_files(
@@ -217,12 +208,10 @@ def _rig_of_files(
     from calibgraph.guessing.guess import guess_rig
     from calibgraph.io.rig_parts import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
 
-    tie_deg, tie_m = sigmas or (RELATIVE_SIGMA_DEG, RELATIVE_SIGMA_CM / 100.0)
     if not mountings and not dataset:
-        made = parts.to_rig(
-            size_px=size_px, relative_sigma_deg=tie_deg, relative_sigma_cm=100.0 * tie_m
-        )
-        return made, None
+        deg, metres = sigmas or (RELATIVE_SIGMA_DEG, RELATIVE_SIGMA_CM / 100.0)
+        sizes: dict[str, Any] = {"relative_sigma_deg": deg, "relative_sigma_cm": 100.0 * metres}
+        return parts.to_rig(size_px=size_px, **sizes), None
     if sigmas is not None:
         raise ValueError("--tie-deg is for files alone; leave --mount and --dataset out")
     guess = guess_rig(

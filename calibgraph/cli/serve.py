@@ -8,7 +8,7 @@ from shlex import quote
 from typer import Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import bag_settings, dataset_from
+from calibgraph.cli.options import bag_settings, dataset_from
 from calibgraph.cli.terminal import print_line
 from calibgraph.errors import CalibrationError, FileError, needs_extra
 
@@ -59,7 +59,7 @@ def serve(
             import_module(package)
     from calibgraph.service.app import create_app, require_safe
     from calibgraph.service.app import serve as serve_app
-    from calibgraph.service.settings import Settings
+    from calibgraph.service.requests import Settings
 
     if new_token is not None:
         _add_token(tokens, new_token)

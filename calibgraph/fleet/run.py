@@ -4,7 +4,7 @@ import hashlib
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
@@ -73,7 +73,9 @@ def run_fleet(
         todo = [job for job in found.jobs if not _is_finished(rows[job.key], hashes[job.key])]
         failed = 0
         with nullcontext(executor) if executor is not None else thread_executor() as opened:
-            for count, (job, outcome) in enumerate(_outcomes(opened, todo, limits), start=1):
+            running = {opened.submit(run_job, job, limits, release()): job for job in todo}
+            for count, future in enumerate(as_completed([*running]), start=1):
+                job, outcome = running.pop(future), _outcome_of(future)
                 rows[job.key] = _rows_of(job, outcome, hashes[job.key])
                 table = pa.Table.from_pylist(rows[job.key], schema=SCHEMA)
                 others = found.others.take(pa.array([job.row] * len(table)))
@@ -122,15 +124,6 @@ def dask_executor(address: str) -> Iterator[Executor]:
             yield executor
         finally:
             executor.shutdown(wait=False)  # cancels what has not ended
-
-
-def _outcomes(
-    executor: Executor, jobs: Iterable[Job], limits: Limits
-) -> Iterator[tuple[Job, Outcome]]:
-    """Jobs with their outcomes, as they end."""
-    running = {executor.submit(run_job, job, limits, release()): job for job in jobs}
-    for future in as_completed([*running]):
-        yield running.pop(future), _outcome_of(future)
 
 
 def _outcome_of(future: Future[Outcome]) -> Outcome:
@@ -193,14 +186,8 @@ def _hashes(jobs: Sequence[Job], report: Progress) -> dict[Key, str]:
     """Of the inputs of all jobs; empty where they cannot be read: the job will fail by it."""
     found = dict[Key, str]()
     with ThreadPoolExecutor(_READERS) as pool:
-        for job, text in zip(jobs, pool.map(_hash_of, jobs), strict=True):
+        for job, future in [(job, pool.submit(job.input_hash)) for job in jobs]:
             report("reading inputs", len(found), len(jobs))
-            found[job.key] = text
+            failed = future.exception() is not None  # of any store's client
+            found[job.key] = "" if failed else future.result()
     return found
-
-
-def _hash_of(job: Job) -> str:
-    try:
-        return job.input_hash()
-    except Exception:  # of any store's client
-        return ""

@@ -108,7 +108,8 @@ def parse_mounting(text: str, camera: str) -> Mounting:
         RigError: if a word is not understood, said twice, or the heading is missing.
     """
     values: dict[str, float] = {}
-    for name, value in _read_items([*_tokens(text)], text, camera):
+    words = [match[1] for match in _TOKEN.finditer(text.lower()) if match[1] != ","]
+    for name, value in _read_items(words, text, camera):
         if name in values:
             raise _refusal(camera, text, f"gives the {name} twice")
         values[name] = value
@@ -122,18 +123,11 @@ def parse_mounting(text: str, camera: str) -> Mounting:
         tilt_deg=given["tilt"],
         roll_deg=rolled,
         place_m=(given["ahead"], given["left"], given["up"]),
-        sigmas={name: _sigma(name, given[name]) if name in said else sigma
+        sigmas={name: sigma if name not in said
+                else SAID_DEG if name in ("heading", "tilt", "roll")
+                else math.hypot(SAID_M, SAID_SHARE * given[name])
                 for name, sigma in WORD_SIGMAS.items()},
     )  # fmt: skip
-
-
-def _sigma(name: str, value: float) -> float:
-    is_angle = name in ("heading", "tilt", "roll")
-    return SAID_DEG if is_angle else math.hypot(SAID_M, SAID_SHARE * value)
-
-
-def _tokens(text: str) -> Iterator[str]:
-    yield from (match[1] for match in _TOKEN.finditer(text.lower()) if match[1] != ",")
 
 
 def _read_items(words: list[str], text: str, camera: str) -> Iterator[tuple[str, float]]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -65,17 +65,9 @@ class CameraEstimate:
         return [bool(value > limit) for value in self.left_out_px]  # NaN is not above
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """The rig that the pairs determine.
-
-    Attributes:
-        rig: of the cameras that are solved, with their covariances; None if none is.
-        cameras: by name, of each with pairs.
-    """
-
-    rig: Rig | None
-    cameras: dict[str, CameraEstimate] = field(default_factory=dict)
+Estimate = tuple[Rig | None, dict[str, CameraEstimate]]
+"""The rig of the cameras that are solved, with their covariances, None if none is; and by name what
+the pairs of each camera give."""
 
 
 def estimate_from_pairs(rig: Rig, pairs: Sequence[Pair]) -> Estimate:
@@ -100,7 +92,7 @@ def estimate_from_pairs(rig: Rig, pairs: Sequence[Pair]) -> Estimate:
             left_out_px=_left_out(camera, some) if name in starts else np.full(len(some), np.nan),
             problem="" if poses[name] else _problem(some),
         )
-    return Estimate(solved, cameras)
+    return solved, cameras
 
 
 def _solve(rig: Rig, starts: dict[str, Array], pairs: Sequence[Pair]) -> Rig:
@@ -125,13 +117,14 @@ def reference_rig(estimate: Estimate) -> Rig:
     Raises:
         CalibrationError: if there is none.
     """
-    if estimate.rig is None:
-        reasons = [f"{name}: {one.problem}" for name, one in estimate.cameras.items()]
+    rig, cameras = estimate
+    if rig is None:
+        reasons = [f"{name}: {one.problem}" for name, one in cameras.items()]
         raise CalibrationError(
             f"the pairs determine no camera yet ({'; '.join(reasons) or 'there is none'}); pick at "
             f"least {MIN_PAIRS} of one camera, on different structures"
         )
-    return estimate.rig
+    return rig
 
 
 def _poses(camera: Camera, pairs: Sequence[Pair]) -> dict[str, tuple[Array, float]]:

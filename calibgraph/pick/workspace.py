@@ -22,7 +22,7 @@ from calibgraph.model.geometry import degrees_and_centimetres
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.pick.estimate import (
     SESSION_FILE,
-    Estimate,
+    CameraEstimate,
     Pair,
     estimate_from_pairs,
     open_session,
@@ -55,7 +55,7 @@ class Workspace:
 
     def state(self) -> dict[str, Any]:
         """Cameras, frames, pairs and what they determine, as plain values."""
-        rig, estimate = self.dataset.rig, self._estimate
+        rig, (solved, cameras) = self.dataset.rig, self._estimate
         return {
             "cameras": {
                 name: {"T_camera_lidar": camera.T_camera_lidar.tolist(),
@@ -66,7 +66,8 @@ class Workspace:
             "frames": [{"index": frame.index, "name": frame.name, "cameras": [*frame.image_paths]}
                        for frame in self.dataset.frames],
             "pairs": [pair.model_dump() for pair in self.session.pairs],
-            "estimates": {name: _answer(estimate, name) for name in estimate.cameras},
+            "estimates": {name: _answer(one, solved.cameras.get(name) if solved else None)
+                          for name, one in cameras.items()},
         }  # fmt: skip
 
     def change(self, pairs: list[Pair]) -> dict[str, Any]:
@@ -95,7 +96,7 @@ class Workspace:
     def projected(self, index: int, name: str) -> NDArray[np.float32]:
         """(k, 3) pixels and distances of the points that a camera sees, at the estimate."""
         points = self.cloud(index)[:, :3].astype(np.float64)
-        return visible_points(points, (self._estimate.rig or self.dataset.rig).cameras.get(
+        return visible_points(points, (self._estimate[0] or self.dataset.rig).cameras.get(
             name, self.dataset.rig.cameras[name]))  # fmt: skip
 
     def _frame(self, index: int, name: str) -> Frame:
@@ -131,9 +132,8 @@ def visible_points(points_lidar_m: Array, camera: Camera) -> NDArray[np.float32]
     return np.column_stack([pixels, distance_m[seen]]).astype(np.float32)
 
 
-def _answer(estimate: Estimate, name: str) -> dict[str, Any]:
+def _answer(one: CameraEstimate, solved: Camera | None) -> dict[str, Any]:
     """What the page shows of a camera."""
-    one, solved = estimate.cameras[name], estimate.rig.cameras.get(name) if estimate.rig else None
     bars = None if solved is None or solved.covariance is None else degrees_and_centimetres(
         np.asarray(solved.covariance))  # fmt: skip
     return {

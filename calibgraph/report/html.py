@@ -169,7 +169,7 @@ def write_result(
             middle = data.frames[len(data.frames) // 2]
             verdicts = {name: one.status for name, one in result.camera_verdicts.items()}
             written += write_overlays(
-                middle, result.initial_rig, result.rig, new, verdicts=verdicts
+                middle, result.initial_rig, new, final=result.rig, verdicts=verdicts
             )
         if with_report:
             write_text(new / REPORT_FILE, render_page(result))
@@ -191,15 +191,14 @@ def check_cells(check: Check) -> tuple[str, str, str]:
     if check.warn is None or check.fail is None or not check.is_graded:
         return in_unit(check.value, check.unit), "", ""
     side: Direction = "at least" if check.warn > check.fail else "at most"
-    warn, fail = (_threshold(side, limit, check.unit) for limit in (check.warn, check.fail))
+    warn, fail = (  # empty if no value can be bad
+        f"{'>' if side == 'at most' else '<'} {in_unit(limit, check.unit)}"
+        if is_reachable(limit, check.unit, side)
+        else ""
+        for limit in (check.warn, check.fail)
+    )
     found = beside(check.value, check.fail if check.status == "FAIL" else check.warn, check.unit)
     return found, warn, fail
-
-
-def _threshold(side: Direction, limit: float, unit: str) -> str:
-    """When a value is bad; empty if no value can be."""
-    sign = ">" if side == "at most" else "<"
-    return f"{sign} {in_unit(limit, unit)}" if is_reachable(limit, unit, side) else ""
 
 
 _DISTANCE_M = 10.0
@@ -255,7 +254,6 @@ def camera_diagrams(
     found, camera = dict[str, str](), result.rig.cameras[name]
     if errors is not None:
         found["residuals"] = plots.residual_scatter(errors, result.residuals[name].sigma_px)
-        found["by_distance"] = plots.residual_by_distance(errors)
         found["over_image"] = plots.residual_map(camera, errors)
         found["coverage"] = plots.coverage(camera, errors)
     rounds = [cameras[name] for cameras in result.rounds if name in cameras]
@@ -288,7 +286,10 @@ def relocate_frames(result: Calibration, dataset: Dataset) -> Calibration:
             under their names.
     """
     available = {frame.index: frame for frame in dataset.frames}
-    names = _frame_names(result)
+    # Where only correspondences have the number, no name is known.
+    names: dict[int, str | None] = {entry["frame"]: entry["name"] for entry in result.frames}
+    if not names and result.correspondences is not None:
+        names = dict.fromkeys(np.unique(result.correspondences.frame).tolist())
     for number, name in names.items():
         if number not in available or name not in (None, available[number].name):
             raise DatasetError(
@@ -314,10 +315,3 @@ def _require_same_files(result: Calibration, entry: Mapping[str, Any], frame: Fr
                 "another content; give the same recording",
                 frame=frame.index,
             )
-
-
-def _frame_names(result: Calibration) -> dict[int, str | None]:
-    """The name of each frame number; None where only correspondences have the number."""
-    if result.frames or result.correspondences is None:
-        return {entry["frame"]: entry["name"] for entry in result.frames}
-    return dict.fromkeys(np.unique(result.correspondences.frame).tolist())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -23,14 +22,6 @@ _PICTURES_BYTES = 3_000_000  # of all pictures together; base64 adds a third
 _SIZES = ((1100, 80), (1100, 70), (960, 65), (800, 60), (640, 60), (480, 50), (320, 40))
 _HEIGHT_PX = 640  # at most, so that a picture and its caption fit on a screen
 _STOPS = 17  # of the scale's gradient
-
-
-@dataclass(frozen=True)
-class Scale:
-    """A gradient of CSS, and its ticks: percent from the left, label."""
-
-    gradient: str
-    ticks: tuple[tuple[float, str], ...]
 
 
 def draw_overlays(
@@ -62,15 +53,19 @@ def width_on_page(camera: Camera) -> int:
     return round(_HEIGHT_PX * camera.width_px / camera.height_px)
 
 
-def depth_scale() -> Scale:
-    """The colours of the distances, linear in their logarithm."""
+def depth_scale() -> tuple[str, list[tuple[float, str]]]:
+    """The colours of the distances, linear in their logarithm.
+
+    Returns:
+        A gradient of CSS, and its ticks: percent from the left, label.
+    """
     low, high = np.log(DEPTH_RANGE_M)
     ticks = np.array([2, 5, 10, 20, 50])
     at = 100 * (np.log(ticks) - low) / (high - low)
     stops = depth_colours(np.exp(np.linspace(low, high, _STOPS)))
     labels = [f"{ticks[0]} m", *map(str, ticks[1:])]
     gradient = ", ".join(f"#{r:02x}{g:02x}{b:02x}" for b, g, r in stops.tolist())
-    return Scale(gradient, tuple(zip(at.tolist(), labels, strict=True)))
+    return gradient, [*zip(at.tolist(), labels, strict=True)]
 
 
 def _to_jpeg(image: NDArray[np.uint8], budget: int) -> str:
@@ -98,51 +93,37 @@ _MARKS: dict[Status, str] = {"PASS": "PASS", "WARN": "WARN", "FAIL": "FAIL, do n
 
 
 def write_overlays(
-    frame: Frame, initial: Rig, final: Rig, folder: Path, *, verdicts: Mapping[str, Status]
-) -> list[Path]:
-    """Write ``overlay_CAMERA.png`` for every camera: before above, after below, its verdict.
-
-    Raises:
-        CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
-    """
-    titles = {
-        name: (f"{name}, frame {frame.name}: before", f"{name}, after: {_MARKS[status]}")
-        for name, status in verdicts.items()
-    }
-    return _write_overlays(frame, (initial, final), titles, folder / "overlay_{name}.png")
-
-
-def write_guess_overlays(frame: Frame, guess: Rig, folder: Path) -> list[Path]:
-    """Write ``guess_CAMERA.png`` for every camera of the guess.
-
-    Raises:
-        CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
-    """
-    titles = {name: (f"{name}, frame {frame.name}: guess",) for name in guess.cameras}
-    return _write_overlays(frame, (guess,), titles, folder / "guess_{name}.png")
-
-
-def _write_overlays(
     frame: Frame,
-    rigs: tuple[Rig, ...],
-    titles: Mapping[str, tuple[str, ...]],
-    path: Path,
+    guess: Rig,
+    folder: Path,
+    *,
+    final: Rig | None = None,
+    verdicts: Mapping[str, Status] | None = None,
 ) -> list[Path]:
-    """Per camera, the points as each rig places them, below each other."""
-    cloud = frame.load_cloud()[:, :3].astype(np.float64)
-    paths = []
-    for name, camera in rigs[0].cameras.items():
+    """Write a picture of every camera: the cloud on its image, by the guess, and by a result below.
+
+    They are ``guess_CAMERA.png``; of a result, with its verdicts, ``overlay_CAMERA.png``.
+
+    Raises:
+        CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
+    """
+    cloud, paths = frame.load_cloud()[:, :3].astype(np.float64), list[Path]()
+    for name, camera in guess.cameras.items():
         image = frame.load_image(name, camera)
+        shown = {f"{name}, frame {frame.name}: {'guess' if final is None else 'before'}": camera}
+        if final is not None and verdicts is not None:
+            shown[f"{name}, after: {_MARKS[verdicts[name]]}"] = final.cameras[name]
         panels = [
-            _titled(
-                draw_points(image, cloud, when_taken(rig.cameras[name], frame.twist_per_s)),
-                title,
-            )
-            for rig, title in zip(rigs, titles[name], strict=True)
+            _titled(draw_points(image, cloud, when_taken(each, frame.twist_per_s)), title)
+            for title, each in shown.items()
         ]
-        paths.append(path.with_name(path.name.replace("{name}", name)))
         picture = shrink(np.vstack([*panels, _depth_bar(image.shape[1])]), _MAX_WIDTH_PX)
-        write_image(paths[-1], picture)
+        encoded, data = cv2.imencode(".png", picture)
+        path = folder / f"{'guess' if final is None else 'overlay'}_{name}.png"
+        if not encoded:
+            raise CalibrationError(f"{path}: shape {picture.shape} cannot be encoded as PNG")
+        write_bytes(path, data.tobytes())
+        paths.append(path)
     return paths
 
 
@@ -160,7 +141,9 @@ def draw_points(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
     column, row = np.rint(pixels).astype(np.intp).T
     colours = depth_colours(np.linalg.norm(points, axis=1))
     drawn = image.copy()
-    side = _dot_side(image.shape[0] * image.shape[1], len(points))
+    # Larger for few points, so that all cover a fixed share.
+    side = np.sqrt(_COVERED_SHARE * image.shape[0] * image.shape[1] / max(len(points), 1))
+    side = int(np.clip(round(side), 1, _MAX_DOT_PX))
     for dy, dx in np.ndindex(side, side):
         rows = np.clip(row + dy - side // 2, 0, image.shape[0] - 1)
         drawn[rows, np.clip(column + dx - side // 2, 0, image.shape[1] - 1)] = colours
@@ -174,20 +157,6 @@ def visible_points(points_lidar_m: Array, camera: Camera) -> tuple[Array, Array]
     pixels, valid = camera.lens.project(points)
     valid &= camera.in_image(pixels)
     return points[valid], pixels[valid]
-
-
-def _dot_side(pixels: int, points: int) -> int:
-    """Side of a point's square [px]: larger for few points, so that all cover a fixed share."""
-    side = np.sqrt(_COVERED_SHARE * pixels / max(points, 1))
-    return int(np.clip(round(side), 1, _MAX_DOT_PX))
-
-
-def write_image(path: Path, image: Image) -> None:
-    """Write a BGR image as PNG, atomically."""
-    encoded, data = cv2.imencode(".png", image)
-    if not encoded:
-        raise CalibrationError(f"{path}: an image of shape {image.shape} cannot be encoded as PNG")
-    write_bytes(path, data.tobytes())
 
 
 def depth_colours(distance_m: Array) -> Image:

@@ -16,7 +16,6 @@ from calibgraph.report.figure import (
     add_legend,
     image_figure,
     new_figure,
-    set_octave_ticks,
     to_data_uri,
 )
 from calibgraph.solver.matches import CameraBlock, camera_blocks
@@ -31,8 +30,6 @@ _INLIER, _OUTLIER, _LINE = "#0072B2", "#D55E00", "#000000"
 
 _MAX_DOTS = 6000
 _MAX_GATES = 2.0  # axes of residuals end here
-_MEDIAN_BINS = 15
-_MIN_PER_BIN = 10
 ARROW_COLUMNS = 12  # cells across the image
 _COVERAGE_COLUMNS = 20
 _ROUND_FACTORS = np.array([1.0, 2.0, 5.0, 10.0])
@@ -58,23 +55,6 @@ def residual_scatter(errors: ReprojectionErrors, sigma_px: float) -> str:
     far = int(np.count_nonzero(np.abs(errors.vectors_px).max(axis=1, initial=0.0) > limit))
     axes.set_title(f"{far} of {len(errors.frame)} are farther out than shown", fontsize=9)
     add_legend(axes, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return to_data_uri(figure)
-
-
-def residual_by_distance(errors: ReprojectionErrors) -> str:
-    """Size of the residuals against the distance of the points, with the running median."""
-    figure = new_figure(3.3)
-    axes = figure.add_axes((0.12, 0.15, 0.85, 0.82))
-    for part, colour, label in _outliers_and_inliers(errors):
-        dots = _thin(np.column_stack([part.distances_m, part.sizes_px]))
-        axes.plot(*dots.T, ".", color=colour, markersize=2.5, alpha=0.5, label=label)
-    middle = _running_median(errors.select(errors.is_inlier))
-    axes.plot(*middle.T, "-", color=_LINE, linewidth=1.8, label="median, inside")
-    axes.axhline(errors.gate_px, color=_LINE, linewidth=1.0, linestyle=":")
-    axes.set(xscale="log", ylim=(0, _MAX_GATES * errors.gate_px))
-    axes.set(xlabel="distance from the camera [m]", ylabel="residual [px]")
-    set_octave_ticks(axes, errors.distances_m)
-    add_legend(axes)
     return to_data_uri(figure)
 
 
@@ -157,18 +137,6 @@ def _thin(dots: Array) -> Array:
     """At most _MAX_DOTS of the rows, evenly spread; more would overlap."""
     rows = np.linspace(0, len(dots) - 1, min(len(dots), _MAX_DOTS)).round().astype(int)
     return np.asarray(dots[rows])
-
-
-def _running_median(errors: ReprojectionErrors) -> Array:
-    """(m, 2) medians of distance and size over bins of equally many matches."""
-    order = np.argsort(errors.distances_m)
-    bins = np.array_split(order, max(1, min(_MEDIAN_BINS, len(order) // _MIN_PER_BIN)))
-    medians = [
-        (np.median(errors.distances_m[rows]), np.median(errors.sizes_px[rows]))
-        for rows in bins
-        if len(rows)
-    ]
-    return np.array(medians).reshape(-1, 2)
 
 
 def arrow_factor(means: Array, cell_px: float) -> float:

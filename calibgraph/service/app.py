@@ -19,8 +19,8 @@ from starlette.concurrency import run_in_threadpool
 from calibgraph.errors import CalibrationError
 from calibgraph.service.problems import add_problem_handlers
 from calibgraph.service.request_guard import RequestGuard
+from calibgraph.service.requests import Settings
 from calibgraph.service.routes import router
-from calibgraph.service.settings import Settings
 from calibgraph.service.state import Service
 
 STATIC_FOLDER = Path(__file__).parent / "static"
@@ -62,18 +62,15 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 
 def require_safe(host: str, *, has_tokens: bool) -> None:
     """Check that a server without tokens is for this machine alone."""
-    if not has_tokens and not _is_loopback(host):
+    try:
+        is_loopback = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        is_loopback = host == "localhost"
+    if not has_tokens and not is_loopback:
         raise CalibrationError(
             f"--host {host}: others could call; give --tokens FILE, or listen on 127.0.0.1; a "
             "token is added to the file by calibgraph serve --tokens FILE --new-token submit"
         )
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def serve(app: FastAPI, host: str, port: int, announce: Callable[[str], None]) -> None:

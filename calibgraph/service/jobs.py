@@ -11,7 +11,7 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, sess
 
 from calibgraph.child_process import ErrorKind, Outcome
 from calibgraph.errors import CalibrationError
-from calibgraph.service.job_requests import Job, JobKind
+from calibgraph.service.requests import Job, JobKind
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 FINISHED: tuple[JobState, ...] = ("succeeded", "failed", "cancelled")

@@ -21,7 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from calibgraph.errors import FileError
 from calibgraph.files import read_text, write_text
 from calibgraph.service.problems import Problem, problem_response
-from calibgraph.service.settings import Settings
+from calibgraph.service.requests import Settings
 
 TokenScope = Literal["read", "submit"]
 SCOPES: tuple[TokenScope, ...] = get_args(TokenScope)

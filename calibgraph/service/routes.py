@@ -13,9 +13,9 @@ from starlette.concurrency import run_in_threadpool
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.report.kit import page_template
 from calibgraph.service.folders import ARCHIVE, FILES, LOG, RESULT, SUMMARY
-from calibgraph.service.job_requests import RECORDING, RIG, TABLE, TEXTS, JobKind, JobProgress
 from calibgraph.service.jobs import JobRecord, JobState
 from calibgraph.service.problems import Problem
+from calibgraph.service.requests import RECORDING, RIG, TABLE, TEXTS, JobKind, JobProgress
 from calibgraph.service.state import Service, service_of
 from calibgraph.service.uploads import receive_job
 

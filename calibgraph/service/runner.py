@@ -10,9 +10,8 @@ from functools import partial
 
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError, Outcome
 from calibgraph.service.folders import INPUT, RESULT, SCRATCH, WORK, DataFolder
-from calibgraph.service.job_requests import Job, JobProgress, JobTask
 from calibgraph.service.jobs import FINISHED, JobRecord, JobTable
-from calibgraph.service.settings import Settings
+from calibgraph.service.requests import Job, JobProgress, JobTask, Settings
 
 log = logging.getLogger("calibgraph.service")
 
@@ -138,7 +137,10 @@ class Runner:
                 self._settings.job_timeout_s,
                 partial(self.steps.__setitem__, record.id),
             )
-            self._renew(slot, failed=outcome.error_kind is not None)
+            slot.jobs += 1
+            if outcome.error_kind is not None or slot.jobs >= _JOBS_PER_CHILD:
+                slot.child.stop()  # it has run many jobs, or may be in disorder
+                slot.jobs = 0
             return outcome
         except ChildTimeoutError as error:
             return Outcome(error_kind="timeout", error=f"{error}; give fewer frames")
@@ -152,13 +154,6 @@ class Runner:
         """What the process of a job gets."""
         job, folder = Job.model_validate_json(record.request), self._folder.of_job(record.id)
         return JobTask(job, folder, self._settings)
-
-    def _renew(self, slot: _Slot, *, failed: bool) -> None:
-        """End a process that has run many jobs, or one that failed: it may be in disorder."""
-        slot.jobs += 1
-        if failed or slot.jobs >= _JOBS_PER_CHILD:
-            slot.child.stop()
-            slot.jobs = 0
 
     def _discard_input(self, id: str) -> None:
         """Remove all of a finished job that is not its result."""

@@ -13,12 +13,11 @@ from fastapi import Request
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
 from calibgraph.errors import CalibrationError
 from calibgraph.service.folders import DataFolder, open_roots
-from calibgraph.service.job_requests import Job
 from calibgraph.service.jobs import JobRecord, JobTable, open_database
 from calibgraph.service.problems import Problem
 from calibgraph.service.request_guard import load_tokens
+from calibgraph.service.requests import Job, Settings
 from calibgraph.service.runner import Runner
-from calibgraph.service.settings import Settings
 
 
 class Service:

@@ -13,7 +13,8 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 
 from calibgraph.files import describe
 from calibgraph.service.folders import INPUT, LOG, DataFolder, require_inside
-from calibgraph.service.job_requests import (
+from calibgraph.service.problems import Problem
+from calibgraph.service.requests import (
     MAX_RECORDINGS,
     PARTS,
     RECORDING,
@@ -23,7 +24,6 @@ from calibgraph.service.job_requests import (
     JobKind,
     recording_name,
 )
-from calibgraph.service.problems import Problem
 
 MOST_TEXT_BYTES = 10**6
 

@@ -24,18 +24,7 @@ from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import pose_rows, retract_all, to_T_lidar_camera
 from calibgraph.model.rig import RelativePose
-from calibgraph.solver.components import (
 from calibgraph.model.verdict import Verdict
-from calibgraph.solver.error_model import Conflict, relative_pose_conflict
-from calibgraph.solver.covariance import ENOUGH_FRAMES
-from calibgraph.solver.covariance import pose_equations
-from calibgraph.solver.places import fit_latent_poses, start_values
-from calibgraph.solver.error_model import ErrorFit
-from calibgraph.solver.sources import (
-    predict_variances,
-    sources_by_camera,
-    variances_by_source,
-)
 from calibgraph.solver.components import (
     Component,
     Evidence,

@@ -111,7 +111,7 @@ def frames_of_table(path: Path) -> Iterator[Item]:
         FileError: wherever the file turns out not to be readable.
     """
     for table in _parts_of_file(require_file(path)):
-        yield from _frames_in(table, str(path))
+        yield from frames_in_table(table, str(path))
 
 
 def require_plausible_motion(path: Path) -> None:
@@ -210,7 +210,7 @@ def require_schema(where: Path | str, schema: pa.Schema) -> None:
         raise FileError(where, str(error)) from error
 
 
-def _frames_in(table: pa.Table, where: str) -> Iterator[Item]:
+def frames_in_table(table: pa.Table, where: str) -> Iterator[Item]:
     """The frames of a table with a checked schema, in ascending order."""
     if table["frame"].null_count:
         count = table["frame"].null_count

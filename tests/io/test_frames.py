@@ -22,7 +22,7 @@ from calibgraph.io import kept_frames
 from calibgraph.io.images import load_image
 from calibgraph.io.kept_frames import KeptFrame, keep_frames
 from calibgraph.io.motion import ScanMotion, twist_between
-from calibgraph.matching.camera_pairs.features import Features, features_of
+from calibgraph.matching.camera_pairs.find import Features, features_of
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
 from calibgraph.pipeline import hash_inputs
 from tests.conftest import SAMPLE, make_camera

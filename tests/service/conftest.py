@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 
 from calibgraph.service.app import create_app
 from calibgraph.service.request_guard import TokenScope, add_token
-from calibgraph.service.settings import Settings
+from calibgraph.service.requests import Settings
 from tests.cli.conftest import save_problem
 
 URL = "http://localhost"

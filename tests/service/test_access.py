@@ -12,7 +12,7 @@ from calibgraph.errors import CalibrationError, FileError
 from calibgraph.service.app import create_app, require_safe
 from calibgraph.service.folders import open_roots
 from calibgraph.service.request_guard import STRICT_HEADERS, add_token, load_tokens
-from calibgraph.service.settings import Settings
+from calibgraph.service.requests import Settings
 from tests.service.conftest import Make, Problem, make_tokens
 
 

@@ -13,8 +13,7 @@ import pytest
 from calibgraph.child_process import Outcome, memory_limit
 from calibgraph.errors import FileError
 from calibgraph.io.dataset import load_dataset
-from calibgraph.service.archives import open_upload
-from calibgraph.service.job_process import run_job
+from calibgraph.service.job_process import open_upload, run_job
 from tests.conftest import SAMPLE
 from tests.service.conftest import Make, Problem, service_folder
 from tests.service.hostile import Hostile, as_form, hostile_uploads, zipped

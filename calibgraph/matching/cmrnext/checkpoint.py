@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -19,12 +19,7 @@ from torch import Tensor
 
 from calibgraph.errors import FileError, in_words
 from calibgraph.files import checked_model, sha256, write_atomically
-from calibgraph.matching.cmrnext.network import RGB_CHANNELS, Architecture, CmrNext
-
-Shapes = Mapping[str, tuple[int, ...]]
-
-_UNCERTAINTY_OF_OUTPUTS = {2: "none", 4: "nll"}
-_DER_OUTPUTS = (6, 8)
+from calibgraph.matching.cmrnext.network import Architecture, CmrNext
 
 SAFETENSORS = ".safetensors"
 
@@ -46,6 +41,11 @@ class _Config(BaseModel):
     systematic_rotation_rad: Annotated[_Number, Field(le=10)] | None = None
     systematic_translation_m: Annotated[_Number, Field(le=1000)] | None = None
     use_reflectance: StrictBool
+    fourier_levels: Annotated[int, Field(strict=True)] = -1
+    context_encoder: Literal["lidar", "rgb"] = "rgb"
+    uncertainty: StrictBool = False
+    unc_freeze: StrictBool = False
+    al_contrario: Literal[False] = False
     normalize_images: StrictBool
     half_resolution: StrictBool | None = None
 
@@ -128,22 +128,32 @@ def _to_checkpoint(
     path: Path, given: Mapping[Any, Any], tensors: Mapping[str, Tensor]
 ) -> Checkpoint:
     try:
-        config = _plain(given)
-        checked_model(_Config, config, path)
-        shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-        architecture = recognize_architecture(shapes, reflectance=config["use_reflectance"])
-        require_config_agrees(architecture, config)
+        # The part that is plain, printable values of ordinary size.
+        config = {key: value for key, value in given.items() if _is_plain(key) and _is_plain(value)}
+        architecture = _architecture(checked_model(_Config, config, path), tensors)
         state = _copy_state(architecture, tensors)
     except ValueError as error:
         raise FileError(path, f"{error}") from None
     return Checkpoint(path, sha256(path), architecture, config, state)
 
 
+def _architecture(config: _Config, tensors: Mapping[str, Tensor]) -> Architecture:
+    """The network by its config, and its width by its first layer; all weights have to fit it."""
+    first = tensors.get("fnet_img.conv1.weight")
+    if first is None or first.ndim != 4:  # noqa: PLR2004 - a convolution
+        raise ValueError("these are not the weights of a CMRNext network")
+    head: Literal["nll", "nll_frozen"] = "nll_frozen" if config.unc_freeze else "nll"
+    return Architecture(
+        fourier_levels=config.fourier_levels,
+        reflectance=config.use_reflectance,
+        context=config.context_encoder,
+        uncertainty=head if config.uncertainty else "none",
+        width=len(first),
+    )
+
+
 def _read_torch(path: Path) -> tuple[dict[Any, Any], dict[str, Tensor]]:
-    return _weights_in(read_torch_file(path), path)
-
-
-def _weights_in(content: Mapping[Any, Any], path: Path) -> tuple[dict[Any, Any], dict[str, Tensor]]:
+    content = read_torch_file(path)
     for key in ("config", "state_dict"):
         if not isinstance(content.get(key), dict):
             raise FileError(path, f"lacks {key!r}: expected the checkpoint of a CMRNext training")
@@ -174,11 +184,6 @@ def _read_safetensors(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     return config, tensors
 
 
-def _plain(config: Mapping[Any, Any]) -> dict[str, Any]:
-    """The part of a config that is plain, printable values of ordinary size."""
-    return {key: value for key, value in config.items() if _is_plain(key) and _is_plain(value)}
-
-
 def _is_plain(value: Any) -> bool:
     if isinstance(value, str):
         return len(value) <= _MAX_TEXT and value.isprintable()
@@ -199,6 +204,11 @@ def _copy_state(architecture: Architecture, tensors: Mapping[str, Tensor]) -> di
     ):
         if names:
             raise ValueError(f"{kind} weights {min(names)!r} ({len(names)} such names)")
+    for name, like in expected.items():
+        if tensors[name].shape != like.shape:
+            network = ", ".join(f"{key} {value}" for key, value in asdict(architecture).items())
+            found, wanted = tuple(tensors[name].shape), tuple(like.shape)
+            raise ValueError(f"{name!r} has shape {found}, expected {wanted}, with {network}")
     state = {name: _copy(name, tensors[name], like) for name, like in expected.items()}
     for name, tensor in state.items():
         if ".norm3." in name and not torch.equal(
@@ -210,8 +220,6 @@ def _copy_state(architecture: Architecture, tensors: Mapping[str, Tensor]) -> di
 
 def _copy(name: str, tensor: Tensor, like: Tensor) -> Tensor:
     """A sound copy of a tensor, in the type that the network expects."""
-    if tensor.shape != like.shape:
-        raise ValueError(f"{name!r} has shape {tuple(tensor.shape)}, expected {tuple(like.shape)}")
     if tensor.is_floating_point() != like.is_floating_point():
         raise ValueError(f"{name!r} holds numbers of type {tensor.dtype}")
     copy = torch.empty(like.shape, dtype=like.dtype).copy_(tensor)
@@ -307,76 +315,3 @@ def _load(path: Path) -> object:
     with torch.serialization.safe_globals(stand_ins), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of pickle protocols: what cannot be read is an error
         return torch.load(path, map_location="cpu", weights_only=True)
-
-
-def recognize_architecture(shapes: Shapes, *, reflectance: bool) -> Architecture:
-    """The architecture that a state dict's shapes belong to.
-
-    Raises:
-        ValueError: if they belong to no supported architecture.
-    """
-    lidar = _dimension(shapes, "fnet_lidar.conv1.weight", 1)
-    context = _dimension(shapes, "cnet.conv1.weight", 1)
-    uncertainty = _recognize_uncertainty(shapes)
-    if context not in (RGB_CHANNELS, lidar):
-        raise ValueError(f"its context encoder reads {context} channels, expected 3 or {lidar}")
-    encoding = lidar - reflectance
-    if encoding < 1 or encoding % 2 == 0:
-        raise ValueError(
-            f"its LiDAR encoder reads {lidar} channels, which does not fit its config's "
-            f"use_reflectance {reflectance}"
-        )
-    return Architecture(
-        fourier_levels=(encoding - 1) // 2 or -1,
-        reflectance=reflectance,
-        context="lidar" if context == lidar else "rgb",
-        uncertainty=uncertainty,  # type: ignore[arg-type]
-        width=_dimension(shapes, "fnet_img.conv1.weight", 0),
-    )
-
-
-def _recognize_uncertainty(shapes: Shapes) -> str:
-    outputs = _dimension(shapes, "update_block.flow_head.conv2.weight", 0)
-    if any(name.startswith("update_block_unc.") for name in shapes):
-        head = _dimension(shapes, "update_block_unc.flow_head.conv2.weight", 0)
-        uncertainty = "nll_frozen" if (outputs, head) == (2, 2) else None
-        outputs = head if outputs == 2 else outputs  # noqa: PLR2004 - the plain head
-    else:
-        uncertainty = _UNCERTAINTY_OF_OUTPUTS.get(outputs)
-    if uncertainty is None:
-        kind = "an evidential (DER)" if outputs in _DER_OUTPUTS else "an unknown"
-        raise ValueError(
-            f"has {kind} uncertainty head of {outputs} outputs, which is not supported"
-        )
-    return uncertainty
-
-
-def require_config_agrees(architecture: Architecture, config: Mapping[str, Any]) -> None:
-    """Compare a checkpoint's config with the architecture of its weights.
-
-    Raises:
-        ValueError: on the first disagreement.
-    """
-    head = {"none": False, "nll": True, "nll_frozen": True}[architecture.uncertainty]
-    of_weights = {
-        "fourier_levels": architecture.fourier_levels,
-        "context_encoder": architecture.context,
-        "uncertainty": head,
-        "unc_freeze": architecture.uncertainty == "nll_frozen",
-        "al_contrario": False,
-    }
-    defaults = {"fourier_levels": -1, "context_encoder": "rgb"}
-    for key, actual in of_weights.items():
-        given = config.get(key, defaults.get(key, False))
-        if key == "unc_freeze" and not head:
-            continue
-        if given != actual:
-            raise ValueError(f"its config has {key} = {given!r}, its weights have {actual!r}")
-
-
-def _dimension(shapes: Shapes, name: str, axis: int) -> int:
-    if name not in shapes:
-        raise ValueError(f"lacks {name!r}: these are not the weights of a CMRNext network")
-    if len(shapes[name]) != 4:  # noqa: PLR2004 - a convolution
-        raise ValueError(f"{name!r} has shape {shapes[name]}, expected a convolution's")
-    return shapes[name][axis]
