@@ -24,7 +24,7 @@ from calibgraph.tracking.state import STRENGTHS, State
 from calibgraph.tracking.sums import Numbers, Sums
 from factors import to_runs
 
-_GATE_STEPS = 2  # by the true Hessian: each leaves about a tenth of the way
+_GATE_STEPS = 3  # by the true Hessian: each leaves about a tenth of the way
 
 
 def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
