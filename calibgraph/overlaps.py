@@ -13,7 +13,7 @@ from calibgraph.matching.run import MatchingRun
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.progress import Progress
 from calibgraph.solver.joint import add_camera_pairs
-from factors.free_lens import CLOCK
+from factors.columns import CLOCK
 
 
 def refine_with_camera_pairs(run: MatchingRun, progress: Progress) -> MatchingRun:

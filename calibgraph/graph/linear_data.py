@@ -14,7 +14,6 @@ from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.variables import cloud_at_key, matched_at_key, paired_key
 from calibgraph.model.geometry import adjoints, invert_each
-from factors import pair_run_sums
 
 
 @dataclass(eq=False)
@@ -113,7 +112,7 @@ class LinearData:
         keys = [paired_key(model.cameras.index(name)) for name in (pair.a, pair.b)]
         shown, here = poses_of(values, keys), clouds[pair.places]
         seen = [invert_each(here) @ pose for pose in shown]
-        sums = pair_run_sums(pair.block, seen[0], seen[1], pair.edges)
+        sums = pair.block.run_sums(seen[0], seen[1], pair.edges)
         chain = np.concatenate([-adjoints(invert_each(pose)) for pose in seen], axis=1)
         across = chain.transpose(0, 2, 1) @ sums.hessian
         cloud, pull = across @ chain, -np.einsum("pij,pi->pj", chain, sums.gradient)

@@ -18,13 +18,13 @@ from calibgraph.graph.variables import seen_lens_key
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import invert, to_T_lidar_camera
 from calibgraph.model.places import Places
+from calibgraph.solver.columns import distortion_evidence, pair_jacobians
 from calibgraph.solver.conflicts import relative_pose_conflict
 from calibgraph.solver.curvature import FittedObjective
 from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
 from calibgraph.solver.lens import lens_errors, lens_term, weak_information
 from calibgraph.solver.objective import Objective
 from calibgraph.solver.optimizer import Optimum
-from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
 from calibgraph.solver.variance_components import (
     VarianceRatios,
     common_error,

@@ -15,7 +15,7 @@ from calibgraph.model.pose_kernel import MAX_DAMPING, descend
 from calibgraph.solver.camera_block import CameraBlock
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, CUT, robust_spreads
 from factors import ProjectionBlock, to_runs
-from factors.block_sums import unpack_sums
+from factors.arrays import unpack_sums
 
 Runs = NDArray[np.int64]
 """(f, 2): the first correspondence of each frame, and the one behind its last."""

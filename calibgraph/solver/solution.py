@@ -16,8 +16,7 @@ from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.solver.curvature import FittedObjective
 from calibgraph.solver.error_model import ErrorFit
-from calibgraph.solver.lens import moved_lenses, put_into
-from calibgraph.solver.lens_estimates import lens_covariances, lens_estimates
+from calibgraph.solver.lens import lens_covariances, lens_estimates, moved_lenses, put_into
 from calibgraph.solver.marginals import Marginals
 from calibgraph.solver.objective import Objective, Scales, Transforms
 from calibgraph.solver.optimizer import Optimum

@@ -21,9 +21,9 @@ from calibgraph.arrays import Array
 from calibgraph.graph.components import EXACT, VarianceComponents, least_cost_of_distortion
 from calibgraph.graph.latent_poses import to_ordering
 from calibgraph.model.findings import MatcherFindings, error_components
+from calibgraph.solver.columns import DistortionEvidence
 from calibgraph.solver.elimination import LatentPoseFit, Linearization, join_linear
 from calibgraph.solver.pair_refinement import pair_sigmas
-from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WithinPlace
 
 Component = Literal["shared", "cloud", "cameras"]

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.solver.camera_block import MIN_MATCHES, CameraBlock, merge
+from calibgraph.solver.columns import DistortionEvidence, distortion_evidence
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.solver.scan_distortion import DistortionEvidence, distortion_evidence
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.frozen import changed
 from calibgraph.tracking.gated import Gated

@@ -23,9 +23,9 @@ from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.variables import cloud_at_key, matched_at_key
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import pose_rows
+from calibgraph.solver.columns import DistortionEvidence
 from calibgraph.solver.curvature import convex_hessian
 from calibgraph.solver.elimination import LatentPoseFit, join_linear
-from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import variance_components
 from calibgraph.solver.within_place import (
     WEAK,

@@ -17,7 +17,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.model.rig import Rig
-from calibgraph.solver.scan_distortion import DistortionEvidence
+from calibgraph.solver.columns import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.events import Event

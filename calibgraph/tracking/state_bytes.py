@@ -26,8 +26,8 @@ from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Rig
 from calibgraph.solver.camera_block import CameraBlock
+from calibgraph.solver.columns import DistortionEvidence
 from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.variance_components import VarianceRatios
 from calibgraph.tracking.camera_state import CameraState
 from calibgraph.tracking.epoch_arrays import from_arrays, to_arrays

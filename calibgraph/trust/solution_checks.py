@@ -13,7 +13,7 @@ from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
 from calibgraph.trust.evidence import Checks, Estimate, Evidence
 from calibgraph.trust.thresholds import threshold
-from factors.free_lens import CLOCK
+from factors.columns import CLOCK
 
 
 def estimate_checks(evidence: Evidence) -> Checks:
