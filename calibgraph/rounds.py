@@ -53,7 +53,7 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.inputs import check_inputs, describe_copies
 from calibgraph.trust.matcher_checks import REMATCH_DEG, REMATCH_M, compare_ends
-from factors.free_lens import CLOCK
+from factors.columns import CLOCK
 
 Datasets = Dataset | Path | str | Sequence[Path | str]
 AnyMatcher = Matcher | Correspondences | Path | str

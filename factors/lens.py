@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.block_arrays import contiguous
+from factors.arrays import contiguous
 from factors.compiled import compiled
 from factors.lens_kernels import (
     EQUIRECTANGULAR,

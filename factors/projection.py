@@ -8,9 +8,9 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.custom import custom_factor
 from factors.lens import Lens
 from factors.loss import robust_noise
+from factors.pose import custom_factor
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from calibgraph.model.config import LensPart
 from calibgraph.model.rig import Camera
 from factors import Clock
-from factors.free_lens import OFFSET, READOUT
+from factors.columns import OFFSET, READOUT
 
 OFFSET_SIGMA_S, READOUT_SIGMA_S = 0.05, 0.03
 """Of the prior, where the rig states none: half a turn of a LiDAR, and a usual read-out."""

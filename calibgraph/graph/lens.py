@@ -28,13 +28,12 @@ from calibgraph.model.lens import IN_DOUBT, LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from factors import (
     BlockSums,
-    FreeLens,
-    FreeLensBlock,
-    free_lens_factor,
+    Columns,
+    columns_factor,
     linear_factor,
     robust_noise,
 )
-from factors.free_lens import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
+from factors.columns import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
 from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
 
 TANGENTIAL_SHARE = 0.1
@@ -54,7 +53,7 @@ class LensVariable:
     """
 
     camera: Camera
-    free: FreeLens
+    free: Columns
     values: Array
 
     @staticmethod
@@ -73,7 +72,7 @@ class LensVariable:
         """
         sigmas = _prior_sigmas(camera, default)
         chosen = {name: sigma for part in parts for name, sigma in sigmas[part].items()}
-        free = FreeLens(camera.lens, tuple(chosen), tuple(chosen.values()), clock_of(camera))
+        free = Columns(camera.lens, tuple(chosen), tuple(chosen.values()), clock_of(camera))
         return LensVariable(camera, free, np.zeros(len(chosen)))
 
     @property
@@ -199,7 +198,7 @@ class FreeLensByPlace:
     """
 
     placed: BlockByPlace
-    lens: FreeLens
+    lens: Columns
     key: int
 
     @property
@@ -207,33 +206,18 @@ class FreeLensByPlace:
         """(p,) the places that have correspondences, in rising order."""
         return self.placed.places
 
-    def sums(self, T_camera_cloud: Array, values: Array) -> list[BlockSums]:
-        """H, b and c of every place with correspondences, by pose and lens.
+    def sums(self, T_camera_cloud: Array, values: Array) -> BlockSums:
+        """H, b and c of every place by pose and lens, stacked.
 
         Args:
-            T_camera_cloud: (p, 4, 4) of these places.
+            T_camera_cloud: (P, 4, 4) of all places.
             values: (k,) of the lens.
         """
-        pairs = zip(self.places, T_camera_cloud, strict=True)
-        return [self._at(int(place)).sums(T, values) for place, T in pairs]
-
-    def stacked_sums(self, T_camera_cloud: Array, values: Array) -> BlockSums:
-        """The same of all P places, (P, 6 + k, 6 + k), zero where there are no correspondences."""
-        count, size = len(T_camera_cloud), 6 + len(values)
-        found = BlockSums(np.zeros((count, size, size)), np.zeros((count, size)), np.zeros(count))
-        sums = self.sums(T_camera_cloud[self.places], values)
-        for place, one in zip(self.places, sums, strict=True):
-            found.hessian[place], found.gradient[place] = one.hessian, one.gradient
-            found.cost[place] = one.cost
-        return found
+        runs = np.column_stack([self.placed.edges[:-1], self.placed.edges[1:]])
+        return self.placed.block.summarize(T_camera_cloud, runs, self.lens, values)
 
     def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
         """The correspondences of one place, lossless, on the variables of these keys."""
-        block = self._at(place)
-        if not len(block.block):
-            return []
-        return [free_lens_factor([cloud, matched, self.key], block)]
-
-    def _at(self, place: int) -> FreeLensBlock:
-        rows = np.arange(self.placed.edges[place], self.placed.edges[place + 1])
-        return FreeLensBlock(self.placed.block.select(rows), self.lens)
+        first, end = self.placed.edges[place : place + 2].tolist()
+        block = self.placed.block.select(np.arange(first, end))
+        return [columns_factor([cloud, matched, self.key], block, self.lens)] if len(block) else []

@@ -17,7 +17,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.solver.solution import Solution
-from factors.free_lens import CLOCK
+from factors.columns import CLOCK
 
 RoundSummary = Mapping[str, Mapping[str, float]]
 """Per camera: number of ``matches``, and the motion of the estimate in the round, ``moved_deg`` and

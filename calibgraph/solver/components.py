@@ -16,9 +16,9 @@ from calibgraph.graph.components import (
     least_cost_of_distortion,
 )
 from calibgraph.model.findings import MatcherFindings, error_components
+from calibgraph.solver.columns import DistortionEvidence
 from calibgraph.solver.pair_refinement import pair_sigmas
 from calibgraph.solver.places import Linearization
-from calibgraph.solver.scan_distortion import DistortionEvidence
 from calibgraph.solver.within_place import WithinPlace
 
 Component = Literal["shared", "cloud", "cameras"]

@@ -25,11 +25,11 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.places import Places
 from calibgraph.model.rig import RelativePose
+from calibgraph.solver.columns import distortion_evidence, pair_jacobians
 from calibgraph.solver.components import common_error, estimate_variance_ratios, variance_components
 from calibgraph.solver.covariance import FittedObjective
 from calibgraph.solver.lens import lens_errors, lens_term, weak_information
 from calibgraph.solver.places import ErrorFit, fit_latent_poses, start_values
-from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
 from calibgraph.solver.two_pass import Objective, Optimum
 from calibgraph.solver.within_place import block_by_place, pairs_by_place, within_place
 from factors import pose_sigmas

@@ -27,7 +27,7 @@ from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS, CUT, robust_spread, ro
 from calibgraph.solver.stage1 import Stage1
 from calibgraph.solver.two_pass import USING_CORRESPONDENCES
 from factors import to_runs
-from factors.block_sums import unpack_sums
+from factors.arrays import unpack_sums
 
 MIN_FRAMES_TO_WEIGH = 8
 """Fewer frames do not determine their own scatter; weights from them would shrink the error bar."""

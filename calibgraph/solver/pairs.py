@@ -29,8 +29,6 @@ from factors import (
     EpipolarBlock,
     SurfaceBlock,
     pair_block_factor,
-    pair_chain,
-    pair_sums,
     unproject,
 )
 
@@ -83,11 +81,8 @@ class PairTerm:
 
     def errors_px(self, T_camera_lidar: Mapping[str, Array]) -> Array:
         """(n,) lengths of the residuals; infinite where B cannot see the point."""
-        poses = self._poses(T_camera_lidar)
-        if isinstance(self.block, SurfaceBlock):
-            residuals, projectable = self.block.residuals(*poses)
-            return np.where(projectable, np.hypot(*residuals.T), np.inf)
-        return np.abs(self.block.residuals(poses[0].between(poses[1])))
+        residuals, projectable = self.block.residuals(*self._poses(T_camera_lidar))
+        return np.where(projectable, np.hypot(*residuals.T), np.inf)
 
     def sigma_px(self, T_camera_lidar: Mapping[str, Array]) -> float:
         """Robust spread of the residuals, per axis."""
@@ -104,17 +99,13 @@ class PairTerm:
 
     def sums(self, T_camera_lidar: Mapping[str, Array]) -> BlockSums:
         """H (12, 12), b (12,) and c, in the tangents of ``T_lidar_a`` and ``T_lidar_b``."""
-        return pair_sums(self.block, *self._poses(T_camera_lidar))
+        return self.block.sums(*self._poses(T_camera_lidar))
 
     def frame_sums(self, T_camera_lidar: Mapping[str, Array]) -> tuple[Array, Array]:
         """(f, 12, 12) H and (f, 12) b of each frame."""
-        poses = self._poses(T_camera_lidar)
-        if isinstance(self.block, SurfaceBlock):
-            sums = self.block.frame_sums(*poses, self.frame_edges)
-            return sums.hessian, sums.gradient
-        chain = pair_chain(*poses)
-        relative = self.block.frame_sums(poses[0].between(poses[1]), self.frame_edges)
-        return chain.T @ relative.hessian @ chain, relative.gradient @ chain
+        a, b = (pose.matrix()[None] for pose in self._poses(T_camera_lidar))
+        sums = self.block.run_sums(a, b, self.frame_edges)
+        return sums.hessian, sums.gradient
 
     @property
     def _axes(self) -> int:

@@ -49,7 +49,7 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.two_pass import MAX_ITERATIONS
-from factors import BlockSums, pair_run_sums
+from factors import BlockSums
 from factors.conditioning import SINGULAR, unit_diagonal
 
 TOLERANCE = 1e-6
@@ -184,7 +184,7 @@ class Linearization:
         for row, number in enumerate(model.matched):
             block, T = model.blocks[model.cameras[number]], self._T_camera_cloud[row]
             if isinstance(block, FreeLensByPlace):
-                sums = block.stacked_sums(T, self.shared.atVector(block.key))
+                sums = block.sums(T, self.shared.atVector(block.key))
             else:
                 sums = block.sums(T)
             n = sums.gradient.shape[1]
@@ -200,7 +200,7 @@ class Linearization:
             numbers = [self.model.cameras.index(name) for name in (pair.a, pair.b)]
             shown = _poses(self.shared, map(paired_key, numbers))
             seen = self.inverses[0, pair.places] @ shown[:, None]
-            sums = pair_run_sums(pair.block, seen[0], seen[1], pair.edges)
+            sums = pair.block.run_sums(seen[0], seen[1], pair.edges)
             by_cloud = -adjoints(invert_each(seen.reshape(-1, 4, 4))).reshape(2, -1, 6, 6)
             by = np.tile(np.eye(12, 18, 6), (len(pair.places), 1, 1))
             by[:, :6, :6], by[:, 6:, :6] = by_cloud

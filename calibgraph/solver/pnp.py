@@ -17,7 +17,7 @@ from calibgraph.model.pose_kernel import MAX_DAMPING, descend
 from calibgraph.model.rig import Camera
 from calibgraph.solver.matches import MIN_MATCHES
 from factors import ProjectionBlock, unproject
-from factors.block_sums import unpack_sums
+from factors.arrays import unpack_sums
 from factors.conditioning import are_regular
 
 Runs = NDArray[np.int64]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from factors.block_arrays import contiguous
+from factors.arrays import contiguous
 from factors.compiled import compiled
 
 CAUCHY_SCALE_SIGMAS = 2.385

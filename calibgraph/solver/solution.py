@@ -29,8 +29,7 @@ from calibgraph.solver.error_model import (
     fit_without_priors,
     relative_pose_conflict,
 )
-from calibgraph.solver.lens import moved_lenses, put_into
-from calibgraph.solver.lens_estimates import lens_covariances, lens_estimates
+from calibgraph.solver.lens import lens_covariances, lens_estimates, moved_lenses, put_into
 from calibgraph.solver.pair_refinement import PairFit, fit_pairs, shared_variance_ratio
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.sources import predict_variances, sources_by_camera, variances_by_source

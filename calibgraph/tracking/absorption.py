@@ -12,9 +12,9 @@ from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
+from calibgraph.solver.columns import distortion_evidence
 from calibgraph.solver.matches import BlockResiduals, CameraBlock, camera_blocks, merge
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.solver.scan_distortion import distortion_evidence
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.cause import chance_limit
 from calibgraph.tracking.estimate import EpochGraph, states_places

@@ -39,15 +39,13 @@ from calibgraph.matching.structure.shift_scores import (
     crop_grids,
     score_frame,
 )
-from calibgraph.model.clock import at_pixels, clock_of
+from calibgraph.model.clock import clock_of
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress, no_progress
-from calibgraph.solver.camera_twist import apply_twist
-from calibgraph.solver.linear_fit import LinearFit, block_of, fit_camera
-from calibgraph.solver.scan_distortion import distortion_fields_px
+from calibgraph.solver.columns import ColumnFit, apply_twist, block_of, fit_columns
 from calibgraph.trust.lens_parameter import (
     NAMES,
     Free,
@@ -57,7 +55,8 @@ from calibgraph.trust.lens_parameter import (
     units_of,
 )
 from calibgraph.trust.thresholds import limit
-from factors import displace
+from factors import Columns, displace
+from factors.columns import DISTORTION
 
 Images = Sequence[PreparedImage]
 """Images of one camera, one per frame."""
@@ -279,21 +278,21 @@ def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: in
 
 def _fit_at_peaks(
     scorer: FrameScorer, camera: Camera, scores: ShiftScores, start: Array, *, places: Places
-) -> LinearFit | None:
+) -> ColumnFit | None:
     """Fit pose and lens to the groups' peaks next to a start, (11,); the scan may be distorted."""
     if not len(scores.weights):
         return None
     table = extract_correspondences(scores, start, "camera")
-    table = at_pixels(camera, with_motion(table, scorer.dataset))
+    table = with_motion(table, scorer.dataset)
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
     usual = MatcherFindings.from_metadata({"matcher": "structure"})
-    points = block.block.points_lidar_m
     of_place = usual.place_variance * places.frames_per_place(block.frame_numbers)
-    bends = distortion_fields_px(camera, points) * np.reshape(usual.bend_sigmas, (3, 1, 1))
-    return fit_camera(
-        camera,
+    lens = lens_variable(camera).free
+    names, sigmas = (*lens.parameters, *DISTORTION), (*lens.sigmas, *usual.bend_sigmas)
+    return fit_columns(
         block,
-        np.concatenate([lens_fields_px(camera, points), bends]),
+        camera.T_camera_lidar,
+        Columns(camera.lens, names, sigmas),
         shared_variance=max(of_place, limit("lens_match_share") * len(block)),
-        considered=len(bends),
+        considered=len(DISTORTION),
     )

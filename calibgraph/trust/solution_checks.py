@@ -16,7 +16,7 @@ from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Estimate, Evidence
 from calibgraph.trust.thresholds import threshold
-from factors.free_lens import CLOCK
+from factors.columns import CLOCK
 
 
 def estimate_checks(evidence: Evidence) -> Checks:

@@ -31,7 +31,7 @@ from calibgraph.solver.error_model import fit_errors
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pairs import pair_terms
 from calibgraph.solver.places import ErrorFit, fit_latent_poses, start_values
-from factors import ProjectionBlock, pair_sums, placed_pair_factor
+from factors import ProjectionBlock, placed_pair_factor
 from tests.conftest import stereo_relative_pose
 from tests.solver.latent import all_values, linearized
 from tests.solver.test_camera_pairs import simulated_pairs
@@ -201,7 +201,7 @@ def test_the_factor_of_a_pair_and_its_cloud_is_that_of_the_moved_cameras(pair: R
     for key, pose in enumerate([cloud, *poses]):
         values.insert(key, pose)
     factor = placed_pair_factor(0, 1, 2, term.block)
-    expected = pair_sums(term.block, *(cloud.between(pose) for pose in poses))
+    expected = term.block.sums(*(cloud.between(pose) for pose in poses))
     assert 2 * factor.error(values) == pytest.approx(expected.cost, rel=1e-9)
     jacobian, right = factor.linearize(values).jacobian()
     gradient = -jacobian.T @ right

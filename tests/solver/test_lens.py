@@ -24,7 +24,7 @@ from calibgraph.model.geometry import twist_between
 from calibgraph.model.rig import IntrinsicsSigma
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.lens_estimates import lens_estimates
+from calibgraph.solver.lens import lens_estimates
 from calibgraph.solver.solution import Solution
 from tests.draws.lenses import put_lens_error
 from tests.solver.latent import all_values

@@ -22,7 +22,7 @@ from calibgraph.matching.structure.windows import Windows
 from calibgraph.memory import mmap_zeros
 from calibgraph.model.clock import seen_at_rows, when_taken
 from calibgraph.model.rig import Camera
-from calibgraph.solver.camera_twist import project_with_jacobian
+from factors import Columns, fields_px
 
 Grids = NDArray[np.float32]
 
@@ -114,7 +114,9 @@ def score_frame(  # noqa: PLR0913 - what is scored, and how
     reach, groups = _reach_steps(camera, level, scale), len(seen.points_lidar_m)
     grids: Grids = mmap_zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
     _add_scores(grids, seen, likelihood=level.fine)
-    pixels_px, jacobian_px = project_with_jacobian(seen.camera, seen.seen_lidar_m)
+    lens, T = Columns(seen.camera.lens), seen.camera.T_camera_lidar
+    pixels_px, fields_of_pose = fields_px(seen.seen_lidar_m, T, lens)
+    jacobian_px = np.ascontiguousarray(fields_of_pose.transpose(2, 1, 0))
     return ShiftScores(
         grids=grids,
         jacobian=jacobian_px * scale[:, None],

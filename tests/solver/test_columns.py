@@ -1,4 +1,4 @@
-"""Bends of the cloud, what a twist does to pixels, and the linear fit of an unknown."""
+"""Columns beside the pose: the scan distortion, what a twist does to pixels, the fit of some."""
 
 from __future__ import annotations
 
@@ -11,18 +11,21 @@ from calibgraph import Camera, Correspondences, MatcherErrors, Rig, simulate_cor
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import adjoints, invert, to_T_lidar_camera, twist_between
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.solver.camera_twist import apply_twist, project_with_jacobian
-from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.linear_fit import LinearFit, block_of, fit_camera
-from calibgraph.solver.scan_distortion import (
+from calibgraph.solver.columns import (
+    ColumnFit,
+    apply_twist,
+    block_of,
     distortion_evidence,
-    distortion_fields_px,
-    distortions_at,
+    fit_columns,
     pair_jacobians,
 )
+from calibgraph.solver.joint import solve_joint
+from factors import Columns, fields_px
 from tests.conftest import KANNALA, RADTAN5, make_camera, points_in_front
+from tests.draws.places import distortions_at
 
 STEP = np.array([2e-4, 2e-3, 4e-3])  # far below the scale of the loss
+SIGMAS = {"k1": 0.01, "k2": 0.1, "offset": 1.0, "elevation": 0.01}
 
 
 def test_elevation_turns_each_line_of_sight_and_motion_grows_with_the_heading() -> None:
@@ -32,19 +35,6 @@ def test_elevation_turns_each_line_of_sight_and_motion_grows_with_the_heading() 
     np.testing.assert_allclose(elevation, [[1.0, 0, 10], [0, 0, 10], [2, 0, 10]], atol=1e-12)
     np.testing.assert_allclose(stretch, elevation * slopes[:, None], atol=1e-12)
     np.testing.assert_allclose(motion, [[0, 0, 0], [0.25, 0, 0], [0.5, 0, 0]], atol=1e-12)
-
-
-def test_the_fields_are_derivatives_of_pixels() -> None:
-    camera, points = make_camera(), points_in_front(np.random.default_rng(0), 50)
-    T = camera.T_camera_lidar
-    for field, bend in zip(
-        distortion_fields_px(camera, points), distortions_at(points), strict=True
-    ):
-        before, after = (
-            camera.lens.project((points + step * bend) @ T[:3, :3].T + T[:3, 3])[0]
-            for step in (-1e-6, 1e-6)
-        )
-        np.testing.assert_allclose(field.T, (after - before) / 2e-6, rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("bend", [0, 1, 2])
@@ -137,17 +127,26 @@ def test_a_pair_follows_the_bends_by_one_motion_of_the_cloud(mixed_rig: Rig) -> 
         make_camera(model="fisheye", distortion=KANNALA),
     ],
 )
-def test_the_jacobian_is_the_derivative_by_a_twist(camera: Camera) -> None:
+def test_the_fields_of_a_pose_are_derivatives_by_a_twist(camera: Camera) -> None:
     points = points_in_front(np.random.default_rng(0), 100)
-    _, jacobian = project_with_jacobian(camera, points)
+    _, fields = see(camera, points)
     step = 1e-6
     for index in range(6):
         twist = step * np.eye(6)[index]
-        plus, minus = (
-            project_with_jacobian(apply_twist(camera, sign * twist), points)[0] for sign in (1, -1)
-        )
+        plus, minus = (see(apply_twist(camera, sign * twist), points)[0] for sign in (1, -1))
         # Central differences: rounding of 1e3 px / 2e-6, and a third derivative times 1e-12.
-        np.testing.assert_allclose((plus - minus) / (2 * step), jacobian[:, :, index], atol=1e-4)
+        np.testing.assert_allclose((plus - minus) / (2 * step), fields[index].T, atol=1e-4)
+
+
+def see(
+    camera: Camera, points: np.ndarray, *lens: str, twist_per_s: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The pixels of points, and their derivatives by pose and lens."""
+    return fields_px(points, camera.T_camera_lidar, columns_of(camera, *lens), twist_per_s)
+
+
+def columns_of(camera: Camera, *parameters: str) -> Columns:
+    return Columns(camera.lens, parameters, tuple(SIGMAS[name] for name in parameters))
 
 
 def table_of(
@@ -159,54 +158,55 @@ def table_of(
     )
 
 
-def fit_table(camera: Camera, table: Correspondences, fields: np.ndarray) -> LinearFit | None:
-    rows = np.argsort(table.frame, kind="stable")
-    return fit_camera(camera, block_of(camera, table), fields[:, :, rows])
+def fit_table(
+    camera: Camera, table: Correspondences, *lens: str, considered: int = 0
+) -> ColumnFit | None:
+    block, free = block_of(camera, table), columns_of(camera, *lens)
+    return fit_columns(block, camera.T_camera_lidar, free, considered=considered)
 
 
 def test_the_fit_is_exact_without_noise() -> None:
     rng = np.random.default_rng(3)
     camera, points = make_camera(), points_in_front(rng, 300)
-    field = rng.standard_normal((1, 2, 300))
     twist = 1e-4 * rng.standard_normal(6)
-    pixels, jacobian = project_with_jacobian(camera, points)
-    table = table_of(pixels + jacobian @ twist + 0.7 * field[0].T, points, 5)
-    fit = fit_table(camera, table, field)
+    pixels, fields = see(camera, points, "k1")
+    of_pose = np.tensordot(twist, fields[:6], axes=1).T
+    fit = fit_table(camera, table_of(pixels + of_pose + 0.7 * fields[6].T, points, 5), "k1")
     freed = fit.free(0)
-    np.testing.assert_allclose(freed.values, [0.7], rtol=1e-6)  # the weak prior is 1e-7 of it
-    np.testing.assert_allclose(freed.twist, twist, atol=1e-9)
-    seen = project_with_jacobian(apply_twist(camera, freed.twist), points)[0]
-    np.testing.assert_allclose(seen, pixels + jacobian @ twist, atol=1e-3)  # second order: 1e-7 f
+    np.testing.assert_allclose(freed.values, [0.7], rtol=1e-4)  # the weak prior is 3e-5 of it
+    np.testing.assert_allclose(freed.twist, twist, atol=1e-7)
+    seen = see(apply_twist(camera, freed.twist), points)[0]
+    np.testing.assert_allclose(seen, pixels + of_pose, atol=1e-3)  # second order: 1e-7 f
 
 
-def test_an_unknown_that_the_pose_compensates_is_not_observable() -> None:
-    points = points_in_front(np.random.default_rng(4), 100)
-    pixels, jacobian = project_with_jacobian(make_camera(), points)
-    field = jacobian[:, :, :1].transpose(2, 1, 0)
-    fit = fit_table(make_camera(), table_of(pixels, points, 4), field)
+def moving_table(camera: Camera, of_camera: np.ndarray, count: int) -> Correspondences:
+    """Matches of a LiDAR with the motion that a twist of the camera is, (6,)."""
+    points = points_in_front(np.random.default_rng(4), count)
+    of_lidar = np.linalg.solve(adjoints(camera.T_camera_lidar[None])[0], of_camera)
+    pixels = see(camera, points)[0]
+    return table_of(pixels, points, 4, twist_per_s=np.tile(of_lidar, (count, 1)))
+
+
+def test_a_column_that_the_pose_compensates_is_not_observable() -> None:
+    camera = make_camera()
+    fit = fit_table(camera, moving_table(camera, np.eye(6)[0], 100), "offset")
     assert fit.free(0).sigmas[0] > 0.99  # as the prior of the pose: a radian
+
+
+def test_compensating_twist_undoes_what_a_column_displaces() -> None:
+    """A camera that waits moves by the twist, the points of its frame by the opposite."""
+    camera, twist = make_camera(), np.random.default_rng(5).standard_normal(6)
+    fit = fit_table(camera, moving_table(camera, twist, 200), "offset")
+    np.testing.assert_allclose(fit.free(0).compensating[:, 0], twist, rtol=1e-5)
 
 
 def test_a_few_rows_and_a_single_frame_have_no_fit_and_no_sigma() -> None:
     rng = np.random.default_rng(8)
-    points = points_in_front(rng, 100)
-    pixels, field = (
-        project_with_jacobian(make_camera(), points)[0],
-        rng.standard_normal((1, 2, 100)),
-    )
-    table = table_of(pixels + rng.standard_normal((100, 2)), points, 1)
-    assert fit_table(make_camera(), table.select(np.arange(20)), field[:, :, :20]) is None
-    fit = fit_table(make_camera(), table, field)
+    camera, points = make_camera(), points_in_front(rng, 100)
+    table = table_of(see(camera, points)[0] + rng.standard_normal((100, 2)), points, 1)
+    assert fit_table(camera, table.select(np.arange(20)), "k1") is None
+    fit = fit_table(camera, table, "k1")
     assert fit is not None and np.isnan(fit.free(0).sigmas).all()
-
-
-def test_compensating_twist_undoes_what_an_unknown_displaces() -> None:
-    rng = np.random.default_rng(5)
-    camera, points = make_camera(), points_in_front(rng, 200)
-    pixels, jacobian = project_with_jacobian(camera, points)
-    twist = rng.standard_normal(6)
-    fit = fit_table(camera, table_of(pixels, points, 4), (jacobian @ twist).T[None])
-    np.testing.assert_allclose(fit.free(0).compensating[:, 0], -twist, rtol=1e-5)
 
 
 @pytest.mark.parametrize("outliers", [0, 90])
@@ -214,30 +214,28 @@ def test_sigmas_are_the_scatter_of_the_values(outliers: int) -> None:
     """Over 60 draws, 0.7 to 1.5 of it: four times the scatter of a standard deviation (9 %)."""
     rng = np.random.default_rng(7)
     camera, points = make_camera(), points_in_front(rng, 300)
-    exact, field = project_with_jacobian(camera, points)[0], rng.standard_normal((1, 2, 300))
-    values, sigmas = [], []
+    exact, values, sigmas = see(camera, points)[0], [], []
     for _ in range(60):
         pixels = exact + rng.standard_normal((300, 2))
         pixels[:outliers] += rng.uniform(-300, 300, (outliers, 2))
-        fit = fit_table(camera, table_of(pixels, points, 30), field)
+        fit = fit_table(camera, table_of(pixels, points, 30), "k1")
         values.append(fit.free(0).values[0])
         sigmas.append(fit.free(0).sigmas[0])
     assert 0.7 < np.mean(sigmas) / np.sqrt(np.mean(np.square(values))) < 1.5
 
 
-def test_what_is_considered_widens_an_unknown_by_its_scatter() -> None:
+def test_what_is_considered_widens_a_column_by_its_scatter() -> None:
     """Over 200 draws, within a fifth: four times the scatter of a standard deviation (5 %)."""
-    rng = np.random.default_rng(9)
+    rng, lens = np.random.default_rng(9), ("k1", "k2", "elevation")
     camera, points = make_camera(), points_in_front(rng, 300)
-    exact, field = project_with_jacobian(camera, points)[0], rng.standard_normal((1, 2, 300))
-    fields = np.concatenate([field, 0.5 * field + 0.1 * rng.standard_normal((2, 2, 300))])
-    values, sigmas = [], []
+    exact, fields = see(camera, points, *lens)
+    values, sigmas, alone = [], [], []
     for _ in range(200):
-        shifts = np.tensordot(rng.standard_normal(2), fields[1:], axes=1).T
+        shifts = np.tensordot(rng.standard_normal(2), fields[7:], axes=1).T
         table = table_of(exact + shifts + 0.1 * rng.standard_normal((300, 2)), points, 30)
-        rows = np.argsort(table.frame, kind="stable")
-        fit = fit_camera(camera, block_of(camera, table), fields[:, :, rows], considered=2)
+        fit = fit_table(camera, table, *lens, considered=2)
         values.append(fit.free(0).values[0])
         sigmas.append(fit.free(0).sigmas[0])
+        alone.append(replace(fit, considered=0).free(0).sigmas[0])
     assert np.mean(sigmas) == pytest.approx(np.std(values), rel=0.2)
-    assert np.mean(sigmas) > 0.6  # sqrt(2) / 2 of what is considered
+    assert np.mean(alone) < 0.5 * np.mean(sigmas)
