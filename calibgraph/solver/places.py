@@ -55,7 +55,7 @@ from factors.conditioning import SINGULAR, unit_diagonal
 TOLERANCE = 1e-6
 """Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""
 
-_ROUNDING = 2e-15  # smallest part of a sum that a difference may leave
+_ROUNDING = 3e-14  # smallest part of a sum that a difference of sums may leave
 _SHARES = 0.5 ** np.arange(12)
 """Of a step: the first that descends; mostly the whole step."""
 
