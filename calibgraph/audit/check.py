@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable, Collection
-from dataclasses import replace
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -107,7 +106,7 @@ def check(
         )
         with watch("places"):
             run = assign_places(run)
-        run = refine_with_camera_pairs(replace(run, progress=report))
+        run = refine_with_camera_pairs(run)
         with watch("checks"):
             cameras, lidar = _judge(run, tolerance, report)
     except CorrespondenceError as error:

@@ -6,14 +6,16 @@ from contextlib import suppress
 from calibgraph.errors import CorrespondenceError
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.protocol import FullMatcher
-from calibgraph.matching.run import MatchingRun, RoundSummary, summarize_round
+from calibgraph.matching.run import MatchingRun
 from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Status
 from calibgraph.progress import Progress, Stopwatch
-from calibgraph.rounds import find_stationary
+from calibgraph.rounds import find_stationary, run_rounds
 from calibgraph.solver.joint import solve_without_failing
+from calibgraph.solver.solution import Solution
 from calibgraph.trust.thresholds import threshold
 
 _REACH_DEG, _REACH_CM = 0.7, 20.0
@@ -36,17 +38,18 @@ def match_from_deployed(
     """
     tracking, places = matcher.tracking_rounds, find_stationary(data, deployed)
 
+    def find(at: Rig, index: int) -> Correspondences:
+        with watch("match"):
+            table = matcher.match(data, at, round_index=index, progress=progress)
+            return table.with_places(places)
+
+    def solve(at: Rig, table: Correspondences) -> Solution:
+        with watch("solve"):
+            return solve_without_failing(at, table, config)
+
     def match(rounds: Sequence[int]) -> MatchingRun:
-        estimate, summaries = deployed, list[RoundSummary]()
-        for index in rounds:
-            with watch("match"):
-                table = matcher.match(data, estimate, round_index=index, progress=progress)
-                table = table.with_places(places)
-            with watch("solve"):
-                solution = solve_without_failing(estimate, table, config)
-            summaries.append(summarize_round(table, estimate, solution.solved_rig))
-            estimate = solution.solved_rig
-        return MatchingRun(data, matcher, deployed, table, solution, tuple(summaries), watch)
+        *_, (table, solution, done) = run_rounds(deployed, rounds, find, solve)
+        return MatchingRun(data, matcher, deployed, table, solution, done, watch, progress=progress)
 
     if not tracking:
         return match(range(matcher.rounds))
