@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -27,9 +26,10 @@ from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.frame_choice import CANDIDATES, without_copies
 from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
-from calibgraph.matching.run import MatchingRun, RoundSummary, summarize_round
+from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.same_images import require_different_images
 from calibgraph.model.config import Config, Reported
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 from calibgraph.model.rig import Rig
@@ -42,8 +42,10 @@ from calibgraph.rounds import (
     assign_places,
     find_stationary,
     refine_with_camera_pairs,
+    run_rounds,
 )
 from calibgraph.solver.joint import solve_without_failing
+from calibgraph.solver.solution import Solution
 from calibgraph.trust.agreement import competing_solution_checks, pair_agreement_checks
 from calibgraph.trust.evidence import Checks, Evidence, concatenate, gather_of_run
 from calibgraph.trust.guess import point_distance_checks
@@ -116,7 +118,7 @@ def check(
         )
         with watch("places"):
             run = assign_places(run)
-        run = refine_with_camera_pairs(replace(run, progress=report))
+        run = refine_with_camera_pairs(run)
         with watch("checks"):
             cameras, lidar = _judge(run, tolerance, report)
     except CorrespondenceError as error:
@@ -268,17 +270,18 @@ def match_from_deployed(
     """
     tracking, places = matcher.tracking_rounds, find_stationary(data, deployed)
 
+    def find(at: Rig, index: int) -> Correspondences:
+        with watch("match"):
+            table = matcher.match(data, at, round_index=index, progress=progress)
+            return table.with_places(places)
+
+    def solve(at: Rig, table: Correspondences) -> Solution:
+        with watch("solve"):
+            return solve_without_failing(at, table, config)
+
     def match(rounds: Sequence[int]) -> MatchingRun:
-        estimate, summaries = deployed, list[RoundSummary]()
-        for index in rounds:
-            with watch("match"):
-                table = matcher.match(data, estimate, round_index=index, progress=progress)
-                table = table.with_places(places)
-            with watch("solve"):
-                solution = solve_without_failing(estimate, table, config)
-            summaries.append(summarize_round(table, estimate, solution.solved_rig))
-            estimate = solution.solved_rig
-        return MatchingRun(data, matcher, deployed, table, solution, tuple(summaries), watch)
+        *_, (table, solution, done) = run_rounds(deployed, rounds, find, solve)
+        return MatchingRun(data, matcher, deployed, table, solution, done, watch, progress=progress)
 
     if not tracking:
         return match(range(matcher.rounds))
