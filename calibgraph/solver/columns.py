@@ -47,9 +47,9 @@ from factors.columns import DISTORTION
 Numbers = NDArray[np.int64]
 
 MIN_ROWS = 30  # fewer correspondences do not determine further columns
-_MAX_ITERATIONS, _NEAR, _CONVERGED = 20, 0.1, 3e-4
+_MAX_ITERATIONS, _NEAR, _SMALL, _CONVERGED = 20, 0.1, 0.02, 3e-4
 """Steps of the fit; the change of the errors (rms), in units of the loss' scale, from which on they
-are Newton's, and at which they end."""
+are Newton's, after which nothing is summed again, and at which they end."""
 _NEARLY_FREE = 1e-4  # information of a column, so that a few matches have an inverse
 _LOSS_MEDIANS = 2.0 * 1.4826  # loss scale of 2 standard deviations, by the median of the errors
 _SAMPLE = 4000  # correspondences: they know the displacement to some 1 % of its size
@@ -167,6 +167,10 @@ def fit_columns(
         change = -np.linalg.solve(used, sums.gradient.sum(axis=0) + weak @ values)
         values = values + change
         moved = float(change @ hessian @ change) / (scale**2 * _given(sums.weights).sum())
+        gradients = sums.gradient
+        if loss_scale and sums.curvature is not None and moved < _SMALL**2:
+            gradients = gradients + sums.curvature @ change  # to first order
+            break
         if not moved > _CONVERGED**2:
             break
         near = moved < _NEAR**2
@@ -174,7 +178,7 @@ def fit_columns(
         return None
     squares, weights = (_given(part).sum() for part in (sums.squares, sums.weights))
     variance = shared_variance * float(squares / (2 * weights))
-    return ColumnFit(values, hessian, sums.gradient, variance, considered)
+    return ColumnFit(values, hessian, gradients, variance, considered)
 
 
 def _given(part: Array | None) -> Array:
