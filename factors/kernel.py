@@ -146,11 +146,8 @@ def summarize(kind: int) -> Any:
         there is room, - sum 2 psi' t t^T.
         """
         size = 7 + len(free)
-        rows, bends, weights = (
-            np.empty((size, WIDTH)),
-            np.empty((size, WIDTH)),
-            np.empty((2, WIDTH)),
-        )
+        rows, bends = np.empty((size, WIDTH)), np.empty((size, WIDTH))
+        weights = np.empty((2, WIDTH))
         for run in range(len(runs)):
             T = poses[run if len(poses) > 1 else 0]
             scale = scales[run if len(scales) > 1 else 0]
@@ -278,15 +275,17 @@ def multiply(factors, row, n):  # type: ignore[no-untyped-def]
 @compiled(inline="always")
 def weigh_columns(loss, scale, n, residuals, weights, sums):  # type: ignore[no-untyped-def]
     """Fill in the root of psi, once for u and once for v, and that of -2 psi'; add rho and psi."""
+    cost = total = 0.0
     for i in range(n):
         u, v = residuals[i], residuals[n + i]
         s = u * u + v * v
         rho, psi = loss_and_weight(loss, scale, s)
+        cost, total = cost + rho, total + psi
         weights[0, i] = weights[0, n + i] = math.sqrt(psi)
         least = s if s > 0.0 else 1.0
         weights[1, i] = math.sqrt(max(psi - weight_along(loss, scale, s, psi), 0.0) / least)
-        sums[0] += rho
-        sums[1] += psi
+    sums[0] += cost
+    sums[1] += total
 
 
 @compiled(inline="always")

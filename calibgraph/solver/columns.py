@@ -21,11 +21,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
@@ -45,9 +45,9 @@ from factors.columns import DISTORTION
 Numbers = NDArray[np.int64]
 
 MIN_ROWS = 30  # fewer correspondences do not determine further columns
-_MAX_ITERATIONS, _NEAR, _CONVERGED = 20, 0.1, 3e-4
+_MAX_ITERATIONS, _NEAR, _SMALL, _CONVERGED = 20, 0.1, 0.02, 3e-4
 """Steps of the fit; the change of the errors (rms), in units of the loss' scale, from which on they
-are Newton's, and at which they end."""
+are Newton's, after which nothing is summed again, and at which they end."""
 _NEARLY_FREE = 1e-4  # information of a column, so that a few matches have an inverse
 _LOSS_MEDIANS = 2.0 * 1.4826  # loss scale of 2 standard deviations, by the median of the errors
 _SAMPLE = 4000  # correspondences: they know the displacement to some 1 % of its size
@@ -153,17 +153,22 @@ def fit_columns(
         return None
     size, runs = 6 + len(free), to_runs(block.frame_edges)
     weak, values = _nearly_free(size), np.zeros(size)
-    near = False  # before, the second derivative may lead away
+    near = loss_scale is not None  # elsewhere the second derivative may lead away
     for _ in range(_MAX_ITERATIONS):
         scale = loss_scale or _median_scale(block.block, T_camera_lidar, free, values)
         sums = block.block.rescale(scale=scale, loss="cauchy").summarize(
-            T_camera_lidar[None], runs, free, step=values, curvature=True
+            T_camera_lidar[None], runs, free, step=values, curvature=near
         )
-        hessian, bent = (part.sum(axis=0) + weak for part in (sums.hessian, _given(sums.curvature)))
-        pull = sums.gradient.sum(axis=0) + weak @ values
-        change = -np.linalg.solve(convex_hessian(bent, hessian) if near else hessian, pull)
+        hessian = used = sums.hessian.sum(axis=0) + weak
+        if sums.curvature is not None:
+            used = convex_hessian(sums.curvature.sum(axis=0) + weak, hessian)
+        change = -np.linalg.solve(used, sums.gradient.sum(axis=0) + weak @ values)
         values = values + change
         moved = float(change @ hessian @ change) / (scale**2 * _given(sums.weights).sum())
+        gradients = sums.gradient
+        if loss_scale and sums.curvature is not None and moved < _SMALL**2:
+            gradients = gradients + sums.curvature @ change  # to first order
+            break
         if not moved > _CONVERGED**2:
             break
         near = moved < _NEAR**2
@@ -171,7 +176,7 @@ def fit_columns(
         return None
     squares, weights = (_given(part).sum() for part in (sums.squares, sums.weights))
     variance = shared_variance * float(squares / (2 * weights))
-    return ColumnFit(values, hessian, sums.gradient, variance, considered)
+    return ColumnFit(values, hessian, gradients, variance, considered)
 
 
 def _given(part: Array | None) -> Array:
@@ -188,9 +193,10 @@ def _median_scale(
     return _LOSS_MEDIANS * math.sqrt(quantile(np.square(errors).sum(axis=0), 0.5)) + 1e-12
 
 
+@cache
 def _nearly_free(size: int) -> Array:
     """(6 + k, 6 + k) information of a pose within sight and of columns that are nearly free."""
-    return np.asarray(block_diag(WEAK, _NEARLY_FREE * np.eye(size - 6)))
+    return np.diag(np.append(np.diag(WEAK), np.full(size - 6, _NEARLY_FREE)))
 
 
 def block_of(camera: Camera, table: Correspondences) -> CameraBlock:
