@@ -61,7 +61,7 @@ def test_frames_of_an_arrow_stream_give_the_updates_of_lines(
 ) -> None:
     """Of columns out of the order of their frames, too."""
     columns = ["camera", "frame", "u_px", "v_px", "x_m", "y_m", "z_m"]
-    table = pq.read_table(io.BytesIO(small.table), columns).replace_schema_metadata(None)
+    table = pq.read_table(io.BytesIO(small.table), columns=columns).replace_schema_metadata(None)
     frames = len(table["frame"].unique())
     body = arrow_stream(table.sort_by([("frame", "descending")]))
     assert working.put("/v1/trackers/arrow", content=small.rig).status_code == 200
