@@ -18,8 +18,8 @@ from .errors import CorrespondenceError as CorrespondenceError
 from .errors import DatasetError as DatasetError
 from .errors import FileError as FileError
 from .errors import RigError as RigError
+from .fleet.files import read_rows as read_rows
 from .fleet.page import write_fleet_report as write_fleet_report
-from .fleet.rows import read_rows as read_rows
 from .fleet.run import run_fleet as run_fleet
 from .graph.objective import block_factor as block_factor
 from .graph.objective import camera_prior_factor as camera_prior_factor

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import numpy as np
-from pydantic import BaseModel, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 
 from calibgraph.errors import FileError
 from calibgraph.yaml_text import describe_value, parse_yaml, yaml_text
@@ -223,7 +223,9 @@ def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> 
 
 
 class StrictNumbers(BaseModel):
-    """A model whose numbers are none of YAML's truth values: ``true`` is not 1 px."""
+    """A frozen model of known keys, whose numbers are no truth values: ``true`` is not 1 px."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     @field_validator("*", mode="before")
     @classmethod

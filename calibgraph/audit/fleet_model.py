@@ -162,9 +162,6 @@ def fit_fleet(observations: Observations) -> FleetModel:
     """The hierarchical model of a fleet, and its vehicles' cameras shrunk towards it.
 
     A measurement with a small error bar stays as it is; one with a large one moves to its batch.
-
-    Args:
-        observations: one row per vehicle and camera.
     """
     models = {str(name): fit_mounts(observations.select(observations.model == name))
               for name in np.unique(observations.model)}  # fmt: skip
@@ -332,10 +329,7 @@ class Observations:
 
 
 def observe(rows: pa.Table) -> Observations:
-    """The rows of a fleet as arrays.
-
-    Args:
-        rows: as of ``read_rows``; columns of numbers beyond its own become covariates.
+    """The rows of a fleet as arrays; columns of numbers beyond its own become covariates.
 
     Raises:
         CalibrationError: if a column is missing, or some poses are alignments and some mounts.

@@ -22,17 +22,10 @@ from calibgraph.report.tables import make_table
 
 
 def write_audit_report(audit: Audit, path: Path | str) -> Path:
-    """Write an audit as one HTML page that needs nothing else: no network, no files beside it.
+    """Write an audit as one HTML page that needs nothing else; returns its path.
 
     Images and the cloud are read from the recording; if they cannot be read, the page names the
     cause and leaves the pictures out.
-
-    Args:
-        audit: of :func:`calibgraph.check`.
-        path: of the page.
-
-    Returns:
-        The path.
 
     Raises:
         FileError: if the page cannot be written.

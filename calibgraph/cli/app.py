@@ -21,10 +21,9 @@ import typer
 
 from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve, track
-from calibgraph.cli.fleet import fleet
 from calibgraph.cli.inspect import doctor, evaluate, export, perturb, report, simulate, weights
 from calibgraph.cli.rig import rig
-from calibgraph.cli.serve import pick, serve
+from calibgraph.cli.serve import fleet, pick, serve
 
 _INTERRUPTED = 130
 _COLLECT_AFTER = 100_000, 20, 20

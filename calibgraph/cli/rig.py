@@ -122,7 +122,7 @@ def rig(
     path = Path(source[0])
     if len(source) == 1 and not correct and _is_to_fill_in(path):
         _refuse_others("a folder of images and clouds", given)
-        _write_template(path, out, mount, lens, forward=forward, force=force)
+        _write_template(path, out, mount, lens, forward=forward, replace=force)
         return
     if out is not None:
         require_new_file(out, ".yaml", ".yml", force=force)
@@ -144,8 +144,8 @@ def rig(
             )  # fmt: skip
             notes, topics = [f"note: {note}" for note in parts.notes], []
             made, guess = _rig_of_files(
-                parts, parse_names("--mount", mount), dataset, forward=forward,
-                size_px=_size_px(size), sigmas=sigmas, progress=progress
+                parts, parse_names("--mount", mount), dataset, sigmas, forward=forward,
+                size_px=_size_px(size), progress=progress
             )  # fmt: skip
         made = state_calibrated(correct_guess(made, correct or ()))
         guess = guess and replace(guess, rig=made)
@@ -198,31 +198,25 @@ def _rig_of_files(
     parts: RigParts,
     mountings: dict[str, str],
     dataset: list[Path] | None,
-    *,
-    forward: str,
-    size_px: tuple[int, int] | None,
     sigmas: tuple[float, float] | None,
-    progress: Any,
+    **options: Any,
 ) -> tuple[Rig, RigGuess | None]:
-    """The rig, and how good its guess is, where cameras are described or searched for."""
+    """The rig, and how good its guess is, where cameras are described or searched for.
+
+    The options are those of :func:`guess_rig`.
+    """
     from calibgraph.guessing.guess import guess_rig
     from calibgraph.io.rig_parts import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
 
     if not mountings and not dataset:
         deg, metres = sigmas or (RELATIVE_SIGMA_DEG, RELATIVE_SIGMA_CM / 100.0)
         sizes: dict[str, Any] = {"relative_sigma_deg": deg, "relative_sigma_cm": 100.0 * metres}
-        return parts.to_rig(size_px=size_px, **sizes), None
+        return parts.to_rig(size_px=options["size_px"], **sizes), None
     if sigmas is not None:
         raise ValueError("--tie-deg is for files alone; leave --mount and --dataset out")
-    guess = guess_rig(
-        parts,
-        mountings={name: text for name, text in mountings.items() if text != _SEARCH},
-        data=dataset or None,
-        search=[name for name, text in mountings.items() if text == _SEARCH],
-        forward=forward,
-        size_px=size_px,
-        progress=progress,
-    )
+    said = {name: text for name, text in mountings.items() if text != _SEARCH}
+    search = [name for name in mountings if name not in said]
+    guess = guess_rig(parts, mountings=said, data=dataset or None, search=search, **options)
     return guess.rig, guess
 
 
@@ -243,13 +237,7 @@ def _rig_of_bags(
 
 
 def _write_template(
-    folder: Path,
-    out: Path | None,
-    mount: list[str] | None,
-    lens: list[str] | None,
-    *,
-    forward: str,
-    force: bool,
+    folder: Path, out: Path | None, mount: list[str] | None, lens: list[str] | None, **options: Any
 ) -> None:
     """Write the rig of a folder, with what is left to fill in, and say what comes next."""
     from calibgraph.guessing.mounting import CALIBRATION
@@ -259,9 +247,7 @@ def _write_template(
     with checked_arguments():
         words = parse_names("--mount", mount)
         known = _lenses(lens, [*cameras_of_folder(folder)])
-        path = write_rig_template(
-            folder, out, mountings=words, lenses=known, forward=forward, replace=force
-        )
+        path = write_rig_template(folder, out, mountings=words, lenses=known, **options)
         pairing = describe_pairing(folder)
     if pairing:
         print_line(pairing)

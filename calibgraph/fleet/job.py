@@ -26,8 +26,8 @@ from calibgraph.child_process import (
     output_to,
 )
 from calibgraph.errors import CalibrationError
+from calibgraph.fleet.files import fetch
 from calibgraph.fleet.manifest import Job
-from calibgraph.fleet.uris import fetch
 from calibgraph.model.calibration import version_of
 
 _LOG, _MOST_LOG = "log.txt", 2**16

@@ -21,7 +21,7 @@ from calibgraph.audit.fleet_model import (
     words,
 )
 from calibgraph.audit.result import twist_cells
-from calibgraph.fleet.rows import Store, read_rows
+from calibgraph.fleet.files import Store, read_rows
 from calibgraph.report.kit import page_template
 
 STATES = ("PASS", "NO RESULT", "WARN", "FAIL")
@@ -54,9 +54,6 @@ def write_fleet_report(out: str) -> FleetReport:
     """Fit the model of the rows in a folder, and write its files and its page beside them.
 
     Of several rows of a vehicle and camera the newest counts.
-
-    Args:
-        out: folder or URI of :func:`calibgraph.run_fleet`.
 
     Raises:
         CalibrationError: if no rows are there, or nothing can be written.

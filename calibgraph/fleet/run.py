@@ -15,9 +15,9 @@ import pyarrow as pa
 
 from calibgraph.child_process import Outcome
 from calibgraph.errors import CalibrationError, FileError, needs_extra
+from calibgraph.fleet.files import ROWS, SCHEMA, Store, read_rows
 from calibgraph.fleet.job import Limits, end_children, interrupt_jobs, release, run_job
 from calibgraph.fleet.manifest import Job, Key, load_manifest
-from calibgraph.fleet.rows import ROWS, SCHEMA, Store, read_rows
 from calibgraph.model.calibration import package_versions
 from calibgraph.parallel import count_cores
 from calibgraph.progress import Progress, no_progress
@@ -67,10 +67,10 @@ def run_fleet(
             another command writes there.
     """
     report, limits = progress or no_progress, limits or Limits()
-    found, store = load_manifest(manifest), Store(out)
+    (jobs, others), store = load_manifest(manifest), Store(out)
     with store.locked():
-        rows, hashes = _known_rows(out, found.jobs), _hashes(found.jobs, report)
-        todo = [job for job in found.jobs if not _is_finished(rows[job.key], hashes[job.key])]
+        rows, hashes = _known_rows(out, jobs), _hashes(jobs, report)
+        todo = [job for job in jobs if not _is_finished(rows[job.key], hashes[job.key])]
         failed = 0
         with nullcontext(executor) if executor is not None else thread_executor() as opened:
             running = {opened.submit(run_job, job, limits, release()): job for job in todo}
@@ -78,17 +78,17 @@ def run_fleet(
                 job, outcome = running.pop(future), _outcome_of(future)
                 rows[job.key] = _rows_of(job, outcome, hashes[job.key])
                 table = pa.Table.from_pylist(rows[job.key], schema=SCHEMA)
-                others = found.others.take(pa.array([job.row] * len(table)))
-                for column in others.schema:
-                    table = table.append_column(column, others[column.name])
+                further = others.take(pa.array([job.row] * len(table)))
+                for column in further.schema:
+                    table = table.append_column(column, further[column.name])
                 _write(store, job, outcome, table)
                 failed += outcome.error_kind is not None
                 stage = f"calibrating ({failed} failed)" if failed else "calibrating"
                 report(stage, count, len(todo))
-    every = [row for job in found.jobs for row in rows[job.key]]
+    every = [row for job in jobs for row in rows[job.key]]
     verdicts = Counter(row["verdict"] for row in every if row["status"] == "done")
     failures = Counter(row["error_kind"] for row in every if row["status"] != "done")
-    return Summary(len(found.jobs), len(found.jobs) - len(todo), dict(verdicts), dict(failures))
+    return Summary(len(jobs), len(jobs) - len(todo), dict(verdicts), dict(failures))
 
 
 @contextmanager

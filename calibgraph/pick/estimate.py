@@ -13,11 +13,11 @@ from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, FileError
-from calibgraph.files import checked_model, read_json, write_text
+from calibgraph.files import StrictNumbers, checked_model, read_json, write_text
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import transform
@@ -191,7 +191,7 @@ SESSION_FORMAT: Literal["calibgraph-pick/2"] = "calibgraph-pick/2"
 _Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-class Pair(BaseModel):
+class Pair(StrictNumbers):
     """A pixel and a point of the cloud that are one place.
 
     Attributes:
@@ -201,15 +201,13 @@ class Pair(BaseModel):
         point_lidar_m: in the LiDAR frame.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     frame: Annotated[int, Field(ge=0)]
     camera: str
     pixel_px: tuple[_Number, _Number]
     point_lidar_m: tuple[_Number, _Number, _Number]
 
 
-class Session(BaseModel):
+class Session(StrictNumbers):
     """The pairs, with the frames and cameras of their dataset.
 
     Attributes:
@@ -217,8 +215,6 @@ class Session(BaseModel):
         cameras: the rig's.
         pairs: in the order in which they were picked.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     format: Literal["calibgraph-pick/2"] = SESSION_FORMAT
     frames: tuple[str, ...]

@@ -45,17 +45,11 @@ from calibgraph.solver.pairs import match_errors_px
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:
-    """Write a result as one HTML page that needs nothing else: no network, no files beside it.
+    """Write a result as one HTML page that needs nothing else; returns its path.
 
     Images and clouds are read from the files that the result names; if they cannot be read, the
-    page names the cause and leaves their pictures out.
-
-    Args:
-        result: any result; without correspondences the residuals' pictures are left out.
-        path: of the page.
-
-    Returns:
-        The path.
+    page names the cause and leaves their pictures out. Without correspondences there are no
+    pictures of residuals.
 
     Raises:
         CorrespondenceError: if the result's correspondences do not belong to its rig.
@@ -155,10 +149,7 @@ def write_result(
 ) -> list[Path]:
     """Write a result in place of an older one: of images with an overlay picture per camera.
 
-    After an error none of them appears, and the calibration is the last.
-
-    Returns:
-        The files to name to the user.
+    After an error none of them appears, and the calibration is the last. Returns the files.
     """
     require_own_tables(folder)
     with written_together(folder, last=CALIBRATION_FILE) as new:
@@ -263,11 +254,7 @@ def camera_diagrams(
 
 
 def recording_name(result: Calibration) -> str:
-    """What a result was made from, in short: the last two folders of its recordings, or its table.
-
-    Returns:
-        The names; empty if the result names no files.
-    """
+    """What a result was made from: the last two folders of its recordings, or its table, if any."""
     if not result.frames:
         return Path(next(iter(result.inputs), "")).name
     found = {os.path.commonpath([e["cloud"], *e["images"].values()]) for e in result.frames}

@@ -12,7 +12,7 @@ from urllib.parse import unquote
 
 from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_folder, sync_folder, write_text
-from calibgraph.fleet.uris import is_local, locate
+from calibgraph.fleet.files import is_local, locate
 
 INPUT, SCRATCH, WORK, RESULT, LOG = "input", "scratch", "work", "result", "log.txt"
 """In a job's folder: its input, its working folder, its result as it is written, then; its log."""

@@ -21,7 +21,7 @@ from calibgraph.child_process import (
 )
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import sha256, write_text
-from calibgraph.fleet.uris import fetch
+from calibgraph.fleet.files import fetch
 from calibgraph.io.dataset import load_dataset
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.named import structure_matcher

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
+from calibgraph.files import StrictNumbers
 from calibgraph.model.config import Config, Terms, config_from
 from calibgraph.parallel import count_cores
 
@@ -37,11 +38,7 @@ def _printable(text: object) -> object:
 Frames = Annotated[str, StringConstraints(max_length=10_000)]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class SolveSettings(_Strict):
+class SolveSettings(StrictNumbers):
     """How correspondences are solved.
 
     Attributes:
@@ -74,7 +71,7 @@ class CalibrationSettings(SolveSettings):
     time_limit_s: Annotated[float, Field(gt=0)] | None = None
 
 
-class CheckSettings(_Strict):
+class CheckSettings(StrictNumbers):
     """How a deployed calibration is checked.
 
     Attributes:
@@ -93,7 +90,7 @@ SETTINGS_OF: Mapping[JobKind, type[BaseModel]] = {
 }  # fmt: skip
 
 
-class Job(_Strict):
+class Job(StrictNumbers):
     """A job as it is kept: its URIs by the name of the input; uploads are in its folder."""
 
     kind: JobKind
@@ -125,7 +122,7 @@ Count = Annotated[int, Field(ge=0)]
 Seconds = Annotated[float, Field(gt=0)]
 
 
-class Settings(BaseModel):
+class Settings(StrictNumbers):
     """Settings of a server.
 
     Attributes:
@@ -146,8 +143,6 @@ class Settings(BaseModel):
         body_bytes: most bytes of a body that is no upload: frames of a tracker.
         grace_s: how long jobs may run on when the server is told to stop.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     data: Path
     database: str | None = None

@@ -20,8 +20,8 @@ from calibgraph.audit.fleet_model import (
 )
 from calibgraph.audit.model import Limits, compare, poses_of, weigh, weighted_mean
 from calibgraph.errors import CalibrationError
+from calibgraph.fleet.files import SCHEMA
 from calibgraph.fleet.page import STATES, report_of
-from calibgraph.fleet.rows import SCHEMA
 from calibgraph.model.geometry import retract_all, to_T_lidar_camera, twists_between
 from tests.draws.fleets import CAMERAS, SPREAD, Fleet, errors_of, simulate_fleet
 

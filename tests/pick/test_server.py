@@ -20,8 +20,7 @@ import pytest
 from calibgraph import CalibrationError, Rig, evaluate, load_dataset, load_rig
 from calibgraph.model.geometry import twist_between
 from calibgraph.pick.estimate import MIN_PAIRS, Pair, estimate_from_pairs, reference_rig
-from calibgraph.pick.server import PickServer
-from calibgraph.pick.workspace import Workspace, visible_points
+from calibgraph.pick.server import PickServer, Workspace, visible_points
 from calibgraph.simulation.rigs import rig_of
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
