@@ -12,7 +12,7 @@ from typer import Argument, Option
 from calibgraph.cli import options
 from calibgraph.cli.arguments import checked_arguments
 from calibgraph.cli.terminal import print_line
-from calibgraph.io.formats.names import EXPORT_FORMATS
+from calibgraph.io.formats import EXPORT_FORMATS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -94,7 +94,7 @@ def export(
 
 def _parse_pose(text: str) -> NDArray[np.float64]:
     """The (4, 4) of six numbers."""
-    from calibgraph.io.rotations import pose_of_angles
+    from calibgraph.io.rig_parts import pose_of_angles
 
     try:
         x, y, z, roll, pitch, yaw = (float(word) for word in text.replace(",", " ").split())

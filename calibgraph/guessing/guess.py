@@ -14,9 +14,9 @@ from calibgraph.errors import CalibrationError, RigError
 from calibgraph.guessing.heading_search import FoundCamera, search_headings
 from calibgraph.guessing.mounting import GRAMMAR, Mounting, check_forward, parse_mounting
 from calibgraph.io.dataset import load_dataset
-from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.formats.rig_import import read_rig_parts
 from calibgraph.io.rig_parts import RigParts
+from calibgraph.io.rigs import describe_rig
 from calibgraph.matching.burnt_in import hide_burnt_in
 from calibgraph.matching.same_images import require_different_images
 from calibgraph.matching.structure.matcher import MAX_SEARCH_DEG, MAX_SEARCH_M

@@ -10,7 +10,7 @@ import yaml
 from calibgraph.file_sets import written_together
 from calibgraph.files import write_text
 from calibgraph.io.dataset import Dataset
-from calibgraph.io.formats.names import EXPORT_FORMATS
+from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.frame import frame_of_entry
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
 from calibgraph.model.geometry import degrees_and_centimetres, invert

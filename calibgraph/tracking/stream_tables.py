@@ -12,7 +12,7 @@ import numpy as np
 
 from calibgraph.errors import CorrespondenceError, FileError, MotionError
 from calibgraph.files import require_file
-from calibgraph.io.correspondence_tables import (
+from calibgraph.io.tables import (
     arrow_reads,
     from_arrow,
     open_parquet,
