@@ -13,9 +13,8 @@ from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.dataset_folders import frames_of_folder
-from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import Frame, hash_source
-from calibgraph.io.rigs import load_rig
+from calibgraph.io.rigs import describe_rig, load_rig
 from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.camera_pairs import overlapping_pairs
 from calibgraph.matching.cloud_similarity import find_up

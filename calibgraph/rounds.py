@@ -13,8 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibgraph.errors import CalibrationError, CorrespondenceError
-from calibgraph.io.dataset import Dataset, load_dataset
-from calibgraph.io.kept_frames import keep_frames
+from calibgraph.io.dataset import Dataset, keep_frames, load_dataset
 from calibgraph.matching.burnt_in import hide_burnt_in
 from calibgraph.matching.camera_pairs import (
     PAIR_FRAMES,

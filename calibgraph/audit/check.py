@@ -18,9 +18,8 @@ from calibgraph.audit.judgement import (
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import load_model
-from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.dataset import Dataset, keep_frames, load_dataset
 from calibgraph.io.frame import hash_source
-from calibgraph.io.kept_frames import keep_frames
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.frame_choice import CANDIDATES, without_copies

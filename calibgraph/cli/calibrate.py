@@ -157,8 +157,8 @@ def solve(
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
     from calibgraph.cli.settings import read_settings
     from calibgraph.files import sha256
-    from calibgraph.io.camera_match_tables import load_camera_matches
     from calibgraph.io.rigs import load_rig
+    from calibgraph.io.tables import load_camera_matches
     from calibgraph.model.result_files import require_result_folder
     from calibgraph.pipeline import solve
     from calibgraph.report.html import write_result

@@ -16,7 +16,7 @@ from typer import Argument, Option
 from calibgraph.cli import options
 from calibgraph.cli.options import bag_settings, checked_arguments
 from calibgraph.cli.terminal import print_json, print_line, progress_bar, terminal
-from calibgraph.io.formats.names import EXPORT_FORMATS
+from calibgraph.io.formats import EXPORT_FORMATS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -262,7 +262,7 @@ def export(
 
 def _parse_pose(text: str) -> NDArray[np.float64]:
     """The (4, 4) of six numbers."""
-    from calibgraph.io.rotations import pose_of_angles
+    from calibgraph.io.rig_parts import pose_of_angles
 
     try:
         x, y, z, roll, pitch, yaw = (float(word) for word in text.replace(",", " ").split())

@@ -16,7 +16,7 @@ from calibgraph.cli import options
 from calibgraph.cli.options import bag_options_from, checked_arguments, parse_names
 from calibgraph.cli.terminal import print_json, print_line, progress_bar
 from calibgraph.errors import CalibrationError
-from calibgraph.io.formats.names import IMPORT_FORMATS
+from calibgraph.io.formats import IMPORT_FORMATS
 
 if TYPE_CHECKING:
     from calibgraph.guessing.guess import RigGuess
@@ -108,8 +108,8 @@ def rig(
     """
     from calibgraph.files import require_new_file
     from calibgraph.io.bags.storage import is_bag
-    from calibgraph.io.formats.describe import describe_rig
     from calibgraph.io.formats.rig_import import read_rig_parts
+    from calibgraph.io.rigs import describe_rig
     from calibgraph.model.lens import state_calibrated
     from calibgraph.model.plausibility import find_implausible
     from calibgraph.trust.conventions import correct_guess

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from calibgraph.files import StrictNumbers, checked_model, read_yaml
-from calibgraph.io.bags.options import Stamps
+from calibgraph.io.bags.storage import Stamps
 from calibgraph.model.config import Config, Terms, config_from
 
 

@@ -16,9 +16,9 @@ from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, RigError
 from calibgraph.guessing.mounting import GRAMMAR, Forward, Mounting, check_forward, parse_mounting
 from calibgraph.io.dataset import Dataset, load_dataset, spread_out
-from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.formats.rig_import import read_rig_parts
 from calibgraph.io.rig_parts import RigParts
+from calibgraph.io.rigs import describe_rig
 from calibgraph.matching.burnt_in import hide_burnt_in
 from calibgraph.matching.same_images import require_different_images
 from calibgraph.matching.structure.acceptance import least_z_score

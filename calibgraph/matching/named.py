@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.io.dataset import Dataset
+from calibgraph.io.tables import load_correspondences
 from calibgraph.matching.protocol import FullMatcher, Matcher
 from calibgraph.model.config import Stage1Source
 from calibgraph.model.correspondences import Correspondences

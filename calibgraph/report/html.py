@@ -16,7 +16,7 @@ from calibgraph.errors import DatasetError
 from calibgraph.file_sets import written_together
 from calibgraph.files import write_text
 from calibgraph.io.dataset import Dataset
-from calibgraph.io.formats.names import EXPORT_FORMATS
+from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.frame import Frame, frame_of_entry, hash_source
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
 from calibgraph.model.geometry import degrees_and_centimetres, invert, point_in_lidar

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
-from calibgraph.io.correspondence_tables import parts_of_table
+from calibgraph.io.tables import parts_of_table
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate, rows_where
 from calibgraph.model.findings import MatcherFindings

@@ -36,13 +36,7 @@ from pydantic_core import from_json
 from calibgraph.errors import CorrespondenceError, FileError, MotionError
 from calibgraph.files import describe, require_file
 from calibgraph.io.bags.storage import is_bag
-from calibgraph.io.correspondence_tables import (
-    arrow_reads,
-    from_arrow,
-    open_parquet,
-    read_arrow,
-    require_rows,
-)
+from calibgraph.io.tables import arrow_reads, from_arrow, open_parquet, read_arrow, require_rows
 from calibgraph.model.correspondences import (
     COORDINATES,
     INFORMATION,

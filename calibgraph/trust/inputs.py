@@ -18,9 +18,14 @@ from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags import scan_duration_s
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.io.frame import Frame, ScanSteps, seconds_between, twist_by_scans
-from calibgraph.io.kept_frames import KeptFrame
-from calibgraph.io.motion import prepare_scan, register
+from calibgraph.io.frame import (
+    Frame,
+    ScanSteps,
+    prepare_scan,
+    register,
+    seconds_between,
+    twist_by_scans,
+)
 from calibgraph.matching.burnt_in import describe_burnt_in
 from calibgraph.model.clock import OF_IMAGES, unused_times
 from calibgraph.model.geometry import angle_deg
@@ -277,7 +282,7 @@ def registered_twists(dataset: Dataset) -> dict[int, Array]:
         CalibrationError, OSError: if a cloud cannot be read.
     """
     chosen = spread_out(dataset.frames, MAX_FRAMES)
-    frames = [f for f in chosen if isinstance(f, KeptFrame) and f.twist_per_s is None]
+    frames = [f for f in chosen if f.kept and f.twist_per_s is None]
 
     def register() -> dict[int, Array]:
         steps = ScanSteps()

@@ -19,7 +19,6 @@ from calibgraph.errors import CalibrationError
 from calibgraph.io.bags import is_bag
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import seconds_between
-from calibgraph.io.kept_frames import KeptFrame
 from calibgraph.matching.run import MatchingRun, with_motion
 from calibgraph.model.clock import clock_of
 from calibgraph.model.correspondences import Correspondences
@@ -152,9 +151,7 @@ def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
     found = registered_twists(dataset)
     chosen = spread_out(dataset.frames, MAX_FRAMES)
     frames = [
-        replace(frame, twist=found[frame.index])
-        if isinstance(frame, KeptFrame) and frame.index in found
-        else frame
+        replace(frame, twist=found[frame.index]) if frame.kept and frame.index in found else frame
         for frame in chosen
         if frame.index in found or frame.twist_per_s is not None
     ]

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibgraph.errors import needs_extra
 from calibgraph.files import write_atomically
-from calibgraph.io.rotations import quaternion_xyzw
+from calibgraph.io.rig_parts import quaternion_xyzw
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera

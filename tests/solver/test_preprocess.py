@@ -21,7 +21,7 @@ from calibgraph import (
     Rig,
     simulate_correspondences,
 )
-from calibgraph.io import correspondence_tables
+from calibgraph.io import tables as correspondence_tables
 from calibgraph.solver import preprocess
 from calibgraph.solver.preprocess import Preprocessed
 from calibgraph.solver.robust import (

@@ -13,8 +13,8 @@ import pytest
 
 from calibgraph import Config, Correspondences, Dataset, Frame, Rig, solve
 from calibgraph.io.bags import MESSAGE_SUFFIX
-from calibgraph.io.kept_frames import keep_frames
-from calibgraph.io.motion import ScanMotion
+from calibgraph.io.dataset import keep_frames
+from calibgraph.io.frame import ScanMotion
 from calibgraph.matching.protocol import FullMatcher, Matcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.geometry import invert

@@ -1,9 +1,9 @@
-"""Correspondence tables from disk: Parquet, or CSV with the same columns."""
+"""Tables from disk, by Arrow: of matches (Parquet, or CSV with the same columns), and Feather."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file, wide_encoding
+from calibgraph.model.camera_matches import COLUMNS, FORMAT, NAMES, NUMBERS, PLANES, CameraMatches
 from calibgraph.model.correspondences import (
     COORDINATES,
     INFORMATION,
@@ -55,10 +56,6 @@ def parts_of_table(path: Path) -> Iterator[Correspondences]:
     """A table in parts, in order: of Parquet some rows at a time; a CSV file whole.
 
     Of Parquet the bytes of one row group are in memory: about a million rows, by most writers.
-
-    Raises:
-        FileError: as of :func:`load_correspondences`, once the wrong part is reached; rows are
-            counted from the beginning of the file.
     """
     rows = 0
     for part in _arrow_parts(require_file(path)):
@@ -68,10 +65,6 @@ def parts_of_table(path: Path) -> Iterator[Correspondences]:
             raise FileError(path, str(error.after(rows))) from error
         rows += len(part)
     require_rows(path, rows)
-
-
-def _metadata_of(schema: pa.Schema) -> Any:
-    return json.loads((schema.metadata or {}).get(b"matcher", b"{}"))
 
 
 def _arrow_parts(path: Path) -> Iterator[pa.Table]:
@@ -181,11 +174,7 @@ def from_arrow(table: pa.Table) -> Correspondences:
 
 
 def require_short_names(column: pa.ChunkedArray) -> None:
-    """Check the names of a dictionary before each of its rows takes memory for one.
-
-    Raises:
-        CorrespondenceError: if one is longer than the name of a camera can be.
-    """
+    """Check the names of a dictionary before each of its rows takes memory for one."""
     import pyarrow as pa
     from pyarrow import compute
 
@@ -231,7 +220,7 @@ def _from_plain_columns(table: pa.Table) -> Correspondences:
         information_px=stack(INFORMATION) if INFORMATION[0] in given else None,
         twist_per_s=stack(TWIST) if TWIST[0] in given else None,
         **{name: _whole(table, name) for name in OPTIONAL_WHOLE if name in given},
-        metadata=_metadata_of(table.schema),
+        metadata=json.loads((table.schema.metadata or {}).get(b"matcher", b"{}")),
     )
 
 
@@ -240,3 +229,90 @@ def _whole(table: pa.Table, name: str) -> NDArray[np.int64]:
     if values.dtype == np.uint64 and (values >= 2**63).any():
         raise CorrespondenceError(f"column {name!r} holds a number beyond 64 bits")
     return np.asarray(values, dtype=np.int64)
+
+
+def load_camera_matches(path: Path | str) -> CameraMatches:
+    """Read a table from Parquet, or from CSV with the same columns.
+
+    Raises:
+        FileError: if the file is missing or truncated, lacks a column, or holds a wrong value.
+    """
+    path = require_file(Path(path))
+    types = {"frame": "int64"} | dict.fromkeys((*NUMBERS, *PLANES), "float64")
+    table = read_arrow(path, NAMES, types)
+    try:
+        return _from_arrow(table, path)
+    except (CorrespondenceError, ValueError, TypeError, LookupError, RecursionError) as error:
+        raise FileError(path, f"holds a wrong value: {error}") from error
+
+
+def _from_arrow(table: pa.Table, path: Path) -> CameraMatches:
+    given, metadata = table.column_names, table.schema.metadata or {}
+    if sorted(given) != sorted(COLUMNS):
+        missing = [name for name in COLUMNS if name not in given]
+        what = f"column {missing[0]!r} is missing" if missing else "there are unknown columns"
+        raise FileError(path, f"{what}; found {given}, expected {list(COLUMNS)}")
+    if (form := metadata.get(b"format", FORMAT.encode())) != FORMAT.encode():
+        raise FileError(path, f"has the format {form!r}, expected {FORMAT!r}")
+    require_no_nulls(table, (*NAMES, "frame", *NUMBERS))
+    for name in NAMES:
+        require_short_names(table[name])
+    names = [table[name].to_pylist() for name in NAMES]
+    stated = json.loads(metadata.get(b"cameras", b"null"))
+    in_order = [name for row in zip(*names, strict=True) for name in row]
+    cameras = tuple(stated or dict.fromkeys(in_order))
+    number = {name: index for index, name in enumerate(cameras)}
+    index = np.array([[number[name] for name in side] for side in names], np.int32).T
+
+    def stack(columns: tuple[str, ...]) -> Array:
+        return np.stack([np.asarray(table[name].to_numpy(), np.float64) for name in columns], 1)
+
+    return CameraMatches(
+        cameras=cameras,
+        camera_index=index.reshape(-1, 2),
+        frame=np.asarray(table["frame"].to_numpy(), np.int64),
+        pixels_px=stack(NUMBERS).reshape(-1, 2, 2),
+        planes_lidar_per_m=stack(PLANES).reshape(-1, 2, 3),
+        metadata=json.loads(metadata.get(b"matcher", b"{}")),
+    )
+
+
+_PACKED = np.array([0x184D2204, 0xFD2FB528], np.uint32)
+
+
+def read_feather(path: Path) -> tuple[list[str], Callable[[str], NDArray[Any]]]:
+    """The names of a file's columns, and a function that returns one as an array."""
+    from pyarrow import feather
+
+    with arrow_reads(path):
+        _require_plausible_buffers(require_file(path))
+        table = feather.read_table(path, memory_map=False)
+        table.validate(full=True)  # Arrow believes offsets and lengths, and would read elsewhere
+
+    def column(name: str) -> NDArray[Any]:
+        if name not in table.column_names:
+            found = ", ".join(table.column_names)
+            raise FileError(path, f"column {name!r} is missing; found {found}")
+        values = table.column(name)
+        if values.null_count:
+            raise FileError(path, f"column {name!r} has {values.null_count} empty values")
+        with arrow_reads(path):
+            return np.asarray(values.to_numpy())
+
+    return table.column_names, column
+
+
+def _require_plausible_buffers(path: Path) -> None:
+    """Check what the packed buffers of a file state, before memory is taken for them.
+
+    Each begins with its unpacked length, in 8 bytes, and the mark of LZ4 or Zstandard.
+    """
+    words = np.fromfile(path, "<u4", offset=0)
+    marks = np.flatnonzero(np.isin(words[2::2], _PACKED))
+    lengths = words[2 * marks].astype(np.int64) + (words[2 * marks + 1].astype(np.int64) << 32)
+    unpacked, size = int(lengths[lengths >= 0].sum()), path.stat().st_size
+    if unpacked > max(_FEW_BYTES, _MOST_RATIO * size):
+        raise FileError(
+            path, f"states {unpacked / 1e6:.0f} MB in {size / 1e6:.1f} MB: points do not pack so; "
+            "write it again"
+        )  # fmt: skip
