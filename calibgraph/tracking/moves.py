@@ -336,9 +336,11 @@ def _count_agreeing(state: State, camera: int, since: int) -> int:
 
 
 def _is_pending(state: State, camera: int) -> bool:
-    """Whether the last frame was an outlier frame, which more may follow."""
+    """Whether the last frame was an outlier frame, and not so many were that they had shown it."""
     last, kept = state.agreements[camera][-1:], state.outliers[camera][-1:]
-    return bool(last and kept) and last[0] == (kept[0].number, False)
+    apart = sum(not good for _, good in state.agreements[camera])
+    few = apart <= state.config.tracking.step_frames + _PATIENCE
+    return bool(last and kept and few) and last[0] == (kept[0].number, False)
 
 
 def detect_small_step(state: State) -> DetectedStep | None:
