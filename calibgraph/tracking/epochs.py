@@ -9,10 +9,11 @@ from calibgraph.model.geometry import (
     invert_each,
     local_coordinates,
     retract_all,
+    to_T_camera_lidar,
     to_T_lidar_camera,
 )
 from calibgraph.model.pose_kernel import logarithms
-from calibgraph.solver.matches import CameraBlock, merge
+from calibgraph.solver.matches import merge
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import add_to_totals, bend_epoch, count_residuals
 from calibgraph.tracking.estimate import EpochGraph, locate_places
@@ -24,7 +25,7 @@ from calibgraph.tracking.state import STRENGTHS, State
 from calibgraph.tracking.sums import Numbers, Sums
 from factors import to_runs
 
-_GATE_STEPS = 3  # by the true Hessian: each leaves about a tenth of the way
+_GATE_STEPS = 4  # by the Hessian by weights, which descend: each leaves a third of the way
 
 
 def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
@@ -38,7 +39,7 @@ def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
     """
     locate_places(state, graph)
     add_to_totals(state, state.sums[state.closed :])
-    newest = retract_all(state.references, graph.equation_5(state.all_sums()))
+    newest = _newest(state, graph)
     steady, poses = state.walk == 0, state.poses.copy()
     poses[-1] = newest
     poses[:, steady] = newest[steady]
@@ -57,6 +58,28 @@ def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
     state.sizes, state.poses = (*state.sizes, 0), np.concatenate([state.poses, newest[None]])
     state.bends = np.concatenate([state.bends, np.zeros_like(state.bends[:1])])
     return report_drift(state)
+
+
+def _newest(state: State, graph: EpochGraph) -> Array:
+    """(n, 4, 4) T_camera_lidar at the minimum of each camera's matches, where the gate is drawn.
+
+    Of all of them, as in a batch: that of the matches within a gate is drawn to where the gate was
+    before. Of a camera that drifts, or has none, that of Eq. 5, which later epochs have a part in.
+    """
+    newest = retract_all(state.references, graph.equation_5(state.all_sums()))
+    for camera in np.flatnonzero(state.walk == 0).tolist():
+        own, pose = state.matches_of(camera), to_T_lidar_camera(state.references[camera])
+        if own is None:
+            continue
+        block, older = own[0].with_scale(state.scales[camera]), state.ungated[camera]
+        reference = pose
+        for _ in range(_GATE_STEPS):
+            sums, step = block.sums(pose), reference.localCoordinates(pose)
+            pull = sums.gradient + older.gradient + older.hessian @ step
+            whole = sums.hessian + older.hessian + WEAK
+            pose = pose.retract(-np.linalg.solve(whole, pull))
+        newest[camera] = to_T_camera_lidar(pose)
+    return newest
 
 
 def _count_epoch(state: State, camera: int) -> None:
@@ -101,7 +124,7 @@ def _regate(state: State, camera: int) -> None:
     for group in np.unique(groups).tolist():
         of_group = np.repeat(groups == group, raw.frame_counts)
         some = raw.select(of_group)
-        gated = Gated.at(_gate_pose(state, camera, some, state.poses[group, camera]), some, scale)
+        gated = Gated.at(state.poses[group, camera], some, scale)
         few = np.repeat(~gated.enough, some.frame_counts)
         within[of_group] = np.where(few, within[of_group], gated.inliers)
         if gated.enough.any():
@@ -121,29 +144,11 @@ def _linearized_at(state: State, camera: int, rows: Numbers, epochs: Numbers) ->
     if state.walk[camera]:
         poses = invert_each(state.poses[epochs, camera])
         return local_coordinates(state.references[camera], poses)
+    if state.config.preset != "auto":  # Eq. 5 knows no places
+        return np.zeros((len(rows), 6))
     row_of = {name: row for row, name in enumerate(state.settled)}
     places = [row_of.get(state.at[row], -1) for row in rows]
     return np.concatenate([state.steps[:, camera], np.zeros((1, 6))])[places]
-
-
-def _gate_pose(state: State, camera: int, raw: CameraBlock, T_camera_lidar: Array) -> Array:
-    """Where the gate is drawn: the minimum of all matches, as in a batch.
-
-    That of the matches within a gate is drawn to where the gate was before. A camera that drifts
-    keeps its estimate, which later epochs have a part in.
-    """
-    if state.walk[camera]:
-        return T_camera_lidar
-    block, older = raw.with_scale(state.scales[camera]), state.ungated[camera]
-    reference = to_T_lidar_camera(state.references[camera])
-    pose = to_T_lidar_camera(T_camera_lidar)
-    for _ in range(_GATE_STEPS):
-        sums, step = block.sums(pose), reference.localCoordinates(pose)
-        pull = sums.gradient + older.gradient + older.hessian @ step
-        root = np.linalg.cholesky(sums.hessian + older.hessian + WEAK)
-        whole = root @ state.curvature[camera] @ root.T
-        pose = pose.retract(-np.linalg.solve(whole, pull))
-    return np.asarray(pose.inverse().matrix())
 
 
 # The summary of older epochs.
