@@ -5,14 +5,21 @@ This package is a leaf: it imports numpy, numba and gtsam, and nothing of calibg
 """
 
 from factors.arrays import BlockSums, square_root, to_runs
-from factors.block import ProjectionBlock, block_factor, columns_factor, fields_px
+from factors.block import (
+    ProjectionBlock,
+    block_factor,
+    columns_factor,
+    fields_px,
+    projection_factor,
+    projection_residual,
+)
 from factors.columns import Clock, Columns, displace
 from factors.conditioning import (
     smallest_scaled_eigenvalue,
     smallest_scaled_eigenvalues,
     unit_diagonal,
 )
-from factors.lens import Lens, LensModel
+from factors.lens import Lens, LensModel, ray_spreads, unproject
 from factors.loss import LOSSES, LossName, robust_noise
 from factors.pairs import (
     EpipolarBlock,
@@ -30,8 +37,6 @@ from factors.pose import (
     relative_pose_factor,
     relative_prior_factor,
 )
-from factors.projection import projection_factor, projection_residual
-from factors.rays import ray_spreads, unproject
 
 __all__ = [
     "LOSSES",

@@ -48,8 +48,8 @@ from factors.kernel import (
     summarize,
 )
 from factors.lens import Lens
-from factors.loss import loss_id
-from factors.pose import custom_factor
+from factors.loss import loss_id, robust_noise
+from factors.pose import custom_factor, keep_last
 
 Array = NDArray[np.float64]
 
@@ -194,10 +194,10 @@ class ProjectionBlock(RobustBlock):
             curvature: whether the second derivative of half the cost is wanted, too.
         """
         runs = np.array([[0, len(self)]]) if runs is None else runs
-        size = 6 + (0 if free is None else len(free))
+        size, variance = 6 + (0 if free is None else len(free)), self.sigma**2
         sums = np.zeros((len(runs), 2 if curvature else 1, size + 2, size + 1))
-        wanted, variance = CURVATURE if curvature else PRODUCTS, self.sigma**2
-        self._summarize(T_camera_lidar, runs, (free, values, step), wanted, sums)
+        wanted = CURVATURE if curvature else PRODUCTS
+        self._summarize(T_camera_lidar, runs, free, values, step, wanted, sums)
         whole = sums[:, :, : size + 1] / variance
         whole += np.triu(whole, 1).swapaxes(-1, -2)
         hessian = whole[:, 0, :size, :size]
@@ -224,29 +224,28 @@ class ProjectionBlock(RobustBlock):
         """
         size, runs = 7 + (0 if free is None else len(free)), np.array([[0, len(self)]])
         found = np.empty((1, size, 2, len(self)))
-        self._summarize(T_camera_lidar[None], runs, (free, values, None), COLUMNS, found)
+        self._summarize(T_camera_lidar[None], runs, free, values, None, COLUMNS, found)
         return np.asarray(found[0] / self.sigma)
 
     def _summarize(
         self,
         T_camera_lidar: Array,
         runs: NDArray[np.int64],
-        of: tuple[Columns | None, Array | None, Array | None],
+        free: Columns | None,
+        values: Array | None,
+        step: Array | None,
         wanted: int,
         out: Array,
     ) -> None:
-        free = Columns(self.lens) if of[0] is None else of[0]
-        lens, columns = self.lens, self._columns
-        if of[0] is not None:
-            lens = free.lens if of[1] is None else free.at(of[1])
-            columns = self._columns_at(free, np.zeros(len(free)) if of[1] is None else of[1])
-        numbers, units = free.packed
+        free = Columns(self.lens) if free is None else free
+        lens = free.lens if values is None else free.at(values)
+        columns = self._columns_at(free, np.zeros(len(free)) if values is None else values)
         moves = free.displacements(columns[:3], columns[4], columns[5:11])
-        step = np.empty(0) if of[2] is None else np.asarray(of[2], np.float64)
+        numbers, units = free.packed
         summarize(lens.kind)(
             lens.packed, contiguous(T_camera_lidar), columns, contiguous(moves), self._whitening,
             loss_id(self.loss), np.array([self.scale * self.sigma]), contiguous(runs), numbers,
-            units, contiguous(step), wanted, out,
+            units, contiguous(np.empty(0) if step is None else step), wanted, out,
         )  # fmt: skip
 
     def _columns_at(self, free: Columns, values: Array) -> Array:
@@ -353,28 +352,14 @@ class ProjectionBlock(RobustBlock):
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
-    """The block as one factor on the variable ``T_lidar_camera``, equal to its separate factors.
+    """The block as one factor on the variable ``T_lidar_camera``, equal to its separate factors."""
+    residual = keep_last(block.error_and_jacobian)
 
-    The factor remembers the error and Jacobian of its last pose: an optimizer evaluates the error
-    of a step and then linearizes at the same pose, which takes one pass over the correspondences.
-    They are replaced as one tuple, so that threads never see a pose with the sums of another.
-    """
-    last: tuple[bytes, tuple[Array, Array]] | None = None
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
+        error, jacobian = residual(values.atPose3(key))
+        return error, [jacobian]
 
-    def error(
-        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
-        nonlocal last
-        T_lidar_camera = values.atPose3(key)
-        pose, found = T_lidar_camera.matrix().tobytes(), last
-        if found is None or found[0] != pose:
-            last = found = (pose, block.error_and_jacobian(T_lidar_camera))
-        residual, jacobian = found[1]
-        if jacobians is not None:
-            jacobians[0] = jacobian
-        return residual
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7), [key], error)
+    return custom_factor(gtsam.noiseModel.Unit.Create(7), [key], linearize)
 
 
 def fields_px(
@@ -428,6 +413,62 @@ def columns_factor(
         return found, [*by_cloud, by_pose, jacobian[:, 6:]]
 
     return custom_factor(gtsam.noiseModel.Unit.Create(7 + len(free)), keys, linearize)
+
+
+def projection_residual(
+    lens: Lens, T_lidar_camera: gtsam.Pose3, point_lidar_m: Array, pixel_px: Array
+) -> tuple[Array, Array]:
+    """Residual ``pi(T_lidar_camera^-1 p) - u`` and its Jacobian.
+
+    Args:
+        lens: the camera's lens.
+        T_lidar_camera: pose of the camera in the LiDAR frame.
+        point_lidar_m: (3,) point in the LiDAR frame.
+        pixel_px: (2,) observed pixel.
+
+    Returns:
+        (2,) residual [px]; (2, 6) Jacobian in GTSAM's tangent (rotation, translation) of the pose.
+    """
+    by_pose = np.zeros((3, 6), order="F")
+    point_camera = T_lidar_camera.transformTo(point_lidar_m, by_pose)
+    pixels, by_point = lens.project_with_jacobian(point_camera)
+    return lens.subtract(pixels, pixel_px)[0], by_point[0] @ by_pose
+
+
+def projection_factor(
+    key: int,
+    lens: Lens,
+    point_lidar_m: ArrayLike,
+    pixel_px: ArrayLike,
+    *,
+    sqrt_information: ArrayLike | None = None,
+    loss: str = "cauchy",
+    scale: float = 4.0,
+) -> gtsam.CustomFactor:
+    """One correspondence as a robust projection factor on ``T_lidar_camera`` (paper, Eq. 5).
+
+    The method in stock GTSAM terms, and the reference of the block factor in tests: it costs a
+    Python call per correspondence.
+
+    Args:
+        key: the pose variable.
+        lens: the camera's lens.
+        point_lidar_m: (3,) point in the LiDAR frame.
+        pixel_px: (2,) observed pixel.
+        sqrt_information: (2, 2) upper triangular whitening matrix [1/px]; identity if None.
+        loss: name of the robust loss.
+        scale: whitened residual norm at which the loss bends (the paper's delta).
+    """
+    point = np.asarray(point_lidar_m, dtype=np.float64)
+    pixel = np.asarray(pixel_px, dtype=np.float64)
+    whitening = np.eye(2) if sqrt_information is None else np.asarray(sqrt_information)
+
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
+        residual, jacobian = projection_residual(lens, values.atPose3(key), point, pixel)
+        return residual, [jacobian]
+
+    base = gtsam.noiseModel.Gaussian.SqrtInformation(whitening)
+    return custom_factor(robust_noise(base, loss=loss, scale=scale), [key], linearize)
 
 
 def _T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:

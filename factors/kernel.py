@@ -34,6 +34,7 @@ from factors.lens_kernels import (
     MIN_DEPTH_M,
     OMNIDIRECTIONAL,
     PINHOLE,
+    distort,
     is_projectable,
     project_one,
     project_radtan,
@@ -324,8 +325,12 @@ def evaluate(kind: int, *, shared: bool = False) -> Any:
             T, tile = poses[np.int64(i) if len(poses) > 1 else 0], np.empty((ROWS, TILE))
             for start in range(runs[i, 0], runs[i, 1], TILE):
                 n = runs[i, 1] - start if runs[i, 1] - start < TILE else TILE
-                inside = kind == RAYS and project_rays(lens, T, columns, start, n, tile)
-                if not inside:
+                inside = False
+                if kind == RAYS:
+                    inside = project_rays(lens, T, columns, start, n, tile)
+                elif kind == PINHOLE:
+                    inside = project_pinhole(lens, T, columns, start, n, tile)
+                if kind != PINHOLE and not inside:
                     project(lens_kind, lens, T, columns, start, n, tile)
                 for k in range(n):
                     valid[start + k] = inside or is_projectable(
@@ -412,7 +417,7 @@ def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-
 def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """``project`` for a pinhole: without branches, if no point lies outside the lens' domain.
 
-    Then the formulas are those of ``lens_kernels._radtan_inside``. False, if a point does.
+    False, if a point does.
     """
     xs, ys, zs = columns[0][start:], columns[1][start:], columns[2][start:]
     us, vs = columns[3][start:], columns[4][start:]
@@ -436,16 +441,7 @@ def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untype
         a, b = x * w, y * w
         r2 = a * a + b * b
         outside += 0.0 if z > MIN_DEPTH_M and r2 <= limit * limit else 1.0
-        over = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * over
-        slope = (
-            k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3) - radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))
-        ) * over
-        cross = 2.0 * (a * b * slope + p1 * a + p2 * b)
-        by_a = radial + 2.0 * a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
-        by_b = radial + 2.0 * b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
-        p = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
-        q = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
+        p, q, by_a, cross, _, by_b = distort(a, b, k1, k2, p1, p2, k3, k4, k5, k6)
         ru[i], rv[i] = fx * p + (cx - us[i]), fy * q + (cy - vs[i])
         fxw, fyw = fx * w, fy * w
         ux[i], uy[i], uz[i] = fxw * by_a, fxw * cross, -fxw * (by_a * a + cross * b)

@@ -28,6 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Self
 
 import gtsam
@@ -38,11 +39,10 @@ from factors.arrays import BlockSums, RobustBlock, contiguous, square_root
 from factors.block import ProjectionBlock
 from factors.compiled import compiled
 from factors.kernel import FAST, TILE, add_products
-from factors.lens import Lens
+from factors.lens import Lens, ray_spreads, unproject
 from factors.lens_kernels import is_projectable, project_one, subtract_columns
 from factors.loss import loss_and_weight, loss_id
-from factors.pose import custom_factor
-from factors.rays import ray_spreads, unproject
+from factors.pose import custom_factor, keep_last
 
 Array = NDArray[np.float64]
 
@@ -197,23 +197,13 @@ def pair_block_factor(
 ) -> gtsam.CustomFactor:
     """All features of a block as one factor on two poses, equal to its separate factors.
 
-    The error and Jacobian of the last poses are kept, as in ``factors.block.block_factor``.
-
     Args:
         key_a: the variable ``T_lidar_a``.
         key_b: the variable ``T_lidar_b``.
         block: of features of camera A, seen in camera B; or correspondences of B, whose points are
             in A's frame.
     """
-    last: tuple[bytes, tuple[Array, Array]] | None = None
-
-    def residual(*poses: gtsam.Pose3) -> tuple[Array, Array]:
-        nonlocal last
-        place, found = b"".join(pose.matrix().tobytes() for pose in poses), last
-        if found is None or found[0] != place:
-            last = found = (place, _error_and_jacobian(block, *poses))
-        return found[1]
-
+    residual = keep_last(partial(_error_and_jacobian, block))
     rows = 7 if isinstance(block, ProjectionBlock) else 13
     return factor_on_two_poses(gtsam.noiseModel.Unit.Create(rows), key_a, key_b, residual)
 

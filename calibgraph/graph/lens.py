@@ -7,6 +7,11 @@
 
 A parameter of l_c is in standard deviations of its prior. The prior has heavy tails: data that are
 sure of a wrong lens leave it, and data that are not stay with it.
+
+The clock is among them: the ``offset`` of the middle row of an image to the points of its frame,
+and the ``readout`` from the first row to the last. Matches show them where the LiDAR moves: its
+twist comes with the correspondences. Constant motion straight ahead shows no offset, which is then
+a translation; at rest the columns are zero, and the parameters stay at their prior.
 """
 
 from __future__ import annotations
@@ -20,7 +25,6 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace
-from calibgraph.graph.clock import clock_sigmas, put_clock_into
 from calibgraph.graph.variables import DISTORTION, lens_key, seen_lens_key
 from calibgraph.model.clock import clock_of
 from calibgraph.model.config import LensPart
@@ -33,10 +37,13 @@ from factors import (
     linear_factor,
     robust_noise,
 )
-from factors.columns import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
+from factors.columns import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL, OFFSET, READOUT
 from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
 
 TANGENTIAL_SHARE = 0.1
+OFFSET_SIGMA_S, READOUT_SIGMA_S = 0.05, 0.03
+"""Of the prior, where the rig states none: half a turn of a LiDAR, and a usual read-out."""
+
 _TAIL_SIGMAS = 2.0  # where the Cauchy loss of a prior bends
 _PLAIN = 2  # radial coefficients that are set free in a rig without distortion
 _EXACT = 1e-3  # prior standard deviations: less would lose digits
@@ -86,7 +93,11 @@ class LensVariable:
 
     def put_into(self, camera: Camera, values: Array) -> Camera:
         """A camera with the lens and clock of (k,) values."""
-        camera = put_clock_into(camera, self.free.clock_at(values), self.free.parameters)
+        clock = self.free.clock_at(values)
+        times = {OFFSET: ("time_offset_s", clock.offset_s), READOUT: ("readout_s", clock.readout_s)}
+        camera = camera.model_copy(
+            update=dict(times[n] for n in self.free.parameters if n in times)
+        )
         if not self.has_free_lens:
             return camera
         packed = self.free.at(values).packed
@@ -119,7 +130,8 @@ def _prior_sigmas(camera: Camera, default: LensSigmas) -> dict[LensPart, dict[st
             for name, number in COEFFICIENT_NUMBERS[kind].items()
             if kind != PINHOLE or number < size
         },
-        **{part: {str(part): sigma} for part, sigma in clock_sigmas(camera).items()},
+        "offset": {OFFSET: camera.time_offset_sigma_s or OFFSET_SIGMA_S},
+        "readout": {READOUT: camera.readout_sigma_s or READOUT_SIGMA_S},
     }
 
 

@@ -12,8 +12,7 @@ from calibgraph.errors import FileError
 from calibgraph.files import checked_model
 from calibgraph.model.rig import KNOWN_LENSES, Intrinsics, find_lens_model, plain_key
 from factors import LensModel
-from factors.lens import COEFFICIENTS, ORDERS
-from factors.wide_lenses import check_mirror
+from factors.lens import COEFFICIENTS, ORDERS, check_mirror
 
 _ROUNDED = 1e-6  # of numbers that are 0 or 1: what writing and reading them may add
 _NO_SKEW = 1e-4
