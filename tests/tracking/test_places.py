@@ -119,11 +119,7 @@ def test_standing_for_long_moves_the_estimate_no_more_than_passing() -> None:
 
 
 def test_a_wrong_place_among_many_hardly_counts() -> None:
-<<<<<<< HEAD
-    """The cloud turned by six sigmas at one of ten: without robust places, a tenth is followed."""
-=======
     """The cloud is turned by six sigmas at one of ten places."""
->>>>>>> w-tracker
     rig, tables = pair_of(), []
     for place in range(10):
         shown = cloud_turned(rig, 0.0042 if place == 4 else 0.0)
@@ -136,13 +132,8 @@ def test_a_wrong_place_among_many_hardly_counts() -> None:
     turned = twist_between(update.T_camera_lidar["left"], rig.T_camera_lidar["left"])
     assert np.linalg.norm(turned[:3]) < 0.04 * 0.0042 + 3 * 0.0007 / np.sqrt(9)
     weights = dict(zip(tracker._state.settled, tracker._state.weights[:, 0], strict=True))
-<<<<<<< HEAD
-    assert weights["4"] < 0.3
-    assert min(weights[str(n)] for n in range(10) if n != 4) > 0.6
-=======
     assert weights.pop("4") < 0.3
     assert min(weights.values()) > 0.6
->>>>>>> w-tracker
 
 
 def test_relative_poses_share_the_error_of_the_cloud() -> None:
