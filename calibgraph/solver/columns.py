@@ -244,30 +244,10 @@ class DistortionEvidence:
     vector: Array
     lens_jacobian: Array = field(default_factory=lambda: np.zeros((0, len(DISTORTION))))
 
-    @staticmethod
-    def none(weak: Array, *, places: int) -> DistortionEvidence:
-        """No matches, with the weak prior alone."""
-        size = len(DISTORTION)
-        information = np.zeros((places, size, size))
-        return DistortionEvidence(
-            np.zeros((len(weak), size)), weak, information, np.zeros((places, size))
-        )
-
     def as_of_one_place(self) -> DistortionEvidence:
         """The sum over places."""
         information, vector = self.information.sum(axis=0), self.vector.sum(axis=0)
         return replace(self, information=information[None], vector=vector[None])
-
-    def __add__(self, other: DistortionEvidence) -> DistortionEvidence:
-        """Both sets of matches of as many places, of cameras with known lenses."""
-        hessian = self.hessian + other.hessian
-        pulled = self.hessian @ self.jacobian + other.hessian @ other.jacobian
-        return DistortionEvidence(
-            np.asarray(np.linalg.solve(hessian, pulled), dtype=np.float64),
-            hessian,
-            self.information + other.information,
-            self.vector + other.vector,
-        )
 
 
 def distortion_evidence(
