@@ -46,8 +46,8 @@ def require_own_folder(folder: Path, read: Iterable[Path] = ()) -> None:
 def written_together(folder: Path, *, last: str) -> Iterator[Path]:
     """In the body, a folder for files that are moved into ``folder`` at its end.
 
-    After an error in the body, as of a full disk, none of them is there, and older ones are as they
-    were. The file named ``last`` is moved last: it is not there before the others.
+    After an error, as of a full disk, none of them is there, and older ones are as they were. The
+    file named ``last`` is moved last: if the process is killed, it is not there before the others.
     What a killed process has left is removed by the next one. Of two processes that write into one
     folder, the files of the later one are there.
 
@@ -110,10 +110,38 @@ def _remove_leftover(folder: Path) -> None:
 
 
 def _move_all(new: Path, folder: Path, last: str) -> None:
-    """Move the files of one folder into another."""
-    for path in sorted(new.iterdir(), key=lambda path: path.name == last):
+    """Move the files of one folder into another; after an error, all is as it was."""
+    paths = sorted(new.iterdir(), key=lambda path: path.name == last)
+    target = folder
+    try:
+        kept = Path(tempfile.mkdtemp(dir=new))
+        for path in paths:
+            target = folder / path.name
+            if target.is_file():
+                _keep(target, kept / path.name)
         try:
-            path.replace(folder / path.name)
-        except OSError as error:
-            raise cannot_write(folder / path.name, error) from error
-    sync_folder(folder)
+            for path in paths:
+                target = folder / path.name
+                path.replace(target)
+            sync_folder(folder)
+        except BaseException:
+            for path in paths:
+                _move_back(path, folder / path.name, kept / path.name)
+            raise
+    except OSError as error:
+        raise cannot_write(target, error) from error
+
+
+def _keep(path: Path, copy: Path) -> None:
+    try:
+        os.link(path, copy, follow_symlinks=False)
+    except OSError:  # a disk without hard links, or a file of another user
+        shutil.copy2(path, copy, follow_symlinks=False)
+
+
+def _move_back(new: Path, target: Path, kept: Path) -> None:
+    """Undo the move of a file, if it was moved."""
+    if not new.exists():
+        target.replace(new)
+        if kept.exists():
+            kept.replace(target)

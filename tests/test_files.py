@@ -182,6 +182,35 @@ def test_two_sets_are_not_mixed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert texts(tmp_path) == dict.fromkeys(NAMES, "second")
 
 
+@pytest.mark.parametrize("fails", [1, 2, 3])
+@pytest.mark.parametrize("has_links", [True, False])
+def test_an_error_between_the_moves_leaves_what_was_there(
+    fails: int, has_links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, moved, replace = {"a.txt": "old", LAST: "old"}, list[Path](), Path.replace
+    for name, text in before.items():
+        (tmp_path / name).write_text(text)
+
+    def move(path: Path, target: Path) -> Path:
+        if target.parent == tmp_path and target not in moved:
+            moved.append(target)
+            if len(moved) == fails:
+                raise OSError(errno.EPERM, "not permitted", str(path))
+        return replace(path, target)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EPERM, "no hard links")
+
+    if not has_links:
+        monkeypatch.setattr("os.link", refuse)
+    monkeypatch.setattr(Path, "replace", move)
+    with pytest.raises(OSError, match="cannot be written .*; choose another folder") as caught:
+        write_all(tmp_path, "new")
+    assert caught.value.filename == str(moved[fails - 1])
+    assert texts(tmp_path) == before
+    assert len([*tmp_path.iterdir()]) == len(before)
+
+
 KILLED = """
 import os, signal, sys
 from pathlib import Path
