@@ -55,7 +55,7 @@ from factors.conditioning import SINGULAR, unit_diagonal
 TOLERANCE = 1e-6
 """Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""
 
-_ROUNDING = 3e-14  # smallest part of a sum that a difference of sums may leave
+_ROUNDING = 3e-15  # smallest part of a sum that a difference may leave
 _SHARES = 0.5 ** np.arange(12)
 """Of a step: the first that descends; mostly the whole step."""
 
@@ -365,7 +365,12 @@ class Linearization:
         values = np.linalg.eigvalsh(unit_diagonal(information)[0])
         before = np.sqrt(np.diag(self.shared_hessian[0])[at]) / units[at]
         left = np.linalg.eigvalsh(information / np.outer(before, before))[0]
-        return bool(values[0] > SINGULAR * values[-1] and left > _ROUNDING)
+        if values[0] <= SINGULAR * values[-1] or left <= _ROUNDING:
+            return False
+        try:
+            return bool(np.diag(self.covariance_of(self.model.reported_keys)).min() > 0)
+        except np.linalg.LinAlgError:
+            return False
 
 
 class _Softened(NamedTuple):

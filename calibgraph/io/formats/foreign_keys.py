@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
@@ -314,7 +315,13 @@ class _Map:
         return values
 
 
-class _Image(StrictNumbers):
+class Foreign(StrictNumbers):
+    """Of another program's file: what is not needed may be there."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class _Image(Foreign):
     size: tuple[Size, Size]
 
 

@@ -16,12 +16,12 @@ from pydantic import ConfigDict, Field
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, FileError
-from calibgraph.files import StrictNumbers, checked_model, read_json, read_text, require_file
+from calibgraph.files import checked_model, read_json, read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.clouds import read_npy
-from calibgraph.io.formats.foreign_keys import read_foreign
+from calibgraph.io.formats.foreign_keys import Foreign, read_foreign
 from calibgraph.io.kitti import CALIBRATION_NAME, NumberLines
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rig_parts import (
@@ -107,7 +107,7 @@ def _is_number(word: str) -> bool:
     return True
 
 
-class _Vector(StrictNumbers):
+class _Vector(Foreign):
     x: float
     y: float
     z: float
@@ -117,22 +117,22 @@ class _Quaternion(_Vector):
     w: float
 
 
-class _Transform(StrictNumbers):
+class _Transform(Foreign):
     translation: _Vector
     rotation: _Quaternion
 
 
-class _TfHeader(StrictNumbers):
+class _TfHeader(Foreign):
     frame_id: str
 
 
-class _Stamped(StrictNumbers):
+class _Stamped(Foreign):
     header: _TfHeader
     child_frame_id: str
     transform: _Transform
 
 
-class _TfMessage(StrictNumbers):
+class _TfMessage(Foreign):
     transforms: list[_Stamped]
 
 
@@ -163,7 +163,7 @@ def read_tf2(documents: list[dict[str, Any]], path: Path) -> RigParts:
     return RigParts(path, links=tuple(links.values()), notes=tuple(notes))
 
 
-class _Pose(StrictNumbers):
+class _Pose(Foreign):
     model_config = ConfigDict(extra="forbid")
 
     x: Finite
@@ -388,18 +388,18 @@ _Nine = Annotated[list[Finite], Field(min_length=9, max_length=9)]
 _Twelve = Annotated[list[Finite], Field(min_length=12, max_length=12)]
 
 
-class _Header(StrictNumbers):
+class _Header(Foreign):
     frame_id: str = ""
 
 
-class _Window(StrictNumbers):
+class _Window(Foreign):
     x_offset: _Count = 0
     y_offset: _Count = 0
     height: _Count = 0
     width: _Count = 0
 
 
-class _Message(StrictNumbers):
+class _Message(Foreign):
     header: _Header = _Header()
     height: Size
     width: Size
