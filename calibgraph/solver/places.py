@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.components import VarianceRatios
@@ -351,26 +352,27 @@ class Linearization:
         if not {*self.model.camera_keys} <= {*self.model.shared_graph.keyVector()}:
             return False  # nothing acts on a camera
         whole, at = self.hessian(), self.model.columns_of(self.model.reported_keys)
-        scaled, units = unit_diagonal(whole)
-        if not (np.isfinite(scaled).all() and (np.diag(whole) > 0).all()):
-            return False
-        others = np.delete(np.arange(len(whole)), at)
-        try:
-            across = np.linalg.solve(scaled[np.ix_(others, others)], scaled[np.ix_(others, at)])
-        except np.linalg.LinAlgError:
-            return False
-        information = scaled[np.ix_(at, at)] - scaled[np.ix_(at, others)] @ across
-        if np.diag(information).min() <= 0:
-            return False
-        values = np.linalg.eigvalsh(unit_diagonal(information)[0])
-        before = np.sqrt(np.diag(self.shared_hessian[0])[at]) / units[at]
-        left = np.linalg.eigvalsh(information / np.outer(before, before))[0]
-        if values[0] <= SINGULAR * values[-1] or left <= _ROUNDING:
+        if not (np.isfinite(whole).all() and (np.diag(whole) > 0).all()):
             return False
         try:
-            return bool(np.diag(self.covariance_of(self.model.reported_keys)).min() > 0)
+            left, own = _left_information(whole, at), self.joint_covariance[at, at]
         except np.linalg.LinAlgError:
             return False
+        if np.diag(left).min() <= 0 or own.min() <= 0:
+            return False
+        values = np.linalg.eigvalsh(unit_diagonal(left)[0])
+        before = np.sqrt(np.diag(self.shared_hessian[0])[at])
+        share = np.linalg.eigvalsh(left / np.outer(before, before))[0]
+        return bool(values[0] > SINGULAR * values[-1] and share > _ROUNDING)
+
+
+def _left_information(hessian: Array, rows: NDArray[np.intp]) -> Array:
+    """(r, r) of some unknowns, the others eliminated."""
+    scaled, units = unit_diagonal(hessian)
+    others = np.delete(np.arange(len(hessian)), rows)
+    across = np.linalg.solve(scaled[np.ix_(others, others)], scaled[np.ix_(others, rows)])
+    left = scaled[np.ix_(rows, rows)] - scaled[np.ix_(rows, others)] @ across
+    return np.asarray(left * np.outer(units[rows], units[rows]))
 
 
 class _Softened(NamedTuple):
