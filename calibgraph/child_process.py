@@ -10,13 +10,16 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from calibgraph.errors import CalibrationError
 from calibgraph.parallel import THREADS_VARIABLE
 
 Process = subprocess.Popen[bytes]
@@ -28,6 +31,32 @@ _ONE_THREAD = dict.fromkeys(
      "NUMBA_NUM_THREADS"), "1",
 )  # fmt: skip
 """The requests share the cores, so that each needs one thread only."""
+
+ErrorKind = Literal["bad input", "io", "out of memory", "timeout", "worker died", "internal error"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended: its result, or why it failed, in one line; its time and what it printed."""
+
+    result: Any = None
+    error_kind: ErrorKind | None = None
+    error: str | None = None
+    seconds: float = 0.0
+    log: str = ""
+
+
+def describe_failure(error: Exception) -> tuple[ErrorKind, str]:
+    """The kind of a job's failure, and its text: wrong data are no fault of the machine's."""
+    if isinstance(error, MemoryError):
+        why = f" ({error})" if str(error) else ""
+        return "out of memory", f"not enough memory{why}; give fewer frames, or more --memory-gb"
+    if isinstance(error, (CalibrationError, ValueError)):
+        return "bad input", str(error)
+    traceback.print_exception(error)
+    if isinstance(error, OSError):
+        return "io", str(error)
+    return "internal error", f"{type(error).__name__}: {error}"
 
 
 class ChildEndedError(Exception):
@@ -87,12 +116,14 @@ class ChildProcess:
                 return
             self.stop()
         ours, theirs = Pipe()
+        # It finds modules where this one does, not in the folder it is started in.
+        folders = os.pathsep.join([os.environ.get("PYTHONPATH", ""), *sys.path]).strip(os.pathsep)
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", self._module, str(theirs.fileno()), *self._arguments],
             stdin=subprocess.PIPE,  # it ends with this process
             stdout=subprocess.DEVNULL,
             pass_fds=[theirs.fileno()],
-            env={**os.environ, **_ONE_THREAD, "PYTHONPATH": _module_folders()},
+            env={**os.environ, **_ONE_THREAD, "PYTHONPATH": folders},
             start_new_session=True,  # Ctrl-C is for the command
         )
         theirs.close()
@@ -130,11 +161,6 @@ class ChildProcess:
         self.stop()
 
 
-def _module_folders() -> str:
-    """Where the process finds modules: where this one does, not in the folder it is started in."""
-    return os.pathsep.join([os.environ.get("PYTHONPATH", ""), *sys.path]).strip(os.pathsep)
-
-
 def _how_it_ended(code: int) -> str:
     """An exit code of a process in words."""
     if code >= 0:
@@ -153,7 +179,13 @@ def answer_requests(
         answer: called with a request, and the function for notes before the answer.
         at_end: called when the parent is gone, in another thread than a request that runs.
     """
-    threading.Thread(target=_end_with_parent, args=(at_end,), daemon=True).start()
+
+    def end_with_parent() -> None:
+        os.read(0, 1)  # not sys.stdin, whose lock would make the exit of Python fail
+        at_end()
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
     connection = Connection(int(sys.argv[1]))
     with suppress(BrokenPipeError, ConnectionResetError):  # the parent has gone
         connection.send("ready")
@@ -163,13 +195,6 @@ def answer_requests(
             except EOFError:
                 return
             connection.send((True, answer(request, lambda note: connection.send((False, note)))))
-
-
-def _end_with_parent(at_end: Callable[[], None]) -> None:
-    """End this process when the parent is gone."""
-    os.read(0, 1)  # not sys.stdin, whose lock would make the exit of Python fail
-    at_end()
-    os._exit(1)
 
 
 @contextmanager

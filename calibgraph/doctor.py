@@ -13,21 +13,19 @@ from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.dataset_folders import frames_of_folder
-from calibgraph.io.formats.describe import describe_rig
 from calibgraph.io.frame import Frame, hash_source
-from calibgraph.io.rigs import load_rig
+from calibgraph.io.rigs import describe_rig, load_rig
 from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.camera_pairs import overlapping_pairs
 from calibgraph.matching.cloud_similarity import find_up
-from calibgraph.matching.frame_choice import choose_frames
+from calibgraph.matching.frame_choice import choose_frames, find_stationary_frames
 from calibgraph.matching.places import UNKNOWN_UP, find_places
 from calibgraph.matching.same_images import find_same_images
-from calibgraph.matching.standstill import find_stationary_frames
 from calibgraph.matching.structure.matcher import MOST_FRAMES
 from calibgraph.model.places import as_groups, describe_places
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores
-from calibgraph.report.point_overlay import write_guess_overlays
+from calibgraph.report.page_overlays import write_overlays
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.trust.inputs import (
     Finding,
@@ -116,7 +114,7 @@ def diagnose(
         findings += _examine_places(examined, max(seen, key=seen.__getitem__), cloud)
         findings += _examine_guess(examined, (frame, cloud), seen)
         if pictures is not None and not any(finding.level == "error" for finding in findings):
-            written = write_guess_overlays(frame, data.rig, pictures)
+            written = write_overlays(frame, data.rig, pictures)
     findings.sort(key=lambda finding: _ORDER.index(finding.level))
     return Diagnosis(tuple(findings), len(data.frames), seen, tuple(written))
 
@@ -150,10 +148,9 @@ def _load(
 
 def _describe(data: Dataset) -> Iterator[Finding]:
     """The content of the dataset, and whether there are enough frames."""
-    count = len(data.frames)
-    yield Finding(
-        "note", f"{_counted(count, 'frame')}, {_counted(len(data.rig.cameras), 'camera')}"
-    )
+    counts = {"frame": (count := len(data.frames)), "camera": len(data.rig.cameras)}
+    words = (f"{number} {noun}{'' if number == 1 else 's'}" for noun, number in counts.items())
+    yield Finding("note", ", ".join(words))
     yield from (Finding("note", note) for note in data.notes)
     if not set(describe_rig(data.rig)) & set(data.notes):
         yield from (Finding("note", line) for line in describe_rig(data.rig))
@@ -169,54 +166,44 @@ def _examine_frames(frames: Sequence[Frame], rig: Rig, findings: list[Finding]) 
     """The frames whose clouds can be read, with findings about clouds and images."""
     read = map_on_cores(_examine_frame, frames, [rig] * len(frames))
     for source in ("", *rig.cameras):
-        problems = [each.problems[source] for each in read if source in each.problems]
+        problems = [found[source] for found, _ in read if source in found]
         if problems:
             others = f"; {len(problems) - 1} more of its frames have errors" if problems[1:] else ""
             findings.append(Finding("error", problems[0] + others))
-    for name in rig.cameras:
-        text = describe_brightness(name, [e.brightness[name] for e in read if name in e.brightness])
-        findings += [Finding("warning", text)] if text else []
-    findings += [Finding("note", line) for line in describe_thinned(e.points for e in read)]
-    readable = [f for f, each in zip(frames, read, strict=True) if "" not in each.problems]
-    findings += _repeats("cloud", [(f.name, f.cloud_path) for f in readable])
-    for name in rig.cameras:
-        images = [(f.name, f.image_paths[name]) for f in readable]
-        findings += _repeats(f"image of {name}", images)
+    warnings = [
+        describe_brightness(name, [means[name] for _, means in read if name in means])
+        for name in rig.cameras
+    ]
+    findings += [Finding("warning", text) for text in warnings if text]
+    points = (int(measured.get("", 0)) for _, measured in read)
+    findings += [Finding("note", line) for line in describe_thinned(points)]
+    readable = [f for f, (problems, _) in zip(frames, read, strict=True) if "" not in problems]
+    sources = {"cloud": [frame.cloud_path for frame in readable]}
+    sources |= {f"image of {n}": [f.image_paths[n] for f in readable] for n in rig.cameras}
+    for what, paths in sources.items():
+        hashes = zip((f.name for f in readable), map_on_cores(hash_source, paths), strict=True)
+        if text := describe_repeats(what, hashes):
+            findings.append(Finding("warning", text))
     return readable
 
 
-@dataclass
-class _Examined:
-    """A frame: problems of its cloud ("") and of images, its points, and mean levels of images."""
-
-    problems: dict[str, str] = field(default_factory=dict)
-    points: int = 0
-    brightness: dict[str, float] = field(default_factory=dict)
-
-
-def _examine_frame(frame: Frame, rig: Rig) -> _Examined:
-    found = _Examined()
+def _examine_frame(frame: Frame, rig: Rig) -> tuple[dict[str, str], dict[str, float]]:
+    """The problems of its cloud ("") and of images; its number of points (""), and mean levels."""
+    problems, measured = dict[str, str](), dict[str, float]()
     try:
-        found.points = len(frame.load_cloud())
+        measured[""] = len(frame.load_cloud())
     except (CalibrationError, OSError) as error:
-        found.problems[""] = str(error)
+        problems[""] = str(error)
     for name, camera in rig.cameras.items():
         try:
             gray = frame.load_gray(name, camera)
         except (CalibrationError, OSError) as error:
-            found.problems[name] = str(error)
+            problems[name] = str(error)
             continue
         if np.ptp(gray) == 0:
-            found.problems[name] = f"{frame.image_paths[name]}: all pixels are {gray[0, 0]}"
-        found.brightness[name] = float(gray.mean())
-    return found
-
-
-def _repeats(what: str, sources: Sequence[tuple[str, Path]]) -> list[Finding]:
-    """Frames with the same cloud or image."""
-    hashes = map_on_cores(hash_source, [path for _, path in sources])
-    text = describe_repeats(what, zip((name for name, _ in sources), hashes, strict=True))
-    return [Finding("warning", text)] if text else []
+            problems[name] = f"{frame.image_paths[name]}: all pixels are {gray[0, 0]}"
+        measured[name] = float(gray.mean())
+    return problems, measured
 
 
 def _examine_places(data: Dataset, camera: str, cloud: NDArray[np.float32]) -> Iterator[Finding]:
@@ -256,8 +243,3 @@ def _examine_guess(
     if len(data.rig.cameras) > 1:
         pairs = ", ".join(f"{a} and {b}" for a, b in overlapping_pairs(data.rig, cloud)) or "none"
         yield Finding("note", f"cameras that see the same by the guess: {pairs}")
-
-
-def _counted(count: int, noun: str) -> str:
-    """A number with its noun."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -30,17 +30,10 @@ class CalibrationError(Exception):
     def __init__(
         self, message: str, *, camera: str | None = None, frame: str | int | None = None
     ) -> None:
-        super().__init__(_one_line(message))
+        text = " ".join(message.split())  # in one line
+        super().__init__(printable(f"{text[:MAX_MESSAGE]}..." if text[MAX_MESSAGE:] else text))
         self.camera = camera
         self.frame = frame
-
-
-def _one_line(message: str) -> str:
-    """The message without line breaks and control characters, at most MAX_MESSAGE long."""
-    text = " ".join(message.split())
-    if len(text) > MAX_MESSAGE:
-        text = f"{text[:MAX_MESSAGE]}..."
-    return printable(text)
 
 
 def printable(text: str) -> str:
@@ -48,12 +41,9 @@ def printable(text: str) -> str:
 
     Characters that are not seen but do something (of control, of direction) are escaped.
     """
-    lines = text.split("\n")
-    return "\n".join(line if line.isprintable() else "".join(map(_visible, line)) for line in lines)
-
-
-def _visible(character: str) -> str:
-    return character if character.isprintable() or character == "\t" else ascii(character)[1:-1]
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in "\t\n" else ascii(c)[1:-1] for c in text)
 
 
 def in_words(error: BaseException) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import numpy as np
-from pydantic import BaseModel, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 
 from calibgraph.errors import FileError
 from calibgraph.yaml_text import describe_value, parse_yaml, yaml_text
@@ -22,7 +22,7 @@ Model = TypeVar("Model", bound=BaseModel)
 MAX_YAML_BYTES = 8 * 2**20
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Write a temporary file beside ``path`` with ``write``, then rename it in one step.
 
     A crash leaves the old file or the new one, never half of one.
@@ -115,16 +115,12 @@ def sync_folder(folder: Path) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
-    write_atomically(path, lambda temporary: _discard(temporary.write_text(text, "utf-8")))
+    write_atomically(path, lambda temporary: temporary.write_text(text, "utf-8"))
 
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a binary file atomically."""
-    write_atomically(path, lambda temporary: _discard(temporary.write_bytes(data)))
-
-
-def _discard(_: object) -> None:
-    return None
+    write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
 def sha256(path: Path) -> str:
@@ -227,7 +223,9 @@ def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> 
 
 
 class StrictNumbers(BaseModel):
-    """A model whose numbers are none of YAML's truth values: ``true`` is not 1 px."""
+    """A frozen model of known keys, whose numbers are no truth values: ``true`` is not 1 px."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     @field_validator("*", mode="before")
     @classmethod

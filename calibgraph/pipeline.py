@@ -13,6 +13,7 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
+from calibgraph.arrays import Array
 from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset
@@ -21,21 +22,20 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import pair_covariances
 from calibgraph.model.lens import with_sigmas
 from calibgraph.model.rig import Rig
-from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.parallel import Threads, with_own_threads
 from calibgraph.progress import Progress, Stopwatch, no_progress
-from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds
+from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds, refine_with_camera_pairs
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess, assess_run, in_order
-from calibgraph.trust.evidence import Evidence, RunEvidence
+from calibgraph.trust.evidence import Evidence, gather
 from calibgraph.trust.image_record import ImageRecord, RunChecks, to_metadata
 from calibgraph.trust.inputs import registered_twists
 from calibgraph.trust.lens_checks import asks_offset
 from calibgraph.trust.observability import weaknesses
 from calibgraph.trust.probability import TABLES, judge, model_of
+from calibgraph.trust.solution_checks import residuals_of
 
 _log = logging.getLogger(__name__)
 
@@ -77,26 +77,25 @@ def calibrate(
         )  # fmt: skip
         if asks_offset(run):
             beside.submit(registered_twists, run.dataset)  # which its checks wait for
-        run = refine_with_camera_pairs(run, report)  # what cameras see in common
+        run = refine_with_camera_pairs(run)  # what cameras see in common
         with run.watch("hash_inputs"):
-            inputs = hash_inputs(run.dataset)
+            run = replace(run, hashes=hash_inputs(run.dataset))
         thinned = describe_thinned(len(frame.load_cloud()) for frame in run.dataset.frames)
-        evidence = go_on_elsewhere(RunEvidence(run, inputs, report))  # where the rounds ended wrong
-        run = evidence.run
+        run, evidence = go_on_elsewhere(run)  # where the rounds ended wrong
         with run.watch("checks"):
-            checks = assess_run(evidence)
-            record = to_metadata(evidence.solution, checks)
+            checks = assess_run(run, evidence)
+            record = to_metadata(evidence, checks)
     for line in thinned:
         _log.warning(line)
     report("done", 1, 1)
     table = run.correspondences
     return replace(
-        to_calibration(evidence.solution, checks),
+        to_calibration(evidence, checks),
         correspondences=table.with_metadata({**table.metadata, **record}),
         frames=tuple(frame.entry() for frame in run.dataset.frames),
         rounds=run.rounds,
         warnings=(*run.warnings, *thinned),
-        inputs=inputs,
+        inputs=dict(run.hashes),
         timings_s=run.watch.seconds,
     )
 
@@ -134,10 +133,14 @@ def solve(
     """
     solution = solve_joint(rig, table, config, terms, camera_matches=camera_matches)
     record = ImageRecord.from_metadata(solution.correspondences.metadata)
-    posteriors = record.posteriors_of(solution.solved_rig.cameras)
-    evidence = Evidence(solution, rig, posteriors, solution.config.excluded_cameras)
     watch = Stopwatch()
     with watch("checks"):
+        evidence = gather(
+            solution,
+            rig,
+            lambda _, groups: record.posteriors_of(solution.solved_rig.cameras, groups),
+            excluded=solution.config.excluded_cameras,
+        )
         checks = record.checks(evidence, assess(evidence))
     result = to_calibration(evidence, checks)
     motion = solution.correspondences
@@ -147,12 +150,7 @@ def solve(
 
 
 def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
-    """A solution with its error bar and its verdict.
-
-    Args:
-        evidence: the solution, and what its checks computed.
-        checks: all of them.
-    """
+    """A solution with its error bar, and its verdict by all checks."""
     solution, cameras = evidence.solution, evidence.cameras
     model, tolerance = model_of(solution.correspondences.matcher), solution.config.tolerance
     models = dict.fromkeys(cameras, model) | dict.fromkeys(checks.unseen, TABLES)
@@ -165,13 +163,9 @@ def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
         initial_rig=evidence.guess,
         covariance={name: evidence.covariance_of(name) for name in cameras},
         joint_covariance=evidence.joint_covariance,
-        pair_covariance=Later(
-            lambda: pair_covariances(
-                evidence.mount_covariance, solution.T_camera_lidar, solution.held
-            )
-        ),
+        pair_covariance=Later(evidence.pair_covariances),
         camera_verdicts=verdicts,
-        residuals=Later(lambda: evidence.residuals),
+        residuals=Later(lambda: residuals_of(solution)),
         counts={name: dict(counts) for name, counts in solution.counts.items()},
         timings_s=dict(solution.timings_s),
         terms=solution.terms,
@@ -183,7 +177,7 @@ def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
         prior_share=evidence.prior_shares,
         error_sources=Later(lambda: evidence.error_sources),
         lens=solution.lens,
-        lens_covariance=evidence.lens_covariance,
+        lens_covariance=_with_poses(solution.lens_covariance, evidence),
         bootstrap=evidence.bootstrap,
         places=solution.correspondences.places.of_frames(solution.correspondences.frame),
         correspondences=solution.correspondences,
@@ -194,6 +188,14 @@ def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
         verdict = result.verdict
         _log.info("%s %s", verdict.status, "; ".join(verdict.reasons))
     return result
+
+
+def _with_poses(lens_covariance: dict[str, Array], evidence: Evidence) -> dict[str, Array]:
+    """The pose's part is the reported one: what widens that is not correlated with the lens."""
+    for name, joint in lens_covariance.items():
+        if (own := evidence.covariance_of(name)) is not None:
+            joint[:6, :6] = own
+    return lens_covariance
 
 
 def hash_inputs(dataset: Dataset) -> dict[str, str]:

@@ -26,10 +26,3 @@ class Stopwatch:
             yield
         finally:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-
-def with_note(progress: Progress, note: str) -> Progress:
-    """The same with a note behind what goes on; an empty one changes nothing."""
-    if not note:
-        return progress
-    return lambda what, done, total: progress(f"{what} ({note})", done, total)

@@ -1,11 +1,14 @@
 """YAML as text: mappings in and out, and what no file of ours may hold refused in one line."""
 
 import re
+from collections.abc import Mapping
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from pydantic import BaseModel
 
 from calibgraph.errors import FileError
 
@@ -180,6 +183,18 @@ def _represent_sequence(dumper: yaml.SafeDumper, data: Any) -> yaml.Node:
     return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=flow)
 
 
+def _represent_object(dumper: yaml.SafeDumper, data: Any) -> yaml.Node:
+    """A mapping that is no dict, a dataclass or a pydantic model, by its fields."""
+    if isinstance(data, Mapping):
+        return dumper.represent_dict({**data})
+    if is_dataclass(data):
+        return dumper.represent_dict(vars(data))
+    if isinstance(data, BaseModel):
+        return dumper.represent_dict(data.model_dump())
+    return dumper.represent_undefined(data)
+
+
+_Dumper.add_multi_representer(object, _represent_object)
 _Dumper.add_representer(list, _represent_sequence)
 _Dumper.add_representer(tuple, _represent_sequence)
 _Dumper.add_representer(np.ndarray, lambda dumper, data: _represent_sequence(dumper, data.tolist()))

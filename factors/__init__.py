@@ -4,50 +4,46 @@ Every factor acts on ``T_lidar_camera``, the pose of a camera in the LiDAR frame
 This package is a leaf: it imports numpy, numba and gtsam, and nothing of calibgraph.
 """
 
-from factors.block import ProjectionBlock, block_factor
-from factors.block_arrays import to_runs
-from factors.block_sums import BlockSums, square_root
-from factors.clock import Clock, displace
+from factors.arrays import BlockSums, square_root, to_runs
+from factors.block import (
+    ProjectionBlock,
+    block_factor,
+    columns_factor,
+    fields_px,
+    projection_factor,
+    projection_residual,
+)
+from factors.columns import Clock, Columns, displace
 from factors.conditioning import (
     smallest_scaled_eigenvalue,
     smallest_scaled_eigenvalues,
     unit_diagonal,
 )
-from factors.custom import linear_factor
-from factors.epipolar import EpipolarBlock
-from factors.free_lens import (
-    FreeLens,
-    FreeLensBlock,
-    free_lens_factor,
-)
-from factors.lens import Lens, LensModel
+from factors.lens import Lens, LensModel, ray_spreads, unproject
 from factors.loss import LOSSES, LossName, robust_noise
-from factors.pair import (
+from factors.pairs import (
+    EpipolarBlock,
     PairBlock,
+    SurfaceBlock,
     pair_block_factor,
     pair_chain,
-    pair_run_sums,
-    pair_sums,
     placed_pair_factor,
 )
 from factors.pose import (
     camera_prior_factor,
     displaced_between_factor,
+    linear_factor,
     pose_sigmas,
     relative_pose_factor,
     relative_prior_factor,
 )
-from factors.projection import projection_factor, projection_residual
-from factors.rays import ray_spreads, unproject
-from factors.surface import SurfaceBlock
 
 __all__ = [
     "LOSSES",
     "BlockSums",
     "EpipolarBlock",
     "Clock",
-    "FreeLens",
-    "FreeLensBlock",
+    "Columns",
     "Lens",
     "LensModel",
     "LossName",
@@ -56,14 +52,13 @@ __all__ = [
     "SurfaceBlock",
     "block_factor",
     "camera_prior_factor",
+    "columns_factor",
     "displaced_between_factor",
     "displace",
-    "free_lens_factor",
+    "fields_px",
     "linear_factor",
     "pair_block_factor",
     "pair_chain",
-    "pair_run_sums",
-    "pair_sums",
     "placed_pair_factor",
     "pose_sigmas",
     "projection_factor",

@@ -7,7 +7,7 @@ For correspondences k with whitened residual r_k, Jacobian J_k, s_k = |r_k|^2 an
 A factor with Jacobian A = [M; 0] (7 x 6), M^T M = H, and error e = [M^-T b; sqrt(c - |M^-T b|^2)]
 has A^T A = H, A^T e = b and |e|^2 = c: the linearization and the error are those of the separate
 robust factors. The root is real, since |M^-T b|^2 <= sum psi_k s_k <= sum rho(s_k) for every loss
-that is concave in s with rho(0) = 0.
+that is concave in s with rho(0) = 0. With k further columns, M has 6 + k columns.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.block_arrays import (
+from factors.arrays import (
+    BlockSums,
     RobustBlock,
     check_shape,
     chunks,
@@ -28,17 +29,30 @@ from factors.block_arrays import (
     join_roots,
     read_only,
     rows_of_root,
+    square_root,
     to_runs,
+    unpack_sums,
 )
-from factors.block_sums import BlockSums, square_root, unpack_sums
-from factors.kernel import COST, CURVATURE, HESSIAN, SUMS, accumulate, evaluate
-from factors.kernel_projection import MATRICES, RAYS
+from factors.columns import CLOCK, Columns, displace
+from factors.kernel import (
+    COLUMNS,
+    COST,
+    CURVATURE,
+    HESSIAN,
+    MATRICES,
+    PRODUCTS,
+    RAYS,
+    SUMS,
+    accumulate,
+    evaluate,
+    summarize,
+)
 from factors.lens import Lens
-from factors.loss import loss_id
+from factors.loss import loss_id, robust_noise
+from factors.pose import custom_factor, keep_last
 
 Array = NDArray[np.float64]
 
-_WORTH_RAYS = 2048  # correspondences (4 us a pass): the kernel compiles for a second
 _WORTH_SHARING = 2_000_000  # correspondences (7 ms): below, waiting for busy cores costs more
 _WIDTHS = {"points_lidar_m": 3, "pixels_px": 2, "sqrt_information": 3, "motion": 7}
 
@@ -82,8 +96,7 @@ class ProjectionBlock(RobustBlock):
         for name, width in _WIDTHS.items():
             if getattr(self, name) is not None:
                 check_shape(name, getattr(self, name), (n, width))
-        loss_id(self.loss)
-        self._check_scale()
+        self._check_loss()
         columns = np.empty((5 if self.motion is None else 12, n))
         columns[:3], columns[3:5] = self.points_lidar_m.T, self.pixels_px.T
         if self.motion is not None:
@@ -156,7 +169,94 @@ class ProjectionBlock(RobustBlock):
         With ``curvature``, also the second derivative of half the cost of each.
         """
         poses, runs = _T_camera_lidar(T_lidar_camera)[None], to_runs(np.asarray(edges, np.int64))
-        return unpack_sums(self._run_sums(poses, runs, None, CURVATURE if curvature else HESSIAN))
+        return self.summarize(poses, runs, curvature=curvature)
+
+    def summarize(
+        self,
+        T_camera_lidar: Array,
+        runs: NDArray[np.int64] | None = None,
+        free: Columns | None = None,
+        values: Array | None = None,
+        *,
+        step: Array | None = None,
+        curvature: bool = False,
+    ) -> BlockSums:
+        """H, b and c of each run by pose and further columns, stacked, and sums of the weights.
+
+        Args:
+            T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
+            runs: (r, 2) as in :meth:`run_sums`; None: one run of all.
+            free: k columns beside the pose; their lens is the block's, too. Without a motion, a
+                clock is not observable.
+            values: (k,) of these; None: zeros.
+            step: (6 + k,) of pose and columns: the residuals are those after so much of it, to
+                first order.
+            curvature: whether the second derivative of half the cost is wanted, too.
+        """
+        runs = np.array([[0, len(self)]]) if runs is None else runs
+        size, variance = 6 + (0 if free is None else len(free)), self.sigma**2
+        sums = np.zeros((len(runs), 2 if curvature else 1, size + 2, size + 1))
+        wanted = CURVATURE if curvature else PRODUCTS
+        self._summarize(T_camera_lidar, runs, free, values, step, wanted, sums)
+        whole = sums[:, :, : size + 1] / variance
+        whole += np.triu(whole, 1).swapaxes(-1, -2)
+        hessian = whole[:, 0, :size, :size]
+        return BlockSums(
+            hessian,
+            whole[:, 0, :size, size],
+            sums[:, 0, -1, 0] / variance,
+            hessian - whole[:, 1, :size, :size] if curvature else None,
+            weights=sums[:, 0, -1, 1],
+            squares=whole[:, 0, size, size],
+        )
+
+    def columns(
+        self, T_camera_lidar: Array, free: Columns | None = None, values: Array | None = None
+    ) -> Array:
+        """(6 + k + 1, 2, n) derivatives of the whitened residuals, and last the residuals.
+
+        In GTSAM's tangent of T_lidar_camera, and by further columns.
+
+        Args:
+            T_camera_lidar: (4, 4).
+            free: k columns beside the pose.
+            values: (k,) of these; None: zeros.
+        """
+        size, runs = 7 + (0 if free is None else len(free)), np.array([[0, len(self)]])
+        found = np.empty((1, size, 2, len(self)))
+        self._summarize(T_camera_lidar[None], runs, free, values, None, COLUMNS, found)
+        return np.asarray(found[0] / self.sigma)
+
+    def _summarize(
+        self,
+        T_camera_lidar: Array,
+        runs: NDArray[np.int64],
+        free: Columns | None,
+        values: Array | None,
+        step: Array | None,
+        wanted: int,
+        out: Array,
+    ) -> None:
+        free = Columns(self.lens) if free is None else free
+        lens = free.lens if values is None else free.at(values)
+        columns = self._columns_at(free, np.zeros(len(free)) if values is None else values)
+        moves = free.displacements(columns[:3], columns[4], columns[5:11])
+        numbers, units = free.packed
+        summarize(lens.kind)(
+            lens.packed, contiguous(T_camera_lidar), columns, contiguous(moves), self._whitening,
+            loss_id(self.loss), np.array([self.scale * self.sigma]), contiguous(runs), numbers,
+            units, contiguous(np.empty(0) if step is None else step), wanted, out,
+        )  # fmt: skip
+
+    def _columns_at(self, free: Columns, values: Array) -> Array:
+        """The arrays of the block, with its points where they are when their pixels are taken."""
+        if self.motion is None or not {*CLOCK} & {*free.parameters}:
+            return self._columns
+        late = self.motion[:, 6] - free.clock_at(values).times_s(self.pixels_px[:, 1])
+        if not late.any():
+            return self._columns
+        points = displace(self.points_lidar_m, self.motion[:, :6], late)
+        return read_only(np.concatenate([points.T, self._columns[3:]]))
 
     def run_sums(
         self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None = None
@@ -186,9 +286,8 @@ class ProjectionBlock(RobustBlock):
         shared = wanted == HESSIAN and len(runs) * len(self) >= _WORTH_SHARING
         shared = shared and int((runs[:, 1] - runs[:, 0]).sum()) >= _WORTH_SHARING
         scales = np.array([self.scale]) if scales is None else scales
-        sums = np.empty((len(runs), SUMS[wanted]))
-        rays = self._has_rays() and wanted != CURVATURE
-        for kind in (RAYS, self.lens.kind) if rays else (self.lens.kind,):
+        sums = np.empty((len(runs), SUMS))
+        for kind in (RAYS, self.lens.kind) if self._has_rays() else (self.lens.kind,):
             # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
             accumulate(kind, shared=shared)(
                 self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
@@ -200,8 +299,7 @@ class ProjectionBlock(RobustBlock):
 
     def _has_rays(self) -> bool:
         """Whether the kernel RAYS serves, unless a point is too near."""
-        numbers = len(self) >= _WORTH_RAYS and len(self._whitening) < MATRICES
-        return numbers and self.lens.is_undistorted_pinhole
+        return len(self._whitening) < MATRICES and self.lens.is_undistorted_pinhole
 
     def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable."""
@@ -217,7 +315,7 @@ class ProjectionBlock(RobustBlock):
             runs: (r, 2) as in :meth:`run_sums`.
         """
         residuals = np.empty((len(self), 2))
-        return residuals, self._evaluate(T_camera_lidar, runs, residuals, None)
+        return residuals, self._evaluate(T_camera_lidar, runs, residuals)
 
     def run_norms(
         self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None, *, factor: float = 1.0
@@ -237,13 +335,14 @@ class ProjectionBlock(RobustBlock):
         return norms
 
     def _evaluate(
-        self, T_camera_lidar: Array, runs: NDArray[np.int64], out: Array, factor: float | None
+        self, T_camera_lidar: Array, runs: NDArray[np.int64], out: Array, factor: float = 0.0
     ) -> NDArray[np.bool_]:
         """Fill in residuals, or norms times a factor; (n,) whether each point is projectable."""
         valid = np.empty(len(self), np.bool_)
-        evaluate(self.lens.kind, norms=factor is not None, shared=len(self) >= _WORTH_SHARING)(
+        kind = RAYS if self.lens.is_undistorted_pinhole else self.lens.kind
+        evaluate(kind, shared=len(self) >= _WORTH_SHARING)(
             self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
-            factor or 1.0, contiguous(runs), out, valid,
+            factor, contiguous(runs), out, valid,
         )  # fmt: skip
         return valid
 
@@ -253,28 +352,123 @@ class ProjectionBlock(RobustBlock):
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
-    """The block as one factor on the variable ``T_lidar_camera``, equal to its separate factors.
+    """The block as one factor on the variable ``T_lidar_camera``, equal to its separate factors."""
+    residual = keep_last(block.error_and_jacobian)
 
-    The factor remembers the error and Jacobian of its last pose: an optimizer evaluates the error
-    of a step and then linearizes at the same pose, which takes one pass over the correspondences.
-    They are replaced as one tuple, so that threads never see a pose with the sums of another.
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
+        error, jacobian = residual(values.atPose3(key))
+        return error, [jacobian]
+
+    return custom_factor(gtsam.noiseModel.Unit.Create(7), [key], linearize)
+
+
+def fields_px(
+    points_lidar_m: Array,
+    T_camera_lidar: Array,
+    free: Columns,
+    twists_per_s: Array | None = None,
+) -> tuple[Array, Array]:
+    """Project points, with the derivatives of the pixels by a twist of the pose and by columns.
+
+    Args:
+        points_lidar_m: (n, 3) where they are when their pixels are taken.
+        T_camera_lidar: (4, 4); the twist xi perturbs it as exp(xi) T_camera_lidar.
+        free: the lens, and k columns.
+        twists_per_s: (6,) or (n, 6) of the LiDAR; of one whose motion is unknown, derivatives by
+            the clock are zero.
+
+    Returns:
+        (n, 2) pixels; (6 + k, 2, n) derivatives: by rotation [px/rad], translation [px/m], columns.
     """
-    last: tuple[bytes, tuple[Array, Array]] | None = None
+    pixels, _ = free.lens.project(points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3])
+    motion = None
+    if twists_per_s is not None:
+        motion = np.empty((len(pixels), 7))
+        motion[:, :6], motion[:, 6] = twists_per_s, free.clock.times_s(pixels[:, 1])
+    block = ProjectionBlock(free.lens, points_lidar_m, pixels, motion=motion)
+    columns = block.columns(T_camera_lidar, free)[:-1]
+    columns[:6] *= -1.0  # T_lidar_camera exp(-xi) is exp(xi) T_camera_lidar, inverted
+    return pixels, columns
 
-    def error(
-        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
-    ) -> Array:
-        nonlocal last
-        T_lidar_camera = values.atPose3(key)
-        pose, found = T_lidar_camera.matrix().tobytes(), last
-        if found is None or found[0] != pose:
-            last = found = (pose, block.error_and_jacobian(T_lidar_camera))
-        residual, jacobian = found[1]
-        if jacobians is not None:
-            jacobians[0] = jacobian
-        return residual
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(7), [key], error)
+def columns_factor(
+    keys: Sequence[int], block: ProjectionBlock, free: Columns
+) -> gtsam.CustomFactor:
+    """The block as one factor on the pose and further columns, equal to its separate factors.
+
+    Args:
+        keys: of ``T_lidar_camera`` and of the columns, a vector of k numbers; a pose
+            ``T_lidar_cloud`` before these displaces the points.
+        block: of the camera.
+        free: the columns.
+    """
+
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
+        *clouds, pose = (values.atPose3(key) for key in keys[:-1])
+        seen = clouds[0].between(pose) if clouds else pose
+        sums = block.summarize(_T_camera_lidar(seen)[None], None, free, values.atVector(keys[-1]))
+        found, jacobian = square_root(BlockSums(sums.hessian[0], sums.gradient[0], sums.cost[0]))
+        by_pose = jacobian[:, :6]
+        by_cloud = [-by_pose @ seen.inverse().AdjointMap()] if clouds else []
+        return found, [*by_cloud, by_pose, jacobian[:, 6:]]
+
+    return custom_factor(gtsam.noiseModel.Unit.Create(7 + len(free)), keys, linearize)
+
+
+def projection_residual(
+    lens: Lens, T_lidar_camera: gtsam.Pose3, point_lidar_m: Array, pixel_px: Array
+) -> tuple[Array, Array]:
+    """Residual ``pi(T_lidar_camera^-1 p) - u`` and its Jacobian.
+
+    Args:
+        lens: the camera's lens.
+        T_lidar_camera: pose of the camera in the LiDAR frame.
+        point_lidar_m: (3,) point in the LiDAR frame.
+        pixel_px: (2,) observed pixel.
+
+    Returns:
+        (2,) residual [px]; (2, 6) Jacobian in GTSAM's tangent (rotation, translation) of the pose.
+    """
+    by_pose = np.zeros((3, 6), order="F")
+    point_camera = T_lidar_camera.transformTo(point_lidar_m, by_pose)
+    pixels, by_point = lens.project_with_jacobian(point_camera)
+    return lens.subtract(pixels, pixel_px)[0], by_point[0] @ by_pose
+
+
+def projection_factor(
+    key: int,
+    lens: Lens,
+    point_lidar_m: ArrayLike,
+    pixel_px: ArrayLike,
+    *,
+    sqrt_information: ArrayLike | None = None,
+    loss: str = "cauchy",
+    scale: float = 4.0,
+) -> gtsam.CustomFactor:
+    """One correspondence as a robust projection factor on ``T_lidar_camera`` (paper, Eq. 5).
+
+    The method in stock GTSAM terms, and the reference of the block factor in tests: it costs a
+    Python call per correspondence.
+
+    Args:
+        key: the pose variable.
+        lens: the camera's lens.
+        point_lidar_m: (3,) point in the LiDAR frame.
+        pixel_px: (2,) observed pixel.
+        sqrt_information: (2, 2) upper triangular whitening matrix [1/px]; identity if None.
+        loss: name of the robust loss.
+        scale: whitened residual norm at which the loss bends (the paper's delta).
+    """
+    point = np.asarray(point_lidar_m, dtype=np.float64)
+    pixel = np.asarray(pixel_px, dtype=np.float64)
+    whitening = np.eye(2) if sqrt_information is None else np.asarray(sqrt_information)
+
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
+        residual, jacobian = projection_residual(lens, values.atPose3(key), point, pixel)
+        return residual, [jacobian]
+
+    base = gtsam.noiseModel.Gaussian.SqrtInformation(whitening)
+    return custom_factor(robust_noise(base, loss=loss, scale=scale), [key], linearize)
 
 
 def _T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:

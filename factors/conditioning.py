@@ -89,7 +89,7 @@ def sigmas_of_hessian(hessian: Array) -> Array:
 
 @compiled()
 def fill_root(hessian, gradient, cost, error, jacobian):  # type: ignore[no-untyped-def]
-    """Fill the (n + 1,) error and transposed Jacobian of ``block_sums.square_root``, by Cholesky.
+    """Fill the (n + 1,) error and transposed Jacobian of ``arrays.square_root``, by Cholesky.
 
     Args:
         hessian: (n, n) H.

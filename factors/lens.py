@@ -5,7 +5,7 @@ inside the field of view in which they are one-to-one. Outside (behind the camer
 angle at which the distortion polynomial folds back) OpenCV returns pixels that mean nothing; here
 such a point is reported as invalid, and its projection is continued continuously (see
 ``lens_kernels.project_one``), so that an optimizer that steps there gets a large, finite error
-instead of a NaN or a wrong small one.
+instead of a NaN or a wrong small one. :func:`unproject` is the inverse, for any lens.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.block_arrays import contiguous
+from factors.arrays import contiguous
 from factors.compiled import compiled
 from factors.lens_kernels import (
     EQUIRECTANGULAR,
@@ -30,7 +30,6 @@ from factors.lens_kernels import (
     is_projectable,
     project_one,
 )
-from factors.wide_lenses import check_mirror, omnidirectional_limit
 
 Array = NDArray[np.float64]
 LensModel = Literal["pinhole", "fisheye", "omnidirectional", "equirectangular"]
@@ -50,7 +49,13 @@ ORDERS: dict[LensModel, str] = {
 }
 """The distortion coefficients of each model in their order, which is OpenCV's."""
 _NO_PIXELS, _NO_JACOBIANS, _NO_VALIDITY = np.empty((0, 2)), np.empty((0, 6)), np.empty(0, np.bool_)
-_MAX_RADTAN_ANGLE_RAD = math.radians(85.0)
+_MAX_PLANE_RADIUS = math.tan(math.radians(85.0))  # polynomials are not fitted beyond
+_TABLE = 500
+_MAX_XI = 100.0  # beyond, the model is a parallel projection, whose focal length is not determined
+_ITERATIONS = 20  # of Newton; 3 to 6 are enough but near the limit of a lens
+_CONVERGED_PX = 1e-10
+_MISS_PX = 0.01
+_SINGULAR = 1e-9  # determinant over the square of the trace, at the limit of a lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +107,7 @@ class Lens:
         """
         coefficients = _checked(fx, fy, distortion, "omnidirectional")
         check_mirror(coefficients[0])
-        limit = omnidirectional_limit(coefficients)
+        limit = _omnidirectional_limit(coefficients)
         return Lens(OMNIDIRECTIONAL, np.array([fx, fy, cx, cy, *coefficients, limit]))
 
     @staticmethod
@@ -167,29 +172,6 @@ class Lens:
         _project_many(self.kind)(self.packed, points, pixels, _NO_VALIDITY, jacobians)
         return pixels, jacobians.reshape(-1, 2, 3)
 
-    def fill_twist_columns(
-        self, T_camera_lidar: Array, points_lidar_m: Array, columns: Array
-    ) -> Array:
-        """Project points in the LiDAR frame, with derivatives by a twist of the camera, by columns.
-
-        Args:
-            T_camera_lidar: (4, 4); the twist xi perturbs it as exp(xi) T_camera_lidar.
-            points_lidar_m: (n, 3) in the LiDAR frame.
-            columns: (6, 2, n), filled: derivatives by rotation [px/rad] and translation [px/m].
-
-        Returns:
-            (2, n) pixels.
-        """
-        points = T_camera_lidar[:3, :3] @ points_lidar_m.T + T_camera_lidar[:3, 3:]
-        pixels, by_point = self.project_with_jacobian(points.T)
-        columns[3:] = by_point.transpose(2, 1, 0)
-        (x, y, z), (by_x, by_y, by_z) = points, columns[3:]
-        # d(exp(xi) p) / d rotation = -[p]x;  g^T (-[p]x) = (p x g)^T.
-        columns[0] = y * by_z - z * by_y
-        columns[1] = z * by_x - x * by_z
-        columns[2] = x * by_y - y * by_x
-        return pixels.T
-
 
 def _checked(fx: float, fy: float, distortion: Sequence[float], model: LensModel) -> Array:
     if not (fx > 0 and fy > 0):
@@ -225,7 +207,7 @@ def _radtan_limit(coefficients: tuple[float, ...]) -> float:
         numerator.deriv() * denominator - numerator * denominator.deriv()
     )
     root = math.sqrt(min(_smallest_positive_root(p.coef) for p in (slope, denominator)))
-    return min(root, math.tan(_MAX_RADTAN_ANGLE_RAD))
+    return min(root, _MAX_PLANE_RADIUS)
 
 
 def _fisheye_limit(coefficients: Array) -> float:
@@ -250,3 +232,114 @@ def _project_many(kind: int) -> Any:
                     jacobians[k, place] = projection[2 + place]
 
     return run
+
+
+def check_mirror(xi: float) -> None:
+    """Check the unified model's xi: 0 is a pinhole, 1 a parabolic mirror, more a fisheye.
+
+    Raises:
+        ValueError: if it is negative or far too large.
+    """
+    if not 0 <= xi <= _MAX_XI:
+        raise ValueError(f"xi of the unified model is {xi:g}, expected 0 to {_MAX_XI:g}")
+
+
+def _omnidirectional_limit(coefficients: Array) -> float:
+    """Field angle [rad] up to which the unified model is one-to-one, without tangential terms.
+
+    At the least of the angles at which the plane's radius stops growing (arccos(-1 / xi), xi > 1),
+    at which the polynomial does, and at which the radius equals a pinhole's at 85 degrees.
+    """
+    xi, k1, k2 = coefficients[:3]
+    slope = np.array([1.0, 3.0 * k1, 5.0 * k2])
+    radius = min(_MAX_PLANE_RADIUS, math.sqrt(_smallest_positive_root(slope)))
+    # sin(t) / (cos(t) + xi) = radius:  sin(t - atan(radius)) = xi radius / sqrt(1 + radius^2).
+    sine = xi * radius / math.hypot(1.0, radius)
+    if sine >= 1.0:
+        return math.acos(-1.0 / xi)
+    return math.atan(radius) + math.asin(sine)
+
+
+def _first_omnidirectional_rays(packed: Array, points: Array) -> Array:
+    """(n, 3) unit rays of points (n, 2) on the plane, but for the tangential distortion.
+
+    Args:
+        packed: parameters of the lens.
+        points: distorted, in focal lengths from the principal point.
+    """
+    xi, k1, k2 = packed[4:7]
+    angle = np.linspace(0.0, packed[12], _TABLE)
+    radius = np.sin(angle) / (np.cos(angle) + xi)
+    found = np.interp(np.hypot(*points.T), radius * (1 + radius**2 * (k1 + radius**2 * k2)), angle)
+    sideways = np.sin(found) / np.maximum(np.hypot(*points.T), np.finfo(float).tiny)
+    return np.column_stack([points * sideways[:, None], np.cos(found)])
+
+
+def _equirectangular_rays(angles_rad: Array) -> Array:
+    """(n, 3) unit rays of angles (n, 2) to the right and down."""
+    right, down = angles_rad.T
+    flat = np.cos(down)
+    return np.column_stack([np.sin(right) * flat, np.sin(down), np.cos(right) * flat])
+
+
+def unproject(lens: Lens, pixels_px: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    """Viewing rays of pixels, by Newton's method on the unit sphere.
+
+    Args:
+        lens: the camera's lens.
+        pixels_px: (n, 2) column and row.
+
+    Returns:
+        (n, 3) unit vectors in the camera frame, and (n,) whether the lens projects each to its
+        pixel. The others mean nothing.
+    """
+    pixels = np.asarray(pixels_px, dtype=np.float64).reshape(-1, 2)
+    rays = _first_rays(lens, pixels)
+    for _ in range(_ITERATIONS):
+        projected, by_ray = lens.project_with_jacobian(rays)
+        missing = lens.subtract(pixels, projected)
+        if not len(rays) or np.abs(missing).max() < _CONVERGED_PX:
+            break
+        rays = rays + np.einsum("nij,nj->ni", _right_inverse(by_ray), missing)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    back, valid = lens.project(rays)
+    with np.errstate(invalid="ignore"):
+        return rays, valid & (
+            np.abs(lens.subtract(back, pixels)).max(axis=1, initial=0.0) < _MISS_PX
+        )
+
+
+def ray_spreads(lens: Lens, rays: Array) -> Array:
+    """(n, 3, 2) derivatives of unit rays by their pixels [1/px]; orthogonal to the rays.
+
+    A projection does not depend on the length of its argument, so the rays are the null spaces of
+    its derivatives, and the right inverses of these are orthogonal to them.
+    """
+    return _right_inverse(lens.project_with_jacobian(rays)[1])
+
+
+def _right_inverse(jacobians: Array) -> Array:
+    """(n, 3, 2) J^T (J J^T)^-1 of (n, 2, 3) J."""
+    gram = jacobians @ jacobians.transpose(0, 2, 1)
+    a, b, c = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
+    over = 1.0 / np.maximum(a * c - b * b, _SINGULAR * (a + c) ** 2)
+    inverse = np.stack([c, -b, -b, a], axis=-1).reshape(-1, 2, 2) * over[:, None, None]
+    return np.asarray(jacobians.transpose(0, 2, 1) @ inverse)
+
+
+def _first_rays(lens: Lens, pixels: Array) -> Array:
+    """(n, 3) rays without distortion."""
+    fx, fy, cx, cy = lens.packed[:4]
+    x, y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
+    if lens.kind == EQUIRECTANGULAR:
+        return _equirectangular_rays(np.column_stack([x, y]))
+    if lens.kind == OMNIDIRECTIONAL:
+        return _first_omnidirectional_rays(lens.packed, np.column_stack([x, y]))
+    radius = np.hypot(x, y)
+    if lens.kind == FISHEYE:
+        angle = np.minimum(radius, 0.9 * lens.packed[-1])
+        sideways = np.sin(angle) / np.maximum(radius, np.finfo(float).tiny)
+        return np.column_stack([x * sideways, y * sideways, np.cos(angle)])
+    inside = np.minimum(1.0, lens.packed[-1] / np.maximum(radius, np.finfo(float).tiny))
+    rays = np.column_stack([x * inside, y * inside, np.ones(len(x))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))

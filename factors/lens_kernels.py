@@ -1,16 +1,20 @@
-"""The projections of the lens models, as kernels: which kinds there are, and their formulas."""
+"""The projections of the lens models, as kernels: which kinds there are, and their formulas.
+
+Omnidirectional cameras have the unified model of Mei and Rives, "Single View Point Omnidirectional
+Camera Calibration from Planar Grids", ICRA 2007: a point goes to the unit sphere, from there to the
+plane z = 1 seen from xi behind the sphere's centre, and is distorted there as by a pinhole's lens.
+OpenCV's ``omnidir`` and Kalibr's ``omni`` are the same.
+"""
 
 import math
 
 from factors.compiled import compiled
-from factors.wide_lenses import (
-    MIN_POLAR_SHARE,
-    project_equirectangular,
-    project_omnidirectional,
-)
 
 MIN_DEPTH_M = 0.05
 """Points with a smaller z are not projectable by a pinhole."""
+
+MIN_POLAR_SHARE = 1e-6
+"""Sine of the angle from a panorama's poles within which it has no longitude."""
 
 PINHOLE, FISHEYE, OMNIDIRECTIONAL, EQUIRECTANGULAR = range(4)
 LIMIT = 12
@@ -32,9 +36,9 @@ def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     if kind == FISHEYE:
         return _fisheye(lens, x, y, z)
     if kind == OMNIDIRECTIONAL:
-        return project_omnidirectional(lens, x, y, z)
+        return _omnidirectional(lens, x, y, z)
     if kind == EQUIRECTANGULAR:
-        return project_equirectangular(lens, x, y, z)
+        return _equirectangular(lens, x, y, z)
     return project_radtan(lens, x, y, z)
 
 
@@ -83,15 +87,19 @@ def _radtan(lens, a, b):  # type: ignore[no-untyped-def]
 
 @compiled(part=True)
 def _radtan_inside(lens, a, b):  # type: ignore[no-untyped-def]
-    k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
-    k4, k5, k6 = lens[9], lens[10], lens[11]
+    return distort(a, b, lens[4], lens[5], lens[6], lens[7], lens[8], lens[9], lens[10], lens[11])
+
+
+@compiled(part=True, forceinline=True)
+def distort(a, b, k1, k2, p1, p2, k3, k4, k5, k6):  # type: ignore[no-untyped-def]
+    """Radial-tangential distortion of a point of the plane, and its Jacobian (row major)."""
     r2 = a * a + b * b
     over = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
     radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * over
     slope = (
         k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3) - radial * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6))
     ) * over
-    cross = 2.0 * a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
+    cross = 2.0 * (a * b * slope + p1 * a + p2 * b)
     return (
         a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a),
         b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b,
@@ -140,6 +148,92 @@ def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
+@compiled(part=True)
+def _equirectangular(lens, x, y, z):  # type: ignore[no-untyped-def]
+    """Longitude and latitude times fx and fy, see ``project_one``."""
+    fx, fy = lens[0], lens[1]
+    n2 = x * x + y * y + z * z
+    # At the poles there is no longitude: the derivative is held, so that it is finite.
+    flat = max(math.sqrt(x * x + z * z), MIN_POLAR_SHARE * math.sqrt(n2), 1e-12)
+    n2 = max(n2, 1e-24)
+    f2 = flat * flat
+    return (
+        fx * math.atan2(x, z) + lens[2],
+        fy * math.atan2(y, flat) + lens[3],
+        fx * z / f2,
+        0.0,
+        -fx * x / f2,
+        -fy * x * y / (n2 * flat),
+        fy * flat / n2,
+        -fy * y * z / (n2 * flat),
+    )
+
+
+@compiled(part=True)
+def _omnidirectional(lens, x, y, z):  # type: ignore[no-untyped-def]
+    """The unified model with its Jacobian, see ``project_one``.
+
+    Past the limiting field angle t0 the pixel moves on outwards from the limiting circle, in
+    proportion to 1 + t - t0, so that it stays finite and continuous right to behind the camera.
+    """
+    rho2 = x * x + y * y
+    rho, n = math.sqrt(rho2), math.sqrt(rho2 + z * z)
+    theta = math.atan2(rho, z)
+    if theta >= lens[12]:
+        return _continue_omnidirectional(lens, x, y, z, theta)
+    xi = lens[4]
+    w = 1.0 / max(z + xi * n, 1e-9)
+    a, b = x * w, y * w
+    p, q, pa, pb, qa, qb = _distort_mirror(lens, a, b)
+    over = xi / max(n, 1e-12)
+    wx, wy, wz = -w * x * over, -w * y * over, -w * (1.0 + z * over)  # derivatives of w, over w
+    fx, fy = lens[0] * w, lens[1] * w
+    by_w_p, by_w_q = pa * x + pb * y, qa * x + qb * y
+    return (
+        lens[0] * p + lens[2],
+        lens[1] * q + lens[3],
+        fx * (pa + by_w_p * wx),
+        fx * (pb + by_w_p * wy),
+        fx * by_w_p * wz,
+        fy * (qa + by_w_q * wx),
+        fy * (qb + by_w_q * wy),
+        fy * by_w_q * wz,
+    )
+
+
+@compiled(part=True)
+def _continue_omnidirectional(lens, x, y, z, theta):  # type: ignore[no-untyped-def]
+    limit = lens[12]
+    radius = math.sin(limit) / (math.cos(limit) + lens[4])
+    rho = math.hypot(x, y)
+    if rho < 1e-12 * (abs(z) + 1e-300):  # right behind, every direction is as good: take +x
+        x, y = 1e-9 * max(abs(z), 1e-3), 0.0
+        rho = x
+    na, nb = x / rho, y / rho
+    p, q, pa, pb, qa, qb = _distort_mirror(lens, radius * na, radius * nb)
+    grown = 1.0 + theta - limit
+    n2 = rho * rho + z * z
+    out, back = z / n2, -rho / n2  # derivatives of theta by rho and by z
+    turn = radius * grown / rho
+    pn, qn = turn * (pa * -nb + pb * na), turn * (qa * -nb + qb * na)  # along the circle
+    fx, fy = lens[0], lens[1]
+    return (
+        fx * p * grown + lens[2],
+        fy * q * grown + lens[3],
+        fx * (p * out * na - pn * nb),
+        fx * (p * out * nb + pn * na),
+        fx * p * back,
+        fy * (q * out * na - qn * nb),
+        fy * (q * out * nb + qn * na),
+        fy * q * back,
+    )
+
+
+@compiled(part=True)
+def _distort_mirror(lens, a, b):  # type: ignore[no-untyped-def]
+    return distort(a, b, lens[5], lens[6], lens[7], lens[8], 0.0, 0.0, 0.0, 0.0)
+
+
 @compiled(inline="always")
 def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Whether a point of the camera frame lies inside the lens' injective domain."""
@@ -147,12 +241,6 @@ def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
         return x * x + y * y + z * z > 0.0 and math.atan2(math.hypot(x, y), z) < lens[LIMIT]
     if kind == EQUIRECTANGULAR:
         return math.hypot(x, z) > MIN_POLAR_SHARE * abs(y)
-    return is_in_cone(lens, x, y, z)
-
-
-@compiled(inline="always")
-def is_in_cone(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Like :func:`is_projectable`, for a lens that looks ahead."""
     return (z > MIN_DEPTH_M) & (x * x + y * y <= (lens[LIMIT] * z) ** 2)
 
 

@@ -10,12 +10,8 @@ import math
 from typing import Literal, get_args
 
 import gtsam
-import numpy as np
-from numpy.typing import NDArray
 
 from factors.compiled import compiled
-
-Array = NDArray[np.float64]
 
 LossName = Literal["l2", "huber", "cauchy", "geman_mcclure", "tukey"]
 LOSSES: tuple[LossName, ...] = get_args(LossName)
@@ -71,19 +67,6 @@ def weight_along(loss, scale, s, psi):  # type: ignore[no-untyped-def]
     if loss == TUKEY:
         return psi - 4.0 * math.sqrt(psi) * s / k
     return psi
-
-
-def losses_and_weights(loss: int, scale: float, squares: Array) -> tuple[Array, Array]:
-    """(n,) losses and (n,) weights of (n,) squared residuals, see :func:`loss_and_weight`."""
-    found = np.empty((2, len(squares)))
-    _fill_losses(loss, scale, squares, found)
-    return found[0], found[1]
-
-
-@compiled()
-def _fill_losses(loss, scale, squares, found):  # type: ignore[no-untyped-def]
-    for i in range(len(squares)):
-        found[0, i], found[1, i] = loss_and_weight(loss, scale, squares[i])
 
 
 def robust_noise(

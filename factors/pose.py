@@ -1,18 +1,70 @@
-"""Factors of poses alone: the paper's two priors, and measured relative poses.
+"""Factors of poses alone: the paper's two priors, measured relative poses; custom factors.
 
 All act on variables ``X = T_lidar_camera``. GTSAM's cost is half the squared whitened error, so a
 paper weight lambda is a sigma of 1 / sqrt(lambda).
 """
 
-from collections.abc import Mapping
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.custom import custom_factor
-
 Array = NDArray[np.float64]
+
+
+def custom_factor(
+    noise: gtsam.noiseModel.Base,
+    keys: Sequence[int],
+    linearize: Callable[[gtsam.Values], tuple[Array, Sequence[Array]]],
+) -> gtsam.CustomFactor:
+    """A factor whose error, and its Jacobians by the variables of the keys, a function gives."""
+
+    def error(
+        factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        found, by_variables = linearize(values)
+        if jacobians is not None:
+            for number, jacobian in enumerate(by_variables):
+                jacobians[number] = np.asfortranarray(jacobian)
+        return found
+
+    return gtsam.CustomFactor(noise, list(keys), error)
+
+
+def keep_last(
+    linearize: Callable[..., tuple[Array, Array]],
+) -> Callable[..., tuple[Array, Array]]:
+    """A function of poses that remembers its last result.
+
+    An optimizer evaluates the error of a step and then linearizes at the same pose, which takes one
+    pass over the correspondences. Poses and result are replaced as one tuple, so that threads never
+    see those with the result of others.
+    """
+    last: tuple[bytes, tuple[Array, Array]] | None = None
+
+    def run(*poses: gtsam.Pose3) -> tuple[Array, Array]:
+        nonlocal last
+        place, found = b"".join(pose.matrix().tobytes() for pose in poses), last
+        if found is None or found[0] != place:
+            last = found = (place, linearize(*poses))
+        return found[1]
+
+    return run
+
+
+def linear_factor(
+    keys: Sequence[int], matrices: Sequence[Array], noise: gtsam.noiseModel.Base
+) -> gtsam.CustomFactor:
+    """A factor on vectors, whose error is the sum of matrices times them."""
+
+    def linearize(values: gtsam.Values) -> tuple[Array, Sequence[Array]]:
+        pairs = zip(matrices, map(values.atVector, keys), strict=True)
+        return np.asarray(sum(matrix @ vector for matrix, vector in pairs)), matrices
+
+    return custom_factor(noise, keys, linearize)
 
 
 def pose_sigmas(*, rotation_rad: float, translation_m: float) -> Array:

@@ -145,9 +145,7 @@ class CommandRun:
 
 
 def leave_out_diagrams(patch: pytest.MonkeyPatch) -> None:
-    for name in (
-        "convergence", "coverage", "residual_by_distance", "residual_map", "residual_scatter",
-    ):  # fmt: skip
+    for name in ("convergence", "coverage", "residual_map", "residual_scatter"):
         patch.setattr(plots, name, lambda *_: "data:image/png;base64,")
 
 

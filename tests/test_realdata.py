@@ -11,7 +11,7 @@ import pytest
 
 import calibgraph
 from calibgraph import Rig
-from calibgraph.matching.cmrnext.architecture import Architecture
+from calibgraph.matching.cmrnext.network import Architecture
 from calibgraph.rounds import match_in_rounds
 from tests.conftest import Call
 from tests.matching.cmrnext.builders import good_content, saved

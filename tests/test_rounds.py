@@ -33,11 +33,10 @@ from calibgraph.matching.structure import StructureMatcher
 from calibgraph.model.config import Terms
 from calibgraph.model.geometry import pose_difference, relative_transform
 from calibgraph.model.verdict import TOLERANCE, WENT_ON, Check
-from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.progress import no_progress
-from calibgraph.rounds import match_in_rounds
+from calibgraph.rounds import match_in_rounds, refine_with_camera_pairs
 from calibgraph.solver.joint import solve_joint, solve_without_failing
-from calibgraph.trust.evidence import RunEvidence
+from calibgraph.trust import evidence
 from calibgraph.trust.matcher_checks import going_on_checks
 from calibgraph.trust.pose_posterior import PosePosterior
 from calibgraph.trust.probability import STRUCTURE, judge
@@ -143,24 +142,23 @@ def told(twist: Array, share: float) -> PosePosterior:
     return PosePosterior(scatter, twist + scatter, share)
 
 
-def follow(run: MatchingRun, *posteriors: PosePosterior) -> tuple[RunEvidence, RunEvidence]:
-    """The evidence before and after, with posteriors that are given one after the other."""
-    evidence = RunEvidence(run, {})
+def follow(run: MatchingRun, *posteriors: PosePosterior) -> MatchingRun:
+    """The run afterwards, with posteriors that are given one after the other."""
     given = [{ONE: each} for each in posteriors]
-    with patch.object(RunEvidence, "_measure_posteriors", side_effect=given):
-        return evidence, go_on_elsewhere(evidence)
+    with patch.object(evidence, "measure_posteriors", side_effect=given):
+        return go_on_elsewhere(run)[0]
 
 
 def test_rounds_go_on_from_where_the_images_say(run: MatchingRun) -> None:
     wrong = displaced(run, AWAY, z_score=1.0)
     right = run.solution.T_camera_lidar[ONE]
     assert pose_difference(wrong.solution.T_camera_lidar[ONE], right)[0] > 0.5
-    _, after = follow(wrong, told(-AWAY, share=0.9), told(np.zeros(6), share=0.1))
-    degrees, centimetres = pose_difference(after.run.solution.T_camera_lidar[ONE], right)
+    after = follow(wrong, told(-AWAY, share=0.9), told(np.zeros(6), share=0.1))
+    degrees, centimetres = pose_difference(after.solution.T_camera_lidar[ONE], right)
     assert degrees < 0.1 and centimetres < 2.0
-    assert after.run.correspondences.findings.z_score[ONE] > 5.0
-    assert after.run.went_on[ONE][0] == pytest.approx(0.6, abs=0.1)
-    assert wrong.rematch is not None and after.run.rematch is None  # it was of the first end
+    assert after.correspondences.findings.z_score[ONE] > 5.0
+    assert after.went_on[ONE][0] == pytest.approx(0.6, abs=0.1)
+    assert wrong.rematch and not after.rematch  # it was of the first end
     (check,) = going_on_checks(after)[ONE]
     assert "ended 0.6 deg" in check.text
 
@@ -170,8 +168,7 @@ def test_an_end_that_agrees_less_is_not_taken_and_the_time_limit_holds(
     run: MatchingRun, z_score: float, late: bool
 ) -> None:
     wrong = replace(displaced(run, AWAY, z_score), is_late=lambda: late)
-    before, after = follow(wrong, told(-AWAY, share=0.9))
-    assert after is before
+    assert follow(wrong, told(-AWAY, share=0.9)) is wrong
 
 
 def test_a_pose_that_the_posterior_chose_is_no_pass() -> None:
@@ -218,7 +215,7 @@ def test_a_camera_whose_matches_are_displaced_comes_back_to_its_neighbour(
 ) -> None:
     off = perturb(truth, rotation_deg=0.3, translation_m=0.0, seed=1).T_camera_lidar
     run = matched(data, table_of(truth.moved_to({PAIR[1]: off[PAIR[1]]})))
-    tied = refine_with_camera_pairs(run, no_progress)
+    tied = refine_with_camera_pairs(run)
     assert tied.solution.camera_matches.pairs() == [PAIR]
     before, after = (pair_error(each.solution.solved_rig, truth) for each in (run, tied))
     assert before[0] > 0.25
@@ -245,8 +242,8 @@ def test_cameras_are_matched_through_the_lenses_that_were_estimated(
     guess = truth.model_copy(update={"cameras": {**truth.cameras, PAIR[0]: wrong}})
     config = Config(estimate=("focal",))
     run = match_in_rounds(data, guess, table_of(truth), config, progress=no_progress)
-    found = refine_with_camera_pairs(run, no_progress).solution
-    right = refine_with_camera_pairs(matched(data, table_of(truth)), no_progress).solution
+    found = refine_with_camera_pairs(run).solution
+    right = refine_with_camera_pairs(matched(data, table_of(truth))).solution
     assert len(found.camera_matches) == pytest.approx(len(right.camera_matches), rel=0.05)
     assert pair_error(found.solved_rig, truth)[1] < 1.0
 
@@ -257,13 +254,13 @@ def test_without_time_terms_or_files_the_run_stays_as_it_is(
     table = table_of(truth)
     run = matched(data, table)
     late = replace(run, out_of_time=True)
-    assert refine_with_camera_pairs(late, no_progress) is late
+    assert refine_with_camera_pairs(late) is late
     stage1 = matched(data, table, "stage1")
-    assert refine_with_camera_pairs(stage1, no_progress) is stage1
+    assert refine_with_camera_pairs(stage1) is stage1
     gone = {name: tmp_path / "gone.png" for name in truth.cameras}
     frames = tuple(replace(frame, image_paths=gone) for frame in data.frames)
     blind = replace(run, dataset=replace(data, frames=frames))
-    assert refine_with_camera_pairs(blind, no_progress) is blind
+    assert refine_with_camera_pairs(blind) is blind
 
 
 @pytest.mark.usefixtures("no_image_checks")

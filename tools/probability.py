@@ -184,7 +184,7 @@ def _most_probable(
 ) -> Array:
     """Intercept, weights of the kinds, how far values and error bars hold."""
     rows = np.array(
-        [[steps(sample.severities.get(kind, 0.0)) for kind in kinds] for sample in samples]
+        [steps(np.array([s.severities.get(kind, 0.0) for kind in kinds])) for s in samples]
     ).reshape(len(samples), -1)
     off, by_bar, by_values = (
         np.array([getattr(sample, name) for sample in samples])

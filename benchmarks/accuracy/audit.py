@@ -40,9 +40,8 @@ from calibgraph import (
     load_rig,
     perturb,
 )
-from calibgraph.audit.judgement import CAMERA_AXES
+from calibgraph.audit.judgement import CAMERA_AXES, FALSE_ALARM_RATE, POWER, tail_of_axis
 from calibgraph.audit.result import by_unit
-from calibgraph.audit.significance import FALSE_ALARM_RATE, POWER, tail_of_axis
 from calibgraph.simulation.scan_errors import draw_scan_errors
 from tools.scenes.sensor_streets import ALIGNMENT, RIGS, aligned_rig, mean_poses, render
 

@@ -50,7 +50,7 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.simulation.scan_errors import draw_scan_errors
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
-from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.evidence import gather
 from calibgraph.trust.image_record import RunChecks
 from tools.scenes.lens_errors import draw_lens_errors
 from tools.scenes.sensor_streets import ALIGNMENT, RIGS, aligned_rig, mean_poses, render
@@ -189,10 +189,10 @@ def solve_streets(streets: Streets) -> Iterator[tuple[str, Record]]:
         streets.start, streets.table, Config(stage1="rig", learnt_weights=False),
         camera_matches=streets.matches,
     )  # fmt: skip
-    evidence = Evidence(solved, guess=streets.start)
+    evidence = gather(solved, streets.start)
     checks = RunChecks(assess(evidence), unseen=evidence.cameras)
     verdicts = to_calibration(evidence, checks).camera_verdicts
-    joint, mount = solved.covariance, solved.marginals.mount
+    joint, mount = solved.covariance, solved.mount
     assert joint is not None and mount.covariance is not None
     errors, T = [], mount.T_camera_lidar
     for place, name in enumerate(T):

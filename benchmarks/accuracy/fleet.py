@@ -19,8 +19,7 @@ import numpy as np
 
 from benchmarks.tables import Table, parser_of, publish
 from calibgraph.audit.findings import Finding, find_changes
-from calibgraph.audit.fleet_model import FleetModel, fit_fleet
-from calibgraph.audit.observations import observe
+from calibgraph.audit.fleet_model import FleetModel, fit_fleet, observe
 from calibgraph.model.geometry import twists_between
 from tests.draws.fleets import Fleet, errors_of, simulate_fleet
 

@@ -25,7 +25,7 @@ from calibgraph.model.geometry import twist_between
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from factors import Clock
-from factors.free_lens import COEFFICIENT_NUMBERS
+from factors.columns import COEFFICIENT_NUMBERS
 from tests.draws.clocks import draw_twists, put_clock_error
 from tests.draws.lenses import put_lens_error
 

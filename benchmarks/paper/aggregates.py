@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.model.geometry import transform
-from calibgraph.solver.geodesic_median import geodesic_median
 from calibgraph.solver.stage1 import median_pose
 
 Array = np.ndarray
@@ -29,7 +28,7 @@ def aggregate(T_camera_lidar: Array, how: str) -> Array:
     if how == "mean":
         return transform(rotations.mean(), translations.mean(axis=0))
     if how == "mode":
-        median = geodesic_median(rotations)
+        median = Rotation.from_matrix(median_pose(T_camera_lidar)[:3, :3])
         tangents = (rotations * median.inv()).as_rotvec()
         mode = np.array([half_sample_mode(column) for column in tangents.T])
         translation = [half_sample_mode(column) for column in translations.T]

@@ -15,8 +15,8 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert, relative_transform, to_T_lidar_camera
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_block import CameraBlock, camera_blocks
-from calibgraph.solver.objective import Transforms
+from calibgraph.solver.matches import CameraBlock, camera_blocks
+from calibgraph.solver.two_pass import Transforms
 
 Array = NDArray[np.float64]
 

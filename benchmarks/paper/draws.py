@@ -29,9 +29,9 @@ from calibgraph.rounds import match_in_rounds
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.simulation.scenarios import SCENARIOS, draw_scenario
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.objective import Transforms
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.solver.stage1 import Stage1, estimate_stage1
+from calibgraph.solver.two_pass import Transforms
 
 GUESS_DEG, GUESS_M = 20.0, 1.5
 """Exact displacement of every guess, the paper's T_delta."""

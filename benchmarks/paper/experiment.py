@@ -16,7 +16,7 @@ from benchmarks.paper.draws import METHODS, TRF_TERMS, Source, run_methods
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config
 from calibgraph.model.metrics import evaluate
-from calibgraph.solver.camera_block import camera_blocks
+from calibgraph.solver.matches import camera_blocks
 
 Numbers = dict[str, dict[str, float]]
 """Per camera, or per pair ``A->B`` of neighbours: metrics by name, without signs."""

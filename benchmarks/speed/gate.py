@@ -55,9 +55,8 @@ from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.parallel import THREADS_VARIABLE
 from calibgraph.progress import no_progress
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.solver.camera_block import camera_blocks
-from calibgraph.solver.objective import Objective
-from calibgraph.solver.optimizer import to_values
+from calibgraph.solver.matches import camera_blocks
+from calibgraph.solver.two_pass import Objective, to_values
 from calibgraph.tracking import warm_up_tracker
 from factors import projection_factor
 

@@ -1,8 +1,7 @@
 """Is a calibration still right? Measured by images and clouds, or by several results."""
 
 from calibgraph.audit.check import check
-from calibgraph.audit.drift import drift
-from calibgraph.audit.drift_result import Drift, Trend, drift_summary
+from calibgraph.audit.drift import Drift, Trend, drift, drift_summary
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit, audit_summary
 
 __all__ = [

@@ -1,25 +1,25 @@
 """``check``: is the calibration that is deployed still right?"""
 
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from pydantic import BaseModel
 
+from calibgraph.arrays import Array
 from calibgraph.audit.judgement import (
     SEARCHES_FARTHER,
     has_too_few_frames,
     judge_camera,
     judge_lidar,
+    tolerance_twist,
 )
-from calibgraph.audit.matching import match_from_deployed
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
-from calibgraph.audit.significance import Tolerance
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import load_model
-from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.dataset import Dataset, keep_frames, load_dataset
 from calibgraph.io.frame import hash_source
-from calibgraph.io.kept_frames import keep_frames
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.frame_choice import CANDIDATES, without_copies
@@ -28,22 +28,32 @@ from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.same_images import require_different_images
 from calibgraph.model.config import Config, Reported
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import pose_difference
 from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Status
-from calibgraph.overlaps import refine_with_camera_pairs
 from calibgraph.parallel import with_own_threads
 from calibgraph.progress import Progress, Stopwatch, no_progress
-from calibgraph.rounds import AnyMatcher, Datasets, assign_places
+from calibgraph.rounds import (
+    AnyMatcher,
+    Datasets,
+    assign_places,
+    find_stationary,
+    refine_with_camera_pairs,
+    run_rounds,
+)
+from calibgraph.solver.joint import solve_without_failing
+from calibgraph.solver.solution import Solution
 from calibgraph.trust.agreement import competing_solution_checks, pair_agreement_checks
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence, concatenate
+from calibgraph.trust.evidence import Checks, Evidence, concatenate, gather_of_run
 from calibgraph.trust.guess import point_distance_checks
 from calibgraph.trust.image_evidence import measure_image_evidence
 from calibgraph.trust.inputs import describe_copies
 from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
-from calibgraph.trust.thresholds import threshold
+from calibgraph.trust.thresholds import limit, threshold
 
 _log = logging.getLogger(__name__)
 
@@ -93,7 +103,7 @@ def check(
         CorrespondenceError: if a table given as matcher is wrong.
         ValueError: if a tolerance is not positive, or the matcher is unknown.
     """
-    tolerance, report = Tolerance(tolerance_deg, tolerance_cm), progress or no_progress
+    tolerance, report = tolerance_twist(tolerance_deg, tolerance_cm), progress or no_progress
     full, watch = find_matcher(matcher, seed=seed), Stopwatch()
     loaded = rig if isinstance(rig, Rig) else load_rig(rig)
     deployed = loaded.model_copy(update={"relative_poses": ()})
@@ -107,7 +117,7 @@ def check(
         )
         with watch("places"):
             run = assign_places(run)
-        run = refine_with_camera_pairs(run, report)
+        run = refine_with_camera_pairs(run)
         with watch("checks"):
             cameras, lidar = _judge(run, tolerance, report)
     except CorrespondenceError as error:
@@ -141,10 +151,10 @@ def _open(data: Dataset, deployed: Rig, matcher: FullMatcher) -> Dataset:
 
 
 def _judge(
-    run: MatchingRun, tolerance: Tolerance, progress: Progress
+    run: MatchingRun, tolerance: Array, progress: Progress
 ) -> tuple[dict[str, CameraAudit], LidarAudit | None]:
     """The audits of all cameras, and of the LiDAR where every measurement can be trusted."""
-    evidence = RunEvidence(run, {}, asks_guess=True).solution
+    evidence = gather_of_run(run, asks_guess=True)
     doubts = _doubts(run, evidence, progress)
     cameras = {
         name: judge_camera(evidence, name, doubts[name], tolerance) for name in run.guess.cameras
@@ -155,7 +165,7 @@ def _judge(
 
 def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[str, str]:
     """Per camera, why its measurement cannot be trusted; empty if it can."""
-    parts = [check(evidence) for check in DOUBTS] + [last_round_checks(RunEvidence(run, {}))]
+    parts = [check(evidence) for check in DOUBTS] + [last_round_checks(run)]
     z_scores = evidence.findings.z_score
     disagree = {name: _doubt_by_z_score(z_scores.get(name)) for name in evidence.cameras}
     open_ = [n for n, doubt in disagree.items() if not (doubt or has_too_few_frames(evidence, n))]
@@ -177,7 +187,7 @@ def _doubts_by_frames(
     """
     if not run.matcher.image_checks_can_fail or not cameras:
         return {}
-    rig, row = run.solution.without_pairs().solved_rig, threshold("frames_best")
+    rig = run.solution.without_pairs().solved_rig
     rig = rig.model_copy(update={"cameras": {name: rig.cameras[name] for name in cameras}})
     found = measure_image_evidence(run.dataset, rig, extrinsics_only=True, progress=progress)
     names = {frame.index: frame.name for frame in run.dataset.frames}
@@ -188,7 +198,7 @@ def _doubts_by_frames(
             "do their images and clouds not belong together?"
         ]
         for camera, of_camera in found.items()
-        if row.grade(of_camera.frames_best) != "PASS"
+        if of_camera.frames_best < limit("frames_best")
     }
 
 
@@ -237,3 +247,64 @@ def provenance(rig: Path | str, data: Dataset) -> tuple[bool, Status | None]:
     clouds = (frame.cloud_path for frame in data.frames if frame.cloud_path.name in names)
     same = any(hash_source(cloud) in result.inputs.values() for cloud in clouds)
     return same, result.verdict.status
+
+
+_REACH_DEG, _REACH_CM = 0.7, 20.0
+"""Errors of the start that the tracking rounds correct."""
+
+
+def match_from_deployed(
+    data: Dataset,
+    deployed: Rig,
+    matcher: FullMatcher,
+    config: Config,
+    *,
+    watch: Stopwatch,
+    progress: Progress,
+) -> MatchingRun:
+    """Match in as few rounds as settle: the last tracking round, all of these, or all rounds.
+
+    Raises:
+        CorrespondenceError: if no camera has enough correspondences.
+    """
+    tracking, places = matcher.tracking_rounds, find_stationary(data, deployed)
+
+    def find(at: Rig, index: int) -> Correspondences:
+        with watch("match"):
+            table = matcher.match(data, at, round_index=index, progress=progress)
+            return table.with_places(places)
+
+    def solve(at: Rig, table: Correspondences) -> Solution:
+        with watch("solve"):
+            return solve_without_failing(at, table, config)
+
+    def match(rounds: Sequence[int]) -> MatchingRun:
+        *_, (table, solution, done) = run_rounds(deployed, rounds, find, solve)
+        return MatchingRun(data, matcher, deployed, table, solution, done, watch, progress=progress)
+
+    if not tracking:
+        return match(range(matcher.rounds))
+    if len(tracking) > 1:  # the last alone, if it ends where it begins, as a converged run
+        with suppress(CorrespondenceError):
+            run = match(tracking[-1:])
+            if not run.solution.held and _has_settled(run, still="PASS"):
+                return run
+    run = match(tracking)
+    return run if _has_settled(run) else match((0, *tracking))
+
+
+def _has_settled(run: MatchingRun, still: Status = "WARN") -> bool:
+    """Whether every camera ended within reach, with a good z-score, after a short last step."""
+    z_scores, last = run.correspondences.findings.z_score, run.rounds[-1]
+    deployed, ended = run.guess.T_camera_lidar, run.solution.solved_rig.T_camera_lidar
+    for name, T in deployed.items():
+        degrees, centimetres = pose_difference(ended[name], T)
+        grades = [
+            threshold("last_round_rotation").grade(last[name]["moved_deg"]),
+            threshold("last_round_translation").grade(last[name]["moved_cm"]),
+        ]
+        is_good = threshold("z_score").grade(z_scores.get(name, 0.0)) == "PASS"
+        is_near = degrees <= _REACH_DEG and centimetres <= _REACH_CM
+        if not (is_good and is_near and {*grades} <= {"PASS", still}):
+            return False
+    return True

@@ -10,23 +10,16 @@ from the scatter of few frames; its stated part, of the error that all frames sh
 * CANNOT TELL: neither.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
-from scipy.special import chdtri, ndtri
+from numpy.typing import ArrayLike
+from scipy.special import chdtri, ndtri, stdtrit
 
 from calibgraph.arrays import Array, Mask
 from calibgraph.audit.result import CameraAudit, LidarAudit
-from calibgraph.audit.significance import (
-    CONFIDENCE,
-    DISPLAY,
-    FALSE_ALARM_RATE,
-    Quantiles,
-    Tolerance,
-    axes_beyond,
-    detectable,
-    tail_of_axis,
-)
 from calibgraph.model.error_sources import MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
@@ -35,6 +28,18 @@ from calibgraph.tracking.cause import Steps, find_cause
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.probability import probability_outside
 from factors import pose_sigmas
+
+FALSE_ALARM_RATE = 1e-3
+"""Probability of a significant axis on a rig, of all its cameras, that has not changed."""
+
+POWER = 0.9
+"""Probability with which the smallest detectable change is told from none."""
+
+CONFIDENCE = 0.95
+"""Probability that an axis that counts as within the tolerance is."""
+
+DISPLAY = np.array([180 / np.pi] * 3 + [100.0] * 3)
+"""From a twist [rad, m] to [deg, cm]."""
 
 CAMERA_AXES = ("x (pitch)", "y (yaw)", "z (roll)", "x (right)", "y (down)", "z (ahead)")
 LIDAR_AXES = ("x", "y", "z", "x", "y", "z")
@@ -57,7 +62,7 @@ _TOO_FEW_FRAMES = (
 )
 
 
-def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance) -> CameraAudit:
+def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Array) -> CameraAudit:
     """The audit of one camera."""
     z_score, covariance = evidence.findings.z_score.get(name), evidence.covariance_of(name)
     if name in evidence.solution.held:
@@ -73,22 +78,22 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Tolerance
     sigma = np.sqrt(np.diag(covariance))
     sources = evidence.error_sources.get(name)
     quantiles = _quantiles(evidence, name, sources)
-    most, least = tolerance.twist, np.zeros(6)
+    least = np.zeros(6)
     if sources is not None:
         now = np.array([sources.rotation_deg, sources.translation_cm])
         least = np.repeat(sources.forecast[MOST_TIMES] / now, 3)
-    status, reason = judge_deviation(deviation, covariance, quantiles, most, least=least)
+    status, reason = judge_deviation(deviation, covariance, quantiles, tolerance, least=least)
     if status == "WRONG" and name in evidence.posteriors:
         posterior = evidence.posteriors[name]
         widest = posterior.widest(covariance)
-        allowed = posterior.log_ratio < quantiles.significant.max() ** 2
-        if allowed or judge_deviation(deviation, widest, quantiles, most)[0] != "WRONG":
+        allowed = posterior.log_ratio < quantiles[0].max() ** 2
+        if allowed or judge_deviation(deviation, widest, quantiles, tolerance)[0] != "WRONG":
             status, reason = "CANNOT TELL", f"{_IMAGES_ALLOW}; {reason}"
     if doubt:
         status, reason = "CANNOT TELL", doubt
     elif status == "WRONG" and len(evidence.cameras) == 1:
         reason += SINGLE_CAMERA
-    smallest = detectable(sigma, quantiles.confident)
+    smallest = detectable(sigma, quantiles[1])
     return CameraAudit(status, reason, deviation, sigma, smallest, z_score)
 
 
@@ -99,14 +104,14 @@ def has_too_few_frames(evidence: Evidence, name: str) -> bool:
     return few and evidence.covariance_of(name) is not None
 
 
-def _quantiles(evidence: Evidence, name: str, sources: ErrorSources | None) -> Quantiles:
+def _quantiles(evidence: Evidence, name: str, sources: ErrorSources | None) -> Array:
     tail = tail_of_axis(len(evidence.cameras))
-    known, block = Quantiles.from_freedom(np.inf, tail), evidence.solution.inliers.blocks.get(name)
+    known, block = student_quantiles(np.inf, tail), evidence.solution.inliers.blocks.get(name)
     if block is None or sources is None:
         return known
-    estimated = Quantiles.from_freedom(block.frames - 1 + PSEUDO_FRAMES, tail)
+    estimated = student_quantiles(block.frames - 1 + PSEUDO_FRAMES, tail)
     shares = [axis.get(MATCHES, 0.0) for axis in (sources.rotation, sources.translation)]
-    return estimated.beside_known(np.repeat(shares, 3), known)
+    return quantiles_in_part(np.repeat(shares, 3), estimated, known)
 
 
 def _deviation(evidence: Evidence, name: str) -> Array:
@@ -118,7 +123,7 @@ def _deviation(evidence: Evidence, name: str) -> Array:
 def judge_deviation(
     deviation: Array,
     covariance: Array,
-    quantiles: Quantiles,
+    quantiles: Array,
     tolerance: Array,
     *,
     least: Array | float = 0.0,
@@ -128,18 +133,18 @@ def judge_deviation(
     Args:
         deviation: (6,) of all axes.
         covariance: (6, 6) of it.
-        quantiles: of its standard deviations.
+        quantiles: (2, 6) of its standard deviations, see :func:`student_quantiles`.
         tolerance: (2,) of the turn [rad] and of the shift [m].
         least: (6,) share of sigma that remains however many frames are recorded.
     """
-    sigma, size = np.sqrt(np.diag(covariance)), np.abs(deviation)
-    significant = size > quantiles.significant * sigma
+    sigma, (largest, confident) = np.sqrt(np.diag(covariance)), quantiles
+    significant = np.abs(deviation) > largest * sigma
     wrong = axes_beyond(deviation, significant, tolerance)
     if wrong.any():
         return "WRONG", describe_motion(deviation, sigma, wrong, CAMERA_AXES)
-    needed, most = detectable(sigma, quantiles.confident), np.repeat(tolerance, 3)
+    needed, most = detectable(sigma, confident), np.repeat(tolerance, 3)
     blind = needed > most
-    unsure = blind | _may_be_beyond(deviation, covariance, quantiles, tolerance)
+    unsure = blind | _may_be_beyond(deviation, covariance, confident, tolerance)
     if unsure.any():
         found = describe_motion(deviation, sigma, unsure, CAMERA_AXES)
         recording_helps = not (least * needed > most).any()
@@ -151,13 +156,11 @@ def judge_deviation(
     return "OK", "no significant deviation, and within the tolerance"
 
 
-def _may_be_beyond(
-    deviation: Array, covariance: Array, quantiles: Quantiles, tolerance: Array
-) -> Mask:
+def _may_be_beyond(deviation: Array, covariance: Array, confident: Array, tolerance: Array) -> Mask:
     """(6,) the largest axes of a turn or shift that is not certainly within the tolerance."""
-    wider = quantiles.confident / ndtri(CONFIDENCE)  # as few frames have it
+    wider = confident / ndtri(CONFIDENCE)  # as few frames have it
     covariance = covariance * np.outer(wider, wider)
-    reach = np.abs(deviation) + quantiles.confident * np.sqrt(np.diag(covariance))
+    reach = np.abs(deviation) + confident * np.sqrt(np.diag(covariance))
     unsure = np.zeros(6, np.bool_)
     for part, most in zip((slice(0, 3), slice(3, 6)), tolerance, strict=True):
         beyond = probability_outside(deviation[part], covariance[part, part], most)
@@ -244,3 +247,62 @@ def describe_motion(motion: Array, sigma: Array, which: Mask, axes: tuple[str, .
         f"{verbs[k]} {axes[k]} by {values[k]:+.2f} {units[k]} (sigma {errors[k]:.2f})"
         for k in np.flatnonzero(which)
     )
+
+
+def tolerance_twist(tolerance_deg: float, tolerance_cm: float) -> Array:
+    """(2,) the largest turn [rad] and the largest shift [m] that are OK, whatever their axes.
+
+    Raises:
+        ValueError: if one is not positive.
+    """
+    for name, value in (("tolerance_deg", tolerance_deg), ("tolerance_cm", tolerance_cm)):
+        if not 0 < value < np.inf:
+            raise ValueError(f"{name} must be positive and finite, found {value}")
+    return np.asarray(np.array([tolerance_deg, tolerance_cm]) / DISPLAY[::3])
+
+
+def axes_beyond(deviation: Array, significant: Mask, tolerance: Array) -> Mask:
+    """(..., 6) True for the significant axes of a turn or a shift that are too large together.
+
+    Args:
+        deviation: (..., 6) rotation and translation.
+        significant: (..., 6) the axes that count.
+        tolerance: (2,) largest turn and shift.
+    """
+    parts = np.where(significant, deviation, 0.0).reshape(*deviation.shape[:-1], 2, 3)
+    is_large = np.linalg.norm(parts, axis=-1) > tolerance
+    return np.asarray(significant & np.repeat(is_large, 3, axis=-1))
+
+
+def student_quantiles(freedom: ArrayLike, tail: float) -> Array:
+    """(2, 6) numbers of sigmas: the largest deviation by chance; the upper bound by CONFIDENCE.
+
+    Args:
+        freedom: degrees of freedom of the sigmas, (6,) or of all; infinite where known.
+        tail: probability of a larger deviation by chance, to either side.
+    """
+    freedom = np.broadcast_to(np.asarray(freedom, np.float64), 6)
+    return np.array([-stdtrit(freedom, tail), stdtrit(freedom, CONFIDENCE)])
+
+
+def quantiles_in_part(share: Array, estimated: Array, known: Array) -> Array:
+    """(2, 6) of a variance of which a (6,) share is estimated: squares add up (after Cochran).
+
+    It errs on the side of fewer alarms: a quarter of the stated ones if the shares are alike.
+    """
+    return np.asarray(np.sqrt(share * estimated**2 + (1 - share) * known**2))
+
+
+def tail_of_axis(cameras: int) -> float:
+    """Probability of a significant deviation by chance, of one of six axes, to either side."""
+    return FALSE_ALARM_RATE / (2 * 6 * cameras)
+
+
+def detectable(sigma: Array, quantile: float | Array) -> Array:
+    """(6,) the smallest change per axis that is beyond a quantile with probability POWER.
+
+    Args:
+        sigma: (6,) standard deviations.
+        quantile: how many of them count, per axis or of all.
+    """
+    return np.asarray((quantile + float(ndtri(POWER))) * sigma)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.audit.significance import axes_beyond
+from calibgraph.audit.judgement import axes_beyond
 from calibgraph.model.geometry import twists_between
 
 _EYE = np.eye(6)

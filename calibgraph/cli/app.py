@@ -20,14 +20,10 @@ from typing import Any, TextIO
 import typer
 
 from calibgraph.cli.audit import check, drift
-from calibgraph.cli.calibrate import calibrate, match, solve
-from calibgraph.cli.export import export
-from calibgraph.cli.fleet import fleet
-from calibgraph.cli.inspect import doctor, evaluate, perturb, report, weights
+from calibgraph.cli.calibrate import calibrate, match, solve, track
+from calibgraph.cli.inspect import doctor, evaluate, export, perturb, report, simulate, weights
 from calibgraph.cli.rig import rig
-from calibgraph.cli.serve import pick, serve
-from calibgraph.cli.simulate import simulate
-from calibgraph.cli.track import track
+from calibgraph.cli.serve import fleet, pick, serve
 
 _INTERRUPTED = 130
 _COLLECT_AFTER = 100_000, 20, 20

@@ -8,7 +8,7 @@ import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import bag_settings, checked_arguments, dataset_from, matcher_from
+from calibgraph.cli.options import bag_settings, checked_arguments, dataset_from, matcher_from
 from calibgraph.cli.terminal import elapsed_s, print_json, print_line, progress_bar, terminal
 
 _EXIT_CODES = {"OK": 0, "WRONG": 1, "CHANGED": 1, "CANNOT TELL": 3}
@@ -35,13 +35,13 @@ def check(
     but the page, if one is wanted.
     """
     from calibgraph.audit import check
-    from calibgraph.audit.significance import Tolerance
+    from calibgraph.audit.judgement import tolerance_twist
     from calibgraph.files import require_new_file
 
     if out is not None:
         require_new_file(out, ".html", ".htm", force=force)
     with checked_arguments():
-        Tolerance(tolerance_deg, tolerance_cm)
+        tolerance_twist(tolerance_deg, tolerance_cm)
         matcher = matcher_from("structure", seed=seed, all_frames=frames is not None)
     data = dataset_from(dataset, rig, frames, bag_settings(config, topic, motion=motion))
     with progress_bar() as progress:
@@ -58,7 +58,7 @@ def check(
 
         print_json(audit_summary(audit))
     else:
-        from calibgraph.audit.tables import print_audit
+        from calibgraph.audit.page import print_audit
 
         print_audit(terminal(), audit, out, elapsed_s())
     raise typer.Exit(_EXIT_CODES[audit.status])
@@ -98,7 +98,7 @@ def drift(
 
         print_json(drift_summary(found))
     else:
-        from calibgraph.audit.tables import print_drift
+        from calibgraph.audit.page import print_drift
 
         print_drift(terminal(), found)
         print_line("nothing was written")

@@ -1,16 +1,27 @@
-"""The commands about what is there: report, evaluate, perturb, doctor, weights."""
+"""The commands report, evaluate, perturb, doctor, weights, export and simulate."""
+
+from __future__ import annotations
 
 import json
 import os
+from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from shlex import join
+from typing import TYPE_CHECKING, Any
 
 import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import bag_settings, checked_arguments
+from calibgraph.cli.options import bag_settings, checked_arguments
 from calibgraph.cli.terminal import print_json, print_line, progress_bar, terminal
+from calibgraph.io.formats import EXPORT_FORMATS
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
 
 _PAGES = (".html", ".htm")
 
@@ -35,8 +46,7 @@ def report(
     from calibgraph.io.calibrations import load_calibration
     from calibgraph.io.dataset import load_dataset
     from calibgraph.model.result_files import REPORT_FILE
-    from calibgraph.report.frames import relocate_frames
-    from calibgraph.report.html import write_report
+    from calibgraph.report.html import relocate_frames, write_report
 
     for path, suffixes in ((out, _PAGES), (rerun, (".rrd",)), (mcap, (".mcap",))):
         if path is not None:
@@ -78,7 +88,7 @@ def evaluate(
     path = rig_file(estimate)
     errors = evaluate(load_rig(estimate), load_rig(reference), error_bars(path))
     if as_json:
-        print_json(errors.to_mapping())
+        print_json(asdict(errors))
     else:
         from calibgraph.report.tables import print_evaluation
 
@@ -175,3 +185,165 @@ def weights(
         from calibgraph.report.tables import print_weights
 
         print_weights(terminal(), checkpoint.summary(), out)
+
+
+_LIST = "list"
+
+
+def _list_formats(format: str) -> str:
+    """Print the formats for ``--format list``, before other arguments are required."""
+    if format == _LIST:
+        from calibgraph.report.as_json import print_line
+
+        width = max(map(len, EXPORT_FORMATS))
+        lines = (f"{name:{width}}  {meaning}" for name, meaning in EXPORT_FORMATS.items())
+        with suppress(BrokenPipeError):
+            print_line("\n".join(lines))
+        raise typer.Exit
+    return format
+
+
+def export(
+    source: Path = Argument(
+        ..., metavar="RESULT|RIG", help="Result (its folder or file), or a rig."
+    ),
+    format: str = Option(
+        ...,
+        metavar="FORMAT",
+        callback=_list_formats,
+        is_eager=True,
+        help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
+    ),
+    out: Path = Option(..., metavar="FILE", help="File to write; of camera_info a folder."),
+    camera: list[str] | None = Option(
+        None, metavar="NAME", help="Only this camera; may be repeated. (default: all)"
+    ),
+    lidar_frame: str | None = Option(
+        None, metavar="FRAME", help="Frame id of the LiDAR. (default: its name in the rig)"
+    ),
+    camera_frame: str | None = Option(
+        None,
+        metavar="TEXT",
+        help="Frame id of optical frames; {camera} is the name. (default: that of the bag, or "
+        "{camera}_optical_frame)",
+    ),
+    lidar_pose: str | None = Option(
+        None,
+        metavar='"X Y Z ROLL PITCH YAW"',
+        help="Of autoware: the LiDAR in sensor_kit_base_link, metres and radians. (default: at 0)",
+    ),
+    even_if_failed: bool = Option(False, "--even-if-failed", help="Also with the verdict FAIL."),
+    force: options.Force = False,
+) -> None:
+    """Write a calibration in the format of another program, with its direction as a comment."""
+    import numpy as np
+
+    from calibgraph.io.formats.export import export_calibration
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.model.plausibility import MAX_DISTANCE_M, find_implausible
+
+    with checked_arguments():
+        T_base_lidar = None if lidar_pose is None else _parse_pose(lidar_pose)
+        written = export_calibration(
+            source, out, format, cameras=camera or None, lidar_frame=lidar_frame,
+            camera_frame=camera_frame, T_base_lidar=T_base_lidar, even_if_failed=even_if_failed,
+            force=force,
+        )  # fmt: skip
+        rig = load_rig(source)
+    rig = rig.model_copy(
+        update={"cameras": {name: rig.cameras[name] for name in camera or rig.cameras}}
+    )
+    if T_base_lidar is not None and np.linalg.norm(T_base_lidar[:3, 3]) > MAX_DISTANCE_M:
+        print_line(f"warning: --lidar-pose {lidar_pose!r}: lengths in millimetres?")
+    lines = [f"warning: {line}" for line in find_implausible(rig)]
+    for line in [*lines, *(f"{path}: written ({format})" for path in written)]:
+        print_line(line)
+
+
+def _parse_pose(text: str) -> NDArray[np.float64]:
+    """The (4, 4) of six numbers."""
+    from calibgraph.io.rig_parts import pose_of_angles
+
+    try:
+        x, y, z, roll, pitch, yaw = (float(word) for word in text.replace(",", " ").split())
+    except ValueError as error:
+        raise ValueError(
+            f"--lidar-pose {text!r}: give six numbers, X Y Z ROLL PITCH YAW"
+        ) from error
+    try:
+        return pose_of_angles((x, y, z), (roll, pitch, yaw))
+    except ValueError as error:
+        raise ValueError(f"--lidar-pose {text!r}: {error}") from error
+
+
+STREET = "street"
+RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # defaults of simulate_street, but for the rig
+_PANEL = "Scenario street"
+
+
+def simulate(
+    scenario: str = Argument(
+        ...,
+        metavar="SCENARIO",
+        help="street: a dataset of scans and images of a drive along a procedural street. "
+        "kitti, walkley: a table of correspondences, with the errors of the paper's matcher.",
+    ),
+    out: Path = Option(..., metavar="DIR", help="Folder to write."),
+    frames: int = Option(10, help="Number of frames."),
+    rotation_deg: float = Option(5.0, min=0, help="Rotation error of the guess, rig.yaml."),
+    translation_m: float = Option(0.3, min=0, help="Translation error of the guess."),
+    seed: options.Seed = 0,
+    rig: str | None = Option(
+        None,
+        metavar="NAME|RIG",
+        rich_help_panel=_PANEL,
+        help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
+        "(two that see more than a half-space), panorama (one that sees all round), sample "
+        f"(three small ones), or a rig file; its extrinsics are the truth. (default: {RIG})",
+    ),
+    beams: int | None = Option(
+        None,
+        metavar="16|32|64|128",
+        rich_help_panel=_PANEL,
+        help=f"Of the LiDAR. (default: {BEAMS})",
+    ),
+    step_m: float | None = Option(
+        None, rich_help_panel=_PANEL, help=f"Mean distance between frames. (default: {STEP_M:g})"
+    ),
+    sensor_errors: float | None = Option(
+        None, rich_help_panel=_PANEL, help="Of the LiDAR: 1 for those of real ones. (default: 0)"
+    ),
+    vary_layout: bool = Option(
+        False, "--vary-layout", rich_help_panel=_PANEL, help="Draw the street's layout by the seed."
+    ),
+) -> None:
+    """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
+    from calibgraph.io.rigs import load_rig
+    from calibgraph.simulation.recording import simulate_street
+    from calibgraph.simulation.rigs import RIG_NAMES, rig_of
+    from calibgraph.simulation.scenarios import SCENARIOS, simulate_table
+
+    common: dict[str, Any] = {
+        "frames": frames, "rotation_deg": rotation_deg, "translation_m": translation_m, "seed": seed
+    }  # fmt: skip
+    of_street: dict[str, Any] = {
+        "rig": rig, "beams": beams, "step_m": step_m, "sensor_errors": sensor_errors,
+        "vary_layout": vary_layout or None,
+    }  # fmt: skip
+    street = {name: value for name, value in of_street.items() if value is not None}
+    with progress_bar() as progress, checked_arguments():
+        if scenario == STREET:
+            name = street.pop("rig", RIG)
+            is_file = name not in RIG_NAMES and name and Path(name).exists()
+            truth = load_rig(name) if is_file else rig_of(name)
+            written = simulate_street(out, truth, **street, **common, progress=progress)
+        elif street and scenario in SCENARIOS:
+            named = " and ".join(f"--{name.replace('_', '-')}" for name in street)
+            raise ValueError(
+                f"scenario {scenario!r} has its own rig and matcher, {named} would change nothing; "
+                f"leave it out, or simulate {STREET!r}"
+            )
+        else:
+            written = simulate_table(out, scenario, **common)
+    for path in written:
+        print_line(f"{path}: written")

@@ -13,10 +13,10 @@ import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
-from calibgraph.cli.arguments import bag_options_from, checked_arguments, parse_names
+from calibgraph.cli.options import bag_options_from, checked_arguments, parse_names
 from calibgraph.cli.terminal import print_json, print_line, progress_bar
 from calibgraph.errors import CalibrationError
-from calibgraph.io.formats.names import IMPORT_FORMATS
+from calibgraph.io.formats import IMPORT_FORMATS
 
 if TYPE_CHECKING:
     from calibgraph.guessing.guess import RigGuess
@@ -108,8 +108,8 @@ def rig(
     """
     from calibgraph.files import require_new_file
     from calibgraph.io.bags.storage import is_bag
-    from calibgraph.io.formats.describe import describe_rig
     from calibgraph.io.formats.rig_import import read_rig_parts
+    from calibgraph.io.rigs import describe_rig
     from calibgraph.model.lens import state_calibrated
     from calibgraph.model.plausibility import find_implausible
     from calibgraph.trust.conventions import correct_guess
@@ -122,14 +122,16 @@ def rig(
     path = Path(source[0])
     if len(source) == 1 and not correct and _is_to_fill_in(path):
         _refuse_others("a folder of images and clouds", given)
-        _write_template(path, out, mount, lens, forward=forward, force=force)
+        _write_template(path, out, mount, lens, forward=forward, replace=force)
         return
     if out is not None:
         require_new_file(out, ".yaml", ".yml", force=force)
     is_of_bag = not (mount or dataset) and all(map(is_bag, source))
     _refuse_others("bags alone" if is_of_bag else "files", given)
     with checked_arguments(), progress_bar("reading") as progress:
-        sigmas = _sigmas(tie_deg, tie_m)
+        if (tie_deg is None) != (tie_m is None):
+            raise ValueError("--tie-deg and --tie-m: give both")
+        sigmas = None if tie_deg is None or tie_m is None else (tie_deg, tie_m)
         if is_of_bag:
             made, notes, topics = _rig_of_bags([*map(Path, source)], topic, sigmas)
             guess = None
@@ -142,8 +144,8 @@ def rig(
             )  # fmt: skip
             notes, topics = [f"note: {note}" for note in parts.notes], []
             made, guess = _rig_of_files(
-                parts, parse_names("--mount", mount), dataset, forward=forward,
-                size_px=_size_px(size), sigmas=sigmas, progress=progress
+                parts, parse_names("--mount", mount), dataset, sigmas, forward=forward,
+                size_px=_size_px(size), progress=progress
             )  # fmt: skip
         made = state_calibrated(correct_guess(made, correct or ()))
         guess = guess and replace(guess, rig=made)
@@ -186,54 +188,35 @@ def _parse_file(text: str) -> tuple[str, Path]:
 
 def _size_px(size: str | None) -> tuple[int, int] | None:
     """Width and height of images whose file has none."""
-    if size is None:
-        return None
-    match = re.fullmatch(r"(\d+)x(\d+)", size)
-    if match is None:
+    match = re.fullmatch(r"(\d+)x(\d+)", size or "")
+    if size is not None and match is None:
         raise ValueError(f"--size {size!r}: give WIDTHxHEIGHT, as 1920x1200")
-    return int(match[1]), int(match[2])
-
-
-def _sigmas(tie_deg: float | None, tie_m: float | None) -> tuple[float, float] | None:
-    """The sigmas of relative poses, [deg] and [m]."""
-    if tie_deg is None and tie_m is None:
-        return None
-    if tie_deg is None or tie_m is None:
-        raise ValueError("--tie-deg and --tie-m: give both")
-    return tie_deg, tie_m
+    return match and (int(match[1]), int(match[2]))
 
 
 def _rig_of_files(
     parts: RigParts,
     mountings: dict[str, str],
     dataset: list[Path] | None,
-    *,
-    forward: str,
-    size_px: tuple[int, int] | None,
     sigmas: tuple[float, float] | None,
-    progress: Any,
+    **options: Any,
 ) -> tuple[Rig, RigGuess | None]:
-    """The rig, and how good its guess is, where cameras are described or searched for."""
+    """The rig, and how good its guess is, where cameras are described or searched for.
+
+    The options are those of :func:`guess_rig`.
+    """
     from calibgraph.guessing.guess import guess_rig
     from calibgraph.io.rig_parts import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
 
-    tie_deg, tie_m = sigmas or (RELATIVE_SIGMA_DEG, RELATIVE_SIGMA_CM / 100.0)
     if not mountings and not dataset:
-        made = parts.to_rig(
-            size_px=size_px, relative_sigma_deg=tie_deg, relative_sigma_cm=100.0 * tie_m
-        )
-        return made, None
+        deg, metres = sigmas or (RELATIVE_SIGMA_DEG, RELATIVE_SIGMA_CM / 100.0)
+        sizes: dict[str, Any] = {"relative_sigma_deg": deg, "relative_sigma_cm": 100.0 * metres}
+        return parts.to_rig(size_px=options["size_px"], **sizes), None
     if sigmas is not None:
         raise ValueError("--tie-deg is for files alone; leave --mount and --dataset out")
-    guess = guess_rig(
-        parts,
-        mountings={name: text for name, text in mountings.items() if text != _SEARCH},
-        data=dataset or None,
-        search=[name for name, text in mountings.items() if text == _SEARCH],
-        forward=forward,
-        size_px=size_px,
-        progress=progress,
-    )
+    said = {name: text for name, text in mountings.items() if text != _SEARCH}
+    search = [name for name in mountings if name not in said]
+    guess = guess_rig(parts, mountings=said, data=dataset or None, search=search, **options)
     return guess.rig, guess
 
 
@@ -254,25 +237,17 @@ def _rig_of_bags(
 
 
 def _write_template(
-    folder: Path,
-    out: Path | None,
-    mount: list[str] | None,
-    lens: list[str] | None,
-    *,
-    forward: str,
-    force: bool,
+    folder: Path, out: Path | None, mount: list[str] | None, lens: list[str] | None, **options: Any
 ) -> None:
     """Write the rig of a folder, with what is left to fill in, and say what comes next."""
-    from calibgraph.guessing.lens_words import CALIBRATION
+    from calibgraph.guessing.mounting import CALIBRATION
     from calibgraph.guessing.template import cameras_of_folder, write_rig_template
     from calibgraph.io.dataset_folders import describe_pairing
 
     with checked_arguments():
         words = parse_names("--mount", mount)
         known = _lenses(lens, [*cameras_of_folder(folder)])
-        path = write_rig_template(
-            folder, out, mountings=words, lenses=known, forward=forward, replace=force
-        )
+        path = write_rig_template(folder, out, mountings=words, lenses=known, **options)
         pairing = describe_pairing(folder)
     if pairing:
         print_line(pairing)
@@ -289,7 +264,7 @@ def _write_template(
 
 def _lenses(given: list[str] | None, cameras: list[str]) -> dict[str, str]:
     """How the lens of each camera is known, as given for all or one, or asked for."""
-    from calibgraph.guessing.lens_words import CALIBRATION, LENS_GRAMMAR
+    from calibgraph.guessing.mounting import CALIBRATION, LENS_GRAMMAR
 
     for_all = [how for how in given or () if "=" not in how]
     if not given and sys.stdin.isatty() and sys.stderr.isatty():

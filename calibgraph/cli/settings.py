@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from calibgraph.files import StrictNumbers, checked_model, read_yaml
-from calibgraph.io.bags.options import Stamps
+from calibgraph.io.bags.storage import Stamps
 from calibgraph.model.config import Config, Terms, config_from
 
 
@@ -25,8 +25,6 @@ class RareSettings(StrictNumbers):
             1400 px width on, if null.
         batch: images per batch; 1 on a CPU and 4 on a GPU, if null.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     terms: Terms = "full"
     stamps: Stamps | None = None

@@ -10,7 +10,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,18 +19,40 @@ from calibgraph.child_process import (
     ChildEndedError,
     ChildProcess,
     ChildTimeoutError,
+    Outcome,
     answer_requests,
+    describe_failure,
     memory_limit,
     output_to,
 )
 from calibgraph.errors import CalibrationError
+from calibgraph.fleet.files import fetch
 from calibgraph.fleet.manifest import Job
-from calibgraph.fleet.task import Limits, Outcome, describe_failure, release
-from calibgraph.fleet.uris import fetch
+from calibgraph.model.calibration import version_of
 
 _LOG, _MOST_LOG = "log.txt", 2**16
 _kept = threading.local()
 _children: list[ChildProcess] = []
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of one job.
+
+    Attributes:
+        timeout_s: wall time, with fetching.
+        memory_bytes: that the job may allocate; None: no limit.
+        fetch_bytes: of remote recordings that are copied to the worker's disk.
+    """
+
+    timeout_s: float = 3600.0
+    memory_bytes: int | None = None
+    fetch_bytes: float = 50e9
+
+
+def release() -> str:
+    """The version of this package."""
+    return version_of("calibgraph")
 
 
 def run_job(job: Job, limits: Limits, of_release: str) -> Outcome:
@@ -125,7 +147,7 @@ def _calibrate(
     """The cells of each camera's row."""
     from calibgraph.io.dataset import load_dataset
     from calibgraph.io.rigs import load_rig
-    from calibgraph.matching.structure import StructureMatcher
+    from calibgraph.matching.named import structure_matcher
     from calibgraph.pipeline import calibrate, solve
 
     settings = job.settings
@@ -133,13 +155,14 @@ def _calibrate(
     paths = [local(uri) for uri in job.recordings]
     if job.is_table and rig is not None:
         return _cells(solve(rig, paths[0], settings.config))
-    given = {"search_deg": settings.search_deg, "search_m": settings.search_m}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if settings.frames is not None:
-        options["most_frames"] = None
     result = calibrate(
         load_dataset(paths, rig, frames=settings.frames),
-        matcher=StructureMatcher(seed=settings.config.seed, **options),
+        matcher=structure_matcher(
+            seed=settings.config.seed,
+            all_frames=settings.frames is not None,
+            search_deg=settings.search_deg,
+            search_m=settings.search_m,
+        ),
         config=settings.config,
         time_limit_s=limits.timeout_s / 2,  # the rest is for the checks
     )

@@ -9,12 +9,11 @@ from typing import Any
 
 import pyarrow as pa
 from pyarrow import csv, parquet
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from calibgraph.errors import CalibrationError, FileError
-from calibgraph.files import checked_model
-from calibgraph.fleet.rows import SCHEMA
-from calibgraph.fleet.uris import fingerprint, in_arrow, join, read_bytes
+from calibgraph.files import StrictNumbers, checked_model
+from calibgraph.fleet.files import SCHEMA, fingerprint, in_arrow, join, read_bytes
 from calibgraph.model.config import Config, config_from
 from calibgraph.yaml_text import parse_yaml
 
@@ -26,15 +25,13 @@ _MOST_BYTES, _MOST_SETTINGS_BYTES = 2**31, 2**20
 _MATCHING = ("frames", "search_deg", "search_m")
 
 
-class Settings(BaseModel):
+class Settings(StrictNumbers):
     """Settings of one job.
 
     Attributes:
         frames: of a recording, as of ``--frames``.
         search_deg, search_m: how far off the guess may be; None: the matcher's default.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     config: Config = Config()
     frames: str | None = None
@@ -81,17 +78,11 @@ class Job:
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-@dataclass(frozen=True, eq=False)
-class Manifest:
-    """The jobs of a manifest, and its further columns, which the rows of results carry."""
+def load_manifest(uri: str) -> tuple[list[Job], pa.Table]:
+    """The jobs of a manifest, Parquet or CSV, and its further columns, which the results carry.
 
-    uri: str
-    jobs: tuple[Job, ...]
-    others: pa.Table
-
-
-def load_manifest(uri: str) -> Manifest:
-    """Read a manifest, Parquet or CSV; relative paths in it start at its folder."""
+    Relative paths in it start at its folder.
+    """
     table = _read(uri)
     for name, count in Counter(table.column_names).items():
         if count > 1:
@@ -116,7 +107,7 @@ def load_manifest(uri: str) -> Manifest:
                 uri, f"row {row}: vehicle {job.vehicle!r} with this recording is in row "
                 f"{first.row} too; remove one"
             )  # fmt: skip
-    return Manifest(uri, (*jobs.values(),), table.drop_columns(cells.column_names))
+    return [*jobs.values()], table.drop_columns(cells.column_names)
 
 
 def _read(uri: str) -> pa.Table:

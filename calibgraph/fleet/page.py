@@ -11,10 +11,17 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from calibgraph.audit.findings import Finding, describe_size, find_changes, moved_lidars
-from calibgraph.audit.fleet_model import FleetModel, Mount, fit_fleet
-from calibgraph.audit.observations import NAMES, newest_rows, observe, words
+from calibgraph.audit.fleet_model import (
+    NAMES,
+    FleetModel,
+    Mount,
+    fit_fleet,
+    newest_rows,
+    observe,
+    words,
+)
 from calibgraph.audit.result import twist_cells
-from calibgraph.fleet.rows import Store, read_rows
+from calibgraph.fleet.files import Store, read_rows
 from calibgraph.report.kit import page_template
 
 STATES = ("PASS", "NO RESULT", "WARN", "FAIL")
@@ -47,9 +54,6 @@ def write_fleet_report(out: str) -> FleetReport:
     """Fit the model of the rows in a folder, and write its files and its page beside them.
 
     Of several rows of a vehicle and camera the newest counts.
-
-    Args:
-        out: folder or URI of :func:`calibgraph.run_fleet`.
 
     Raises:
         CalibrationError: if no rows are there, or nothing can be written.

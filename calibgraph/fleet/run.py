@@ -4,7 +4,7 @@ import hashlib
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
@@ -13,11 +13,11 @@ from typing import Any
 
 import pyarrow as pa
 
+from calibgraph.child_process import Outcome
 from calibgraph.errors import CalibrationError, FileError, needs_extra
-from calibgraph.fleet.job import end_children, interrupt_jobs, run_job
+from calibgraph.fleet.files import ROWS, SCHEMA, Store, read_rows
+from calibgraph.fleet.job import Limits, end_children, interrupt_jobs, release, run_job
 from calibgraph.fleet.manifest import Job, Key, load_manifest
-from calibgraph.fleet.rows import ROWS, SCHEMA, Store, read_rows
-from calibgraph.fleet.task import Limits, Outcome, release
 from calibgraph.model.calibration import package_versions
 from calibgraph.parallel import count_cores
 from calibgraph.progress import Progress, no_progress
@@ -67,26 +67,28 @@ def run_fleet(
             another command writes there.
     """
     report, limits = progress or no_progress, limits or Limits()
-    found, store = load_manifest(manifest), Store(out)
+    (jobs, others), store = load_manifest(manifest), Store(out)
     with store.locked():
-        rows, hashes = _known_rows(out, found.jobs), _hashes(found.jobs, report)
-        todo = [job for job in found.jobs if not _is_finished(rows[job.key], hashes[job.key])]
+        rows, hashes = _known_rows(out, jobs), _hashes(jobs, report)
+        todo = [job for job in jobs if not _is_finished(rows[job.key], hashes[job.key])]
         failed = 0
         with nullcontext(executor) if executor is not None else thread_executor() as opened:
-            for count, (job, outcome) in enumerate(_outcomes(opened, todo, limits), start=1):
+            running = {opened.submit(run_job, job, limits, release()): job for job in todo}
+            for count, future in enumerate(as_completed([*running]), start=1):
+                job, outcome = running.pop(future), _outcome_of(future)
                 rows[job.key] = _rows_of(job, outcome, hashes[job.key])
                 table = pa.Table.from_pylist(rows[job.key], schema=SCHEMA)
-                others = found.others.take(pa.array([job.row] * len(table)))
-                for column in others.schema:
-                    table = table.append_column(column, others[column.name])
+                further = others.take(pa.array([job.row] * len(table)))
+                for column in further.schema:
+                    table = table.append_column(column, further[column.name])
                 _write(store, job, outcome, table)
                 failed += outcome.error_kind is not None
                 stage = f"calibrating ({failed} failed)" if failed else "calibrating"
                 report(stage, count, len(todo))
-    every = [row for job in found.jobs for row in rows[job.key]]
+    every = [row for job in jobs for row in rows[job.key]]
     verdicts = Counter(row["verdict"] for row in every if row["status"] == "done")
     failures = Counter(row["error_kind"] for row in every if row["status"] != "done")
-    return Summary(len(found.jobs), len(found.jobs) - len(todo), dict(verdicts), dict(failures))
+    return Summary(len(jobs), len(jobs) - len(todo), dict(verdicts), dict(failures))
 
 
 @contextmanager
@@ -124,15 +126,6 @@ def dask_executor(address: str) -> Iterator[Executor]:
             executor.shutdown(wait=False)  # cancels what has not ended
 
 
-def _outcomes(
-    executor: Executor, jobs: Iterable[Job], limits: Limits
-) -> Iterator[tuple[Job, Outcome]]:
-    """Jobs with their outcomes, as they end."""
-    running = {executor.submit(run_job, job, limits, release()): job for job in jobs}
-    for future in as_completed([*running]):
-        yield running.pop(future), _outcome_of(future)
-
-
 def _outcome_of(future: Future[Outcome]) -> Outcome:
     """The outcome of a task, or that its worker was lost."""
     try:
@@ -151,7 +144,7 @@ def _rows_of(job: Job, outcome: Outcome, input_hash: str) -> list[dict[str, Any]
         "input_hash": input_hash, "versions": json.dumps(package_versions()),
     }  # fmt: skip
     if outcome.error_kind is None:
-        return [{**common, "status": "done", **cells} for cells in outcome.cameras]
+        return [{**common, "status": "done", **cells} for cells in outcome.result]
     error = {"error_kind": outcome.error_kind, "error": outcome.error}
     return [{**common, "camera": "", "status": "failed", **error}]
 
@@ -193,14 +186,8 @@ def _hashes(jobs: Sequence[Job], report: Progress) -> dict[Key, str]:
     """Of the inputs of all jobs; empty where they cannot be read: the job will fail by it."""
     found = dict[Key, str]()
     with ThreadPoolExecutor(_READERS) as pool:
-        for job, text in zip(jobs, pool.map(_hash_of, jobs), strict=True):
+        for job, future in [(job, pool.submit(job.input_hash)) for job in jobs]:
             report("reading inputs", len(found), len(jobs))
-            found[job.key] = text
+            failed = future.exception() is not None  # of any store's client
+            found[job.key] = "" if failed else future.result()
     return found
-
-
-def _hash_of(job: Job) -> str:
-    try:
-        return job.input_hash()
-    except Exception:  # of any store's client
-        return ""

@@ -99,10 +99,6 @@ class QuadraticByPlace:
     T_lidar_camera: Sequence[gtsam.Pose3]
     information: Array
 
-    def with_variance(self, factor: float) -> QuadraticByPlace:
-        """Multiply the variance of the matches."""
-        return replace(self, information=self.information / factor)
-
     def sums(self, T_camera_cloud: Array) -> BlockSums:
         """H, b and c of every place at a pose of its own, (P, 4, 4), stacked."""
         count = len(T_camera_cloud)
@@ -124,42 +120,6 @@ class QuadraticByPlace:
             )
             for row in np.flatnonzero(self.places == place).tolist()
         ]
-
-
-@dataclass(frozen=True, eq=False)
-class SummarizedByPlace:
-    """One camera's correspondences, and the quadratics that are left of earlier ones.
-
-    Attributes:
-        earlier: the quadratics.
-        recent: the correspondences.
-    """
-
-    earlier: QuadraticByPlace
-    recent: BlockByPlace
-
-    @cached_property
-    def places(self) -> Numbers:
-        """(p,) the places that have either, in rising order."""
-        return np.union1d(self.earlier.places, self.recent.places)
-
-    def with_variance(self, factor: float) -> SummarizedByPlace:
-        """Multiply the variance of the matches; the loss keeps its tuning constant in pixels."""
-        return SummarizedByPlace(
-            self.earlier.with_variance(factor), self.recent.with_variance(factor)
-        )
-
-    def sums(self, T_camera_cloud: Array) -> BlockSums:
-        """H, b and c of every place at a pose of its own, (P, 4, 4), stacked."""
-        one, two = self.earlier.sums(T_camera_cloud), self.recent.sums(T_camera_cloud)
-        return BlockSums(
-            one.hessian + two.hessian, one.gradient + two.gradient, one.cost + two.cost
-        )
-
-    def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
-        """Those of both, on the variables of these keys."""
-        parts = self.earlier, self.recent
-        return [factor for part in parts for factor in part.factors(place, cloud, matched)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,8 @@ from calibgraph.arrays import Array
 
 EXACT = 1e-5
 """Standard deviation [rad and m] of what holds exactly; less is lost in rounding."""
+
+_SETTLED = 0.1  # relative change of the ratios: the data leave far more open
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,21 +51,38 @@ class VarianceComponents:
     distortion_size: float | Array = 1.0
     robust_scale: float = np.inf
 
-    def with_fixed_weights(self, weight: Array) -> VarianceComponents:
-        """Quadratic losses of the same curvature as the robust ones.
 
-        Args:
-            weight: (P, 1 + N) of the cloud and of each camera at each place.
-        """
-        clouds = self.cloud_at_place / weight[:, 0, None, None]
-        cameras = weight[:, 1:, None, None]
+@dataclass(frozen=True)
+class VarianceRatios:
+    """Variances over their priors.
+
+    Attributes:
+        shared: of what all places share: the cloud, its distortion, the cameras' matches and pairs.
+        cloud: of the cloud at one place.
+        cameras: of a camera's matches at one place.
+    """
+
+    shared: float = 1.0
+    cloud: float = 1.0
+    cameras: float = 1.0
+
+    def scale(self, prior: VarianceComponents) -> VarianceComponents:
+        """Components of these ratios."""
         return replace(
-            self,
-            cloud_at_place=clouds,
-            at_place=self.at_place / cameras,
-            scatter_at_place=self.scatter_at_place / cameras,
-            robust_scale=np.inf,
+            prior,
+            cloud=self.shared * prior.cloud,
+            camera=self.shared * prior.camera,
+            pairs=self.shared * prior.pairs,
+            distortion_size=self.shared * prior.distortion_size,
+            cloud_at_place=self.cloud * prior.cloud_at_place,
+            at_place=self.cameras * prior.at_place,
+            scatter_at_place=self.cameras * prior.scatter_at_place,
         )
+
+    def is_near(self, other: VarianceRatios) -> bool:
+        """Whether all are the same to some percent."""
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        return all(abs(one - two) <= _SETTLED * abs(two) for one, two in pairs)
 
 
 def least_cost_of_distortion(parts: VarianceComponents) -> float:

@@ -20,20 +20,19 @@ poses of a camera are equal, and the graph is that of Eq. 5 of the paper.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
     BlockByPlace,
     PairByPlace,
     QuadraticByPlace,
-    SummarizedByPlace,
 )
 from calibgraph.graph.components import EXACT, VarianceComponents, shown_distortion
 from calibgraph.graph.lens import FreeLensByPlace, LensTerm, lens_graph
@@ -58,7 +57,7 @@ from factors import (
     robust_noise,
 )
 
-Data = BlockByPlace | QuadraticByPlace | SummarizedByPlace | FreeLensByPlace
+Data = BlockByPlace | QuadraticByPlace | FreeLensByPlace
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +76,7 @@ class LatentPoseModel:
         lens_errors: by the numbers of cameras, (6, 6) covariance of ``b_c``, which is then
             reported, about the mount or alignment: of the pose that follows what is not estimated
             of lens and clock.
+        frames: the numbers of the frames of each place.
     """
 
     cameras: tuple[str, ...]
@@ -87,17 +87,12 @@ class LatentPoseModel:
     of: Reported = "alignment"
     lenses: Mapping[int, LensTerm] = field(default_factory=dict)
     lens_errors: Mapping[int, Array] = field(default_factory=dict)
+    frames: Sequence[NDArray[np.int64]] = ()
 
     @property
     def places(self) -> int:
         """Number of places."""
         return len(self.components.at_place)
-
-    def with_blocks(self, blocks: Mapping[str, Data]) -> LatentPoseModel:
-        """The same graph with other data of the same cameras at the same places."""
-        model = copy.copy(self)  # with the graphs that are made, since data are in none of them
-        object.__setattr__(model, "blocks", blocks)
-        return model
 
     @property
     def camera_keys(self) -> list[int]:
@@ -151,9 +146,17 @@ class LatentPoseModel:
         ]
 
     @cached_property
+    def present(self) -> NDArray[np.bool_]:
+        """(M, P) where a matched camera has data."""
+        found = np.zeros((len(self.matched), self.places), dtype=np.bool_)
+        for row, number in enumerate(self.matched):
+            found[row, self.blocks[self.cameras[number]].places] = True
+        return found
+
+    @cached_property
     def shared_graph(self) -> gtsam.NonlinearFactorGraph:
-        """The factors of what all places share: of errors, pose graph, lenses."""
-        return join(self.error_graph, self.pose_graph, self.lens_graph)
+        """The factors of what all places share: of errors, ties, pose graph, lenses."""
+        return join(self.error_graph, self.tie_graph, self.pose_graph, self.lens_graph)
 
     @cached_property
     def lens_graph(self) -> gtsam.NonlinearFactorGraph:
@@ -162,8 +165,13 @@ class LatentPoseModel:
 
     @cached_property
     def error_graph(self) -> gtsam.NonlinearFactorGraph:
-        """Those of errors alone: priors, distortion, camera."""
-        return _shared_graph(self)
+        """Those of the errors that have variance components: cloud, distortion, camera, pairs."""
+        return _error_graph(self)
+
+    @cached_property
+    def tie_graph(self) -> gtsam.NonlinearFactorGraph:
+        """Those of the poses that are reported to the mounts."""
+        return _tie_graph(self)
 
     @cached_property
     def place_graph(self) -> gtsam.NonlinearFactorGraph:
@@ -177,18 +185,60 @@ class LatentPoseModel:
         return [*matched, *map(cloud_at_key, range(self.places))]
 
     @property
-    def shared_keys(self) -> list[int]:
-        """Keys of the variables that no place has of its own; the reported ones last.
+    def tied_keys(self) -> list[int]:
+        """Keys of ``o`` and every ``m_c``."""
+        return [CLOUD, *map(matched_key, self.matched)]
 
-        Mounts before the distortion: in this order no exact tie is left to a weak variable.
-        """
+    @property
+    def touched_keys(self) -> list[int]:
+        """Keys of the shared variables that factors of places have."""
+        return [*self.tied_keys, *map(paired_key, self.paired), *map(seen_lens_key, self.lenses)]
+
+    @cached_property
+    def shared_keys(self) -> list[int]:
+        """Keys of the variables that no place has of its own; the touched ones first."""
         distortion = [DISTORTION] if self.is_distorted else []
-        lenses = [key(number) for key in (seen_lens_key, lens_key) for number in self.lenses]
-        shown = [*map(matched_key, self.matched), *map(paired_key, self.paired)]
+        poses = [*self.camera_keys, *map(aligned_key, self.aligned)]
         bodies = map(body_key, self.lens_errors)
-        poses = [*self.camera_keys, *map(aligned_key, self.aligned), *bodies]
-        others = [key for key in poses if key not in self.reported_keys]
-        return [CLOUD, *shown, *others, *lenses, *distortion, *self.reported_keys]
+        return [*self.touched_keys, *map(lens_key, self.lenses), *distortion, *poses, *bodies]
+
+    @cached_property
+    def columns(self) -> dict[int, NDArray[np.intp]]:
+        """By key of a shared variable, its columns among all of them."""
+        own = {DISTORTION: self.components.distortion_jacobian.shape[2]}
+        for number, term in self.lenses.items():
+            own[lens_key(number)] = own[seen_lens_key(number)] = len(term.variable.free)
+        sizes = [own.get(key, 6) for key in self.shared_keys]
+        parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+        return dict(zip(self.shared_keys, parts, strict=True))
+
+    def columns_of(self, keys: Sequence[int]) -> NDArray[np.intp]:
+        """The columns of some shared variables."""
+        return np.concatenate([self.columns[key] for key in keys])
+
+    @property
+    def size(self) -> int:
+        """Number of these columns."""
+        return int(self.columns[self.shared_keys[-1]][-1]) + 1
+
+    @cached_property
+    def touched(self) -> int:
+        """Number of the columns of those that factors of places have; they are the first."""
+        return int(self.columns[self.touched_keys[-1]][-1]) + 1
+
+    @cached_property
+    def columns_of_matches(self) -> list[NDArray[np.intp]]:
+        """Per matched camera, of o_p in front of all, m_c and s_c."""
+        lenses = [[seen_lens_key(n)] if n in self.lenses else [] for n in self.matched]
+        keys = [[matched_key(n), *own] for n, own in zip(self.matched, lenses, strict=True)]
+        return [np.append(np.arange(6), 6 + self.columns_of(own)) for own in keys]
+
+    @cached_property
+    def columns_of_pairs(self) -> list[NDArray[np.intp]]:
+        """Per pair, of o_p in front of all, n_a and n_b."""
+        names = [(self.cameras.index(pair.a), self.cameras.index(pair.b)) for pair in self.pairs]
+        keys = [[paired_key(a), paired_key(b)] for a, b in names]
+        return [np.append(np.arange(6), 6 + self.columns_of(own)) for own in keys]
 
     @cached_property
     def ordering(self) -> gtsam.Ordering:
@@ -226,15 +276,12 @@ def to_ordering(keys: Iterable[int]) -> gtsam.Ordering:
     return gtsam.Ordering([*keys])
 
 
-def _shared_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
-    """Priors of what all places share; x_c to y_c and n_c, y_c to m_c."""
+def _error_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
+    """Priors of cloud and distortion; y_c to m_c, and x_c to n_c."""
     parts, graph = model.components, gtsam.NonlinearFactorGraph()
     graph.add(gtsam.PriorFactorPose3(CLOUD, gtsam.Pose3(), _noise(parts.cloud)))
     if model.is_distorted:
         graph.push_back(_distortion_graph(parts))
-    for number, jacobian in model.aligned.items():
-        edge = camera_key(number), aligned_key(number)
-        graph.add(_displaced(model, edge, jacobian, EXACT**2 * np.eye(6)))
     seen = aligned_key if model.is_distorted else camera_key
     for number in model.matched:
         edge, noise = (seen(number), matched_key(number)), _noise(parts.camera)
@@ -243,12 +290,21 @@ def _shared_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
         else:
             shifts = term.shifts(number, is_distorted=model.is_distorted)
             graph.add(displaced_between_factor(*edge, shifts, noise))
-    for number, covariance in model.lens_errors.items():
-        edge = model.fitted_key(number), body_key(number)
-        graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), _noise(covariance)))
     for number in model.paired:
         edge = camera_key(number), paired_key(number)
         graph.add(_displaced(model, edge, parts.pair_distortion_jacobian[number], parts.pairs))
+    return graph
+
+
+def _tie_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
+    """x_c to y_c, and what is reported to b_c."""
+    graph = gtsam.NonlinearFactorGraph()
+    for number, jacobian in model.aligned.items():
+        edge = camera_key(number), aligned_key(number)
+        graph.add(_displaced(model, edge, jacobian, EXACT**2 * np.eye(6)))
+    for number, covariance in model.lens_errors.items():
+        edge = model.fitted_key(number), body_key(number)
+        graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), _noise(covariance)))
     return graph
 
 

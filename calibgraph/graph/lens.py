@@ -7,6 +7,11 @@
 
 A parameter of l_c is in standard deviations of its prior. The prior has heavy tails: data that are
 sure of a wrong lens leave it, and data that are not stay with it.
+
+The clock is among them: the ``offset`` of the middle row of an image to the points of its frame,
+and the ``readout`` from the first row to the last. Matches show them where the LiDAR moves: its
+twist comes with the correspondences. Constant motion straight ahead shows no offset, which is then
+a translation; at rest the columns are zero, and the parameters stay at their prior.
 """
 
 from __future__ import annotations
@@ -20,7 +25,6 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace
-from calibgraph.graph.clock import clock_sigmas, put_clock_into
 from calibgraph.graph.variables import DISTORTION, lens_key, seen_lens_key
 from calibgraph.model.clock import clock_of
 from calibgraph.model.config import LensPart
@@ -28,16 +32,18 @@ from calibgraph.model.lens import IN_DOUBT, LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from factors import (
     BlockSums,
-    FreeLens,
-    FreeLensBlock,
-    free_lens_factor,
+    Columns,
+    columns_factor,
     linear_factor,
     robust_noise,
 )
-from factors.free_lens import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL
+from factors.columns import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL, OFFSET, READOUT
 from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
 
 TANGENTIAL_SHARE = 0.1
+OFFSET_SIGMA_S, READOUT_SIGMA_S = 0.05, 0.03
+"""Of the prior, where the rig states none: half a turn of a LiDAR, and a usual read-out."""
+
 _TAIL_SIGMAS = 2.0  # where the Cauchy loss of a prior bends
 _PLAIN = 2  # radial coefficients that are set free in a rig without distortion
 _EXACT = 1e-3  # prior standard deviations: less would lose digits
@@ -54,7 +60,7 @@ class LensVariable:
     """
 
     camera: Camera
-    free: FreeLens
+    free: Columns
     values: Array
 
     @staticmethod
@@ -73,7 +79,7 @@ class LensVariable:
         """
         sigmas = _prior_sigmas(camera, default)
         chosen = {name: sigma for part in parts for name, sigma in sigmas[part].items()}
-        free = FreeLens(camera.lens, tuple(chosen), tuple(chosen.values()), clock_of(camera))
+        free = Columns(camera.lens, tuple(chosen), tuple(chosen.values()), clock_of(camera))
         return LensVariable(camera, free, np.zeros(len(chosen)))
 
     @property
@@ -87,7 +93,11 @@ class LensVariable:
 
     def put_into(self, camera: Camera, values: Array) -> Camera:
         """A camera with the lens and clock of (k,) values."""
-        camera = put_clock_into(camera, self.free.clock_at(values), self.free.parameters)
+        clock = self.free.clock_at(values)
+        times = {OFFSET: ("time_offset_s", clock.offset_s), READOUT: ("readout_s", clock.readout_s)}
+        camera = camera.model_copy(
+            update=dict(times[n] for n in self.free.parameters if n in times)
+        )
         if not self.has_free_lens:
             return camera
         packed = self.free.at(values).packed
@@ -120,7 +130,8 @@ def _prior_sigmas(camera: Camera, default: LensSigmas) -> dict[LensPart, dict[st
             for name, number in COEFFICIENT_NUMBERS[kind].items()
             if kind != PINHOLE or number < size
         },
-        **{part: {str(part): sigma} for part, sigma in clock_sigmas(camera).items()},
+        "offset": {OFFSET: camera.time_offset_sigma_s or OFFSET_SIGMA_S},
+        "readout": {READOUT: camera.readout_sigma_s or READOUT_SIGMA_S},
     }
 
 
@@ -199,7 +210,7 @@ class FreeLensByPlace:
     """
 
     placed: BlockByPlace
-    lens: FreeLens
+    lens: Columns
     key: int
 
     @property
@@ -207,23 +218,18 @@ class FreeLensByPlace:
         """(p,) the places that have correspondences, in rising order."""
         return self.placed.places
 
-    def sums(self, T_camera_cloud: Array, values: Array) -> list[BlockSums]:
-        """H, b and c of every place with correspondences, by pose and lens.
+    def sums(self, T_camera_cloud: Array, values: Array) -> BlockSums:
+        """H, b and c of every place by pose and lens, stacked.
 
         Args:
-            T_camera_cloud: (p, 4, 4) of these places.
+            T_camera_cloud: (P, 4, 4) of all places.
             values: (k,) of the lens.
         """
-        pairs = zip(self.places, T_camera_cloud, strict=True)
-        return [self._at(int(place)).sums(T, values) for place, T in pairs]
+        runs = np.column_stack([self.placed.edges[:-1], self.placed.edges[1:]])
+        return self.placed.block.summarize(T_camera_cloud, runs, self.lens, values)
 
     def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
         """The correspondences of one place, lossless, on the variables of these keys."""
-        block = self._at(place)
-        if not len(block.block):
-            return []
-        return [free_lens_factor([cloud, matched, self.key], block)]
-
-    def _at(self, place: int) -> FreeLensBlock:
-        rows = np.arange(self.placed.edges[place], self.placed.edges[place + 1])
-        return FreeLensBlock(self.placed.block.select(rows), self.lens)
+        first, end = self.placed.edges[place : place + 2].tolist()
+        block = self.placed.block.select(np.arange(first, end))
+        return [columns_factor([cloud, matched, self.key], block, self.lens)] if len(block) else []

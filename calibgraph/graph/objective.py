@@ -23,20 +23,13 @@ from factors import (
     relative_prior_factor,
 )
 
+# fmt: off
 __all__ = [  # with the factors that calibgraph re-exports
-    "block_factor",
-    "camera_prior_factor",
-    "join",
-    "objective_graph",
-    "pose_key",
-    "prior_graph",
-    "projection_factor",
-    "projection_graph",
-    "relative_pose_factor",
-    "relative_pose_graph",
+    "block_factor", "camera_prior_factor", "join", "objective_graph", "pose_key",
+    "projection_factor", "projection_graph", "relative_pose_factor", "relative_pose_graph",
     "relative_prior_factor",
-    "relative_prior_graph",
 ]
+# fmt: on
 
 
 def pose_key(cameras: Sequence[str], name: str) -> int:
@@ -49,39 +42,6 @@ def projection_graph(
 ) -> gtsam.NonlinearFactorGraph:
     """The reprojection term: one lossless block factor per camera that has correspondences."""
     return _graph(block_factor(pose_key(cameras, name), block) for name, block in blocks.items())
-
-
-def prior_graph(
-    cameras: Sequence[str], T_hat_camera_lidar: Mapping[str, Array], *, weight: float
-) -> gtsam.NonlinearFactorGraph:
-    """The per-camera priors, lambda |log(T_hat_i^-1 T_i)|^2; empty if the weight is zero."""
-    return _graph(
-        camera_prior_factor(pose_key(cameras, name), T, weight=weight)
-        for name, T in T_hat_camera_lidar.items()
-        if weight > 0
-    )
-
-
-def relative_prior_graph(
-    cameras: Sequence[str],
-    T_hat_camera_lidar: Mapping[str, Array],
-    *,
-    weight: float,
-) -> gtsam.NonlinearFactorGraph:
-    """The relative-pose priors, mu |log(T_hat_12^-1 T_2 T_1^-1)|^2, of Stage-1 estimates.
-
-    Over each camera and the next one, a spanning set; empty if the weight is zero.
-    """
-    return _graph(
-        relative_prior_factor(
-            pose_key(cameras, one),
-            pose_key(cameras, two),
-            relative_transform(T_hat_camera_lidar[two], T_hat_camera_lidar[one]),
-            weight=weight,
-        )
-        for one, two in pairwise(T_hat_camera_lidar)
-        if weight > 0
-    )
 
 
 def relative_pose_graph(
@@ -127,11 +87,15 @@ def objective_graph(
         lambda_ = mu = 0.0
     if terms in ("priors", "stage1"):
         blocks = {}
-    return join(                                           # minimize over T_1 ... T_N:
-        projection_graph(cameras, blocks),                 # sum rho(|w (u - pi(T_i, p))|^2)
-        relative_pose_graph(cameras, rig.relative_poses),  # + measured relative poses (ours)
-        prior_graph(cameras, T_hat, weight=lambda_),       # + lambda sum_i |log(T_hat_i^-1 T_i)|^2
-        relative_prior_graph(cameras, T_hat, weight=mu),   # + mu |log(T_hat_12^-1 T_2 T_1^-1)|^2
+    key = {name: pose_key(cameras, name) for name in cameras}
+    return join(                                              # minimize over T_1 ... T_N:
+        projection_graph(cameras, blocks),                    # sum rho(|w (u - pi(T_i, p))|^2)
+        relative_pose_graph(cameras, rig.relative_poses),     # + measured relative poses (ours)
+        _graph(camera_prior_factor(key[i], T, weight=lambda_)  # + lambda sum |log(T_hat^-1 T)|^2
+               for i, T in T_hat.items() if lambda_ > 0),
+        _graph(relative_prior_factor(                         # + mu |log(T_hat_12^-1 T_2 T_1^-1)|^2
+                   key[i], key[j], relative_transform(T_hat[j], T_hat[i]), weight=mu)
+               for i, j in pairwise(T_hat) if mu > 0),        # of each camera and the next
     )
 # fmt: on
 

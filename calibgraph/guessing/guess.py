@@ -1,7 +1,10 @@
-"""A rig with a guess per camera: by words, by a file, or by a search over all headings."""
+"""A rig with a guess per camera: by words, by a file, or by a search over all headings.
+
+The search is for cameras without any guess, by images and clouds.
+"""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import quote
@@ -11,17 +14,22 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, RigError
-from calibgraph.guessing.heading_search import FoundCamera, search_headings
-from calibgraph.guessing.mounting import GRAMMAR, Mounting, check_forward, parse_mounting
-from calibgraph.io.dataset import load_dataset
-from calibgraph.io.formats.describe import describe_rig
+from calibgraph.guessing.mounting import GRAMMAR, Forward, Mounting, check_forward, parse_mounting
+from calibgraph.io.dataset import Dataset, load_dataset, spread_out
 from calibgraph.io.formats.rig_import import read_rig_parts
 from calibgraph.io.rig_parts import RigParts
+from calibgraph.io.rigs import describe_rig
 from calibgraph.matching.burnt_in import hide_burnt_in
 from calibgraph.matching.same_images import require_different_images
-from calibgraph.matching.structure.matcher import MAX_SEARCH_DEG, MAX_SEARCH_M
+from calibgraph.matching.structure.acceptance import least_z_score
+from calibgraph.matching.structure.bodies import Body, lead, place
+from calibgraph.matching.structure.frame_cache import FrameCache, load_camera_frames
+from calibgraph.matching.structure.global_search import ALONE
+from calibgraph.matching.structure.matcher import MAX_SEARCH_DEG, MAX_SEARCH_M, SEARCH_FRAMES
+from calibgraph.matching.structure.pose_search import PoseSearch, SearchRange
 from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Rig
+from calibgraph.parallel import core_pool
 from calibgraph.progress import Progress, no_progress
 
 Source = Literal["words", "pair", "file", "search"]
@@ -32,6 +40,33 @@ FOUND_DEG, FOUND_M = 1.0, 0.15
 """Of cameras that the search found: they are nearer in benchmarks/notes/accuracy.md, where the
 frames of one place err together."""
 SIGMAS = 2.0  # of the guess, which the search of a calibration has to reach
+
+
+HEADINGS_DEG = tuple(range(0, 360, 30))
+RANGE = SearchRange(float(np.radians(20.0)), 1.5)
+"""About each heading: neighbours overlap."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundCamera:
+    """The best pose of a camera over all headings.
+
+    Attributes:
+        T_camera_lidar: (4, 4).
+        z_score: agreement of images and clouds there, in standard deviations of chance agreement.
+        needed: the z-score from which on that is no chance agreement.
+        seen_by: the camera that placed it, where one that was found before sees the same.
+    """
+
+    T_camera_lidar: Array
+    z_score: float
+    needed: float
+    seen_by: str | None = None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the camera was found."""
+        return self.z_score >= self.needed
 
 
 @dataclass(frozen=True)
@@ -137,7 +172,12 @@ def guess_rig(
     _require_cameras(parts, words, search)
     said = {name: mounting.T_camera_lidar(axis) for name, mounting in words.items()}
     missing = [n for n in parts.lenses if n in search or n not in {**said, **parts.T_camera_lidar}]
-    tied = _tied_cameras(parts, said, set(missing) - set(search))
+    tied = {
+        name: (to, T_camera_lidar)
+        for to, T in reversed(said.items())  # the first, if several
+        for name, T_camera_lidar in parts.tied_to({to: T}).items()
+        if name in missing and name not in search
+    }
     unknown = [name for name in missing if name not in tied]
     if unknown and data is None:
         raise RigError(
@@ -161,25 +201,17 @@ def guess_rig(
         name: CameraGuess("words", one.rotation_sigma_deg, one.translation_sigma_m, "by words")
         for name, one in words.items()
     }
-    known |= {name: _by_pair(known[to], said[to], to, T) for name, (to, T) in tied.items()}
-    known |= {name: _by_search(one) for name, one in found.items()}
+    for name, (to, T) in tied.items():  # its rotation error moves the camera at a distance
+        deg, apart_m = known[to].rotation_sigma_deg, camera_center(T) - camera_center(said[to])
+        shift_m = float(np.linalg.norm(apart_m)) * math.radians(deg)
+        metres = math.hypot(known[to].translation_sigma_m, shift_m)
+        known[name] = CameraGuess("pair", deg, metres, f"by its pose to {to}")
+    for name, one in found.items():
+        seen = f", as {one.seen_by} sees it" if one.seen_by else ""
+        text = f"found with a z-score of {one.z_score:.1f}{seen}"
+        known[name] = CameraGuess("search", FOUND_DEG, FOUND_M, text, one.z_score)
     by_file = CameraGuess("file", FILE_DEG, FILE_M, "by a file")
     return RigGuess(rig, {name: known.get(name, by_file) for name in rig.cameras})
-
-
-def _tied_cameras(
-    parts: RigParts, said: Mapping[str, Array], names: Collection[str]
-) -> dict[str, tuple[str, Array]]:
-    """The cameras that a relative pose ties to one with words, to the first if to several.
-
-    With the name of the other, and their own T_camera_lidar.
-    """
-    tied: dict[str, tuple[str, Array]] = {}
-    for to, T in said.items():
-        for name, T_camera_lidar in parts.tied_to({to: T}).items():
-            if name in names and name not in tied:
-                tied[name] = to, T_camera_lidar
-    return tied
 
 
 def _require_cameras(parts: RigParts, words: Mapping[str, Mounting], search: Sequence[str]) -> None:
@@ -206,15 +238,62 @@ def _require_found(found: Mapping[str, FoundCamera]) -> None:
         )
 
 
-def _by_pair(other: CameraGuess, T_other_lidar: Array, to: str, T: Array) -> CameraGuess:
-    """The other's sigmas, with its rotation error times the distance added to the translation."""
-    apart_m = float(np.linalg.norm(camera_center(T) - camera_center(T_other_lidar)))
-    shift_m = apart_m * math.radians(other.rotation_sigma_deg)
-    translation_m = math.hypot(other.translation_sigma_m, shift_m)
-    return CameraGuess("pair", other.rotation_sigma_deg, translation_m, f"by its pose to {to}")
+def search_headings(
+    dataset: Dataset,
+    rig: Rig,
+    cameras: Iterable[str],
+    *,
+    forward: Forward = "+x",
+    seed: int = 0,
+    progress: Progress = no_progress,
+) -> dict[str, FoundCamera]:
+    """Find cameras without a guess: only the lens is known, and that images are upright.
+
+    One after another, over headings all round, each within 20 degrees and 1.5 m per axis of a level
+    camera at the LiDAR. Those that are found place others that see the same.
+
+    Raises:
+        FileError: if an image or a cloud cannot be read.
+    """
+    names = list(cameras)
+    lenses = {name: rig.cameras[name] for name in names}
+    only = Rig(lidar=rig.lidar, cameras=lenses)
+    found: dict[str, FoundCamera] = {}
+    with core_pool() as cores:
+        chosen = spread_out(dataset.frames, SEARCH_FRAMES)
+        frames = load_camera_frames(FrameCache(), chosen, only, cores)
+        search = PoseSearch(only, frames, RANGE, seed=seed, out_of_time=lambda: False)
+        for index, name in enumerate(names):
+            body = {name: lenses[name]}
+            starts = [Mounting(float(deg)).T_camera_lidar(forward) for deg in HEADINGS_DEG]
+            seen = _place_by_others(search, body, found)
+            candidates = []
+            for number, start in enumerate([] if seen else starts):
+                done = index * len(starts) + number
+                progress(f"searching all headings: {name}", done, len(names) * len(starts))
+                candidates.append(search.with_roll(place(body, start), 0.0, effort=1))
+            if seen is None:
+                best = max(candidates, key=lambda candidate: candidate.z_score)
+                T, needed = lead(best.body).T_camera_lidar, least_z_score(len(candidates))
+                seen = FoundCamera(T, best.z_score, needed)
+            found[name] = seen
+    return found
 
 
-def _by_search(one: FoundCamera) -> CameraGuess:
-    seen = f", as {one.seen_by} sees it" if one.seen_by else ""
-    text = f"found with a z-score of {one.z_score:.1f}{seen}"
-    return CameraGuess("search", FOUND_DEG, FOUND_M, text, one.z_score)
+def _place_by_others(
+    search: PoseSearch, body: Body, found: dict[str, FoundCamera]
+) -> FoundCamera | None:
+    """The camera where one that was found sees it; None if that is not accepted."""
+    for by, other in found.items():
+        if not other.accepted:
+            continue
+        seen = search.seen_by({by: search.rig.cameras[by].moved_to(other.T_camera_lidar)}, body)
+        if seen is None:
+            continue
+        candidate = search.at(seen)
+        placed = FoundCamera(
+            lead(candidate.body).T_camera_lidar, candidate.z_score, least_z_score(ALONE), by
+        )
+        if placed.accepted:
+            return placed
+    return None

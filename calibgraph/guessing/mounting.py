@@ -1,16 +1,23 @@
-"""Mountings in words: "rear-left 60 deg right, 20 deg down, 0.4 m ahead of the LiDAR"."""
+"""Mountings and lenses in words.
+
+"rear-left 60 deg right, 20 deg down, 0.4 m ahead of the LiDAR"; "90 deg", a horizontal field of
+view, or "4 mm 3 um" of a spec sheet.
+"""
 
 import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import RigError
 from calibgraph.model.geometry import T_OPTICAL_LINK, invert, transform
+from calibgraph.model.lens import IN_DOUBT
+from calibgraph.model.rig import Camera, Intrinsics
 
 Forward = Literal["+x", "-x", "+y", "-y"]
 
@@ -101,7 +108,8 @@ def parse_mounting(text: str, camera: str) -> Mounting:
         RigError: if a word is not understood, said twice, or the heading is missing.
     """
     values: dict[str, float] = {}
-    for name, value in _read_items([*_tokens(text)], text, camera):
+    words = [match[1] for match in _TOKEN.finditer(text.lower()) if match[1] != ","]
+    for name, value in _read_items(words, text, camera):
         if name in values:
             raise _refusal(camera, text, f"gives the {name} twice")
         values[name] = value
@@ -115,18 +123,11 @@ def parse_mounting(text: str, camera: str) -> Mounting:
         tilt_deg=given["tilt"],
         roll_deg=rolled,
         place_m=(given["ahead"], given["left"], given["up"]),
-        sigmas={name: _sigma(name, given[name]) if name in said else sigma
+        sigmas={name: sigma if name not in said
+                else SAID_DEG if name in ("heading", "tilt", "roll")
+                else math.hypot(SAID_M, SAID_SHARE * given[name])
                 for name, sigma in WORD_SIGMAS.items()},
     )  # fmt: skip
-
-
-def _sigma(name: str, value: float) -> float:
-    is_angle = name in ("heading", "tilt", "roll")
-    return SAID_DEG if is_angle else math.hypot(SAID_M, SAID_SHARE * value)
-
-
-def _tokens(text: str) -> Iterator[str]:
-    yield from (match[1] for match in _TOKEN.finditer(text.lower()) if match[1] != ",")
 
 
 def _read_items(words: list[str], text: str, camera: str) -> Iterator[tuple[str, float]]:
@@ -164,3 +165,60 @@ def _read_number(value: float, words: list[str], text: str, camera: str) -> tupl
 
 def _refusal(camera: str, text: str, what: str) -> RigError:
     return RigError(f"camera {camera!r}: {text!r} {what}; understood are {GRAMMAR}", camera=camera)
+
+
+CALIBRATION = "calibration"
+LENS_GRAMMAR = (
+    f"{CALIBRATION}; a horizontal field of view, as '90 deg'; or focal length and size of a pixel, "
+    "as '4 mm 3 um'"
+)
+_NUMBER = r"(\d+(?:\.\d+)?|\.\d+)"
+_FIELD_OF_VIEW = re.compile(rf"{_NUMBER} *(?:deg|degrees|°)")
+_SPEC_SHEET = re.compile(rf"{_NUMBER} *mm[ ,]+{_NUMBER} *(?:um|µm)")
+_MOST_DEG = 150.0
+"""Of a lens without distortion; images of wider ones are curved, and need a calibration."""
+
+
+def parse_lens(text: str, camera: str, size_px: tuple[int, int]) -> dict[str, Any] | None:
+    """The lens of a camera's entry in a rig file, with how well it is known.
+
+    Args:
+        text: as of ``LENS_GRAMMAR``.
+        camera: its name, for messages.
+        size_px: width and height of the image.
+
+    Returns:
+        None of a calibration, whose numbers are to be filled in; else a lens without distortion,
+        with the principal point in the middle.
+
+    Raises:
+        RigError: if it is not understood.
+    """
+    words = text.strip().lower()
+    if words == CALIBRATION:
+        return None
+    width, height = size_px
+    if found := _FIELD_OF_VIEW.fullmatch(words):
+        degrees = float(found[1])
+        if not 0 < degrees <= _MOST_DEG:
+            raise RigError(
+                f"camera {camera!r}: a field of view of {degrees:g} deg; of one over "
+                f"{_MOST_DEG:g} deg the image is curved: calibrate the lens, and give "
+                f"{CALIBRATION}",
+                camera=camera,
+            )
+        focal_px = 0.5 * width / math.tan(math.radians(0.5 * degrees))
+    elif (found := _SPEC_SHEET.fullmatch(words)) and float(found[2]) > 0 < float(found[1]):
+        focal_px = 1000.0 * float(found[1]) / float(found[2])
+    else:
+        raise RigError(f"camera {camera!r}: lens {text!r}; expected {LENS_GRAMMAR}", camera=camera)
+    f, centre = round(focal_px, 2), (0.5 * (width - 1), 0.5 * (height - 1))
+    lens = Camera(
+        width_px=width,
+        height_px=height,
+        intrinsics_px=Intrinsics(fx=f, fy=f, cx=centre[0], cy=centre[1]),
+        T_camera_lidar=np.eye(4),
+    )
+    fields = "intrinsics_px", "distortion", "intrinsics_sigma_px", "distortion_sigma"
+    stated = IN_DOUBT.state_in(lens).model_dump(mode="json")
+    return {key: stated[key] for key in fields}

@@ -9,8 +9,7 @@ import numpy as np
 
 from calibgraph.errors import FileError
 from calibgraph.files import require_new_file, write_text
-from calibgraph.guessing.lens_words import parse_lens
-from calibgraph.guessing.mounting import check_forward, parse_mounting
+from calibgraph.guessing.mounting import check_forward, parse_lens, parse_mounting
 from calibgraph.io.bags import is_bag
 from calibgraph.io.clouds import CLOUD_SUFFIXES
 from calibgraph.io.dataset_folders import folder_layout, published_folder
@@ -59,10 +58,10 @@ def write_rig_template(
     for option, words in (("--mount", mountings), ("--lens", lenses)):
         for name in words.keys() - sources.keys():
             raise ValueError(f"{option} {name}=...: no such camera; found are {', '.join(sources)}")
-    cameras = {
-        name: _camera(name, _size(source), (mountings.get(name), lenses.get(name)), forward)
-        for name, source in sources.items()
-    }
+    cameras = {}
+    for name, source in sources.items():
+        size_px = image_size(next(iter(files_by_stem(source, IMAGE_SUFFIXES).values())))
+        cameras[name] = _camera(name, size_px, (mountings.get(name), lenses.get(name)), forward)
     head = (files("calibgraph.guessing") / "rig_head.txt").read_text(encoding="utf-8")
     own = [] if out is None else [str(out)]
     head = head.format(
@@ -100,11 +99,6 @@ def _require_plain_folder(folder: Path) -> None:
         raise FileError(
             folder, "brings its own rig, from which calibrate starts; calibgraph doctor shows it"
         )
-
-
-def _size(source: Path) -> tuple[int, int]:
-    """Width and height of a camera's first image."""
-    return image_size(next(iter(files_by_stem(source, IMAGE_SUFFIXES).values())))
 
 
 def _camera(

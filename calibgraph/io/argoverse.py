@@ -13,7 +13,6 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
-from calibgraph.io.feather import read_feather
 from calibgraph.io.frame_files import (
     FrameFiles,
     IncompleteCamera,
@@ -22,7 +21,8 @@ from calibgraph.io.frame_files import (
     files_by_stem,
 )
 from calibgraph.io.images import IMAGE_SUFFIXES
-from calibgraph.io.rotations import pose_of_quaternion
+from calibgraph.io.rig_parts import pose_of_quaternion
+from calibgraph.io.tables import read_feather
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
 
@@ -70,7 +70,6 @@ def _camera(log: Path, name: str) -> Camera:
 
 
 def _row(path: Path, name: str, columns: Sequence[str]) -> dict[str, Any]:
-    """The row of a sensor in a table."""
     column = read_feather(path)[1]
     names, table = [*map(str, column("sensor_name"))], {key: column(key) for key in columns}
     if name not in names:

@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, StrictBool
+from pydantic import AfterValidator, BaseModel, BeforeValidator, StrictBool
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, holds_truth_value, load_model, read_yaml, sha256
-from calibgraph.io.camera_match_tables import load_camera_matches
-from calibgraph.io.correspondence_tables import load_correspondences
+from calibgraph.io.tables import load_camera_matches, load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.error_sources import ErrorSources
@@ -84,8 +83,8 @@ def _require_possible(value: Any, where: str) -> None:
         )
 
 
-def _square(value: Any) -> Array:
-    """A square matrix of finite numbers as an array."""
+def _covariance(value: Any) -> Array:
+    """A covariance: a square matrix of finite numbers, symmetric, and of no negative variance."""
     try:
         found = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -94,20 +93,6 @@ def _square(value: Any) -> Array:
         raise ValueError("expected a matrix of numbers, found a truth value in it")
     if found.ndim != 2 or len({*found.shape}) != 1 or not (np.abs(found) <= _LARGEST).all():  # noqa: PLR2004
         raise ValueError(f"expected a square matrix of finite numbers, found {found.shape}")
-    return found
-
-
-def _covariance(value: Any) -> Array:
-    """The covariance of one or more poses."""
-    found = _positive(value)
-    if len(found) % _POSE:
-        raise ValueError(f"expected 6 rows for each pose, found {found.shape}")
-    return found
-
-
-def _positive(value: Any) -> Array:
-    """A covariance: symmetric, and of no negative variance."""
-    found = _square(value)
     variances = np.diag(found)
     units = np.sqrt(np.where(variances > 0, variances, 1.0))
     correlations = found / np.outer(units, units)
@@ -118,18 +103,22 @@ def _positive(value: Any) -> Array:
     return found
 
 
-def _covariance_of_one(value: Any) -> Array:
-    """A (6, 6) covariance."""
-    found = _covariance(value)
-    if len(found) != _POSE:
+def _of_poses(found: Array) -> Array:
+    if len(found) % _POSE:
+        raise ValueError(f"expected 6 rows for each pose, found {found.shape}")
+    return found
+
+
+def _of_one_pose(found: Array) -> Array:
+    if len(_of_poses(found)) != _POSE:
         raise ValueError(f"expected a 6x6 matrix, found {found.shape}")
     return found
 
 
 Matrix4 = Annotated[Any, BeforeValidator(rigid_transform)]
-Covariance = Annotated[Any, BeforeValidator(_covariance_of_one)]
-JointCovariance = Annotated[Any, BeforeValidator(_covariance)]
-LensCovariance = Annotated[Any, BeforeValidator(_positive)]
+LensCovariance = Annotated[Any, BeforeValidator(_covariance)]
+JointCovariance = Annotated[LensCovariance, AfterValidator(_of_poses)]
+Covariance = Annotated[LensCovariance, AfterValidator(_of_one_pose)]
 
 
 class _Motion(BaseModel):
@@ -193,17 +182,17 @@ def _require_consistent(
 ) -> None:
     """Check that the verdict follows from its checks, and all parts are of the same cameras."""
     verdict = content.get("verdict", {})
-    stated = {"the rig": verdict.get("status") if isinstance(verdict, dict) else verdict}
-    derived = {"the rig": found.verdict.status}
-    for name, of_camera in parts.camera_verdicts.items():
-        stated[f"camera {name!r}"] = of_camera.status
-        derived[f"camera {name!r}"] = found.camera_verdicts[name].status
-    for what, status in stated.items():
-        if status != derived[what]:
+    status = verdict.get("status") if isinstance(verdict, dict) else verdict
+    verdicts = [("the rig", status, found.verdict.status)] + [
+        (f"camera {name!r}", each.status, found.camera_verdicts[name].status)
+        for name, each in parts.camera_verdicts.items()
+    ]
+    for what, stated, derived in verdicts:
+        if stated != derived:
             raise FileError(
                 path,
-                f"has the verdict {status} of {what}, its checks give {derived[what]}: it was "
-                "edited; write it again",
+                f"has the verdict {stated} of {what}, its checks give {derived}: it was edited; "
+                "write it again",
             )
     names, joint = set(found.rig.cameras), found.joint_covariance
     right = {part: names == {*getattr(found, part)} for part in _OF_ALL_CAMERAS}
@@ -232,26 +221,17 @@ def _is_whole(sigmas: Any, camera: str) -> bool:
 
 _OF_ALL_CAMERAS = ("covariance", "camera_verdicts", "counts")
 _OF_SOME_CAMERAS = (
-    "residuals",
-    "stage1_T_camera_lidar",
-    "weaknesses",
-    "prior_share",
-    "bootstrap",
-    "error_sources",
+    "residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "bootstrap", "error_sources",
     "lens",
-)
-_PLAIN = (
-    "covariance", "joint_covariance", "pair_covariance", "stage1_T_camera_lidar", "residuals",
-    "weaknesses", "rounds", "counts", "timings_s", "terms", "prior_share", "error_sources",
-    "inputs", "versions", "date", "warnings", "lens", "moves", "places",
 )  # fmt: skip
-assert {*_PLAIN, *_OF_ALL_CAMERAS, *_OF_SOME_CAMERAS} <= {f.name for f in fields(Calibration)}
+_OTHERWISE = {"rig", "initial_rig", "config", "camera_verdicts", "lens_covariance"}
+_PLAIN = {f.name for f in fields(Calibration)} & _Parts.model_fields.keys() - _OTHERWISE
+"""The parts that are those of a calibration as they are."""
 
 
 def _table(
     result: Path, name: str, content: Mapping[str, Any], load: Callable[[Path], Table]
 ) -> Table | None:
-    """A table of the result, if there is one."""
     path = result.with_name(name)
     if not path.is_file():
         return None

@@ -1,39 +1,39 @@
-"""Datasets: frames of one rig, from folders and ROS bags.
-
-Images and clouds are decoded when they are loaded.
-"""
+"""Datasets: frames of one rig, from folders and ROS bags, decoded when loaded; or from arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import uuid
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from shlex import quote
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import cv2
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bag_frames import FoundFrames, frames_of_bag
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.messages import CLOUDS, Bag
-from calibgraph.io.bags.options import NEAR_S
 from calibgraph.io.bags.rig import doubtful_axes
-from calibgraph.io.bags.storage import REPAIR_ROS2
-from calibgraph.io.clouds import read_cloud_notes
-from calibgraph.io.dataset_folders import (
-    FolderFrames,
-    folder_layout,
-    frames_of_folder,
-    published_folder,
+from calibgraph.io.bags.storage import NEAR_S, REPAIR_ROS2
+from calibgraph.io.clouds import (
+    RawCloud,
+    check_points,
+    cloud_of_array,
+    describe_cloud,
+    with_intensity,
 )
-from calibgraph.io.formats.describe import describe_rig
-from calibgraph.io.frame import Frame, twist_by_scans
+from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, published_folder
+from calibgraph.io.frame import Frame, Kept, twist_by_scans
 from calibgraph.io.frame_files import RigRead, way_out
-from calibgraph.io.rigs import read_rig
+from calibgraph.io.rigs import describe_rig, read_rig
 from calibgraph.memory import available_bytes
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import Camera, Rig
+from calibgraph.parallel import KeyedCache
 
 Item = TypeVar("Item")
 _BYTES_PER_PIXEL = 24  # of an image: BGR, gray, gradients and depths of a frame
@@ -81,7 +81,11 @@ class Dataset:
             frames: ``start:stop:step`` as in Python, or positions separated by commas.
         """
         try:
-            kept = [self.frames[i] for i in _indices(frames, len(self.frames))]
+            if ":" in frames:
+                ends = (int(part) if part.strip() else None for part in frames.split(":"))
+                kept = self.frames[slice(*ends)]
+            else:
+                kept = tuple(self.frames[int(part)] for part in frames.split(","))
         except (ValueError, IndexError, TypeError) as error:
             raise ValueError(
                 f"frames {frames!r}: expected start:stop:step or positions separated by commas, "
@@ -142,32 +146,18 @@ def load_dataset(
         prefix = f"{path.name}/" if len(data.folders) > 1 else ""
         start = 1 + max((frame.index for frame in recorded), default=-1)
         found = (
-            frames_of_bag(path, data.rig.cameras, bag, start=start, prefix=prefix)
-            if is_bag(path)
-            else _frames_of_files(
-                path,
-                frames_of_folder(
-                    path,
-                    list(data.rig.cameras),
-                    complete=frames is None,
-                    sync_tolerance_s=bag.sync_tolerance_s,
-                ),
-                data.rig,
-                start=start,
-                prefix=prefix,
-                interval_s=interval_s,
-            )
-        )
+            frames_of_bag(path, data.rig.cameras, bag, start=start, prefix=prefix) if is_bag(path)
+            else _frames_of_files(path, data.rig, start, prefix, complete=frames is None,
+                                  tolerance_s=bag.sync_tolerance_s, interval_s=interval_s)
+        )  # fmt: skip
         chosen += found.chosen
         recorded += found.recorded
         notes += found.notes
     others = () if recorded == chosen else tuple(recorded)
     data = replace(data, frames=tuple(chosen), recorded=others, notes=tuple(notes))
     data = data if frames is None else _complete(data.select(frames))
-    of_clouds = (
-        note for each in data.frames[:1] for note in read_cloud_notes(each.cloud_path, each.columns)
-    )
-    return replace(data, notes=(*of_clouds, *data.notes))
+    of_cloud = data.frames[0].describe_cloud() if data.frames else ()
+    return replace(data, notes=(*of_cloud, *data.notes))
 
 
 def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -> Dataset:
@@ -195,25 +185,15 @@ def _require_memory(path: Path, rig: Rig) -> None:
 
 
 def _frames_of_files(
-    path: Path,
-    found: FolderFrames,
-    rig: Rig,
-    *,
-    start: int,
-    prefix: str,
-    interval_s: float | None,
-) -> FoundFrames:
+    path: Path, rig: Rig, start: int, prefix: str, *,
+    complete: bool, tolerance_s: float, interval_s: float | None,
+) -> FoundFrames:  # fmt: skip
     """The frames of a folder; the complete ones where names are stamps."""
+    found = frames_of_folder(path, [*rig.cameras], complete=complete, sync_tolerance_s=tolerance_s)
     frames = tuple(
-        Frame(
-            start + number,
-            prefix + files.stem,
-            files.cloud,
-            files.images,
-            columns=rig.cloud_columns,
-        )
-        for number, files in enumerate(found.files)
-        if not found.pairing or rig.cameras.keys() <= files.images.keys()
+        Frame(start + n, prefix + each.stem, each.cloud, each.images, columns=rig.cloud_columns)
+        for n, each in enumerate(found.files)
+        if not found.pairing or rig.cameras.keys() <= each.images.keys()
     )
     frames = frames if interval_s is None else _driven(frames, interval_s)
     published = published_folder(path)
@@ -261,14 +241,6 @@ def spread_out(items: Sequence[Item], most: int) -> list[Item]:
     return [items[place] for place in places]
 
 
-def _indices(text: str, count: int) -> list[int]:
-    """The positions that ``start:stop:step`` or a list separated by commas selects of ``count``."""
-    if ":" not in text:
-        return [range(count)[int(part)] for part in text.split(",")]
-    parts = [int(part) if part.strip() else None for part in text.split(":")]
-    return list(range(count))[slice(*parts)]
-
-
 def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
     if not paths:
         raise ValueError("no dataset folder given")
@@ -310,3 +282,123 @@ def _require_same_lenses(first: Path, rig: Rig, path: Path, other: Rig) -> None:
             f"{path}: its cameras differ from those of {first} (names, sizes, intrinsics or image "
             "times); calibrate different rigs apart"
         )
+
+
+MAX_BYTES = 300_000_000
+"""Of all that is kept of a dataset: 300 gray images of a megapixel."""
+
+
+def keep_frames(data: Dataset) -> Dataset:
+    """The dataset with frames whose files are decoded once.
+
+    Only the frames themselves, not the others that were recorded.
+    """
+    if any(frame.kept for frame in data.frames):
+        return data
+    kept = Kept(KeyedCache(MAX_BYTES), KeyedCache())
+    return replace(data, frames=tuple(replace(frame, kept=kept) for frame in data.frames))
+
+
+_COLOURS = (3, 4)  # channels
+
+
+def dataset_from_arrays(
+    rig: Rig,
+    clouds: Sequence[ArrayLike],
+    images: Mapping[str, Sequence[ArrayLike]],
+    *,
+    twists_per_s: ArrayLike | None = None,
+) -> Dataset:
+    """A dataset of arrays, to be calibrated without files. Images are not copied if they fit.
+
+    Args:
+        rig: lenses and the guess.
+        clouds: per frame (n, 3) x y z or (n, 4) x y z intensity [m] in the LiDAR frame, or an array
+            with such named fields; finite but for rows of NaN or zeros without a return.
+        images: per camera and frame, (height, width, 3) BGR or (height, width) gray, uint8.
+        twists_per_s: per frame, (6,) rotation [rad/s] and translation [m/s] of the LiDAR along its
+            axes, if it moves and a time offset or read-out is to be estimated or known.
+
+    Raises:
+        DatasetError: if cameras, frames, shapes or values do not fit together.
+    """
+    if not isinstance(images, Mapping) or images.keys() != rig.cameras.keys():
+        given = ", ".join(map(str, images)) if isinstance(images, Mapping) else "no camera by name"
+        raise DatasetError(
+            f"images are of {given or 'no camera'}, the rig has {', '.join(rig.cameras)}"
+        )
+    count = _count(clouds, "clouds")
+    for name, of_camera in images.items():
+        if (others := _count(of_camera, f"images[{name!r}]")) != count:
+            raise DatasetError(
+                f"{count} clouds, but {others} images of {name}; give one each per frame",
+                camera=name,
+            )
+    if not count:
+        raise DatasetError("no frame given")
+    twists = None if twists_per_s is None else np.array(twists_per_s, dtype=np.float64)
+    if twists is not None and not (twists.shape == (count, 6) and np.isfinite(twists).all()):
+        raise DatasetError(f"twists_per_s: expected ({count}, 6) finite numbers, one row a frame")
+    root = Path("arrays") / uuid.uuid4().hex[:8]  # caches tell frames apart by their paths
+    frames = []
+    for number in range(count):
+        name = f"{number:06d}"
+        cloud, paths = root / "lidar" / name, {camera: root / camera / name for camera in images}
+        points = with_intensity(_cloud(clouds[number], number).points)
+        arrays: dict[Path, NDArray[Any]] = {cloud: points} | {
+            paths[camera]: _image(images[camera][number], lens, camera, number)
+            for camera, lens in rig.cameras.items()
+        }
+        twist = None if twists is None else twists[number]
+        frames.append(Frame(number, name, cloud, paths, twist=twist, arrays=arrays))
+    return Dataset(
+        rig=rig,
+        frames=tuple(frames),
+        folders=(root,),
+        notes=tuple(describe_cloud("clouds[0]", _cloud(clouds[0], 0))),
+    )
+
+
+def _count(values: Sequence[ArrayLike], name: str) -> int:
+    """The number of frames in a list of arrays."""
+    if isinstance(values, np.ndarray) and values.ndim == 2:  # noqa: PLR2004
+        found = f"one array of shape {values.shape}"
+    elif hasattr(values, "__len__") and hasattr(values, "__getitem__"):
+        return len(values)
+    else:
+        found = f"of type {type(values).__name__}"
+    raise DatasetError(f"{name} is {found}, expected a list with an array per frame")
+
+
+def _cloud(cloud: ArrayLike, number: int) -> RawCloud:
+    name = f"clouds[{number}]"
+    try:
+        found = cloud_of_array(_array(cloud, name), name)
+        return found._replace(points=check_points(found.points, name))
+    except FileError as error:
+        raise DatasetError(str(error), frame=number) from None
+
+
+def _array(values: ArrayLike, name: str) -> NDArray[Any]:
+    try:
+        return np.asarray(values)
+    except (ValueError, TypeError) as error:
+        raise DatasetError(f"{name}: {error}; give an array") from None
+
+
+def _image(image: ArrayLike, camera: Camera, name: str, number: int) -> NDArray[np.uint8]:
+    where = f"images[{name!r}][{number}]"
+    pixels = _array(image, where)
+    gray = pixels.ndim == 2  # noqa: PLR2004
+    shape = (camera.height_px, camera.width_px)
+    known = gray or (pixels.ndim == len(_COLOURS) + 1 and pixels.shape[2] in _COLOURS)
+    if pixels.dtype != np.uint8 or not known or pixels.shape[:2] != shape:
+        raise DatasetError(
+            f"{where} has shape {pixels.shape} of {pixels.dtype}, expected {(*shape, 3)} or "
+            f"{shape} of uint8, as the rig gives its size",
+            camera=name,
+            frame=number,
+        )
+    return np.asarray(
+        cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR) if gray else pixels[:, :, :3], np.uint8
+    )

@@ -15,7 +15,6 @@ import numpy as np
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io import kitti
 from calibgraph.io.argoverse import argoverse
-from calibgraph.io.bags.options import NEAR_S
 from calibgraph.io.bags.stamps import (
     TopicStamps,
     after_ns,
@@ -24,6 +23,7 @@ from calibgraph.io.bags.stamps import (
     nearest,
     offsets_of,
 )
+from calibgraph.io.bags.storage import NEAR_S
 from calibgraph.io.clouds import CLOUD_SUFFIXES
 from calibgraph.io.frame_files import (
     FrameFiles,
@@ -133,11 +133,7 @@ def _stamps(files: Mapping[str, Path]) -> TopicStamps | None:
 
 
 def _paired_by_stamps(
-    folder: Path,
-    clouds: TopicStamps,
-    images: Mapping[str, TopicStamps],
-    *,
-    sync_tolerance_s: float,
+    folder: Path, clouds: TopicStamps, images: Mapping[str, TopicStamps], *, sync_tolerance_s: float
 ) -> FolderFrames:
     """Each cloud with the image of every camera that is nearest by its name, as in a bag."""
     frames = [FrameFiles(path.stem, path, {}) for path in clouds.paths]
@@ -183,7 +179,6 @@ def describe_pairing(folder: Path) -> str:
 
 
 def _image_folder(folder: Path, layout: FolderLayout, camera: str) -> Path:
-    """The folder of a camera's images."""
     if camera not in layout.images:
         for path in (folder / "cameras").glob(f"{glob.escape(camera)}.*"):
             if remedy := way_out(path):

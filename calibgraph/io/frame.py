@@ -1,33 +1,95 @@
-"""A frame: one cloud and the images taken with it; the cloud as recorded, or without motion."""
+"""A frame: one cloud and the images taken with it; and how the LiDAR moves meanwhile."""
+
+from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.errors import DatasetError
+from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.files import sha256
-from calibgraph.io.bags import MESSAGE_SUFFIX, hash_message
-from calibgraph.io.burnt_in import BurntIn
-from calibgraph.io.clouds import load_cloud, thin_cloud
-from calibgraph.io.frame_files import stamp_ns_in_name
-from calibgraph.io.images import load_image
-from calibgraph.io.motion import (
-    PreparedScan,
-    ScanMotion,
-    prepare_scan,
-    register,
-    twist_between,
+from calibgraph.io.bags import MESSAGE_SUFFIX, hash_message, load_bag_cloud, load_bag_image
+from calibgraph.io.bags.messages import read_message
+from calibgraph.io.clouds import (
+    RawCloud,
+    describe_cloud,
+    load_cloud,
+    read_returns,
+    thin_cloud,
+    with_intensity,
 )
+from calibgraph.io.frame_files import stamp_ns_in_name
+from calibgraph.io.images import BurntIn, load_image, require_size
+from calibgraph.memory import mmap_copy
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
+from calibgraph.parallel import KeyedCache
+from factors import displace
+
+_COARSE_M, _FINE_M = 1.0, 0.25
+_REACHES_M = 4.0, 1.0  # of both registrations: 40 m/s in 0.1 s
+PreparedScan = tuple[tuple[Any, Any], tuple[Any, Any]]
+"""A thinned cloud of small_gicp and its tree, coarse and fine."""
+
+
+@dataclass(frozen=True)
+class ScanMotion:
+    """How the LiDAR moves during a scan, and the instant for which its points are wanted.
+
+    Attributes:
+        twist_per_s: rotation [rad/s] and translation [m/s] along the LiDAR's axes.
+        to_s: the instant, in seconds after the stamp of the scan.
+        T_world_lidar: (4, 4) at the stamp, if poses of the drive are given; not kept in results.
+    """
+
+    twist_per_s: tuple[float, ...]
+    to_s: float
+    T_world_lidar: Array | None = field(default=None, compare=False, repr=False)
+
+    def correct(self, points_m: NDArray[np.floating], times_s: Array) -> Array:
+        """(n, 3) where points, taken at times [s] after the stamp, would be seen at the instant."""
+        points = points_m.astype(np.float64)
+        return displace(points, np.array(self.twist_per_s), times_s - self.to_s)
+
+
+def twist_between(T_world_before: Array, T_world_after: Array, seconds: float) -> Array:
+    """(6,) rotation [rad/s] and translation [m/s] per second, from two (4, 4) poses."""
+    step = gtsam.Pose3(invert(T_world_before) @ T_world_after)
+    return np.asarray(gtsam.Pose3.Logmap(step) / seconds, dtype=np.float64)
+
+
+def prepare_scan(points_m: Array) -> PreparedScan:
+    """Thin a scan, (n, 3), for :func:`register`; this takes longer than the registration."""
+    import small_gicp
+
+    coarse, fine = (small_gicp.preprocess_points(points_m, size) for size in (_COARSE_M, _FINE_M))
+    return coarse, fine
+
+
+def register(target: PreparedScan, source: PreparedScan, where: Path) -> Array:
+    """(4, 4) T_target_source of two scans, coarse and then fine."""
+    import small_gicp
+
+    T = np.eye(4)
+    for (cloud, tree), (moved, _), reach_m in zip(target, source, _REACHES_M, strict=True):
+        found = small_gicp.align(cloud, moved, tree, T, max_correspondence_distance=reach_m)
+        T = np.asarray(found.T_target_source)
+    if not found.converged:
+        raise DatasetError(
+            f"{where}: its scan and a neighbouring one do not fit, so that the motion is "
+            "unknown; take neighbouring clouds of one drive, or leave --interval-s or --motion out"
+        )
+    return T
+
 
 _MOST_M_S = 100.0  # of a vehicle
 _MOTION = "motion"
@@ -35,16 +97,15 @@ _MOTION = "motion"
 _COLUMNS = "cloud_columns"
 
 
-class Sized(Protocol):
-    """A value that knows its size in memory."""
-
-    @property
-    def nbytes(self) -> int:
-        """Size in memory."""
-        ...
+Derived = TypeVar("Derived")
+Number = TypeVar("Number", np.float32, np.uint8)
 
 
-Derived = TypeVar("Derived", bound=Sized)
+class Kept(NamedTuple):
+    """What frames of a dataset keep, unless others came since, by their number; and in common."""
+
+    values: KeyedCache[tuple[int, Hashable], Any]
+    common: KeyedCache[Hashable, Any]
 
 
 @dataclass(frozen=True)
@@ -62,6 +123,7 @@ class Frame:
         burnt_in: per camera, what its images are filled at when they are loaded.
         columns: names of those of a .bin cloud, if the rig states them.
         arrays: the cloud and images by their paths, which are names, if they are in memory.
+        kept: gray images, the cloud and what derives of them, which may then not be written to.
 
     The motion and the twist are computed when they are needed, by functions that keep what they
     found.
@@ -79,6 +141,7 @@ class Frame:
     arrays: Mapping[Path, NDArray[Any]] = field(
         default_factory=dict, kw_only=True, compare=False, repr=False
     )
+    kept: Kept | None = field(default=None, kw_only=True, compare=False, repr=False)
 
     @property
     def motion(self) -> ScanMotion | None:
@@ -110,35 +173,70 @@ class Frame:
         """(4, 4) of the LiDAR in a frame fixed to the ground; None if no poses are given."""
         return None if self.motion is None else self.motion.T_world_lidar
 
-    def with_burnt_in(self, found: Mapping[str, BurntIn]) -> "Frame":
+    def with_burnt_in(self, found: Mapping[str, BurntIn]) -> Frame:
         """The frame whose images are filled where something is burnt in; it is not kept."""
-        own = {each.name: getattr(self, each.name) for each in fields(Frame)}
-        return Frame(**{**own, "burnt_in": found})
+        return replace(self, burnt_in=found, kept=None)
 
     def load_cloud(self) -> NDArray[np.float32]:
         """(n, 4) x y z [m], intensity; see :func:`calibgraph.io.clouds.load_cloud`; thinned."""
-        if self.cloud_path in self.arrays:
-            return thin_cloud(self.arrays[self.cloud_path])
-        return thin_cloud(load_cloud(self.cloud_path, self.motion, self.columns))
+        return self._keep("cloud", self._load_cloud)
+
+    def _load_cloud(self) -> NDArray[np.float32]:
+        path, motion = self.cloud_path, self.motion
+        if path.suffix == MESSAGE_SUFFIX:
+            found = with_intensity(load_bag_cloud(path, motion.correct if motion else None))
+        else:
+            found = self.arrays[path] if path in self.arrays else load_cloud(path, self.columns)
+        return thin_cloud(found)
+
+    def describe_cloud(self) -> list[str]:
+        """Notes about its cloud; none if it cannot be read, which is named where it is loaded."""
+        path = self.cloud_path
+        try:
+            if path.suffix == MESSAGE_SUFFIX:
+                fields = tuple(each.name for each in read_message(path)[1].fields)
+                cloud = RawCloud(load_bag_cloud(path), fields)
+            else:
+                cloud = read_returns(path, self.columns)
+        except (CalibrationError, OSError):
+            return []
+        return list(describe_cloud(str(path), cloud))
 
     def load_image(self, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width, 3) image, BGR; see :func:`calibgraph.io.images.load_image`."""
         path, burnt_in = self.image_paths[name], self.burnt_in.get(name)
-        image = self.arrays[path] if path in self.arrays else load_image(path, camera)
+        if path.suffix == MESSAGE_SUFFIX:
+            image = load_bag_image(path)
+            require_size(path, image.shape[1::-1], camera)
+        else:
+            image = self.arrays[path] if path in self.arrays else load_image(path, camera)
         return image if burnt_in is None else burnt_in.fill(image)
 
     def load_gray(self, name: str, camera: Camera) -> NDArray[np.uint8]:
         """(height, width) the same image, gray."""
-        gray = cv2.cvtColor(self.load_image(name, camera), cv2.COLOR_BGR2GRAY)
-        return np.asarray(gray, dtype=np.uint8)
 
-    def derive(self, key: Hashable, make: Callable[[], Derived]) -> Derived:  # noqa: ARG002
-        """A value that follows from its files and the key; see ``KeptFrame``."""
-        return make()
+        def load() -> NDArray[np.uint8]:
+            gray = cv2.cvtColor(self.load_image(name, camera), cv2.COLOR_BGR2GRAY)
+            return np.asarray(gray, dtype=np.uint8)
+
+        return self._keep(("gray", name), load)
+
+    def _keep(self, key: Hashable, load: Callable[[], NDArray[Number]]) -> NDArray[Number]:
+        return load() if self.kept is None else self.derive(key, lambda: mmap_copy(load()))
+
+    def derive(self, key: Hashable, make: Callable[[], Derived]) -> Derived:
+        """What follows from its files and the key; made once if frames are kept."""
+        found: Derived = self.kept.values.get((self.index, key), make) if self.kept else make()
+        return found
+
+    def derive_for_all(self, key: Hashable, make: Callable[[], Derived]) -> Derived:
+        """What kept frames of a dataset have in common, made once. It bounds its own memory."""
+        found: Derived = self.kept.common.get(key, make) if self.kept else make()
+        return found
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 of the cloud and the images, by path; computed once."""
-        return self._hashes
+        return self.derive_for_all(("hashes", self.index), lambda: self._hashes)
 
     @cached_property
     def _hashes(self) -> dict[str, str]:
@@ -159,7 +257,9 @@ class Frame:
         motion = self.motion
         if self.find_twist is not None:
             motion = ScanMotion(tuple(np.asarray(self.twist_per_s).tolist()), 0.0)
-        return files if motion is None else {**files, _MOTION: motion.entry()}
+        if motion is not None:
+            files[_MOTION] = {"twist_per_s": list(motion.twist_per_s), "to_s": motion.to_s}
+        return files
 
 
 class ScanSteps:
@@ -169,11 +269,7 @@ class ScanSteps:
         self._scans, self._steps = dict[Path, PreparedScan](), dict[tuple[Path, Path], Array]()
 
     def between(self, frame: Frame, other: Frame) -> Array:
-        """(4, 4) T_frame_other.
-
-        Raises:
-            DatasetError: if the scans do not fit.
-        """
+        """(4, 4) T_frame_other."""
         one, two = frame.cloud_path, other.cloud_path
         if (two, one) in self._steps:
             return invert(self._steps[two, one])
@@ -189,20 +285,11 @@ class ScanSteps:
 
 
 def twist_by_scans(
-    frame: Frame,
-    beside: Sequence[tuple[Frame, float]],
-    steps: ScanSteps | None = None,
+    frame: Frame, beside: Sequence[tuple[Frame, float]], steps: ScanSteps | None = None
 ) -> Array:
     """(6,) mean twist between a frame's scan and those before and after, by registration.
 
-    Args:
-        frame: whose twist is wanted.
-        beside: the frames before and after in the recording, or one of them, and by how much later
-            they are [s].
-        steps: those that are known; none.
-
-    Raises:
-        DatasetError: if there is none, scans do not fit, or the speed is beyond that of a vehicle.
+    They are given with how much later they are [s]. Known steps are not computed again.
     """
     if not beside:
         raise DatasetError(
@@ -235,7 +322,7 @@ def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
     motion, columns = entry.get(_MOTION), entry.get(_COLUMNS)
     if motion is None:
         return Frame(*files, columns=columns)
-    found = ScanMotion.of_entry(motion)
+    found = ScanMotion(tuple(motion["twist_per_s"]), motion["to_s"])
     return Frame(*files, find_motion=lambda: found, columns=columns)
 
 

@@ -64,6 +64,7 @@ def kitti_drive(drive: Path) -> PublishedFolder | None:
         cameras, lidar = (_of_date(drive, file) for file in _RAW)
         image, number = _first_image(images[name]), name.removeprefix("image_")
         T = transform(lidar.array("R", 3, 3), lidar.array("T", 3))
+        rectified = transform(cameras.array("R_rect_00", 3, 3), np.zeros(3)) @ T
         for line in (f"P_rect_{number}", f"S_rect_{number}"):
             if line not in cameras:
                 raise IncompleteCamera(cameras.path, f"line {line!r} is missing")
@@ -74,7 +75,7 @@ def kitti_drive(drive: Path) -> PublishedFolder | None:
                 f"images are {size[0]}x{size[1]} px, and in {cameras.path.name} S_rect_{number} "
                 f"{width}x{height}; take the rectified drive (_sync)",
             )
-        return _camera(cameras, f"P_rect_{number}", _rectified(cameras, "R_rect_00", T), image)
+        return _camera(cameras, f"P_rect_{number}", rectified, image)
 
     return _folder(drive, clouds, images, read)
 
@@ -90,9 +91,10 @@ def kitti_object(folder: Path) -> PublishedFolder | None:
         stem = _commonest(folder)[0]
         lines = NumberLines(folder / _OBJECT / f"{stem}.txt")
         T = np.vstack([lines.array("Tr_velo_to_cam", 3, 4), [0.0, 0.0, 0.0, 1.0]])
+        rectified = transform(lines.array("R0_rect", 3, 3), np.zeros(3)) @ T
         found = [images[name] / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES]
         image = next((path for path in found if path.is_file()), found[0])
-        return _camera(lines, f"P{name[-1]}", _rectified(lines, "R0_rect", T), image)
+        return _camera(lines, f"P{name[-1]}", rectified, image)
 
     def note() -> str:
         count, kept = len([*(folder / CLOUD_FOLDER).glob("*.bin")]), len(_commonest(folder))
@@ -150,13 +152,6 @@ def _of_date(drive: Path, name: str) -> "NumberLines":
         path = drive.parent / name
         raise FileError(path, "no such file; put the calibration of the drive's date there")
     return NumberLines(found[0])
-
-
-def _rectified(lines: "NumberLines", key: str, T_camera0_lidar: Array) -> Array:
-    rectify = np.eye(4)
-    rectify[:3, :3] = lines.array(key, 3, 3)
-    T: Array = rectify @ T_camera0_lidar
-    return T
 
 
 def _camera(lines: "NumberLines", key: str, T_rectified_lidar: Array, image: Path) -> Camera:

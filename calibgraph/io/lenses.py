@@ -12,8 +12,7 @@ from calibgraph.errors import FileError
 from calibgraph.files import checked_model
 from calibgraph.model.rig import KNOWN_LENSES, Intrinsics, find_lens_model, plain_key
 from factors import LensModel
-from factors.lens import COEFFICIENTS, ORDERS
-from factors.wide_lenses import check_mirror
+from factors.lens import COEFFICIENTS, ORDERS, check_mirror
 
 _ROUNDED = 1e-6  # of numbers that are 0 or 1: what writing and reading them may add
 _NO_SKEW = 1e-4
@@ -112,11 +111,7 @@ def _model_name(key: str, value: Any) -> str:
 
 
 def unified_coefficients(xi: float, values: Sequence[float], path: Path | str) -> tuple[float, ...]:
-    """The coefficients here of the unified model: xi, and k1, k2, p1, p2 of others, or none.
-
-    Raises:
-        FileError: if there is another number of coefficients, or xi is out of range.
-    """
+    """The coefficients here of the unified model: xi, and k1, k2, p1, p2 of others, or none."""
     try:
         check_mirror(xi)
     except ValueError as error:
@@ -133,11 +128,7 @@ def unified_coefficients(xi: float, values: Sequence[float], path: Path | str) -
 def fitted_coefficients(
     values: Sequence[float], model: LensModel, path: Path | str
 ) -> tuple[float, ...]:
-    """Distortion coefficients in a number that the model has: zeros at the end come and go.
-
-    Raises:
-        FileError: if there are more coefficients than the model has.
-    """
+    """Distortion coefficients in a number that the model has: zeros at the end come and go."""
     kept = tuple(float(value) for value in np.trim_zeros(np.array(values, dtype=float), "b"))
     if model == "pinhole" and not kept:
         return ()
@@ -166,11 +157,7 @@ def listed_coefficients(
 
 
 def intrinsics_of_matrix(K: ArrayLike, where: Path | str) -> Intrinsics:
-    """The focal lengths and the principal point of a (3, 3) camera matrix [px].
-
-    Raises:
-        FileError: if it is no such matrix: zeros, skew, another scale, transposed.
-    """
+    """The focal lengths and the principal point of a (3, 3) camera matrix [px]."""
     found = np.array(K, dtype=np.float64)
     if found.shape != (3, 3):
         raise FileError(where, f"has the shape {found.shape}, expected a 3x3 camera matrix")
@@ -192,18 +179,13 @@ def intrinsics_of_matrix(K: ArrayLike, where: Path | str) -> Intrinsics:
 
 
 def listed_intrinsics(values: Sequence[float], where: Path | str) -> Intrinsics:
-    """Those that a file lists as fx, fy, cx, cy [px].
-
-    Raises:
-        FileError: if there are not four, or a focal length is not positive.
-    """
+    """Those that a file lists as fx, fy, cx, cy [px]."""
     if len(values) != len(Intrinsics.model_fields):
         raise FileError(where, f"has {len(values)} numbers, expected fx, fy, cx, cy")
     return checked_model(Intrinsics, dict(zip(Intrinsics.model_fields, values, strict=True)), where)
 
 
 def _remedy(K: NDArray[np.float64]) -> str:
-    """How to mend a camera matrix of another form."""
     if abs(K[0, 1]) > _NO_SKEW * K[0, 0] and not K[1:, 0].any():
         return (
             f"its skew is {K[0, 1]:.6g} px, and lenses here have none: calibrate the lens without "

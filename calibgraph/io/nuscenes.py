@@ -19,14 +19,9 @@ from pydantic import BaseModel
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model, read_text
-from calibgraph.io.frame_files import (
-    FrameFiles,
-    IncompleteCamera,
-    PublishedFolder,
-    describe_motion,
-)
+from calibgraph.io.frame_files import FrameFiles, IncompleteCamera, PublishedFolder, describe_motion
 from calibgraph.io.lenses import intrinsics_of_matrix
-from calibgraph.io.rotations import pose_of_quaternion
+from calibgraph.io.rig_parts import pose_of_quaternion
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera, Finite
 
@@ -202,11 +197,7 @@ def _motion(path: Path) -> str:
 
 
 def _find_tables(path: Path) -> tuple[Path, str | None] | None:
-    """The folder of the tables, and the scene if the path names one; None if there are no tables.
-
-    Raises:
-        FileError: if there are several versions.
-    """
+    """The folder of the tables, and the scene if the path names one; None if there are none."""
     folder, scene = (path, None) if path.exists() else (path.parent, path.name)
     if (folder / "sample_data.json").is_file():
         return folder, scene
@@ -218,7 +209,6 @@ def _find_tables(path: Path) -> tuple[Path, str | None] | None:
 
 
 def _read_tables(path: Path) -> _Tables:
-    """The samples of a nuScenes folder or scene."""
     folder, scene = _find_tables(path) or (path, None)
     whole = _read_all(folder, (folder / "sample_data.json").stat().st_mtime_ns)
     if scene is None:
@@ -277,7 +267,6 @@ def _by_token(
 
 
 def _read_list(path: Path) -> list[dict[str, Any]]:
-    """The objects of a JSON list."""
     try:
         content = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:

@@ -1,21 +1,128 @@
-"""What files or a bag hold about a rig: lenses, extrinsics, frames; and the rig of it."""
+"""What files or a bag hold about a rig: lenses, extrinsics, trees of frames; and the rig of it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
-from typing import Any
+from typing import Any, NamedTuple
+
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, RigError
 from calibgraph.files import checked_model
-from calibgraph.io.frame_tree import Link
 from calibgraph.io.lenses import CameraLens
-from calibgraph.model.geometry import invert
-from calibgraph.model.rig import Mount, Rig
+from calibgraph.model.geometry import invert, transform
+from calibgraph.model.rig import ROUNDING, Mount, Rig
+
+_TURN_RAD = 2 * math.pi + ROUNDING
+
+
+def quaternion_xyzw(T: Array) -> list[float]:
+    """[x, y, z, w] of the rotation of a (4, 4), w not negative."""
+    found = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)
+    return [float(value) for value in found]
+
+
+def roll_pitch_yaw(T: Array) -> list[float]:
+    """[roll, pitch, yaw] [rad] about fixed x, y, z: R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF."""
+    return [float(value) for value in gtsam.Rot3(T[:3, :3]).rpy()]
+
+
+def pose_of_quaternion(xyz_m: Sequence[float], xyzw: Sequence[float]) -> Array:
+    """(4, 4) of a translation and a quaternion of length 1, up to rounded digits."""
+    length = math.hypot(*xyzw)
+    if not abs(length - 1.0) <= ROUNDING:
+        raise ValueError(f"quaternion {list(xyzw)} has length {length:.3g}, expected 1")
+    return transform(Rotation.from_quat(xyzw).as_matrix(), xyz_m)
+
+
+def pose_of_angles(xyz_m: Sequence[float], rpy_rad: Sequence[float]) -> Array:
+    """(4, 4) of a translation and roll, pitch, yaw about fixed axes.
+
+    Raises:
+        ValueError: if an angle is beyond a turn: of degrees, most are.
+    """
+    roll, pitch, yaw = rpy_rad
+    if max(map(abs, rpy_rad)) > _TURN_RAD:
+        raise ValueError(
+            f"roll, pitch, yaw are {roll:g}, {pitch:g}, {yaw:g} rad, beyond 2 pi: are they in "
+            "degrees? give radians, 90 deg is 1.5708"
+        )
+    return transform(gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix(), xyz_m)
+
+
+class Link(NamedTuple):
+    """The (4, 4) pose of a child frame in its parent; a note if it can move, or on its source."""
+
+    parent: str
+    child: str
+    T_parent_child: Array
+    note: str = ""
+
+
+Links = Mapping[str, Link]
+"""By child frame."""
+
+
+def ancestors(links: Links, frame: str) -> dict[str, Array]:
+    """(4, 4) T_ancestor_frame of the frame itself and all above it, nearest first."""
+    found, T, above = {frame: np.eye(4)}, np.eye(4), frame
+    while above in links and links[above].parent not in found:
+        T = links[above].T_parent_child @ T
+        above = links[above].parent
+        found[above] = T
+    return found
+
+
+def T_between(links: Links, target: str, source: str) -> Array | None:
+    """(4, 4) T_target_source through the frame that both hang from; None if there is none."""
+    above_target, above_source = ancestors(links, target), ancestors(links, source)
+    for frame, T_frame_target in above_target.items():
+        if frame in above_source:
+            T_target_source: Array = invert(T_frame_target) @ above_source[frame]
+            return T_target_source
+    return None
+
+
+def links_between(links: Links, frame: str, other: str) -> list[Link]:
+    """The links of the way between two frames that are connected."""
+    way = ancestors(links, frame).keys() ^ ancestors(links, other).keys()
+    return [links[each] for each in sorted(way)]
+
+
+def find_mounts(
+    cameras: Mapping[str, tuple[str, Array]], lidar: str, links: Links
+) -> dict[str, Mount]:
+    """The mounts of cameras. A camera below the LiDAR itself, or that shares all links, has none.
+
+    ``cameras`` are, by name, the frame in the tree, and (4, 4) T_camera_frame from it.
+    """
+    above = {name: ancestors(links, frame) for name, (frame, _) in cameras.items()}
+    above_lidar = ancestors(links, lidar)
+    found = {}
+    for name, (frame, T_camera_frame) in cameras.items():
+        others = {each for other, way in above.items() if other != name for each in way}
+        own = [each for each in above[name] if each in links and each not in others
+               and each not in above_lidar]  # fmt: skip
+        if not own or links[own[-1]][:2] == (lidar, frame):
+            continue
+        child, parent = own[-1], links[own[-1]].parent
+        T_parent_lidar = T_between(links, parent, lidar)
+        if T_parent_lidar is not None:
+            T_camera_child = T_camera_frame @ invert(above[name][child])
+            found[name] = Mount(
+                parent=parent, child=child, T_parent_lidar=T_parent_lidar,
+                T_camera_child=T_camera_child,
+            )  # fmt: skip
+    return found
+
 
 ONLY_CAMERA = ""
 """The name of a camera whose file states none; there is only one such camera."""
@@ -105,12 +212,7 @@ class RigParts:
         relative_sigma_deg: float = RELATIVE_SIGMA_DEG,
         relative_sigma_cm: float = RELATIVE_SIGMA_CM,
     ) -> Rig:
-        """The rig, with further (4, 4) T_camera_lidar, which replace the files'.
-
-        Raises:
-            RigError, DatasetError: if a size or an extrinsic is missing.
-            FileError: if a value is no camera's.
-        """
+        """The rig, with further (4, 4) T_camera_lidar, which replace the files'."""
         T = {**self.T_camera_lidar, **(extrinsics or {})}
         sigmas = math.radians(relative_sigma_deg), relative_sigma_cm / 100.0
         content: dict[str, Any] = {
@@ -163,3 +265,8 @@ class RigParts:
 def frame_names(links: Iterable[Link]) -> list[str]:
     """The frames of links."""
     return sorted({name for link in links for name in link[:2]})
+
+
+def frame_id(name: str) -> str:
+    """A name as ROS frame id: other characters than letters, digits, _ / . - become _."""
+    return re.sub(r"[^\w/.-]", "_", name)

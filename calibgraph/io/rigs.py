@@ -1,9 +1,13 @@
-"""Rigs from disk: rig files, results, dataset folders, published data sets, ROS bags."""
+"""Rigs from disk: rig files, results, dataset folders, published data sets, ROS bags; in words."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_json, read_yaml
 from calibgraph.io.bags import BagOptions, is_bag
@@ -12,6 +16,7 @@ from calibgraph.io.calibrations import is_calibration, rig_of_calibration
 from calibgraph.io.dataset_folders import published_folder
 from calibgraph.io.frame_files import RigRead
 from calibgraph.io.kitti import CALIBRATION_NAME, kitti_sequence
+from calibgraph.model.geometry import angle_deg, camera_center
 from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import RIG_FORMAT, Camera, Rig
 
@@ -62,7 +67,9 @@ def _rig_of_file(path: Path) -> Rig:
             path, f"key 'format' is missing; add the line `format: {RIG_FORMAT}`, or make a rig "
             "of a file of another program with calibgraph rig"
         )  # fmt: skip
-    _require_filled(content, path)
+    if keys := list(_placeholders(content, "")):
+        others = f", and {len(keys) - 1} more keys" if keys[1:] else ""
+        raise FileError(path, f"{keys[0]} is still {FILL_IN}{others}; write the values of your rig")
     return checked_model(Rig, content, path)
 
 
@@ -82,16 +89,7 @@ def _exported_rig(content: dict[str, Any], path: Path) -> Rig:
     return checked_model(Rig, {"lidar": content.get("lidar_frame"), "cameras": cameras}, path)
 
 
-def _require_filled(content: object, path: Path) -> None:
-    """Refuse a rig file in which a placeholder is left."""
-    keys = list(_placeholders(content, ""))
-    if keys:
-        others = f", and {len(keys) - 1} more keys" if keys[1:] else ""
-        raise FileError(path, f"{keys[0]} is still {FILL_IN}{others}; write the values of your rig")
-
-
 def _placeholders(content: object, key: str) -> Iterator[str]:
-    """The keys whose value is a placeholder."""
     if isinstance(content, dict):
         for name, value in content.items():
             yield from _placeholders(value, f"{key}.{name}" if key else str(name))
@@ -126,3 +124,75 @@ def find_rig_file(path: Path | str) -> Path | None:
         names = (RIG_FILE, CALIBRATION_FILE)
     paths = (folder / name for name in (*names, CALIBRATION_NAME))
     return next((path for path in paths if path.is_file()), None)
+
+
+_LIDAR_SIDES = (("ahead", "behind"), ("left", "right"), ("above", "below"))
+_CAMERA_SIDES = (("right", "left"), ("below", "above"), ("ahead", "behind"))
+_LEAST_M = 0.005
+_LEAST_DEG = 0.5
+_LEAST_ROLL_DEG = 5.0  # below, a camera hangs straight
+_UPRIGHT = 0.95  # of sin(elevation), 72 deg: beyond, left and right mean little
+
+
+def describe_rig(rig: Rig) -> list[str]:
+    """One sentence per camera, in a LiDAR frame x forward, y left, z up, and per relative pose."""
+    lines = []
+    for name, T in rig.T_camera_lidar.items():
+        center = _position(camera_center(T), _LIDAR_SIDES, "the LiDAR")
+        lines.append(f"{name} looks {_direction(T)}, {center}")
+    for pair in rig.relative_poses:
+        sigma_deg = math.degrees(pair.rotation_sigma_rad)
+        lines.append(
+            f"{pair.b} {_position(pair.T_a_b[:3, 3], _CAMERA_SIDES, pair.a)}, in the axes of "
+            f"{pair.a}, turned by {angle_deg(pair.T_a_b[:3, :3]):.1f} deg against it (1 sigma: "
+            f"{sigma_deg:.2g} deg, {100 * pair.translation_sigma_m:.2g} cm)"
+        )
+    return lines
+
+
+def _direction(T_camera_lidar: Array) -> str:
+    """The axis of the LiDAR frame nearest to the optical axis, and the angles from it."""
+    _, down, axis = T_camera_lidar[:3, :3]
+    if abs(axis[2]) > _UPRIGHT:
+        off = math.degrees(math.acos(min(1.0, abs(float(axis[2])))))
+        words = f"along LiDAR {'+' if axis[2] > 0 else '-'}z"
+        return words + (f", {off:.0f} deg off it" if off >= _LEAST_DEG else "")
+    index = int(np.argmax(np.abs(axis[:2])))
+    sign = "+" if axis[index] > 0 else "-"
+    heading = math.degrees(math.atan2(axis[1], axis[0]))
+    nearest = {"+x": 0.0, "+y": 90.0, "-x": 180.0, "-y": -90.0}[f"{sign}{'xy'[index]}"]
+    turned = (heading - nearest + 180.0) % 360.0 - 180.0
+    raised = math.degrees(math.asin(axis[2]))
+    words = f"along LiDAR {sign}{'xy'[index]}"
+    parts = [_turn(turned, "to the left", "to the right"), _turn(raised, "up", "down")]
+    parts.append(_roll(axis, down))
+    return ", ".join([words, *(part for part in parts if part)])
+
+
+def _turn(angle: float, positive: str, negative: str) -> str:
+    if abs(angle) < _LEAST_DEG:
+        return ""
+    return f"{abs(angle):.0f} deg {positive if angle > 0 else negative}"
+
+
+def _roll(axis: Array, down: Array) -> str:
+    """How far the image is turned about the optical axis, if it is."""
+    level = np.cross(axis, [0.0, 0.0, 1.0])  # to the right, in the horizontal plane
+    level /= np.linalg.norm(level)
+    straight = np.cross(axis, level)
+    roll = math.degrees(math.atan2(float(down @ level), float(down @ straight)))
+    return f"its image turned by {abs(roll):.0f} deg" if abs(roll) >= _LEAST_ROLL_DEG else ""
+
+
+def _position(offset_m: Array, sides: Sequence[tuple[str, str]], what: str) -> str:
+    parts = [
+        (abs(value), side[0] if value > 0 else side[1])
+        for value, side in zip(offset_m.tolist(), sides, strict=True)
+        if abs(value) >= _LEAST_M
+    ]
+    if not parts:
+        return f"sits at {what}"
+    texts = [f"{value:.2f} m {side}" for value, side in parts]
+    joined = " and ".join([", ".join(texts[:-1]), texts[-1]] if len(texts) > 1 else texts)
+    preposition = "" if parts[-1][1] in ("above", "below", "behind") else "of "
+    return f"sits {joined} {preposition}{what}"

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.io.burnt_in import BurntIn, Rectangle
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
+from calibgraph.io.images import BurntIn, Rectangle
 from calibgraph.model.geometry import angle_deg
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores

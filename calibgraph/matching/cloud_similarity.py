@@ -185,8 +185,12 @@ def align_with_any(now: UprightCloud, known: Sequence[UprightCloud]) -> tuple[in
     similar = [row for row in starts if starts[row][0] > LEAST_CORRELATION]
     for row in sorted(similar, key=lambda row: -starts[row][0])[:_VERIFIED]:
         T_known_now = _refine(known[row], now, starts[row][1])
-        if T_known_now is not None and _overlap(known[row], now, T_known_now) > LEAST_OVERLAP:
-            return row, invert(T_known_now)
+        if T_known_now is None:
+            continue
+        T_now_known = invert(T_known_now)
+        shares = _share(known[row], now, T_known_now), _share(now, known[row], T_now_known)
+        if min(shares) > LEAST_OVERLAP:
+            return row, T_now_known
     return None
 
 
@@ -259,12 +263,8 @@ def _rigid_fit(source: Array, target: Array) -> Array:
     return transform(R, means[1] - R @ means[0])
 
 
-def _overlap(known: UprightCloud, now: UprightCloud, T_known_now: Array) -> float:
-    """The share of points near one of the other cloud, the smaller of both clouds' shares."""
-    return min(_share(known, now, T_known_now), _share(now, known, invert(T_known_now)))
-
-
 def _share(target: UprightCloud, source: UprightCloud, T_target_source: Array) -> float:
+    """The share of one cloud's points that are near one of the other's."""
     moved = source.points_m @ T_target_source[:3, :3].T + T_target_source[:3, 3]
     both = [np.hypot(p[:, 0], p[:, 1]) < _COMMON_M for p in (moved, source.points_m)]
     moved = _some(moved[both[0] & both[1]], _OVERLAP_POINTS)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibgraph.io.correspondence_tables import load_correspondences
 from calibgraph.io.dataset import Dataset
+from calibgraph.io.tables import load_correspondences
 from calibgraph.matching.protocol import FullMatcher, Matcher
 from calibgraph.model.config import Stage1Source
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress
+
+if TYPE_CHECKING:
+    from calibgraph.matching.structure import StructureMatcher
 
 
 class TableMatcher:
@@ -45,9 +49,7 @@ def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int =
     if not isinstance(matcher, (str, Path)):
         return FullMatcher(matcher)
     if str(matcher) == "structure":
-        from calibgraph.matching.structure import StructureMatcher
-
-        return FullMatcher(StructureMatcher(seed=seed))
+        return FullMatcher(structure_matcher(seed=seed))
     if Path(matcher).suffix in (".parquet", ".csv"):
         return FullMatcher(TableMatcher(load_correspondences(matcher)))
     if str(matcher) == "cmrnext":
@@ -59,3 +61,22 @@ def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int =
         f"unknown matcher {str(matcher)!r}; known are 'structure', 'cmrnext' and a table of "
         "correspondences (.parquet or .csv)"
     )
+
+
+def structure_matcher(
+    *, seed: int, all_frames: bool = False, **search: float | None
+) -> StructureMatcher:
+    """The matcher ``structure``.
+
+    Args:
+        seed: of everything random.
+        all_frames: match all frames, as when the user has selected them.
+        search: its search_deg and search_m; None for the default; both 0 for no search.
+    """
+    from calibgraph.matching.structure import StructureMatcher
+
+    given: dict[str, Any] = {name: value for name, value in search.items() if value is not None}
+    if given and not any(given.values()):
+        given = dict.fromkeys(search)
+    frames: dict[str, Any] = {"most_frames": None} if all_frames else {}
+    return StructureMatcher(seed=seed, **given, **frames)

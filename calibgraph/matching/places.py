@@ -8,9 +8,8 @@ direction, is recognised by the cloud of the place's first frame. Clouds are com
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from itertools import pairwise
 
 import gtsam
@@ -21,9 +20,8 @@ from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame, seconds_between
-from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
-from calibgraph.matching.camera_pairs.geometry import relative_pose
-from calibgraph.matching.camera_pairs.surfaces import planes_at
+from calibgraph.matching.camera_pairs.find import Features, features_of, match_features
+from calibgraph.matching.camera_pairs.geometry import planes_at, relative_pose
 from calibgraph.matching.cloud_similarity import (
     LEAST_UPRIGHT,
     Z_UP,
@@ -49,7 +47,8 @@ drive: only there can an unknown motion be a short one."""
 
 Motion = NDArray[np.float64] | None
 """(4, 4) T_later_earlier of the LiDAR; None where the two frames have too little in common."""
-
+FeaturesOf = Callable[[str], Features | None]
+"""Of a camera's image of one frame."""
 
 UNKNOWN_UP = (
     "which way is up in the clouds is unknown, so that they are not compared: all frames are taken "
@@ -108,11 +107,17 @@ class PlaceWalk:
         if before is None or before.cloud_path.parent != frame.cloud_path.parent:
             self._find_place(frame)
             return self._first
-        step = self._motion_by_clouds(before, frame) if step is None else step
         if step is None:
-            follows = self._in_sequence and _follows(before, frame)
-            self._find_place(frame, may_stay=follows or not self._are_comparable(before, frame))
-            return self._first
+            earlier, later = (self._upright_cloud(each) for each in (before, frame))
+            found = earlier and later and self._align(later, [earlier])
+            step = found[1] if found else None
+            if step is None:  # unless enough stands upright in both, nothing shows another place
+                follows = self._in_sequence and _follows(before, frame)
+                unlike = all(
+                    each and len(each.points_m) >= LEAST_UPRIGHT for each in (earlier, later)
+                )
+                self._find_place(frame, may_stay=follows or not unlike)
+                return self._first
         self._T_now_first = step @ self._T_now_first
         if _distance_m(self._T_now_first) > PLACE_M:
             self._find_place(frame, left=self._first)
@@ -141,11 +146,6 @@ class PlaceWalk:
         while self._most is not None and len(self._known) > self._most:
             del self._known[next(iter(self._known))]
 
-    def _motion_by_clouds(self, before: Frame, now: Frame) -> Motion:
-        earlier, later = self._upright_cloud(before), self._upright_cloud(now)
-        found = earlier and later and self._align(later, [earlier])
-        return found[1] if found else None
-
     def _align(self, now: UprightCloud, known: Sequence[UprightCloud]) -> tuple[int, Array] | None:
         """As of :func:`align_with_any`, in the axes of the LiDAR."""
         found = align_with_any(now, known)
@@ -153,11 +153,6 @@ class PlaceWalk:
             return None
         T_up_lidar = transform(self._R_up_lidar)
         return found[0], invert(T_up_lidar) @ found[1] @ T_up_lidar
-
-    def _are_comparable(self, before: Frame, now: Frame) -> bool:
-        """Whether enough stands upright in both clouds that they were alike at one place."""
-        clouds = self._upright_cloud(before), self._upright_cloud(now)
-        return all(cloud is not None and len(cloud.points_m) >= LEAST_UPRIGHT for cloud in clouds)
 
     def _upright_cloud(self, frame: Frame) -> UprightCloud | None:
         """The upright structure of a frame's cloud; None where up is unknown, or if unreadable.
@@ -178,22 +173,20 @@ class PlaceWalk:
 
 
 def _given_motion(before: Frame, now: Frame) -> Motion:
-    """The motion by poses or twists; None if one cannot be found, which the matcher reports."""
+    """The motion by the poses of both frames, or by their twists if they are close in time.
+
+    None if one cannot be found, which the matcher reports.
+    """
     try:
-        return _by_poses_or_twists(before, now)
+        one, two = before.T_world_lidar, now.T_world_lidar
+        if one is not None and two is not None:
+            return invert(two) @ one
+        seconds = seconds_between(before, now)
+        if seconds is None or abs(seconds) > MOST_S:
+            return None
+        twists = before.twist_per_s, now.twist_per_s
     except (CalibrationError, OSError):
         return None
-
-
-def _by_poses_or_twists(before: Frame, now: Frame) -> Motion:
-    """The motion by the poses of both frames, or by their twists if they are close in time."""
-    one, two = before.T_world_lidar, now.T_world_lidar
-    if one is not None and two is not None:
-        return invert(two) @ one
-    seconds = seconds_between(before, now)
-    if seconds is None or abs(seconds) > MOST_S:
-        return None
-    twists = before.twist_per_s, now.twist_per_s
     if twists[0] is None or twists[1] is None:
         return None
     return np.asarray(gtsam.Pose3.Expmap(-seconds * (twists[0] + twists[1]) / 2).matrix())
@@ -228,7 +221,7 @@ class PlaceFinder:
     def __init__(self, rig: Rig, *, most_places: int | None = None, seed: int = 0) -> None:
         self._rig, self._seed = rig, seed
         self._walk = PlaceWalk(most_places, in_sequence=True, rig=rig)
-        self._before: _SeenFrame | None = None
+        self._before: tuple[Frame, FeaturesOf] | None = None
 
     def remember(self, frame: Frame) -> None:
         """Register a place by its first frame, without moving to it."""
@@ -239,38 +232,23 @@ class PlaceFinder:
 
         A frame whose image or cloud cannot be read is of the place of the one before.
         """
-        seen, before = _SeenFrame(frame, {}), self._before
-        self._before = seen
-        step = None if before is None else _given_motion(before.frame, frame)
+        features = cache(lambda name: _detect(frame, name, self._rig.cameras[name]))
+        before, self._before = self._before, (frame, features)
+        step = None if before is None else _given_motion(before[0], frame)
         if before is not None and step is None:
-            step = self._step(before, seen)
+            step = self._step(before, self._before)
         return self._walk.first_of_place(frame, step)
 
-    def _step(self, before: _SeenFrame, now: _SeenFrame) -> Motion:
+    def _step(self, before: tuple[Frame, FeaturesOf], now: tuple[Frame, FeaturesOf]) -> Motion:
         for name, lens in self._rig.cameras.items():
             try:
-                earlier = before.frame, before.features(name, lens)
-                both = earlier, (now.frame, now.features(name, lens))
+                both = (before[0], before[1](name)), (now[0], now[1](name))
                 step = _motion(both, lens=lens, seed=self._seed)
             except (CalibrationError, OSError):  # the matcher reports it
                 continue
             if step is not None:
                 return step
         return None
-
-
-@dataclass(frozen=True)
-class _SeenFrame:
-    """A frame, and the features of its images as far as they were wanted."""
-
-    frame: Frame
-    found: dict[str, Features | None]
-
-    def features(self, name: str, lens: Camera) -> Features | None:
-        """The features of a camera's image."""
-        if name not in self.found:
-            self.found[name] = _detect(self.frame, name, lens)
-        return self.found[name]
 
 
 def motions(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -> list[Motion]:

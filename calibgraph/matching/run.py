@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from calibgraph.arrays import Array
 from calibgraph.errors import MotionError
 from calibgraph.io.dataset import Dataset
 from calibgraph.matching.protocol import FullMatcher
@@ -14,28 +15,13 @@ from calibgraph.model.correspondences import TWIST_RULE, Correspondences, beyond
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
-from calibgraph.progress import Stopwatch
+from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.solver.solution import Solution
-from factors.free_lens import CLOCK
+from factors.columns import CLOCK
 
 RoundSummary = Mapping[str, Mapping[str, float]]
 """Per camera: number of ``matches``, and the motion of the estimate in the round, ``moved_deg`` and
 ``moved_cm``."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rematch:
-    """The ends of matching from two starts, the second displaced from the end of the first.
-
-    Attributes:
-        first: the end of the rounds.
-        again: the end of matching from the displaced start; None if it failed.
-        failure: the error message if it failed.
-    """
-
-    first: Rig
-    again: Rig | None
-    failure: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +40,16 @@ class MatchingRun:
         missed_rounds: number of rounds that the time limit cut off.
         out_of_time: whether the time limit has passed.
         warnings: about the dataset and its guess; about a lens or clock that did not settle.
-        rematch: the test from a displaced start; None if it was not made.
+        rematch: per camera that was matched again from a start displaced from the end of the
+            rounds, (4, 4) T_camera_lidar of that end, and of the end from there.
+        rematch_failure: why there is no such end; then both are that of the rounds.
         is_late: whether the time limit has passed by now.
         went_on: per camera whose rounds went on from where its images agree better, how far that
             was [deg, cm].
         excluded: cameras that the user excluded.
         copies: names of the frames that were left out as copies, each with that of its original.
+        hashes: SHA-256 of the files that it read, by path.
+        progress: called as the work goes on.
     """
 
     dataset: Dataset
@@ -72,11 +62,14 @@ class MatchingRun:
     missed_rounds: int = 0
     out_of_time: bool = False
     warnings: tuple[str, ...] = ()
-    rematch: Rematch | None = None
+    rematch: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+    rematch_failure: str = ""
     is_late: Callable[[], bool] = lambda: False
     went_on: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     excluded: tuple[str, ...] = ()
     copies: tuple[tuple[str, str], ...] = ()
+    hashes: Mapping[str, str] = field(default_factory=dict)
+    progress: Progress = no_progress
 
 
 def require_known_motion(data: Dataset, matcher: FullMatcher, parts: Sequence[LensPart]) -> None:

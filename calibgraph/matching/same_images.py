@@ -70,17 +70,13 @@ def find_same_images(data: Dataset, rig: Rig) -> list[str]:
             shown = [f.index for f in (at if later == 0 else frames.values())]
             pairs = [(views[i, a], views.get((i + later, b))) for i in shown]
             if _are_same([(one, two) for one, two in pairs if one and two]):
-                lines.append(_describe(a, b, later))
+                lines.append(
+                    f"{a} and {b} have the same images{', a frame apart' if later else ''}: one "
+                    "device under two names, or a copied folder; give each camera its own images, "
+                    "or take one out of the rig"
+                )
                 break
     return lines
-
-
-def _describe(a: str, b: str, later: int) -> str:
-    apart = ", a frame apart" if later else ""
-    return (
-        f"{a} and {b} have the same images{apart}: one device under two names, or a copied folder; "
-        "give each camera its own images, or take one out of the rig"
-    )
 
 
 def _view(frame: Frame, name: str, rig: Rig) -> _View | None:

@@ -302,48 +302,36 @@ class Calibration:
         return f"Calibration({self.verdict.status}; {', '.join(self.rig.cameras)})"
 
     def _to_mapping(self) -> dict[str, Any]:
-        return {
+        cameras = self.rig.cameras
+        verdicts = self.camera_verdicts.items()
+        content = {
             "format": result_files.CALIBRATION_FORMAT,
             "verdict": self.verdict.to_mapping(),
-            "summary": self.summary.to_mapping(),
-            "camera_verdicts": {
-                name: {**verdict.to_mapping(), "checks": [vars(c) for c in verdict.checks]}
-                for name, verdict in self.camera_verdicts.items()
-            },
-            "weaknesses": {name: list(words) for name, words in self.weaknesses.items()},
-            "prior_share": self.prior_share,
-            "error_sources": {name: vars(one) for name, one in self.error_sources.items()},
+            "summary": self.summary,
+            "camera_verdicts": {n: {**of.to_mapping(), "checks": of.checks} for n, of in verdicts},
             "frames": FRAMES_SENTENCE,
-            "T_camera_lidar": self.T_camera_lidar,
-            "sigmas": {name: _sigma_mapping(self.covariance[name]) for name in self.rig.cameras},
+            "sigmas": {name: _sigma_mapping(self.covariance[name]) for name in cameras},
             "error_bar_holds": {
-                n: self.error_bar_holds(n) for n in (*self.rig.cameras, *self.pair_covariance)
+                name: self.error_bar_holds(name) for name in (*cameras, *self.pair_covariance)
             },
-            "rig": self.rig.model_dump(),
             "covariance_of": TANGENT_SENTENCE,
-            "covariance": dict(self.covariance),
-            "joint_covariance": self.joint_covariance,
             "pair_covariance_of": PAIR_TANGENT_SENTENCE,
-            "pair_covariance": dict(self.pair_covariance),
-            "lens": {name: [vars(one) for one in of] for name, of in self.lens.items()},
             "lens_covariance": {name: self.joint_of_lens(name) for name in self.lens_covariance},
             "bootstrap_covariance": self.bootstrap,
-            "residuals": {name: vars(value) for name, value in self.residuals.items()},
-            "counts": self.counts,
-            "frames_used": list(self.frames),
-            "moves": list(self.moves),
-            "places": [list(place) for place in self.places],
-            "rounds": list(self.rounds),
-            "warnings": list(self.warnings),
-            "initial_rig": self.initial_rig.model_dump(),
-            "stage1_T_camera_lidar": self.stage1_T_camera_lidar,
-            "terms": self.terms,
-            "config": self.config.model_dump(),
-            "timings_s": self.timings_s,
-            "inputs": self.inputs,
-            "versions": self.versions,
-            "date": self.date,
+            "frames_used": self.frames,
         }
+        return {key: content[key] if key in content else getattr(self, key) for key in _KEYS}
+
+
+_KEYS = (
+    "format", "verdict", "summary", "camera_verdicts", "weaknesses", "prior_share",
+    "error_sources", "frames", "T_camera_lidar", "sigmas", "error_bar_holds", "rig",
+    "covariance_of", "covariance", "joint_covariance", "pair_covariance_of", "pair_covariance",
+    "lens", "lens_covariance", "bootstrap_covariance", "residuals", "counts", "frames_used",
+    "moves", "places", "rounds", "warnings", "initial_rig", "stage1_T_camera_lidar", "terms",
+    "config", "timings_s", "inputs", "versions", "date",
+)  # fmt: skip
+"""Of the file, in its order; those that are no attributes are made for it."""
 
 
 def _sigma_mapping(covariance: Array | None) -> dict[str, list[float]] | None:

@@ -5,16 +5,14 @@ they explain each other: a wrong guess makes matches wrong, and not the other wa
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Cause:
-    """A cause that several checks may notice."""
+class Cause(NamedTuple):
+    """A cause that several checks may notice: what to do, and by kind of check what else."""
 
-    title: str
     action: str
-    kinds: Mapping[str, str] = field(default_factory=dict)
+    kinds: Mapping[str, str]
 
 
 _SWAPPED = "Check whether the images of two cameras, or their extrinsics in the rig, are swapped."
@@ -29,26 +27,22 @@ _ESTIMATED_AS = {"focal_length": "focal", "distortion": "distortion", "principal
 # fmt: off
 CAUSES: dict[str, Cause] = {
     "brightness": Cause(
-        "images that are too dark or too bright",
         "Record by daylight, or with another exposure.",
         {"brightness of the images": ""},
     ),
     "repeats": Cause(
-        "frames that repeat others",
         "See why the named images or clouds repeat, and leave the repeats out.",
         {"equal files": "", "copies": "Leave the copies out.",
          "repeated_frames": "Take frames while the vehicle drives.",
          "stuck": "See why the same points come again: a LiDAR that stands, too, measures others."},
     ),
     "guess": Cause(
-        "the guess, or its convention",
         "Correct the guess: T_camera_lidar maps LiDAR points to x right, y down, z ahead, in "
         "metres.",
         {
             "convention of the guess": "Undo the named mistake, and "
             "calibrate again.",
             "guess_translation": "",
-            "guess_length": "Give the translation of T_camera_lidar in metres.",
             "swapped_cameras": _SWAPPED,
             "point_distance": "Give the clouds in metres.",
             "search": "Correct the guess, or calibrate with a wider search (--search-deg up to 45, "
@@ -58,13 +52,11 @@ CAUSES: dict[str, Cause] = {
         },
     ),
     "search": Cause(
-        "too few frames to find a camera in",
         "Record at least 5 frames, 10 s apart; if the camera is not found in them either, correct "
         "the guess, and see with doctor whether images and clouds belong together.",
         {"search_in_few_frames": ""},
     ),
     "time": Cause(
-        "images and clouds of different times",
         "Pair each image with the cloud of its own instant: correct the time stamps or the offset.",
         {"own_clouds": "", "clouds of another time": "",
          **dict.fromkeys(("time_offset", "lens_time_offset"), "Correct the time stamps, or "
@@ -73,7 +65,6 @@ CAUSES: dict[str, Cause] = {
          "Then correct the named time in the rig, or state its sigma."},
     ),
     "lens": Cause(
-        "the intrinsics",
         "Check the intrinsics: focal lengths, distortion, its model and the image size must "
         "belong to these images.",
         {
@@ -89,7 +80,6 @@ CAUSES: dict[str, Cause] = {
         },
     ),
     "cameras": Cause(
-        "cameras that contradict each other",
         "Check the intrinsics and guesses of both cameras, and that their images are of one "
         "instant and not swapped.",
         {"pair_agreement": "",
@@ -99,40 +89,36 @@ CAUSES: dict[str, Cause] = {
          "so, state it in relative_poses."},
     ),
     "priors": Cause(
-        "priors and relative poses",
         "Check relative_poses and priors in the rig: p_a = T_a_b * p_b, and their sigmas.",
         {"relative_pose": "",
          "prior_share": "Give this camera matches of its own, or check its priors: they decide."},
     ),
     "agreement": Cause(
-        "image and cloud that agree too little", _STRUCTURE,
+        _STRUCTURE,
         {"z_score": "Check the guess, the intrinsics, and that images and clouds belong together.",
          "chance": "",
-         "displaced_z_score": "", "frames_best": "", "rematch_rotation": "",
+         "displaced_z_score": "", "rematch_rotation": "",
          "rematch_translation": "", "matching again": "", "last_round_rotation": _FROM_RESULT,
          "last_round_translation": _FROM_RESULT},
     ),
     "matches": Cause(
-        "wrong correspondences",
         "Look at the residuals of the matches in the report: too many are wrong.",
         {"competing_solution": "", "failed_frames": "",
          "assumed_spread": "Leave loss_scale_px out of the config, or raise it.",
          "start_dependence": _LEARNED, "memorization": _LEARNED},
     ),
     "frames": Cause(
-        "frames or places that contradict each other", _FRAMES,
+        _FRAMES,
         {"outlier_frames": "", "place_distance": "", "place_inliers": "", "bootstrap_sigma": "",
          "disagreeing_frames": "Check whether the camera was moved.",
          "drift": "Check whether the camera's mount is loose."},
     ),
     "solver": Cause(
-        "a solve that did not end",
         _SPREAD,
         {"convergence": "", "terms": "Solve with the terms full: they have an error bar.",
          "time limit": "Raise --time-limit-s, or take fewer --frames."},
     ),
     "data": Cause(
-        "too little data",
         "Record more frames.",
         {"correspondences": "Check that this camera's images are sharp and show what the LiDAR "
          "measures.",
@@ -148,11 +134,11 @@ CAUSES: dict[str, Cause] = {
          "blind frames": "Check that the camera delivers images and sees what the LiDAR sees."},
     ),
     "error bar": Cause(
-        "an error bar that is wide beside the tolerance", "",
+        "",
         {"sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE,
          "beyond_tolerance": _STRUCTURE},
     ),
-    "other": Cause("a check of another version", ""),
+    "other": Cause("", {}),  # of another version
 }
 # fmt: on
 

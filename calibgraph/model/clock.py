@@ -19,7 +19,7 @@ from calibgraph.model.config import LensPart
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Camera, Rig
 from factors import Clock, displace
-from factors.free_lens import CLOCK
+from factors.columns import CLOCK
 
 _log = logging.getLogger(__name__)
 

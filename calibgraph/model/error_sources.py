@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
@@ -80,26 +79,26 @@ class ErrorSources:
 
     def describe(self, tolerance: tuple[float, float]) -> str:
         """The error bar that is larger beside the tolerance [deg, cm], and what would shrink it."""
-        bar = self._larger(tolerance)
-        most = SHRINKS_WITH.get(max(bar.shares, key=bar.shares.__getitem__, default=""), "")
+        sigma, _, unit, shares = self._larger(tolerance)
+        most = SHRINKS_WITH.get(max(shares, key=shares.__getitem__, default=""), "")
         advice = f" {most[:1].upper()}{most[1:]} would help most." if most else ""
-        return f"{in_unit(bar.sigma, bar.unit, 2)} (1 sigma).{advice}"
+        return f"{in_unit(sigma, unit, 2)} (1 sigma).{advice}"
 
     def action(self, tolerance: tuple[float, float]) -> str:
         """The action that shrinks the error bar enough for a PASS, in one sentence; empty if it is.
 
         For a tolerance of rotation [deg] and distance [cm].
         """
-        bar = self._larger(tolerance)
-        if bar.sigma <= NEEDED * bar.tolerance:
+        sigma, most, unit, shares = self._larger(tolerance)
+        if sigma <= NEEDED * most:
             return ""
-        if bar.shares.get(FLAT, 0.0) > _MOST:  # more frames of the same scenes are as flat
+        if shares.get(FLAT, 0.0) > _MOST:  # more frames of the same scenes are as flat
             return (
-                f"Record {SHRINKS_WITH[FLAT]}: poses {in_unit(bar.sigma, bar.unit, 2)} apart "
+                f"Record {SHRINKS_WITH[FLAT]}: poses {in_unit(sigma, unit, 2)} apart "
                 "explain these images almost equally well."
             )
         for source, advice in _ADVICE.items():
-            if bar.shares.get(source, 0.0) > _MOST:
+            if shares.get(source, 0.0) > _MOST:
                 return advice
         enough = [
             times
@@ -107,27 +106,22 @@ class ErrorSources:
             if deg <= NEEDED * tolerance[0] and cm <= NEEDED * tolerance[1]
         ]
         if enough and enough[0] < MOST_TIMES:
-            places = ", at more places" if bar.shares.get(PLACES, 0.0) > _MENTIONED else ""
+            places = ", at more places" if shares.get(PLACES, 0.0) > _MENTIONED else ""
             return f"Record {enough[0]} times as many frames{places}."
         best = self.forecast.get(MOST_TIMES, (self.rotation_deg, self.translation_cm))
-        least = in_unit(best[0] if bar.unit == "deg" else best[1], bar.unit, 2)
+        least = in_unit(best[0] if unit == "deg" else best[1], unit, 2)
         return (
             "Tolerate more (tolerance_deg, tolerance_cm in --config), or give measured "
             f"relative_poses or priors: {least} of common error remain with any number of frames."
         )
 
-    def _larger(self, tolerance: tuple[float, float]) -> _Bar:
-        """The value of rotation or translation, whichever is larger relative to its tolerance."""
-        rotation = _Bar(self.rotation_deg, "deg", self.rotation, tolerance[0])
-        translation = _Bar(self.translation_cm, "cm", self.translation, tolerance[1])
-        return max(rotation, translation, key=lambda bar: bar.sigma / bar.tolerance)
-
-
-class _Bar(NamedTuple):
-    sigma: float
-    unit: str
-    shares: Mapping[str, float]
-    tolerance: float
+    def _larger(
+        self, tolerance: tuple[float, float]
+    ) -> tuple[float, float, str, Mapping[str, float]]:
+        """Of rotation or translation, which is larger beside its tolerance; that, unit, shares."""
+        rotation = self.rotation_deg, tolerance[0], "deg", self.rotation
+        translation = self.translation_cm, tolerance[1], "cm", self.translation
+        return max(rotation, translation, key=lambda bar: bar[0] / bar[1])
 
 
 def left_out(config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool) -> str:

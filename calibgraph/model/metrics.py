@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -73,17 +73,6 @@ class Evaluation:
     lens_px: dict[str, float] = field(default_factory=dict)
     time_offset_ms: dict[str, float] = field(default_factory=dict)
     readout_ms: dict[str, float] = field(default_factory=dict)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """As plain numbers, for JSON."""
-        return {
-            "cameras": {name: asdict(error) for name, error in self.cameras.items()},
-            "pairs": {name: asdict(error) for name, error in self.pairs.items()},
-            "deviations": {name: asdict(found) for name, found in self.deviations.items()},
-            "lens_px": {n: v if np.isfinite(v) else None for n, v in self.lens_px.items()},
-            "time_offset_ms": self.time_offset_ms,
-            "readout_ms": self.readout_ms,
-        }
 
 
 def evaluate(

@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, StrictInt, TypeAdapter, ValidationError
 
 from calibgraph.errors import CorrespondenceError
 
@@ -46,11 +47,17 @@ class Places:
         Raises:
             CorrespondenceError: if they are not lists of lists of frame numbers.
         """
-        if not metadata:
-            return NOWHERE
         key = STATIONARY if STATIONARY in metadata else _STATIONARY_BEFORE
-        named = _groups(metadata, PLACES) if PLACES in metadata else None
-        return Places(_groups(metadata, key), named)
+        found = {}
+        for name in (name for name in (PLACES, key) if name in metadata):
+            try:
+                found[name] = _READER.validate_python(metadata[name])
+            except ValidationError as error:
+                raise CorrespondenceError(
+                    f"{name} of the table's metadata must be lists of frame numbers, as in "
+                    f"[[0, 1, 2], [7, 8]], found {metadata[name]!r:.60}"
+                ) from error
+        return Places(found.get(key, ()), found.get(PLACES))
 
     def to_metadata(self) -> dict[str, Any]:
         """As keys of the metadata; unknown values have no key."""
@@ -87,6 +94,8 @@ class Places:
         return next((str(group[0]) for group in self.places or () if number in group), "")
 
 
+_Frames = Annotated[tuple[StrictInt, ...], Field(min_length=1)]
+_READER = TypeAdapter(tuple[_Frames, ...])
 NOWHERE = Places()
 """Nobody looked for places."""
 
@@ -108,17 +117,3 @@ def _describe_numbers(group: Sequence[int]) -> str:
     runs = groupby(enumerate(group), key=lambda item: item[1] - item[0])
     numbers = ([number for _, number in run] for _, run in runs)
     return ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in numbers)
-
-
-def _groups(metadata: Mapping[str, Any], key: str) -> Groups:
-    groups = metadata.get(key, [])
-    good = isinstance(groups, list) and all(
-        isinstance(group, list) and group and all(type(number) is int for number in group)
-        for group in groups
-    )
-    if not good:
-        raise CorrespondenceError(
-            f"{key} of the table's metadata must be lists of frame numbers, as in "
-            f"[[0, 1, 2], [7, 8]], found {groups!r:.60}"
-        )
-    return as_groups(groups)

@@ -177,12 +177,14 @@ SecondsSigma = Annotated[float, Field(ge=1e-6, le=10)]
 class _Model(StrictNumbers):
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
+    @model_serializer(mode="wrap")
+    def _leave_out_what_is_not_given(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in dump(self).items() if value is not None}
+
 
 IMAGE_TIMES = "time_offset_s", "time_offset_sigma_s", "readout_s", "readout_sigma_s"
 KNOWLEDGE = "intrinsics_sigma_px", "distortion_sigma", *IMAGE_TIMES
 """Fields of a camera on its times, and how well these and the lens are known."""
-_LEFT_OUT = "covariance", "frame_id", "mount", *KNOWLEDGE
-"""Of a camera, where they are None."""
 
 _LENS = "intrinsics_px", "distortion", "time_offset_s", "readout_s"
 
@@ -249,11 +251,6 @@ class Camera(_Model):
     readout_s: Seconds | None = None
     readout_sigma_s: SecondsSigma | None = None
 
-    @model_serializer(mode="wrap")
-    def _leave_out_what_is_not_given(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        fields: dict[str, Any] = dump(self)
-        return {n: value for n, value in fields.items() if value is not None or n not in _LEFT_OUT}
-
     @model_validator(mode="after")
     def _lens_can_be_built(self) -> Self:
         if self.width_px * self.height_px > MAX_PIXELS:
@@ -313,13 +310,6 @@ class Rig(_Model):
     relative_poses: tuple[RelativePose, ...] = ()
     cloud_columns: tuple[str, ...] | None = None
     """Names of the float32 columns of .bin clouds, such as x, y, z, intensity, ring."""
-
-    @model_serializer(mode="wrap")
-    def _without_absent_columns(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        content: dict[str, Any] = serialize(self)
-        if self.cloud_columns is None:
-            content.pop("cloud_columns", None)
-        return content
 
     @model_validator(mode="after")
     def _relative_poses_name_cameras(self) -> Self:

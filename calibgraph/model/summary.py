@@ -5,8 +5,7 @@ Terminal, report, service, fleet and files show the same :class:`Summary`.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 from calibgraph.model.causes import CAUSES, action_of, cause_of
 from calibgraph.model.error_sources import ErrorSources
@@ -76,16 +75,6 @@ class Summary:
     error_bar: str
     others: tuple[Reason, ...]
     moves: tuple[str, ...] = ()
-
-    def to_mapping(self) -> dict[str, Any]:
-        """As plain values, for YAML and JSON."""
-        return {key: _plain(value) for key, value in asdict(self).items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def summarize(

@@ -293,7 +293,6 @@ class Threshold:
         fail: the last value that is not FAIL.
         unit: of the values; "share" is printed in percent.
         question: what the check answers, in words.
-        reason: why these limits: what they mean, or the data that they were read from.
         advice: the meaning if it is not PASS; for what to do, see ``model.causes``.
         of_tolerance: whether the limits are for the default tolerance, and scale with another one.
     """
@@ -305,7 +304,6 @@ class Threshold:
     fail: float
     unit: str
     question: str
-    reason: str
     advice: str = ""
     of_tolerance: bool = False
 

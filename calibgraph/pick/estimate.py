@@ -1,19 +1,27 @@
-"""What the pairs determine: PnP by the paper's three solvers, then one solve of all cameras."""
+"""The pairs of a session, kept in a file after every change, and what they determine.
+
+By PnP with the paper's three solvers, then by one solve of all cameras.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import CalibrationError, FileError
+from calibgraph.files import StrictNumbers, checked_model, read_json, write_text
 from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.pick.session import Pair, to_table
 from calibgraph.pipeline import solve
 from calibgraph.solver.pnp import view_plane
 
@@ -57,17 +65,9 @@ class CameraEstimate:
         return [bool(value > limit) for value in self.left_out_px]  # NaN is not above
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """The rig that the pairs determine.
-
-    Attributes:
-        rig: of the cameras that are solved, with their covariances; None if none is.
-        cameras: by name, of each with pairs.
-    """
-
-    rig: Rig | None
-    cameras: dict[str, CameraEstimate] = field(default_factory=dict)
+Estimate = tuple[Rig | None, dict[str, CameraEstimate]]
+"""The rig of the cameras that are solved, with their covariances, None if none is; and by name what
+the pairs of each camera give."""
 
 
 def estimate_from_pairs(rig: Rig, pairs: Sequence[Pair]) -> Estimate:
@@ -92,7 +92,7 @@ def estimate_from_pairs(rig: Rig, pairs: Sequence[Pair]) -> Estimate:
             left_out_px=_left_out(camera, some) if name in starts else np.full(len(some), np.nan),
             problem="" if poses[name] else _problem(some),
         )
-    return Estimate(solved, cameras)
+    return solved, cameras
 
 
 def _solve(rig: Rig, starts: dict[str, Array], pairs: Sequence[Pair]) -> Rig:
@@ -117,13 +117,14 @@ def reference_rig(estimate: Estimate) -> Rig:
     Raises:
         CalibrationError: if there is none.
     """
-    if estimate.rig is None:
-        reasons = [f"{name}: {one.problem}" for name, one in estimate.cameras.items()]
+    rig, cameras = estimate
+    if rig is None:
+        reasons = [f"{name}: {one.problem}" for name, one in cameras.items()]
         raise CalibrationError(
             f"the pairs determine no camera yet ({'; '.join(reasons) or 'there is none'}); pick at "
             f"least {MIN_PAIRS} of one camera, on different structures"
         )
-    return estimate.rig
+    return rig
 
 
 def _poses(camera: Camera, pairs: Sequence[Pair]) -> dict[str, tuple[Array, float]]:
@@ -183,3 +184,75 @@ def _problem(pairs: Sequence[Pair]) -> str:
     if len(pairs) < MIN_PAIRS:
         return f"{len(pairs)} of {MIN_PAIRS} pairs"
     return "its points lie on one line" if np.hypot(*spread[1:]) < _LINE_M else ""
+
+
+SESSION_FILE = "session.json"
+SESSION_FORMAT: Literal["calibgraph-pick/2"] = "calibgraph-pick/2"
+_Number = Annotated[float, Field(ge=-1e6, le=1e6)]
+
+
+class Pair(StrictNumbers):
+    """A pixel and a point of the cloud that are one place.
+
+    Attributes:
+        frame: number of the frame.
+        camera: its name.
+        pixel_px: (column, row).
+        point_lidar_m: in the LiDAR frame.
+    """
+
+    frame: Annotated[int, Field(ge=0)]
+    camera: str
+    pixel_px: tuple[_Number, _Number]
+    point_lidar_m: tuple[_Number, _Number, _Number]
+
+
+class Session(StrictNumbers):
+    """The pairs, with the frames and cameras of their dataset.
+
+    Attributes:
+        frames: names, by which a session is known to fit a dataset.
+        cameras: the rig's.
+        pairs: in the order in which they were picked.
+    """
+
+    format: Literal["calibgraph-pick/2"] = SESSION_FORMAT
+    frames: tuple[str, ...]
+    cameras: tuple[str, ...]
+    pairs: Annotated[tuple[Pair, ...], Field(max_length=2000)] = ()
+
+    def save(self, path: Path) -> None:
+        """Write the session; the file is whole or as before."""
+        write_text(path, json.dumps(self.model_dump(), separators=(",", ":")) + "\n")
+
+
+def open_session(path: Path, frames: Sequence[str], cameras: Sequence[str]) -> Session:
+    """The session of a file, or a new one.
+
+    Raises:
+        FileError: if the file is of another dataset or no session.
+    """
+    new = Session(frames=tuple(frames), cameras=tuple(cameras))
+    if not path.exists():
+        return new
+    session = checked_model(Session, read_json(path), path)
+    if (session.frames, session.cameras) != (new.frames, new.cameras):
+        raise FileError(
+            path,
+            "is a session of other frames or cameras; give the same --frames, or another --out",
+        )
+    return session
+
+
+def to_table(pairs: Sequence[Pair], **further: str) -> Correspondences:
+    """The pairs as a table of correspondences; their frames share no error of a matcher."""
+    return Correspondences.from_arrays(
+        camera=np.array([pair.camera for pair in pairs], dtype=np.str_),
+        frame=np.array([pair.frame for pair in pairs], dtype=np.int64),
+        pixels_px=np.array([pair.pixel_px for pair in pairs]),
+        points_lidar_m=np.array([pair.point_lidar_m for pair in pairs]),
+        metadata={
+            "matcher": "pick", "systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0,
+            **further,
+        },
+    )  # fmt: skip

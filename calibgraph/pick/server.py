@@ -1,18 +1,172 @@
-"""The page's server: it answers this machine alone, at an address that nobody else knows."""
+"""A dataset and its session: what the page shows, and what it writes; and the server of the page.
+
+The server answers this machine alone, at an address that nobody else knows.
+"""
 
 from __future__ import annotations
 
 import json
 import secrets
+import threading
+from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
+from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from calibgraph.errors import CalibrationError
-from calibgraph.pick.session import Pair
-from calibgraph.pick.workspace import Workspace
+from calibgraph.arrays import Array
+from calibgraph.errors import CalibrationError, DatasetError
+from calibgraph.io.dataset import Dataset
+from calibgraph.io.frame import Frame
+from calibgraph.io.rigs import REFERENCE_FILE
+from calibgraph.matching.structure.visibility import find_in_view, find_visible
+from calibgraph.model.geometry import degrees_and_centimetres
+from calibgraph.model.rig import Camera, Rig
+from calibgraph.pick.estimate import (
+    SESSION_FILE,
+    CameraEstimate,
+    Pair,
+    estimate_from_pairs,
+    open_session,
+    reference_rig,
+    to_table,
+)
+
+TABLE_FILE = "picked.parquet"
+_KEPT = 8  # clouds and images in memory
+_JPEG_QUALITY = 95
+_HIDDEN_SPACINGS = 1.5  # side of a cell in which near points hide far ones
+
+
+class Workspace:
+    """A session of picking.
+
+    Raises:
+        FileError: if the folder holds a session of another dataset.
+    """
+
+    def __init__(self, dataset: Dataset, folder: Path) -> None:
+        self.dataset, self.folder = dataset, folder
+        self._frames = {frame.index: frame for frame in dataset.frames}
+        names = [frame.name for frame in dataset.frames]
+        self.session = open_session(folder / SESSION_FILE, names, [*dataset.rig.cameras])
+        self._estimate = estimate_from_pairs(dataset.rig, self.session.pairs)
+        self._lock = threading.Lock()
+        self.cloud = lru_cache(_KEPT)(self._cloud)
+        self.image = lru_cache(_KEPT)(self._image)
+
+    def state(self) -> dict[str, Any]:
+        """Cameras, frames, pairs and what they determine, as plain values."""
+        rig, (solved, cameras) = self.dataset.rig, self._estimate
+        return {
+            "cameras": {
+                name: {"T_camera_lidar": camera.T_camera_lidar.tolist(),
+                       "width_px": camera.width_px,
+                       "height_px": camera.height_px}
+                for name, camera in rig.cameras.items()
+            },
+            "frames": [{"index": frame.index, "name": frame.name, "cameras": [*frame.image_paths]}
+                       for frame in self.dataset.frames],
+            "pairs": [pair.model_dump() for pair in self.session.pairs],
+            "estimates": {name: _answer(one, solved.cameras.get(name) if solved else None)
+                          for name, one in cameras.items()},
+        }  # fmt: skip
+
+    def change(self, pairs: list[Pair]) -> dict[str, Any]:
+        """Replace all pairs, save them, and return the new state.
+
+        Raises:
+            DatasetError: if a pair is of a frame or camera that the dataset does not have.
+        """
+        for pair in pairs:
+            self._frame(pair.frame, pair.camera)
+        with self._lock:
+            session = self.session.model_copy(update={"pairs": tuple(pairs)})
+            estimate = estimate_from_pairs(self.dataset.rig, pairs)
+            session.save(self.folder / SESSION_FILE)
+            self.session, self._estimate = session, estimate
+            return self.state()
+
+    def write(self) -> list[Path]:
+        """Write the pairs as a table, and the reference with its error bars."""
+        rig = reference_rig(self._estimate)
+        table, reference = self.folder / TABLE_FILE, self.folder / REFERENCE_FILE
+        to_table(self.session.pairs).save(table)
+        rig.save(reference, first_line="\n".join(_sigmas(rig)))
+        return [table, reference]
+
+    def projected(self, index: int, name: str) -> NDArray[np.float32]:
+        """(k, 3) pixels and distances of the points that a camera sees, at the estimate."""
+        points = self.cloud(index)[:, :3].astype(np.float64)
+        return visible_points(points, (self._estimate[0] or self.dataset.rig).cameras.get(
+            name, self.dataset.rig.cameras[name]))  # fmt: skip
+
+    def _frame(self, index: int, name: str) -> Frame:
+        frame = self._frames.get(index)
+        if frame is None or name not in frame.image_paths:
+            raise DatasetError(f"the dataset has no image of camera {name!r} in frame {index}")
+        return frame
+
+    def _cloud(self, index: int) -> NDArray[np.float32]:
+        """(n, 4) finite points and their intensity, NaN if there is none."""
+        if index not in self._frames:
+            raise DatasetError(f"the dataset has no frame {index}")
+        cloud = self._frames[index].load_cloud()
+        intensity = cloud[:, 3:4] if cloud.shape[1] > 3 else np.full((len(cloud), 1), np.nan)  # noqa: PLR2004
+        full = np.asarray(np.hstack([cloud[:, :3], intensity]), np.float32)
+        return np.asarray(full[np.isfinite(full[:, :3]).all(axis=1)])
+
+    def _image(self, index: int, name: str) -> bytes:
+        """The image as a JPEG."""
+        image = self._frame(index, name).load_image(name, self.dataset.rig.cameras[name])
+        _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        return data.tobytes()
+
+
+def visible_points(points_lidar_m: Array, camera: Camera) -> NDArray[np.float32]:
+    """(k, 3) column, row and distance of the points that no much nearer point hides."""
+    rows, angles, distance_m = find_in_view(points_lidar_m, camera)
+    area = float(np.prod(np.maximum(np.ptp(angles, axis=0), 1e-6))) if len(rows) > 1 else 1.0
+    cell_rad = _HIDDEN_SPACINGS * float(np.sqrt(area / max(len(rows), 1)))
+    seen = find_visible(angles, distance_m, cell_rad)
+    T = camera.T_camera_lidar
+    pixels, _ = camera.lens.project(points_lidar_m[rows[seen]] @ T[:3, :3].T + T[:3, 3])
+    return np.column_stack([pixels, distance_m[seen]]).astype(np.float32)
+
+
+def _answer(one: CameraEstimate, solved: Camera | None) -> dict[str, Any]:
+    """What the page shows of a camera."""
+    bars = None if solved is None or solved.covariance is None else degrees_and_centimetres(
+        np.asarray(solved.covariance))  # fmt: skip
+    return {
+        "problem": one.problem,
+        "solver": one.solver,
+        "solver_px": one.solver_px,
+        "sigma_deg": None if bars is None else bars[0].tolist(),
+        "sigma_cm": None if bars is None else bars[1].tolist(),
+        "residuals_px": [row if np.isfinite(row).all() else None
+                         for row in one.residuals_px.tolist()],
+        "wrong": one.wrong,
+    }  # fmt: skip
+
+
+def _sigmas(rig: Rig) -> list[str]:
+    """A comment per camera: its standard deviations, for people."""
+    lines = ["# standard deviations about and along the camera's x, y and z:"]
+    for name, camera in rig.cameras.items():
+        if camera.covariance is not None:
+            degrees, centimetres = degrees_and_centimetres(np.asarray(camera.covariance))
+            turn = " ".join(f"{value:.3f}" for value in degrees)
+            shift = " ".join(f"{value:.2f}" for value in centimetres)
+            lines.append(f"#   {json.dumps(name)}: {turn} deg, {shift} cm")
+    return lines
+
 
 MAX_BODY_BYTES = 2**20
 _PAGE = {

@@ -5,6 +5,7 @@ import math
 import os
 import sys
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
         "cannot_tell": result.verdict.cannot_tell,
         "probability_off": _probability(result.verdict),
         "reasons": list(result.verdict.reasons),
-        "summary": result.summary.to_mapping(),
+        "summary": asdict(result.summary),
         "warnings": list(result.warnings),
         "places": [list(place) for place in result.places],
         "cameras": cameras,

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibgraph.arrays import Array
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -90,18 +88,3 @@ def add_legend(axes: Axes, **where: Any) -> None:
     axes.set_axisbelow(True)
     style = {"loc": "upper right", "markerscale": 3, "framealpha": 0.85, **where}
     axes.legend(fontsize=8, borderpad=0.3, handlelength=1.4, **style)
-
-
-def set_octave_ticks(axes: Axes, values: Array) -> None:
-    """Label a logarithmic x axis at the powers of two within the range of the values."""
-    from matplotlib.ticker import NullFormatter, NullLocator
-
-    ticks = 2.0 ** np.arange(-3, 12)
-    low, high = np.min(values, initial=1.0), np.max(values, initial=2.0)
-    if len(values):
-        low, high = values.min() / 1.1, values.max() * 1.1
-    shown = ticks[(ticks >= low) & (ticks <= high)]
-    axes.set_xlim(low, high)
-    axes.set_xticks(shown, [f"{tick:g}" for tick in shown])
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_minor_formatter(NullFormatter())

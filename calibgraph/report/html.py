@@ -1,19 +1,25 @@
 """The page: the template, filled with all of a result; and the files of a result in its folder."""
 
+import os
 import shlex
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
+from calibgraph.errors import DatasetError
 from calibgraph.file_sets import written_together
 from calibgraph.files import write_text
 from calibgraph.io.dataset import Dataset
-from calibgraph.io.formats.names import EXPORT_FORMATS
-from calibgraph.io.frame import frame_of_entry
+from calibgraph.io.formats import EXPORT_FORMATS
+from calibgraph.io.frame import Frame, frame_of_entry, hash_source
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
-from calibgraph.model.geometry import degrees_and_centimetres, invert
+from calibgraph.model.geometry import degrees_and_centimetres, invert, point_in_lidar
 from calibgraph.model.metrics import pose_error
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
@@ -24,33 +30,26 @@ from calibgraph.model.result_files import (
     TABLES,
     require_own_tables,
 )
-from calibgraph.report.camera_section import (
-    camera_diagrams,
-    check_cells,
-    matrix_text,
-    pose_text,
-    worked_point,
-)
-from calibgraph.report.frames import recording_name
+from calibgraph.model.rig import Camera
+from calibgraph.model.verdict import Check, Direction, beside, in_unit, is_reachable
+from calibgraph.report import plots
 from calibgraph.report.kit import page_template
-from calibgraph.report.page_overlays import depth_scale, draw_overlays, width_on_page
-from calibgraph.report.point_overlay import write_overlays
-from calibgraph.report.reprojection_errors import reprojection_errors
-from calibgraph.solver.camera_pairs import match_errors_px
+from calibgraph.report.page_overlays import (
+    depth_scale,
+    draw_overlays,
+    width_on_page,
+    write_overlays,
+)
+from calibgraph.report.plots import ReprojectionErrors, reprojection_errors
+from calibgraph.solver.pairs import match_errors_px
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:
-    """Write a result as one HTML page that needs nothing else: no network, no files beside it.
+    """Write a result as one HTML page that needs nothing else; returns its path.
 
     Images and clouds are read from the files that the result names; if they cannot be read, the
-    page names the cause and leaves their pictures out.
-
-    Args:
-        result: any result; without correspondences the residuals' pictures are left out.
-        path: of the page.
-
-    Returns:
-        The path.
+    page names the cause and leaves their pictures out. Without correspondences there are no
+    pictures of residuals.
 
     Raises:
         CorrespondenceError: if the result's correspondences do not belong to its rig.
@@ -150,10 +149,7 @@ def write_result(
 ) -> list[Path]:
     """Write a result in place of an older one: of images with an overlay picture per camera.
 
-    After an error none of them appears, and the calibration is the last.
-
-    Returns:
-        The files to name to the user.
+    After an error none of them appears, and the calibration is the last. Returns the files.
     """
     require_own_tables(folder)
     with written_together(folder, last=CALIBRATION_FILE) as new:
@@ -164,7 +160,7 @@ def write_result(
             middle = data.frames[len(data.frames) // 2]
             verdicts = {name: one.status for name, one in result.camera_verdicts.items()}
             written += write_overlays(
-                middle, result.initial_rig, result.rig, new, verdicts=verdicts
+                middle, result.initial_rig, new, final=result.rig, verdicts=verdicts
             )
         if with_report:
             write_text(new / REPORT_FILE, render_page(result))
@@ -173,3 +169,136 @@ def write_result(
     for name in set(TABLES) - names:
         (folder / name).unlink(missing_ok=True)  # of the result that this one replaces
     return [folder / path.name for path in written]
+
+
+def check_cells(check: Check) -> tuple[str, str, str]:
+    """The value of a check and its thresholds, as text; empty where there is none.
+
+    The order of the thresholds gives the side on which values are bad. A status that the value
+    does not give, since it depends on more, has none.
+    """
+    if check.value is None:
+        return "", "", ""
+    if check.warn is None or check.fail is None or not check.is_graded:
+        return in_unit(check.value, check.unit), "", ""
+    side: Direction = "at least" if check.warn > check.fail else "at most"
+    warn, fail = (  # empty if no value can be bad
+        f"{'>' if side == 'at most' else '<'} {in_unit(limit, check.unit)}"
+        if is_reachable(limit, check.unit, side)
+        else ""
+        for limit in (check.warn, check.fail)
+    )
+    found = beside(check.value, check.fail if check.status == "FAIL" else check.warn, check.unit)
+    return found, warn, fail
+
+
+_DISTANCE_M = 10.0
+
+
+def worked_point(camera: Camera, errors: ReprojectionErrors | None) -> str:
+    """Project the used correspondence nearest to 10 m, or a point on the optical axis, in lines."""
+    T = camera.T_camera_lidar
+    used = None if errors is None else errors.select(errors.is_inlier)
+    if used is None or not len(used.frame):
+        point, matched = point_in_lidar(T, np.array([0.0, 0.0, _DISTANCE_M])), ""
+    else:
+        row = int(np.argmin(np.abs(used.distances_m - _DISTANCE_M)))
+        point, (u, v) = used.points_lidar_m[row], used.pixels_px[row]
+        matched = (
+            f"\nmatched pixel            = ({u:.2f}, {v:.2f}) px in frame {used.frame[row]}, "
+            f"residual {used.sizes_px[row]:.2f} px"
+        )
+    p_camera, k = T[:3, :3] @ point + T[:3, 3], camera.intrinsics_px
+    u, v = camera.lens.project(p_camera[None])[0][0]
+    distortion = ", ".join(f"{each:g}" for each in camera.distortion) or "none"
+    return (
+        f"p_lidar                  = {_vector(point)} m\n"
+        f"p_camera = R p_lidar + t = {_vector(p_camera)} m\n"
+        f"lens                     = {camera.model}, fx {k.fx:.3f}, fy {k.fy:.3f}, "
+        f"cx {k.cx:.3f}, cy {k.cy:.3f}; distortion {distortion}\n"
+        f"projected pixel (u, v)   = ({u:.2f}, {v:.2f}) px{matched}"
+    )
+
+
+def _vector(values: Array) -> str:
+    return f"({', '.join(f'{value:.3f}' for value in values)})"
+
+
+def matrix_text(T: Array) -> str:
+    """The rows of a matrix, a line each."""
+    return "\n".join(" ".join(f"{value: .6f}" for value in row) for row in T)
+
+
+def pose_text(T: Array) -> str:
+    """Translation and quaternion of a transform, with their order and unit."""
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    return (
+        f"translation x y z   = {' '.join(f'{v:.6f}' for v in T[:3, 3])} m\n"
+        f"quaternion  x y z w = {x:.6f} {y:.6f} {z:.6f} {w:.6f}"
+    )
+
+
+def camera_diagrams(
+    result: Calibration, name: str, errors: ReprojectionErrors | None
+) -> dict[str, str]:
+    """Residuals, coverage and convergence of a camera, as data URIs by name."""
+    found, camera = dict[str, str](), result.rig.cameras[name]
+    if errors is not None:
+        found["residuals"] = plots.residual_scatter(errors, result.residuals[name].sigma_px)
+        found["over_image"] = plots.residual_map(camera, errors)
+        found["coverage"] = plots.coverage(camera, errors)
+    rounds = [cameras[name] for cameras in result.rounds if name in cameras]
+    if len(rounds) > 1:
+        found["convergence"] = plots.convergence(rounds)
+    return found
+
+
+def recording_name(result: Calibration) -> str:
+    """What a result was made from: the last two folders of its recordings, or its table, if any."""
+    if not result.frames:
+        return Path(next(iter(result.inputs), "")).name
+    found = {os.path.commonpath([e["cloud"], *e["images"].values()]) for e in result.frames}
+    return ", ".join("/".join(Path(each).parts[-2:]) for each in sorted(found))
+
+
+def relocate_frames(result: Calibration, dataset: Dataset) -> Calibration:
+    """The result with the paths of its images and clouds taken from a dataset that has moved.
+
+    Args:
+        result: of ``calibrate``, or of a table whose frame numbers are those of the dataset.
+        dataset: the same folders in the same order.
+
+    Raises:
+        DatasetError: if the dataset does not have the result's frames, or other images or clouds
+            under their names.
+    """
+    available = {frame.index: frame for frame in dataset.frames}
+    # Where only correspondences have the number, no name is known.
+    names: dict[int, str | None] = {entry["frame"]: entry["name"] for entry in result.frames}
+    if not names and result.correspondences is not None:
+        names = dict.fromkeys(np.unique(result.correspondences.frame).tolist())
+    for number, name in names.items():
+        if number not in available or name not in (None, available[number].name):
+            raise DatasetError(
+                f"{', '.join(map(str, dataset.folders))}: has no frame number {number}"
+                f"{'' if name is None else f' named {name!r}'}, which the result was made from; "
+                "give the same folders in the same order",
+                frame=number,
+            )
+    for entry in result.frames:
+        _require_same_files(result, entry, available[entry["frame"]])
+    return replace(result, frames=tuple(available[number].entry() for number in names))
+
+
+def _require_same_files(result: Calibration, entry: Mapping[str, Any], frame: Frame) -> None:
+    """Check that a frame's cloud and images are those that the result was made from."""
+    before = {"cloud": entry["cloud"], **entry["images"]}
+    now = {"cloud": frame.cloud_path, **frame.image_paths}
+    for what in before.keys() & now.keys():
+        recorded = result.inputs.get(before[what])
+        if recorded is not None and recorded != hash_source(now[what]):
+            raise DatasetError(
+                f"{now[what]}: is not what the result was made from ({before[what]}): it has "
+                "another content; give the same recording",
+                frame=frame.index,
+            )

@@ -13,14 +13,10 @@ def page_template(package: str) -> Template:
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(each, "") for each in (package, "calibgraph.report")]),
         autoescape=True,
-        finalize=_seen,
+        # Texts of others without characters that are not seen; markup is ours.
+        finalize=lambda value: printable(value) if type(value) is str else value,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     return environment.get_template("page.html.j2")
-
-
-def _seen(value: object) -> object:
-    """Texts of others without characters that are not seen; markup is ours."""
-    return printable(value) if type(value) is str else value

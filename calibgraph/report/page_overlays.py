@@ -4,30 +4,24 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
+from calibgraph.files import write_bytes
 from calibgraph.io.frame import Frame
 from calibgraph.model.clock import when_taken
-from calibgraph.model.rig import Camera
-from calibgraph.report.point_overlay import DEPTH_RANGE_M, depth_colours, draw_points, shrink
+from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.verdict import Status
 
 _PICTURES_BYTES = 3_000_000  # of all pictures together; base64 adds a third
 _SIZES = ((1100, 80), (1100, 70), (960, 65), (800, 60), (640, 60), (480, 50), (320, 40))
 _HEIGHT_PX = 640  # at most, so that a picture and its caption fit on a screen
 _STOPS = 17  # of the scale's gradient
-
-
-@dataclass(frozen=True)
-class Scale:
-    """A gradient of CSS, and its ticks: percent from the left, label."""
-
-    gradient: str
-    ticks: tuple[tuple[float, str], ...]
 
 
 def draw_overlays(
@@ -59,15 +53,19 @@ def width_on_page(camera: Camera) -> int:
     return round(_HEIGHT_PX * camera.width_px / camera.height_px)
 
 
-def depth_scale() -> Scale:
-    """The colours of the distances, linear in their logarithm."""
+def depth_scale() -> tuple[str, list[tuple[float, str]]]:
+    """The colours of the distances, linear in their logarithm.
+
+    Returns:
+        A gradient of CSS, and its ticks: percent from the left, label.
+    """
     low, high = np.log(DEPTH_RANGE_M)
     ticks = np.array([2, 5, 10, 20, 50])
     at = 100 * (np.log(ticks) - low) / (high - low)
     stops = depth_colours(np.exp(np.linspace(low, high, _STOPS)))
     labels = [f"{ticks[0]} m", *map(str, ticks[1:])]
     gradient = ", ".join(f"#{r:02x}{g:02x}{b:02x}" for b, g, r in stops.tolist())
-    return Scale(gradient, tuple(zip(at.tolist(), labels, strict=True)))
+    return gradient, [*zip(at.tolist(), labels, strict=True)]
 
 
 def _to_jpeg(image: NDArray[np.uint8], budget: int) -> str:
@@ -82,3 +80,126 @@ def _to_jpeg(image: NDArray[np.uint8], budget: int) -> str:
         if len(data) <= budget:
             break
     return f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}"
+
+
+Image = NDArray[np.uint8]
+
+DEPTH_RANGE_M = (2.0, 60.0)
+_MAX_WIDTH_PX = 1280  # of a file, so that those of many cameras stay small
+_BAR_PX = 34
+_COVERED_SHARE = 0.2  # of the image, covered by points
+_MAX_DOT_PX = 7
+_MARKS: dict[Status, str] = {"PASS": "PASS", "WARN": "WARN", "FAIL": "FAIL, do not use"}
+
+
+def write_overlays(
+    frame: Frame,
+    guess: Rig,
+    folder: Path,
+    *,
+    final: Rig | None = None,
+    verdicts: Mapping[str, Status] | None = None,
+) -> list[Path]:
+    """Write a picture of every camera: the cloud on its image, by the guess, and by a result below.
+
+    They are ``guess_CAMERA.png``; of a result, with its verdicts, ``overlay_CAMERA.png``.
+
+    Raises:
+        CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
+    """
+    cloud, paths = frame.load_cloud()[:, :3].astype(np.float64), list[Path]()
+    for name, camera in guess.cameras.items():
+        image = frame.load_image(name, camera)
+        shown = {f"{name}, frame {frame.name}: {'guess' if final is None else 'before'}": camera}
+        if final is not None and verdicts is not None:
+            shown[f"{name}, after: {_MARKS[verdicts[name]]}"] = final.cameras[name]
+        panels = [
+            _titled(draw_points(image, cloud, when_taken(each, frame.twist_per_s)), title)
+            for title, each in shown.items()
+        ]
+        picture = shrink(np.vstack([*panels, _depth_bar(image.shape[1])]), _MAX_WIDTH_PX)
+        encoded, data = cv2.imencode(".png", picture)
+        path = folder / f"{'guess' if final is None else 'overlay'}_{name}.png"
+        if not encoded:
+            raise CalibrationError(f"{path}: shape {picture.shape} cannot be encoded as PNG")
+        write_bytes(path, data.tobytes())
+        paths.append(path)
+    return paths
+
+
+def draw_points(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
+    """Draw a cloud on an image, near points over far ones, coloured by their distance.
+
+    Args:
+        image: (height, width, 3) BGR.
+        points_lidar_m: (n, 3) in the LiDAR frame.
+        camera: lens and extrinsic.
+    """
+    points, pixels = visible_points(points_lidar_m, camera)
+    order = np.argsort(-np.linalg.norm(points, axis=1))
+    points, pixels = points[order], pixels[order]
+    column, row = np.rint(pixels).astype(np.intp).T
+    colours = depth_colours(np.linalg.norm(points, axis=1))
+    drawn = image.copy()
+    # Larger for few points, so that all cover a fixed share.
+    side = np.sqrt(_COVERED_SHARE * image.shape[0] * image.shape[1] / max(len(points), 1))
+    side = int(np.clip(round(side), 1, _MAX_DOT_PX))
+    for dy, dx in np.ndindex(side, side):
+        rows = np.clip(row + dy - side // 2, 0, image.shape[0] - 1)
+        drawn[rows, np.clip(column + dx - side // 2, 0, image.shape[1] - 1)] = colours
+    return drawn
+
+
+def visible_points(points_lidar_m: Array, camera: Camera) -> tuple[Array, Array]:
+    """The points that a camera sees: (m, 3) in its frame, and (m, 2) their pixels."""
+    T = camera.T_camera_lidar
+    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    pixels, valid = camera.lens.project(points)
+    valid &= camera.in_image(pixels)
+    return points[valid], pixels[valid]
+
+
+def depth_colours(distance_m: Array) -> Image:
+    """(n, 3) BGR: red is near, blue is far, linear in the logarithm of the distance."""
+    if not len(distance_m):  # OpenCV refuses empty arrays
+        return np.empty((0, 3), np.uint8)
+    low, high = np.log(DEPTH_RANGE_M)
+    share = np.clip((np.log(distance_m) - low) / (high - low), 0.0, 1.0)
+    levels = np.rint(255 * (1 - share)).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0], dtype=np.uint8)
+
+
+def _titled(image: Image, title: str) -> Image:
+    scale = max(0.5, image.shape[1] / 1600)
+    strip = np.zeros((round(44 * scale), image.shape[1], 3), np.uint8)
+    white, thickness = (255, 255, 255), max(1, round(1.5 * scale))
+    origin = (round(12 * scale), round(30 * scale))
+    cv2.putText(
+        strip, title, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.8 * scale, white, thickness, cv2.LINE_AA
+    )
+    return np.vstack([strip, image])
+
+
+def _depth_bar(width: int) -> Image:
+    """A strip with the colours of the distances, with labels."""
+    scale = max(0.5, width / 1600)
+    low, high = np.log(DEPTH_RANGE_M)
+    distances = np.exp(np.linspace(low, high, width))
+    bar = np.repeat(depth_colours(distances)[None], round(_BAR_PX * scale), axis=0)
+    for tick in (2, 5, 10, 20, 50):
+        x = int((np.log(tick) - low) / (high - low) * (width - 1))
+        for colour, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):  # outlined
+            cv2.putText(
+                bar, f"{tick} m", (x + 4, round(24 * scale)), cv2.FONT_HERSHEY_SIMPLEX,
+                0.7 * scale, colour, max(1, round(thickness * scale)), cv2.LINE_AA,
+            )  # fmt: skip
+    return bar
+
+
+def shrink(image: Image, max_width_px: int) -> Image:
+    """The image, scaled down to at most this width."""
+    factor = max_width_px / image.shape[1]
+    if factor >= 1:
+        return image
+    size = (max_width_px, max(1, round(image.shape[0] * factor)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

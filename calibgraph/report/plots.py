@@ -3,30 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.report.figure import (
     add_legend,
     image_figure,
     new_figure,
-    set_octave_ticks,
     to_data_uri,
 )
-from calibgraph.report.reprojection_errors import ReprojectionErrors
+from calibgraph.solver.matches import CameraBlock, camera_blocks
+from calibgraph.solver.preprocess import preprocess
 
 if TYPE_CHECKING:
     from calibgraph.model.rig import Camera
+
 
 # Colours that the colour-blind can tell apart (Okabe and Ito, "Color universal design").
 _INLIER, _OUTLIER, _LINE = "#0072B2", "#D55E00", "#000000"
 
 _MAX_DOTS = 6000
 _MAX_GATES = 2.0  # axes of residuals end here
-_MEDIAN_BINS = 15
-_MIN_PER_BIN = 10
 ARROW_COLUMNS = 12  # cells across the image
 _COVERAGE_COLUMNS = 20
 _ROUND_FACTORS = np.array([1.0, 2.0, 5.0, 10.0])
@@ -52,23 +55,6 @@ def residual_scatter(errors: ReprojectionErrors, sigma_px: float) -> str:
     far = int(np.count_nonzero(np.abs(errors.vectors_px).max(axis=1, initial=0.0) > limit))
     axes.set_title(f"{far} of {len(errors.frame)} are farther out than shown", fontsize=9)
     add_legend(axes, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return to_data_uri(figure)
-
-
-def residual_by_distance(errors: ReprojectionErrors) -> str:
-    """Size of the residuals against the distance of the points, with the running median."""
-    figure = new_figure(3.3)
-    axes = figure.add_axes((0.12, 0.15, 0.85, 0.82))
-    for part, colour, label in _outliers_and_inliers(errors):
-        dots = _thin(np.column_stack([part.distances_m, part.sizes_px]))
-        axes.plot(*dots.T, ".", color=colour, markersize=2.5, alpha=0.5, label=label)
-    middle = _running_median(errors.select(errors.is_inlier))
-    axes.plot(*middle.T, "-", color=_LINE, linewidth=1.8, label="median, inside")
-    axes.axhline(errors.gate_px, color=_LINE, linewidth=1.0, linestyle=":")
-    axes.set(xscale="log", ylim=(0, _MAX_GATES * errors.gate_px))
-    axes.set(xlabel="distance from the camera [m]", ylabel="residual [px]")
-    set_octave_ticks(axes, errors.distances_m)
-    add_legend(axes)
     return to_data_uri(figure)
 
 
@@ -153,18 +139,6 @@ def _thin(dots: Array) -> Array:
     return np.asarray(dots[rows])
 
 
-def _running_median(errors: ReprojectionErrors) -> Array:
-    """(m, 2) medians of distance and size over bins of equally many matches."""
-    order = np.argsort(errors.distances_m)
-    bins = np.array_split(order, max(1, min(_MEDIAN_BINS, len(order) // _MIN_PER_BIN)))
-    medians = [
-        (np.median(errors.distances_m[rows]), np.median(errors.sizes_px[rows]))
-        for rows in bins
-        if len(rows)
-    ]
-    return np.array(medians).reshape(-1, 2)
-
-
 def arrow_factor(means: Array, cell_px: float) -> float:
     """A round factor by which the longer arrows fill their cells."""
     longest = float(np.quantile(np.hypot(*means.T), 0.9)) if len(means) else 0.0
@@ -204,3 +178,95 @@ def mean_residuals(
     cell = np.array([camera.width_px / columns, camera.height_px / len(counts)])
     centres = (np.column_stack(full[::-1]) + 0.5) * cell - 0.5
     return centres, np.column_stack(sums) / counts[full][:, None], float(cell[0])
+
+
+@dataclass(frozen=True, eq=False)
+class ReprojectionErrors:
+    """The errors of one camera's preprocessed correspondences.
+
+    Attributes:
+        points_lidar_m: (n, 3) in the LiDAR frame.
+        pixels_px: (n, 2) matched pixels.
+        vectors_px: (n, 2) projected less matched, along the directions that the match constrains:
+            for an edge, across it. The gate compares its length.
+        distances_m: (n,) from the camera to the points.
+        frame: (n,) frame numbers.
+        gate_px: tau of the result.
+    """
+
+    points_lidar_m: Array
+    pixels_px: Array
+    vectors_px: Array
+    distances_m: Array
+    frame: NDArray[np.int64]
+    gate_px: float
+
+    @property
+    def sizes_px(self) -> Array:
+        """(n,) lengths of ``vectors_px``."""
+        return np.asarray(np.hypot(*self.vectors_px.T))
+
+    @property
+    def is_inlier(self) -> NDArray[np.bool_]:
+        """(n,) whether the error is within the gate."""
+        return np.asarray(self.sizes_px <= self.gate_px)
+
+    def select(self, rows: NDArray[np.bool_]) -> ReprojectionErrors:
+        """The errors of some correspondences."""
+        columns: dict[str, Any] = {
+            name: column[rows]
+            for name, column in vars(self).items()
+            if isinstance(column, np.ndarray)
+        }
+        return replace(self, **columns)
+
+
+def reprojection_errors(result: Calibration) -> dict[str, ReprojectionErrors]:
+    """The errors of each camera with correspondences; empty without a table.
+
+    Raises:
+        CorrespondenceError: if the table does not belong to the result's rig.
+    """
+    if result.correspondences is None:
+        return {}
+    # The last of several rounds of matching started near the result, not at the guess.
+    start = result.rig if len(result.rounds) > 1 else result.initial_rig
+    table = preprocess(start, result.correspondences, result.config).table
+    blocks = camera_blocks(result.rig, table, result.config)
+    return {
+        name: _errors_at(result.T_camera_lidar[name], blocks[name], measured.gate_px)
+        for name, measured in result.residuals.items()
+        if name in blocks
+    }
+
+
+def _errors_at(T_camera_lidar: Array, matches: CameraBlock, gate_px: float) -> ReprojectionErrors:
+    """The errors of those matches that project into the camera at this extrinsic."""
+    block = matches.block
+    residuals, valid = block.residuals(to_T_lidar_camera(T_camera_lidar))
+    points_camera = block.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+    everything = ReprojectionErrors(
+        points_lidar_m=block.points_lidar_m,
+        pixels_px=block.pixels_px,
+        vectors_px=constrained(residuals, matches.information),
+        distances_m=np.linalg.norm(points_camera, axis=1),
+        frame=matches.frame,
+        gate_px=gate_px,
+    )
+    return everything.select(valid)
+
+
+def constrained(residuals: Array, information: Array | None) -> Array:
+    """(n, 2) I^(1/2) r / lambda_max^(1/2); its length is ``whitening.constrained_error_px``.
+
+    The root of a 2x2 matrix I is (I + sqrt(det I) E) / sqrt(tr I + 2 sqrt(det I)).
+    """
+    if information is None:
+        return residuals
+    uu, uv, vv = information.T
+    largest = (uu + vv) / 2 + np.hypot((uu - vv) / 2, uv)
+    root = np.sqrt(np.maximum(uu * vv - uv**2, 0.0))
+    scale = np.sqrt((uu + vv + 2 * root) * largest)
+    x, y = residuals.T
+    rooted = np.column_stack([(uu + root) * x + uv * y, uv * x + (vv + root) * y])
+    return np.asarray(rooted / scale[:, None])

@@ -2,47 +2,61 @@
 
 import json
 import os
+import re
 import shutil
 import time
+import zipfile
 from pathlib import Path
 from typing import Any
 
 from calibgraph.audit import audit_summary, check
 from calibgraph.audit.page import write_audit_report
-from calibgraph.child_process import Note, answer_requests, memory_limit, output_to
-from calibgraph.errors import CalibrationError
+from calibgraph.child_process import (
+    Note,
+    Outcome,
+    answer_requests,
+    describe_failure,
+    memory_limit,
+    output_to,
+)
+from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import sha256, write_text
-from calibgraph.fleet.task import describe_failure
-from calibgraph.fleet.uris import fetch
+from calibgraph.fleet.files import fetch
 from calibgraph.io.dataset import load_dataset
 from calibgraph.io.rigs import load_rig
-from calibgraph.matching.structure import StructureMatcher
+from calibgraph.matching.named import structure_matcher
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.pipeline import calibrate, solve
 from calibgraph.progress import Progress
 from calibgraph.report.as_json import finite, result_summary
 from calibgraph.report.html import write_result
-from calibgraph.service.archives import open_upload, table_suffix
-from calibgraph.service.data_folder import ARCHIVE, FILES, INPUT, LOG, SCRATCH, SUMMARY, WORK
-from calibgraph.service.job_requests import (
+from calibgraph.service.folders import (
+    ARCHIVE,
+    FILES,
+    INPUT,
+    LOG,
+    SCRATCH,
+    SUMMARY,
+    WORK,
+    require_inside,
+)  # fmt: skip
+from calibgraph.service.requests import (
     RIG,
     TABLE,
     CalibrationSettings,
     CheckSettings,
-    JobOutcome,
     JobProgress,
     JobTask,
     SolveSettings,
     recording_name,
 )
-from calibgraph.service.places import require_inside
 
 _NOTE_EVERY_S = 0.1
 _KNOWN_SUFFIXES = (".bag", ".mcap", ".db3", ".parquet", ".csv", ".yaml", ".yml", ".txt")
 
 
-def run_job(task: JobTask, note: Note) -> JobOutcome:
+def run_job(task: JobTask, note: Note) -> Outcome:
     """Run a job; what is wrong with its data is part of the outcome.
 
     Its paths are relative, so that no answer has one of the server's.
@@ -60,7 +74,7 @@ def run_job(task: JobTask, note: Note) -> JobOutcome:
         if isinstance(error, OSError):  # whose text may name the server's files
             text = error.strerror or type(error).__name__
     text = text.replace(f"{task.folder}/{SCRATCH}/", "").replace(str(task.folder), "")
-    return JobOutcome(error_kind=kind, error=str(CalibrationError(text)))
+    return Outcome(error_kind=kind, error=str(CalibrationError(text)))
 
 
 def _input(task: JobTask, name: str) -> Path | None:
@@ -85,7 +99,7 @@ def _room(task: JobTask) -> int:
 
 def _fetched(task: JobTask, uri: str, name: str) -> Path:
     """A link to what is at a URI, or to the copy of what is remote."""
-    require_inside(uri, task.roots)
+    require_inside(uri, task.settings.roots)
     copies = Path(f"{name}_copy")
     copies.mkdir()
     try:
@@ -104,7 +118,7 @@ def _recordings(task: JobTask) -> list[Path]:
     return [path for name in names if (path := _input(task, name)) is not None]
 
 
-def _solve(task: JobTask, progress: Progress) -> JobOutcome:
+def _solve(task: JobTask, progress: Progress) -> Outcome:
     settings = SolveSettings.model_validate(task.job.settings)
     rig, table = _input(task, RIG), _input(task, TABLE)
     assert rig is not None and table is not None  # of each job
@@ -114,20 +128,21 @@ def _solve(task: JobTask, progress: Progress) -> JobOutcome:
     return _write(task, result, None, with_report=settings.report)
 
 
-def _calibrate(task: JobTask, progress: Progress) -> JobOutcome:
+def _calibrate(task: JobTask, progress: Progress) -> Outcome:
     settings = CalibrationSettings.model_validate(task.job.settings)
     rig = _input(task, RIG)
     guess = None if rig is None else load_rig(rig)
     data = load_dataset(_recordings(task), guess, frames=settings.frames)
-    options: dict[str, Any] = {"search_deg": settings.search_deg, "search_m": settings.search_m}
-    if settings.search:
-        options = {name: value for name, value in options.items() if value is not None}
-    if settings.frames is not None:
-        options["most_frames"] = None
+    most = {"search_deg": settings.search_deg, "search_m": settings.search_m}
+    matcher = structure_matcher(
+        seed=settings.config.seed,
+        all_frames=settings.frames is not None,
+        **(most if settings.search else dict.fromkeys(most, 0.0)),
+    )
     most_s = task.settings.job_timeout_s / 2  # the rest is for the checks and the report
     result = calibrate(
         data,
-        matcher=_input(task, TABLE) or StructureMatcher(seed=settings.config.seed, **options),
+        matcher=_input(task, TABLE) or matcher,
         config=settings.config,
         terms=settings.terms,
         time_limit_s=min(settings.time_limit_s or most_s, most_s),
@@ -137,31 +152,30 @@ def _calibrate(task: JobTask, progress: Progress) -> JobOutcome:
     return _write(task, result, data, with_report=settings.report)
 
 
-def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) -> JobOutcome:
+def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) -> Outcome:
     written = write_result(result, task.folder / WORK / FILES, data, with_report=with_report)
     _write_summary(task, result_summary(result, [Path(path.name) for path in written]))
-    return JobOutcome(result.verdict.status, result.verdict.cannot_tell)
+    return Outcome((result.verdict.status, result.verdict.cannot_tell))
 
 
-def _check(task: JobTask, progress: Progress) -> JobOutcome:
+def _check(task: JobTask, progress: Progress) -> Outcome:
     settings = CheckSettings.model_validate(task.job.settings)
     rig = _input(task, RIG)
     assert rig is not None  # of each job
-    options: dict[str, Any] = {} if settings.frames is None else {"most_frames": None}
     data = load_dataset(_recordings(task), load_rig(rig), frames=settings.frames)
     audit = check(
         rig,
         data,
         tolerance_deg=settings.tolerance_deg,
         tolerance_cm=settings.tolerance_cm,
-        matcher=StructureMatcher(seed=settings.seed, **options),
+        matcher=structure_matcher(seed=settings.seed, all_frames=settings.frames is not None),
         seed=settings.seed,
         progress=progress,
     )
     progress("writing", 0, 1)
     write_audit_report(audit, task.folder / WORK / FILES / REPORT_FILE)
     _write_summary(task, audit_summary(audit))
-    return JobOutcome(audit.status, audit.status == "CANNOT TELL")
+    return Outcome((audit.status, audit.status == "CANNOT TELL"))
 
 
 def _write_summary(task: JobTask, summary: dict[str, Any]) -> None:
@@ -188,9 +202,124 @@ def _progress(note: Note) -> Progress:
     return progress
 
 
-def _answer(task: JobTask, note: Note) -> JobOutcome:
+def _answer(task: JobTask, note: Note) -> Outcome:
     with output_to(task.folder / LOG), memory_limit(task.settings.memory_bytes):
         return run_job(task, note)
+
+
+MOST_FILES = 100_000
+MOST_RATIO = 100
+"""Clouds and images of sensors pack to a third at best; zeros to a thousandth."""
+_ANY_RATIO_BYTES = 10**8
+_NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}"
+_LAYOUT = re.compile(
+    rf"(?:rig\.yaml|calib\.txt|times\.txt|metadata\.yaml|{_NAME}\.(?:db3|mcap)"
+    rf"|(?:lidar|velodyne|image_[0-9])/{_NAME}|cameras/{_NAME}/{_NAME})"
+)
+"""What an archive may hold: a dataset folder, a KITTI odometry sequence, or a ROS 2 bag."""
+
+_DATA = re.compile(r"(?:lidar|velodyne|image_[0-9]|cameras)/")
+"""Folders in which nothing is left out."""
+
+_JUNK = re.compile(
+    r"(?:.*/)?(?:__MACOSX/.*|\.DS_Store|\._[^/]*|Thumbs\.db|desktop\.ini)", re.IGNORECASE
+)
+"""What file managers add."""
+
+_BAGS = {b"#ROSBAG V2.0": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
+_ZIP = b"PK\x03\x04"
+
+
+def open_upload(upload: Path, target: Path, most_bytes: int) -> Path:
+    """The recording in an upload, by its first bytes: linked, or unpacked into a folder.
+
+    Args:
+        upload: the file, which stays as it is.
+        target: of the folder, or of the bag without its suffix.
+        most_bytes: of all unpacked files.
+
+    Raises:
+        FileError: if it is neither, or an archive holds something else, or too much.
+    """
+    with upload.open("rb") as file:
+        head = file.read(16)
+    for mark, suffix in _BAGS.items():
+        if head.startswith(mark):
+            bag = target.with_name(target.name + suffix)
+            bag.hardlink_to(upload)
+            return bag
+    if not head.startswith(_ZIP):
+        raise FileError(target, "is no .zip of a dataset folder, and no bag (.bag, .mcap, .db3)")
+    try:
+        _unpack(upload, target, most_bytes)
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+        raise FileError(target, f"cannot be unpacked ({error}); make the .zip again") from error
+    return target
+
+
+def table_suffix(path: Path) -> str:
+    """The suffix of an uploaded table by its first bytes: Parquet, else CSV."""
+    with path.open("rb") as file:
+        return ".parquet" if file.read(4) == b"PAR1" else ".csv"
+
+
+def _unpack(packed: Path, folder: Path, most_bytes: int) -> None:
+    """Unpack an archive, if all its names and sizes are as they should be."""
+    with zipfile.ZipFile(packed) as archive:
+        files = [m for m in archive.infolist() if not m.is_dir()]
+        if len(files) > MOST_FILES:
+            raise FileError(folder.name, f"{len(files)} files, expected up to {MOST_FILES}")
+        files = [m for m in files if not _JUNK.fullmatch(m.filename)]
+        targets = _targets([m.filename for m in files], folder.name)
+        size = sum(m.file_size for m in files)  # zipfile reads no more than that
+        packed_size = packed.stat().st_size
+        most = min(most_bytes, max(_ANY_RATIO_BYTES, MOST_RATIO * packed_size))
+        if size > most:
+            why = f"{packed_size} bytes stand for {size} when unpacked, expected up to {most}"
+            raise FileError(folder.name, f"{why}; send a recording of a sensor, or less of it")
+        folder.mkdir()
+        for name, target in targets.items():
+            path = folder / target
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with archive.open(name) as source, path.open("xb") as file:
+                shutil.copyfileobj(source, file, 2**20)
+
+
+def _targets(names: list[str], where: str) -> dict[str, str]:
+    """Where files of an archive belong in the dataset's folder, which may be in other folders."""
+    for name in names:
+        if not name.isprintable() or "\\" in name or {"", ".", ".."} & {*name.split("/")}:
+            raise _unexpected(name, where)
+    top = _top_folder(names)
+    targets = {name: name.removeprefix(top) for name in names}
+    left_out = [target for target in targets.values() if not _LAYOUT.fullmatch(target)]
+    for target in left_out:
+        if _DATA.match(target) or len(left_out) == len(targets):
+            raise _unexpected(target, where)
+    if left_out:
+        named = ", ".join(ascii(target[:100]) for target in left_out[:20])
+        print(f"{where}: {len(left_out)} files are no part of a dataset, and left out: {named}")
+    kept = {name: target for name, target in targets.items() if _LAYOUT.fullmatch(target)}
+    if len({name.lower() for name in names}) < len(names):
+        raise FileError(where, "holds a name twice")
+    return kept
+
+
+def _top_folder(names: list[str]) -> str:
+    """The folder in an archive that holds the dataset: the one in which most names fit."""
+    shared = os.path.commonpath([f"/{name}" for name in names]) if names else "/"
+    parts = [f"{part}/" for part in shared.split("/") if part]
+    folders = ["".join(parts[:depth]) for depth in range(len(parts) + 1)]
+    fits = [sum(bool(_LAYOUT.fullmatch(n.removeprefix(top))) for n in names) for top in folders]
+    return folders[fits.index(max(fits))]
+
+
+def _unexpected(name: str, where: str) -> FileError:
+    return FileError(
+        where,
+        f"holds {ascii(name[:100])}, expected rig.yaml, lidar/STEM.npy, cameras/NAME/STEM.png, "
+        "or a KITTI sequence or ROS 2 bag, with names of letters, digits, _, - and .",
+    )
 
 
 if __name__ == "__main__":

@@ -9,9 +9,9 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, sessionmaker
 
+from calibgraph.child_process import ErrorKind, Outcome
 from calibgraph.errors import CalibrationError
-from calibgraph.fleet.task import ErrorKind
-from calibgraph.service.job_requests import Job, JobKind, JobOutcome
+from calibgraph.service.requests import Job, JobKind
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 FINISHED: tuple[JobState, ...] = ("succeeded", "failed", "cancelled")
@@ -148,11 +148,12 @@ class JobTable:
         with self._sessions.begin() as session:
             return session.scalar(start)
 
-    def finish(self, id: str, outcome: JobOutcome) -> None:
+    def finish(self, id: str, outcome: Outcome) -> None:
         """Give a running job its final state, unless it was cancelled."""
+        verdict, cannot_tell = outcome.result or (None, None)
         values = {
             "state": "succeeded" if outcome.error_kind is None else "failed",
-            "verdict": outcome.verdict, "cannot_tell": outcome.cannot_tell,
+            "verdict": verdict, "cannot_tell": cannot_tell,
             "error_kind": outcome.error_kind, "error": outcome.error, "finished_s": time.time(),
         }  # fmt: skip
         self._change(_is(id, "running"), values)

@@ -1,17 +1,37 @@
-"""What every request passes: its host and origin, its token, the size and time of its body."""
+"""What every request passes: its host and origin, its token, the size and time of its body.
+
+A token has a scope; the token file holds their hashes alone.
+"""
 
 import asyncio
+import hashlib
+import re
+import secrets
 import time
+from base64 import b64decode
 from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal, get_args
 from urllib.parse import SplitResult, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from calibgraph.service.access import Scope as TokenScope
-from calibgraph.service.access import Tokens, require_scope
+from calibgraph.errors import FileError
+from calibgraph.files import read_text, write_text
 from calibgraph.service.problems import Problem, problem_response
-from calibgraph.service.settings import Settings
+from calibgraph.service.requests import Settings
+
+TokenScope = Literal["read", "submit"]
+SCOPES: tuple[TokenScope, ...] = get_args(TokenScope)
+"""The second includes the first."""
+
+Tokens = dict[str, TokenScope]
+"""The scope of each token, by the token's SHA-256."""
+
+_LINE = re.compile(f"({'|'.join(SCOPES)}) ([0-9a-f]{{64}})")
+_REALM = 'Basic realm="calibgraph: any name, a token as the password"'
 
 STRICT_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; object-src 'none'; base-uri 'none'; "
@@ -148,3 +168,45 @@ def _split(url: str) -> SplitResult:
         return urlsplit(url)
     except ValueError:
         return urlsplit("")
+
+
+def load_tokens(path: Path) -> Tokens:
+    """The tokens of a file: a line each, its scope and its hash."""
+    found: Tokens = {}
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        match = _LINE.fullmatch(line.strip())
+        if match is None:
+            expected = "expected a scope and a hash, as calibgraph serve --new-token writes"
+            raise FileError(path, f"line {number} is {line[:40]!r}, {expected}")
+        found[match[2]] = SCOPES[SCOPES.index(match[1])]
+    return found
+
+
+def add_token(path: Path, scope: TokenScope) -> str:
+    """Make a token, which is kept nowhere, and add its hash to a file, which is made if missing."""
+    tokens, secret = load_tokens(path) if path.exists() else {}, secrets.token_urlsafe(32)
+    tokens[_hash(secret)] = scope
+    write_text(path, "".join(f"{each} {digest}\n" for digest, each in tokens.items()))
+    path.chmod(0o600)
+    return secret
+
+
+def _hash(token: str) -> str:
+    """SHA-256: a token is 256 random bits, which no one finds by trying, nor by taking the time."""
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+def require_scope(tokens: Tokens | None, authorization: str, needed: TokenScope) -> None:
+    """Refuse a caller whose token, of Bearer or the password of Basic, lacks a scope."""
+    if tokens is None:
+        return
+    scheme, _, given = authorization.partition(" ")
+    if scheme.lower() == "basic":
+        with suppress(ValueError):
+            given = b64decode(given, validate=True).decode().partition(":")[2]
+    scope = tokens.get(_hash(given.strip()))
+    if scope is None:
+        text = "give a token: Authorization: Bearer TOKEN"
+        raise Problem(401, text, {"WWW-Authenticate": _REALM})
+    if SCOPES.index(scope) < SCOPES.index(needed):
+        raise Problem(403, f"this needs a token of scope {needed}, found {scope}")

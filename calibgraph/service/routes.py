@@ -1,4 +1,4 @@
-"""Routes of jobs and of their results, the page, health and a few counters."""
+"""Routes of jobs and of their results, of trackers, the page, health and a few counters."""
 
 import asyncio
 import time
@@ -7,20 +7,21 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from starlette.concurrency import run_in_threadpool
 
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.report.kit import page_template
-from calibgraph.service.data_folder import ARCHIVE, FILES, LOG, RESULT, SUMMARY
-from calibgraph.service.job_requests import RECORDING, RIG, TABLE, TEXTS, JobKind, JobProgress
+from calibgraph.service.folders import ARCHIVE, FILES, LOG, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord, JobState
 from calibgraph.service.problems import Problem
+from calibgraph.service.requests import RECORDING, RIG, TABLE, TEXTS, JobKind, JobProgress
 from calibgraph.service.state import Service, service_of
 from calibgraph.service.uploads import receive_job
 
 State = Annotated[Service, Depends(service_of)]
 Before = Annotated[int | None, Query(ge=0, le=2**62)]
+TrackerName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}$")]
 router = APIRouter()
 
 REPORT_POLICY = (
@@ -88,7 +89,7 @@ async def submit(kind: JobKind, request: Request, response: Response, state: Sta
     """Ask for a job: a form with files, or fields with their URIs, and settings as JSON."""
     size = int(request.headers.get("content-length", "0"))
     await run_in_threadpool(state.require_room, size)
-    id, job = await receive_job(request, kind, state.folder, state.roots)
+    id, job = await receive_job(request, kind, state.folder, state.settings.roots)
     record = await run_in_threadpool(state.add, id, job)
     response.headers["Location"] = f"/v1/jobs/{id}"
     return _answer(record, state)
@@ -195,3 +196,15 @@ def metrics(state: State) -> str:
         for status, n in sorted(state.answers.items())
     ]
     return "\n".join([*jobs, *answers, ""])
+
+
+async def _tracker(
+    name: TrackerName, request: Request, state: State, config: str = "{}"
+) -> Response:
+    """PUT a rig file to begin, POST frames (JSON lines), GET the last estimate, DELETE it."""
+    text = await state.trackers.ask(request.method, name, await request.body(), config)
+    return Response(text, media_type="application/json")
+
+
+for _method in ("PUT", "POST", "GET", "DELETE"):
+    router.add_api_route("/v1/trackers/{name}", _tracker, methods=[_method])

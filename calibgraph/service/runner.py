@@ -8,12 +8,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 
-from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
-from calibgraph.service.data_folder import INPUT, RESULT, SCRATCH, WORK, DataFolder
-from calibgraph.service.job_requests import Job, JobOutcome, JobProgress, JobTask
+from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError, Outcome
+from calibgraph.service.folders import INPUT, RESULT, SCRATCH, WORK, DataFolder
 from calibgraph.service.jobs import FINISHED, JobRecord, JobTable
-from calibgraph.service.places import Root
-from calibgraph.service.settings import Settings
+from calibgraph.service.requests import Job, JobProgress, JobTask, Settings
 
 log = logging.getLogger("calibgraph.service")
 
@@ -41,10 +39,8 @@ class Runner:
         added: to be set when a job was added.
     """
 
-    def __init__(
-        self, table: JobTable, folder: DataFolder, settings: Settings, roots: tuple[Root, ...]
-    ) -> None:
-        self._table, self._folder, self._settings, self._roots = table, folder, settings, roots
+    def __init__(self, table: JobTable, folder: DataFolder, settings: Settings) -> None:
+        self._table, self._folder, self._settings = table, folder, settings
         self.steps: dict[str, JobProgress] = {}
         self._slots = [_Slot() for _ in range(settings.jobs_at_once)]
         self._threads: list[threading.Thread] = []
@@ -129,22 +125,25 @@ class Runner:
             slot.job = None
         self.steps.pop(record.id, None)
 
-    def _ask(self, slot: _Slot, record: JobRecord) -> JobOutcome | None:
+    def _ask(self, slot: _Slot, record: JobRecord) -> Outcome | None:
         """What the child answers; None if the job is to wait again."""
         try:
             slot.child.start()
             current = self._table.get(record.id)
             if current is None or current.state != "running":  # cancelled meanwhile
-                return JobOutcome(error_kind="bad input", error="cancelled")
-            outcome: JobOutcome = slot.child.ask(
+                return Outcome(error_kind="bad input", error="cancelled")
+            outcome: Outcome = slot.child.ask(
                 self.task(record),
                 self._settings.job_timeout_s,
                 partial(self.steps.__setitem__, record.id),
             )
-            self._renew(slot, failed=outcome.error_kind is not None)
+            slot.jobs += 1
+            if outcome.error_kind is not None or slot.jobs >= _JOBS_PER_CHILD:
+                slot.child.stop()  # it has run many jobs, or may be in disorder
+                slot.jobs = 0
             return outcome
         except ChildTimeoutError as error:
-            return JobOutcome(error_kind="timeout", error=f"{error}; give fewer frames")
+            return Outcome(error_kind="timeout", error=f"{error}; give fewer frames")
         except ChildEndedError as error:
             slot.child.stop()
             if not self._is_stopping.is_set():
@@ -154,14 +153,7 @@ class Runner:
     def task(self, record: JobRecord) -> JobTask:
         """What the process of a job gets."""
         job, folder = Job.model_validate_json(record.request), self._folder.of_job(record.id)
-        return JobTask(job, folder, self._roots, self._settings)
-
-    def _renew(self, slot: _Slot, *, failed: bool) -> None:
-        """End a process that has run many jobs, or one that failed: it may be in disorder."""
-        slot.jobs += 1
-        if failed or slot.jobs >= _JOBS_PER_CHILD:
-            slot.child.stop()
-            slot.jobs = 0
+        return JobTask(job, folder, self._settings)
 
     def _discard_input(self, id: str) -> None:
         """Remove all of a finished job that is not its result."""

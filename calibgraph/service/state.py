@@ -1,20 +1,23 @@
 """What the routes of a server share."""
 
+import asyncio
 import shutil
+import zlib
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
 
 from fastapi import Request
 
+from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
 from calibgraph.errors import CalibrationError
-from calibgraph.service.access import load_tokens
-from calibgraph.service.data_folder import DataFolder
-from calibgraph.service.job_requests import Job
+from calibgraph.service.folders import DataFolder, open_roots
 from calibgraph.service.jobs import JobRecord, JobTable, open_database
-from calibgraph.service.places import open_roots
 from calibgraph.service.problems import Problem
+from calibgraph.service.request_guard import load_tokens
+from calibgraph.service.requests import Job, Settings
 from calibgraph.service.runner import Runner
-from calibgraph.service.settings import Settings
-from calibgraph.service.trackers import Trackers
 
 
 class Service:
@@ -25,17 +28,18 @@ class Service:
     """
 
     def __init__(self, settings: Settings) -> None:
+        settings = settings.model_copy(update={"roots": open_roots(settings.roots)})
         self.settings, self.is_stopping = settings, False
         self.answers: Counter[int] = Counter()  # by status
         self.tokens = None if settings.tokens is None else load_tokens(settings.tokens)
-        self.roots, self.folder = open_roots(settings.roots), DataFolder(settings.data)
+        self.folder = DataFolder(settings.data)
         try:
             self.engine = open_database(self.folder.path, settings.database, self.folder.owner)
         except CalibrationError:
             self.folder.close()
             raise
         self.jobs = JobTable(self.engine)
-        self.runner = Runner(self.jobs, self.folder, settings, self.roots)
+        self.runner = Runner(self.jobs, self.folder, settings)
         self.trackers = Trackers(
             self.folder.trackers, settings.tracker_processes, settings.memory_bytes
         )
@@ -79,3 +83,35 @@ class Service:
 async def service_of(request: Request) -> Service:
     """The parts of the server that a request is for."""
     return request.app.state.service  # type: ignore[no-any-return]
+
+
+class Trackers:
+    """The processes that hold the trackers; each tracker is in one of them."""
+
+    def __init__(self, folder: Path, processes: int, memory_bytes: int) -> None:
+        self.folder, child = folder, (f"{__package__}.tracker_process", (str(memory_bytes),))
+        self._hosts = [(ChildProcess(*child), ThreadPoolExecutor(1)) for _ in range(processes)]
+
+    async def ask(self, method: str, name: str, body: bytes, config: str) -> str:
+        """What the process of a tracker answers; a :class:`Problem` if it refuses."""
+        child, pool = self._hosts[zlib.crc32(name.encode()) % len(self._hosts)]
+        request, loop = (method, self.folder / name, body, config), asyncio.get_running_loop()
+        status, text = await loop.run_in_executor(pool, _ask, child, request)
+        if status == 200:  # noqa: PLR2004
+            return text
+        raise Problem(status, text)
+
+    def close(self) -> None:
+        """End the processes; what they answered is on disk."""
+        for child, pool in self._hosts:
+            pool.shutdown(cancel_futures=True)
+            child.close()
+
+
+def _ask(child: ChildProcess, request: Any) -> tuple[int, str]:
+    try:
+        child.start()
+        return child.ask(request, 120.0)  # type: ignore[no-any-return]
+    except (ChildEndedError, ChildTimeoutError) as error:
+        child.stop()
+        return 503, f"{error}; send the frames again: those that were taken in are known"

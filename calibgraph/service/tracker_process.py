@@ -4,22 +4,31 @@ import gc
 import json
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
-from calibgraph.child_process import answer_requests, memory_limit
+import pyarrow as pa
+
+from calibgraph.child_process import answer_requests, describe_failure, memory_limit
 from calibgraph.files import sync_folder, write_bytes, write_text
-from calibgraph.fleet.task import describe_failure
 from calibgraph.io.rigs import load_rig
 from calibgraph.model.config import config_from
 from calibgraph.report.as_json import finite, result_summary
 from calibgraph.tracking import DurableCalibrator, Update, update_all, warm_up_tracker
-from calibgraph.tracking.frame_group import in_groups
+from calibgraph.tracking.assessment import json_lines
 from calibgraph.tracking.state import require_poses_alone
-from calibgraph.tracking.stream_lines import frames_of_lines
-from calibgraph.tracking.streams import Refused
-from calibgraph.tracking.update import json_lines
+from calibgraph.tracking.streams import (
+    Item,
+    Refused,
+    frames_in_table,
+    frames_of_lines,
+    in_groups,
+    require_schema,
+)
 
 Held = dict[Path, DurableCalibrator]
+_ARROW = b"\xff\xff\xff\xff"
+"""The first bytes of an Arrow IPC stream, which no JSON has."""
 
 
 def answer(held: Held, request: tuple[str, Path, bytes, str]) -> tuple[int, str]:
@@ -59,9 +68,22 @@ def answer(held: Held, request: tuple[str, Path, bytes, str]) -> tuple[int, str]
     return status, text
 
 
+def _frames_of(body: bytes) -> Iterator[Item]:
+    """The frames of JSON lines, or of a table of correspondences as an Arrow IPC stream."""
+    if not body.startswith(_ARROW):
+        return frames_of_lines([body], "frames")
+    try:
+        table = pa.ipc.open_stream(body).read_all()
+        table.validate(full=True)  # what is sent may be damaged
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"not a whole Arrow IPC stream ({error}); send it again") from error
+    require_schema("frames", table.schema)
+    return frames_in_table(table, "frames")
+
+
 def _take_frames(calibrator: DurableCalibrator, body: bytes) -> str:
     """Take in frames, ten by one write; one with a motion of no vehicle refuses all of them."""
-    items = [*frames_of_lines([body], "frames")]
+    items = [*_frames_of(body)]
     updates, refused, known = list[Update](), list[str](), 0
     for item in items:  # slower frames look right, and are not
         if isinstance(item, Refused) and item.by_motion:

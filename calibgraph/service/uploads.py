@@ -12,8 +12,9 @@ from starlette.datastructures import FormData, UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
 from calibgraph.files import describe
-from calibgraph.service.data_folder import INPUT, LOG, DataFolder
-from calibgraph.service.job_requests import (
+from calibgraph.service.folders import INPUT, LOG, DataFolder, require_inside
+from calibgraph.service.problems import Problem
+from calibgraph.service.requests import (
     MAX_RECORDINGS,
     PARTS,
     RECORDING,
@@ -23,8 +24,6 @@ from calibgraph.service.job_requests import (
     JobKind,
     recording_name,
 )
-from calibgraph.service.places import Root, require_inside
-from calibgraph.service.problems import Problem
 
 MOST_TEXT_BYTES = 10**6
 
@@ -39,7 +38,7 @@ class _Form(MultiPartParser):
 
 
 async def receive_job(
-    request: Request, kind: JobKind, folder: DataFolder, roots: tuple[Root, ...]
+    request: Request, kind: JobKind, folder: DataFolder, roots: tuple[str, ...]
 ) -> tuple[str, Job]:
     """Read the form of a job, which is on disk then; its id, which names its folder, and it."""
     if not request.headers.get("content-type", "").startswith("multipart/form-data"):
@@ -66,7 +65,7 @@ async def receive_job(
 
 
 def _keep(
-    form: FormData, kind: JobKind, folder: DataFolder, roots: tuple[Root, ...]
+    form: FormData, kind: JobKind, folder: DataFolder, roots: tuple[str, ...]
 ) -> tuple[str, Job]:
     """Write the files of a form into the folder of a new job."""
     id = secrets.token_hex(16)

@@ -1,7 +1,7 @@
 """The paper's method, from correspondences to the optimum; start at ``joint.solve_joint``.
 
-In the order of use: ``preprocess``, ``pnp`` and ``stage1``, ``camera_block`` and
-``block_residuals`` with ``whitening`` and ``residual_scale``, ``frame_weights`` (not in the paper)
-with ``frame_poses``, ``objective`` (the graph of Eq. 5, its minimum, the gate), ``error_model``
-with ``elimination``, ``marginals``.
+In the order of use: ``preprocess``, ``pnp`` and ``stage1``, ``matches`` with ``robust``,
+``frame_weights`` (not in the paper), ``two_pass`` (the graph of Eq. 5, its minimum, the gate),
+``pairs`` and ``pair_refinement``, ``error_model`` with ``places``, ``components`` and ``sources``,
+``solution``.
 """

@@ -1,19 +1,130 @@
-"""Covariances by the scatter between frames, whose matches share errors, and by single matches."""
+"""An objective at extrinsics that fit it: its derivatives, covariances by frames and matches."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.objective import relative_pose_graph
+from calibgraph.graph.objective import pose_key, relative_pose_graph
 from calibgraph.model.findings import error_components
-from calibgraph.model.geometry import pose_rows
-from calibgraph.solver.curvature import (
-    FittedObjective,
-    add_pair_hessians,
-    pose_hessian,
-    robust_hessians,
-    rows_of_pair,
-)
+from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
+from calibgraph.solver.pairs import rows_of_pair
+from calibgraph.solver.two_pass import Objective, Scales, Transforms, to_values
+from factors import BlockSums, ProjectionBlock
 from factors.conditioning import sigmas_of_hessian
+
+
+def convex_hessian(hessian: Array, otherwise: Array) -> Array:
+    """The Hessian if it is positive definite; few matches near the gate may spoil it."""
+    return hessian if _is_positive_definite(hessian) else otherwise
+
+
+def positive_part(matrix: Array) -> Array:
+    """The positive semidefinite matrix nearest to a symmetric one."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def _is_positive_definite(hessian: Array) -> bool:
+    try:
+        np.linalg.cholesky(hessian)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def pose_equations(
+    graph: gtsam.NonlinearFactorGraph, cameras: Sequence[str], T_camera_lidar: Mapping[str, Array]
+) -> tuple[Array, Array]:
+    """(6 N, 6 N) Gauss-Newton Hessian and (6 N,) gradient of the factors between poses."""
+    hessian, gradient = np.zeros((6 * len(cameras), 6 * len(cameras))), np.zeros(6 * len(cameras))
+    keys, present = [pose_key(cameras, name) for name in cameras], {*graph.keyVector()}
+    numbers = [number for number, key in enumerate(keys) if key in present]
+    if numbers:
+        linear = graph.linearize(to_values(cameras, T_camera_lidar))
+        own = linear.hessian(gtsam.Ordering([keys[number] for number in numbers]))
+        rows = np.concatenate([np.r_[pose_rows(number)] for number in numbers])
+        hessian[np.ix_(rows, rows)], gradient[rows] = own[0], -own[1]
+    return hessian, gradient
+
+
+def robust_hessians(sums: BlockSums) -> Array:
+    """(f, 6, 6) second derivatives of half the robust cost of frames, by their sums.
+
+    Where it is not convex, the reweighted Hessian, which is positive semidefinite.
+
+    Args:
+        sums: with the curvature, of (f) frames.
+    """
+    assert sums.curvature is not None
+    if _is_positive_definite(sums.curvature):
+        return sums.curvature
+    return np.array([*map(convex_hessian, sums.curvature, sums.hessian)])
+
+
+def robust_hessian(sums: BlockSums) -> Array:
+    """(6, 6) the same of all frames together."""
+    assert sums.curvature is not None
+    return convex_hessian(sums.curvature.sum(axis=0), sums.hessian.sum(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class FittedObjective:
+    """An objective, its scales, and the extrinsics where it is examined.
+
+    Attributes:
+        objective: after the gate.
+        scales: of the residuals.
+        T_camera_lidar: (4, 4) of all cameras: its minimum.
+        held: cameras that nothing determines; they are known to a radian and a metre.
+    """
+
+    objective: Objective
+    scales: Scales
+    T_camera_lidar: Transforms
+    held: tuple[str, ...] = ()
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Their names, in the order of the extrinsics."""
+        return tuple(self.T_camera_lidar)
+
+    def pose(self, camera: str) -> gtsam.Pose3:
+        """T_lidar_camera of a camera, the variable of the graph."""
+        return to_T_lidar_camera(self.T_camera_lidar[camera])
+
+    @cached_property
+    def projections(self) -> Mapping[str, ProjectionBlock]:
+        """Per camera with correspondences, these with their scale."""
+        return {n: b.with_scale(self.scales[n]) for n, b in self.objective.blocks.items()}
+
+    @cached_property
+    def frame_sums(self) -> Mapping[str, BlockSums]:
+        """Per camera with correspondences, the sums of its frames; empty without terms."""
+        if not self.objective.uses_correspondences:
+            return {}
+        edges = {name: block.frame_edges for name, block in self.objective.blocks.items()}
+        return {
+            name: block.frame_sums(self.pose(name), edges[name], curvature=True)
+            for name, block in self.projections.items()
+        }
+
+    @cached_property
+    def robust_hessians(self) -> Mapping[str, Array]:
+        """Per camera with correspondences, their (6, 6) :func:`robust_hessian`."""
+        return {name: robust_hessian(sums) for name, sums in self.frame_sums.items()}
+
+    def data_only(self) -> FittedObjective:
+        """The correspondences alone, at their minimum near here."""
+        free = self.objective.data_only()
+        start = {name: self.T_camera_lidar[name] for name in free.cameras}
+        return FittedObjective(free, self.scales, free.minimize(start, self.scales).T_camera_lidar)
+
 
 ENOUGH_FRAMES = 5
 """From so many on, the scatter between frames decides about the error bar; with fewer, mostly what
@@ -42,7 +153,7 @@ def bootstrap_covariances(at: FittedObjective, draws: int, seed: int) -> dict[st
     if not draws or not at.objective.uses_correspondences:
         return {}
     gradients, hessians = _by_frame(at)
-    priors = pose_hessian(at.objective.pose_graph, at.cameras, at.T_camera_lidar)
+    priors = pose_equations(at.objective.pose_graph, at.cameras, at.T_camera_lidar)[0]
     priors += np.diag(np.repeat(np.isin(at.cameras, at.held), 6).astype(np.float64))
     rng, frames = np.random.default_rng(seed), len(gradients)
     times = rng.multinomial(frames, np.full(frames, 1 / frames), draws).astype(np.float64)
@@ -121,9 +232,11 @@ def data_sigmas(at: FittedObjective) -> Array:
     """
     objective, cameras, T_camera_lidar = at.objective, at.cameras, at.T_camera_lidar
     measured = relative_pose_graph(objective.cameras, objective.rig.relative_poses)
-    hessian = pose_hessian(measured, cameras, T_camera_lidar)
-    for name, block in at.projections.items():
+    hessian = pose_equations(measured, cameras, T_camera_lidar)[0]
+    for name, sums in at.frame_sums.items():
         rows = pose_rows(cameras.index(name))
-        hessian[rows, rows] += block.sums(at.pose(name)).hessian
-    add_pair_hessians(hessian, objective.pairs, T_camera_lidar)
+        hessian[rows, rows] += sums.hessian.sum(axis=0)
+    for pair in objective.pairs:
+        both = rows_of_pair(cameras, pair)
+        hessian[np.ix_(both, both)] += pair.sums(T_camera_lidar).hessian
     return sigmas_of_hessian(hessian).reshape(-1, 6)

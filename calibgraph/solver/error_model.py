@@ -11,75 +11,78 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace
+from calibgraph.graph.components import VarianceRatios
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.objective import join, pose_key
 from calibgraph.graph.variables import seen_lens_key
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
-from calibgraph.model.geometry import invert, to_T_lidar_camera
-from calibgraph.model.places import Places
-from calibgraph.solver.conflicts import relative_pose_conflict
-from calibgraph.solver.curvature import FittedObjective
-from calibgraph.solver.elimination import LatentPoseFit, fit_latent_poses, start_values
-from calibgraph.solver.lens import lens_errors, lens_term, weak_information
-from calibgraph.solver.objective import Objective
-from calibgraph.solver.optimizer import Optimum
-from calibgraph.solver.scan_distortion import distortion_evidence, pair_jacobians
-from calibgraph.solver.variance_components import (
-    VarianceRatios,
-    common_error,
-    estimate_variance_ratios,
-    variance_components,
+from calibgraph.model.geometry import (
+    invert,
+    relative_covariance,
+    relative_transform,
+    to_T_lidar_camera,
 )
+from calibgraph.model.places import Places
+from calibgraph.model.rig import RelativePose
+from calibgraph.solver.columns import distortion_evidence, pair_jacobians
+from calibgraph.solver.components import common_error, estimate_variance_ratios, variance_components
+from calibgraph.solver.covariance import FittedObjective
+from calibgraph.solver.lens import lens_errors, lens_term, weak_information
+from calibgraph.solver.places import ErrorFit, fit_latent_poses, start_values
+from calibgraph.solver.two_pass import Objective, Optimum
 from calibgraph.solver.within_place import block_by_place, pairs_by_place, within_place
+from factors import pose_sigmas
+
+
+@dataclass(frozen=True, eq=False)
+class Conflict:
+    """The difference of a measured relative pose from the correspondences' estimate of it.
+
+    Attributes:
+        pair: the relative pose of the rig file.
+        difference: (6,) tangent from measured to estimated T_a_b: rotation [rad], translation [m],
+            along the axes of b.
+        sigmas: (6,) standard deviations expected of it: the measurement's and the estimate's.
+    """
+
+    pair: RelativePose
+    difference: Array
+    sigmas: Array
+
+    @property
+    def largest(self) -> float:
+        """The largest component of the difference, in its standard deviations."""
+        return float(np.abs(self.difference / self.sigmas).max())
+
+
+def relative_pose_conflict(
+    pair: RelativePose,
+    cameras: tuple[str, ...],
+    T_camera_lidar: Mapping[str, Array],
+    covariance: Array,
+) -> Conflict:
+    """The difference of a relative pose from an estimate, and the sigma expected of it.
+
+    Args:
+        pair: the measured relative pose.
+        cameras: names in the order of the covariance.
+        T_camera_lidar: per camera, (4, 4) from the correspondences alone.
+        covariance: (6 N, 6 N) of these.
+    """
+    estimated = relative_transform(T_camera_lidar[pair.a], T_camera_lidar[pair.b])
+    difference = gtsam.Pose3.Logmap(gtsam.Pose3(invert(pair.T_a_b) @ estimated))
+    sigmas = pair.rotation_sigma_rad, pair.translation_sigma_m
+    own = pose_sigmas(rotation_rad=sigmas[0], translation_m=sigmas[1]) ** 2
+    places = cameras.index(pair.a), cameras.index(pair.b)
+    of_pair = relative_covariance(covariance, *places, invert(estimated))
+    return Conflict(pair, difference, np.sqrt(own + np.diag(of_pair)))
+
 
 Numbers = NDArray[np.int64]
 
 _ROUNDS = 3  # of fits and estimates of the variance ratios
 _COARSE_TOLERANCE = 1e-4  # relative change of the cost, meanwhile
-
-
-@dataclass(frozen=True, eq=False)
-class ErrorFit:
-    """The optimum of the error model.
-
-    Attributes:
-        fit: the optimum, with the variance ratios that fit the data.
-        places: the frame numbers of each place.
-        ratios: of its variance components.
-        without_priors: the optimum without measured relative poses and priors, where some are
-            measured.
-    """
-
-    fit: LatentPoseFit
-    places: tuple[Numbers, ...]
-    ratios: VarianceRatios
-    without_priors: ErrorFit | None = None
-
-    @property
-    def model(self) -> LatentPoseModel:
-        """The graph."""
-        return self.fit.linear.model
-
-    def with_shared_ratio(self, least: float) -> ErrorFit:
-        """The same optimum; the covariances of what all places share have at least this ratio."""
-        factor = least / self.ratios.shared
-        if factor <= 1.0:
-            return self
-        parts = self.model.components
-        components = replace(
-            parts,
-            cloud=factor * parts.cloud,
-            camera=factor * parts.camera,
-            distortion_size=factor * parts.distortion_size,
-        )
-        fit = self.fit.with_model(replace(self.model, components=components))
-        return replace(self, fit=fit, ratios=replace(self.ratios, shared=least))
-
-    @property
-    def T_camera_lidar(self) -> dict[str, Array]:
-        """Per camera, (4, 4)."""
-        return self.fit.T_camera_lidar
 
 
 def refine_with_error_model(
@@ -119,8 +122,8 @@ def refine_with_error_model(
     if found is None:
         return None, optimum
     found = replace(found, without_priors=free)
-    fit, T = found.fit, found.T_camera_lidar
-    return found, Optimum(T, fit.cost, optimum.iterations + fit.iterations, fit.converged)
+    iterations = optimum.iterations + found.iterations
+    return found, Optimum(found.T_camera_lidar, found.cost, iterations, found.converged)
 
 
 def fit_without_priors(
@@ -135,7 +138,7 @@ def fit_without_priors(
 def _without_contradictions(inliers: Objective, free: ErrorFit) -> Objective:
     """Without the relative poses that the correspondences of both their cameras contradict."""
     cameras, limit = free.model.cameras, error_components().contradiction_sigmas
-    measured, mount = inliers.rig.relative_poses, free.fit.of_mount
+    measured, mount = inliers.rig.relative_poses, free.of_mount
     T = mount.T_camera_lidar
     kept = tuple(
         pair
@@ -169,17 +172,18 @@ def fit_errors(at: FittedObjective, findings: MatcherFindings, places: Places) -
         model, start_values(model, at.T_camera_lidar), relative_tolerance=_COARSE_TOLERANCE
     )
     if fit is not None and np.isfinite(prior.robust_scale):  # an outlying place has no evidence
-        weight = fit.place_weights(prior.robust_scale)
+        weight = fit.linear.weights
         prior = replace(prior, distortion_weight=weight[:, :1] * weight[:, 1:])
         model = replace(model, components=prior)
     for _ in range(_ROUNDS):
-        found = ratios if fit is None else estimate_variance_ratios(fit, ratios)
+        found = ratios if fit is None else estimate_variance_ratios(fit.linear, ratios)
         if fit is None or found.is_near(ratios):
             break
         model, ratios = replace(model, components=found.scale(prior)), found
-        fit = fit_latent_poses(model, fit, relative_tolerance=_COARSE_TOLERANCE)
-    fit = None if fit is None else fit_latent_poses(model, fit)
-    return None if fit is None else ErrorFit(fit, tuple(frames), ratios)
+        fit = fit_latent_poses(model, fit.linear, relative_tolerance=_COARSE_TOLERANCE)
+    if fit is not None:
+        fit = fit_latent_poses(model, fit.linear, is_determined=fit.model is model)
+    return None if fit is None else replace(fit, ratios=ratios)
 
 
 def split_frames(inliers: Objective, places: Places) -> list[Numbers]:
@@ -239,7 +243,7 @@ def error_model(
     features = pairs_by_place(pairs, places)
     of, errors = inliers.config.of, lens_errors(at)
     return LatentPoseModel(
-        cameras, blocks, features, graph, components, of, lenses=lenses, lens_errors=errors
+        cameras, blocks, features, graph, components, of, lenses, errors, tuple(places)
     )
 
 

@@ -21,11 +21,13 @@ from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import invert, local_coordinates
 from calibgraph.parallel import map_on_cores
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.frame_poses import FrameFits, fit_each_frame, move_damped
-from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS, robust_spread, robust_spreads
+from calibgraph.solver.matches import CameraBlock
+from calibgraph.solver.pnp import move_damped
+from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS, CUT, robust_spread, robust_spreads
 from calibgraph.solver.stage1 import Stage1
+from calibgraph.solver.two_pass import USING_CORRESPONDENCES
 from factors import to_runs
+from factors.arrays import unpack_sums
 
 MIN_FRAMES_TO_WEIGH = 8
 """Fewer frames do not determine their own scatter; weights from them would shrink the error bar."""
@@ -44,21 +46,86 @@ _CONVERGED = 1e-6  # rad, m: far below any standard deviation
 _CONFIDENCE_BINS, _BIN_MATCHES = 20, 100  # a spread of 100 matches is known to 7 %
 _CHANCE = 2.0  # times the mean square displacement by noise: exceeded by 5 % of frames
 _MIN_SIZE = 0.05  # of a frame's spread, which is at least MIN_SIGMA_PX
+_OWN_STEPS = 6  # Gauss-Newton steps to a frame's own extrinsic, at most
+_SETTLED = 0.05  # standard deviations: a shorter step of all frames is the last
+_MAX_STEP_RAD = 0.05  # rotation of one step, 3 degrees: beyond it the linearization does not hold
+_MAX_SPREAD = 1e6  # px, in place of the infinite spread of a frame that is all behind its camera
+_MIN_MATCHES = 10  # fewer residuals about a frame's own extrinsic (6 unknowns) give no spread
 
 
 @dataclass(frozen=True, eq=False)
-class WeighedFrames:
-    """The correspondences of all cameras, weighted by their residuals.
+class FrameFits:
+    """The frames of a camera, each at its own extrinsic.
 
     Attributes:
-        blocks: per camera, without the correspondences of outlier frames.
-        T_camera_lidar: per camera, (4, 4) where the frames are densest; a start for the solve.
-        outlier_frames: per camera, how many frames have weight zero.
+        T_camera_lidar: (f, 4, 4) each frame's own.
+        counts: (f,) matches.
+        spreads: (f,) of whitened residuals about the common extrinsic, from those about their own.
+        spreads_px: (f,) of unweighted ones, about their own.
+        hessians: (f, 6, 6) of whitened residuals there, in the tangent of T_lidar_camera.
+        sizes: (n,) of the residuals there, over the frame's spread, as ``CameraBlock.all_sizes``;
+            infinite where a point is not projectable.
     """
 
-    blocks: Mapping[str, CameraBlock]
-    T_camera_lidar: dict[str, Array]
-    outlier_frames: Mapping[str, int]
+    T_camera_lidar: Array
+    counts: Array
+    spreads: Array
+    spreads_px: Array
+    hessians: Array
+    sizes: Array
+
+    @property
+    def noise(self) -> Array:
+        """(f,) mean square displacement of whitened pixels by the noise of the own extrinsic."""
+        return 6 * self.spreads**2 / self.counts
+
+
+def fit_each_frame(block: CameraBlock, own: Array, common: Array) -> FrameFits:
+    """Fit every frame alone by damped Gauss-Newton steps, its loss as wide as its residuals spread.
+
+    Args:
+        block: of one camera.
+        own: (f, 4, 4) T_camera_lidar of its frames, by PnP of each.
+        common: (4, 4) T_camera_lidar that a frame starts from if its own fits worse.
+    """
+    runs, counts = to_runs(block.frame_edges), block.frame_counts
+    least = block.least_spreads(runs)
+
+    def bounded(spreads: Array) -> Array:
+        return np.minimum(np.maximum(spreads, least), _MAX_SPREAD)
+
+    tried = np.stack([own, np.broadcast_to(common, own.shape)])
+    found = [robust_spreads(block.all_sizes(T, runs)[1], runs) for T in tried]
+    better = found[0] <= found[1]
+    T: Array = np.where(better[:, None, None], tried[0], tried[1])
+    spreads = bounded(np.where(better, found[0], found[1]))
+    for _ in range(_OWN_STEPS):
+        sums = block.block.packed_run_sums(T, runs, CAUCHY_SCALE_SIGMAS * spreads)
+        T, steps = move_damped(sums, T, most_rad=_MAX_STEP_RAD)
+        hessians = unpack_sums(sums).hessian
+        lengths = np.sqrt(np.einsum("fi,fij,fj->f", steps, hessians, steps)) / spreads
+        sizes_px, sizes = block.all_sizes(T, runs)
+        spreads = bounded(robust_spreads(sizes, runs))
+        if lengths.max() < _SETTLED:
+            break
+    spreads_px = spreads if sizes_px is sizes else robust_spreads(sizes_px, runs)
+    each = np.repeat(spreads, counts)
+    inside = np.add.reduceat(sizes <= CUT * each, runs[:, 0])
+    spreads = _about_common_extrinsic(spreads, counts.astype(np.float64), inside)
+    return FrameFits(T, counts.astype(np.float64), spreads, spreads_px, hessians, sizes / each)
+
+
+def _about_common_extrinsic(spreads: Array, counts: Array, inside: Array) -> Array:
+    """(f,) spreads of residuals about the common extrinsic, from those about each frame's own.
+
+    Six unknowns take their share of 2 n residuals; where they take most of the ``inside``, from
+    which a spread is measured, it is at least that of a typical frame: among outliers there is
+    always a pose that fits a few matches exactly.
+    """
+    grown = spreads * np.sqrt(2 * counts / np.maximum(2 * counts - 6, 1))
+    enough = inside >= _MIN_MATCHES
+    typical = float(np.median(grown[enough] if enough.any() else grown))
+    return np.asarray(np.where(enough, grown, np.maximum(grown, typical)))
 
 
 def weigh_all_frames(
@@ -69,8 +136,8 @@ def weigh_all_frames(
     *,
     config: Config,
     terms: Terms,
-) -> WeighedFrames:
-    """The correspondences of every camera, weighted by their residuals.
+) -> dict[str, tuple[CameraBlock, Array, int]]:
+    """Per camera, as of :func:`weigh_frames`; its correspondences, weighted by their residuals.
 
     Unchanged if ``learnt_weights`` is off, Stage 1 is not PnP, or ``terms`` has no reprojection
     term.
@@ -83,9 +150,8 @@ def weigh_all_frames(
         config: ``learnt_weights``, ``stage1``.
         terms: of the objective.
     """
-    uses_correspondences = terms in ("full", "reprojection")
-    if not (config.learnt_weights and config.stage1 == "pnp" and uses_correspondences and blocks):
-        return WeighedFrames(blocks, dict(start), {})
+    if not (config.learnt_weights and config.stage1 == "pnp" and terms in USING_CORRESPONDENCES):
+        return {name: (block, start[name], 0) for name, block in blocks.items()}
 
     def weigh(name: str) -> tuple[CameraBlock, Array, int]:
         return weigh_frames(
@@ -95,12 +161,7 @@ def weigh_all_frames(
             stage1[name].by_frame if name in stage1 else {},
         )
 
-    kept, centers, outliers = zip(*map_on_cores(weigh, [*blocks]), strict=True)
-    return WeighedFrames(
-        blocks=dict(zip(blocks, kept, strict=True)),
-        T_camera_lidar={**start, **dict(zip(blocks, centers, strict=True))},
-        outlier_frames=dict(zip(blocks, outliers, strict=True)),
-    )
+    return dict(zip(blocks, map_on_cores(weigh, [*blocks]), strict=True))
 
 
 def weigh_frames(

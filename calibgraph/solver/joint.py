@@ -15,18 +15,24 @@ from calibgraph.model.correspondences import MAX_COORDINATE, Correspondences
 from calibgraph.model.places import Places
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Stopwatch
-from calibgraph.solver.camera_block import CameraBlock, camera_blocks
-from calibgraph.solver.camera_pairs import PairTerm, tying_pairs
-from calibgraph.solver.curvature import FittedObjective
+from calibgraph.solver.covariance import FittedObjective
 from calibgraph.solver.error_model import refine_with_error_model
 from calibgraph.solver.frame_weights import weigh_all_frames
 from calibgraph.solver.lens import Lenses, moved_lenses, put_into
-from calibgraph.solver.objective import USING_CORRESPONDENCES, Objective, Transforms
+from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.pair_refinement import refine_with_pairs
+from calibgraph.solver.pairs import PairTerm, tying_pairs
 from calibgraph.solver.preprocess import Preprocessed, preprocess
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.stage1 import Stage1, T_hat, estimate_stage1
-from calibgraph.solver.start import best_start, require_determined, require_known
+from calibgraph.solver.two_pass import (
+    USING_CORRESPONDENCES,
+    Objective,
+    Transforms,
+    best_start,
+    require_determined,
+    require_known,
+)
 
 _MOST_ROUNDS = 8  # of solves, each from the lenses of the last
 _SETTLED = 0.1  # standard deviations: a smaller change of a lens ends the rounds
@@ -83,13 +89,15 @@ def solve_joint(
         start = best_start(rig, blocks, pairwise, config, terms=terms, tied=tied)     # x_0
 
     with watch("weights"):                                                 # ours: frame weights
-        frames = weigh_all_frames(kept.table, blocks, pairwise, start, config=config, terms=terms)
+        weighed = weigh_all_frames(kept.table, blocks, pairwise, start, config=config, terms=terms)
+        blocks = {name: block for name, (block, *_) in weighed.items()}
+        start |= {name: densest for name, (_, densest, _) in weighed.items()}
 
     objective = Objective(                                                 # Eq. 5
-        rig, frames.blocks, T_hat(pairwise), config, terms, lenses=lenses or {})
+        rig, blocks, T_hat(pairwise), config, terms, lenses=lenses or {})
 
     with watch("pass1"):                                                   # Two-Pass Solver
-        rough, scales = objective.minimize_with_scale(frames.T_camera_lidar)   # 1. fit
+        rough, scales = objective.minimize_with_scale(start)           # 1. fit
     with watch("pass2"):
         inliers = objective.without_outliers(rough, scales)                # 2. gate tau
         optimum = inliers.minimize(rough, scales)                          # 3. fit again
@@ -100,7 +108,7 @@ def solve_joint(
             optimum, kept.table.findings, kept.table.places)
 
     require_in_reach(optimum.T_camera_lidar)
-    outlier_frames = frames.outlier_frames
+    outlier_frames = {name: outliers for name, (*_, outliers) in weighed.items()}
     counts = count_correspondences(
         kept, objective, inliers, pairwise, outlier_frames=outlier_frames
     )
@@ -166,8 +174,7 @@ def _solve_with_lenses(
         )
         is_known = solution.correspondences.twist_per_s is not None
         require_motion(config.estimate, is_known=is_known)
-        fit = None if solution.errors is None else solution.errors.fit
-        lenses, change = moved_lenses(lenses, fit)
+        lenses, change = moved_lenses(lenses, solution.errors)
         if change < _SETTLED:
             return solution
     return replace(solution, optimum=replace(solution.optimum, converged=False))
@@ -201,7 +208,7 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
     Returns:
         The same optimum where no pair of cameras has enough in common.
     """
-    alone, watch = solution.without_pairs(), Stopwatch()
+    alone, watch = replace(solution.without_pairs(), camera_matches=matches), Stopwatch()
     stops = solution.correspondences.places
     by_stop = replace(matches, frame=stops.merge_stationary(matches.frame))
     with watch("camera_pairs"):
@@ -217,10 +224,8 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
         optimum=optimum,
         counts=count_common_features(alone.counts, inliers.pairs),
         timings_s={**solution.timings_s, **watch.seconds},
-        camera_matches=matches,
-        before_pairs=alone.optimum if inliers.pairs else None,
         errors=errors,
-        errors_before_pairs=alone.errors if inliers.pairs else None,
+        alone=alone if inliers.pairs else None,
     )
 
 

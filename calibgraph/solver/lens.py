@@ -1,4 +1,4 @@
-"""Lenses that are estimated together with the extrinsics: their part of the error model.
+"""Lenses and clocks that are estimated, or that may err: their part of the error model.
 
 What matches of one frame share, or of all frames, also looks like another lens. It belongs between
 the lens l_c and s_c, as the matches show it: with C the covariance of pose and lens by independent
@@ -16,17 +16,18 @@ from scipy.linalg import block_diag
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.graph.components import EXACT
-from calibgraph.graph.lens import FreeLensByPlace, LensTerm, LensVariable
+from calibgraph.graph.lens import LensTerm, LensVariable
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.config import LensPart
 from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
-from calibgraph.model.lens import LensSigmas
+from calibgraph.model.lens import LensEstimate, LensSigmas
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.curvature import FittedObjective, positive_part
-from calibgraph.solver.elimination import LatentPoseFit
+from calibgraph.solver.covariance import FittedObjective, positive_part
+from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
-from factors import FreeLensBlock
+from factors import to_runs
+from factors.columns import CENTRE_X, CENTRE_Y, FOCAL, OFFSET, READOUT
 
 Lenses = Mapping[str, LensVariable]
 
@@ -37,6 +38,8 @@ lens."""
 _LENS: tuple[LensPart, ...] = "focal", "centre", "distortion"
 _WEAK_PRIOR = 0.01  # information: a lens that is ten sigmas off is hardly held back
 _MOST_STEPS, _MINIMAL = 20, 1e-4  # of Gauss-Newton; decrease of the cost by the last
+_DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
+_UNITS = {FOCAL: "px", CENTRE_X: "px", CENTRE_Y: "px", OFFSET: "s", READOUT: "s"}
 
 
 def put_into(rig: Rig, lenses: Lenses) -> Rig:
@@ -64,24 +67,46 @@ def lens_term(
         T_camera_lidar: (4, 4) the minimum for independent matches.
         findings: the matcher's error.
     """
-    by_place = FreeLensByPlace(placed, lens.free, 0)
-    at = _minimum(by_place, T_camera_lidar, lens)
-    hessians = np.array([one.hessian for one in by_place.sums(*at)])
-    scatter = _frame_scatter(FreeLensBlock(placed.block, lens.free), placed, at)
-    counts = len(placed.block), len(placed.count_of_frame)
-    of_poses = within.at_place(findings.place_variance)[placed.places]
-    in_graph = np.linalg.inv(
-        _information_in_graph(hessians, of_poses, within.least, lens).sum(axis=0)
-    )
+    hessians, gradients = _by_place_at_minimum(lens, placed, T_camera_lidar)
+    counts = len(placed.block), len(gradients)
+    # In the graph m_c and s_c know of the matches what the poses a_cp of their places leave.
+    own = np.linalg.inv(hessians / within.least + weak_information(lens))
+    own[:, :6, :6] += within.at_place(findings.place_variance)[placed.places]
+    in_graph = np.linalg.inv(np.linalg.inv(own).sum(axis=0))
     hessian = hessians.sum(axis=0) + weak_information(lens)
     covariance = np.linalg.inv(hessian)
-    scatter = _allow_for_few_frames(scatter, hessian, *counts)
+    scatter = _allow_for_few_frames(gradients.T @ gradients, hessian, *counts)
     of_matches = MATCH_SHARE * counts[0] if any(findings.systematic_sigmas) else 0.0
     shared = within.efficiency * max(findings.place_variance * within.alike, of_matches)
     whole = within.efficiency**2 * (covariance @ scatter @ covariance) + shared * covariance
     excess = positive_part((whole - in_graph)[6:, 6:])
-    compensating = np.asarray(-np.linalg.solve(hessian[:6, :6], hessian[:6, 6:]))
-    return LensTerm(lens, excess, np.zeros((len(excess), 0)), compensating)
+    return LensTerm(lens, excess, np.zeros((len(excess), 0)), -_given_in(hessian, slice(6, None)))
+
+
+def _given_in(hessian: Array, columns: slice | list[int]) -> Array:
+    """(6, m) H_xx^-1 H_xe of some columns."""
+    return np.asarray(np.linalg.solve(hessian[:6, :6], hessian[:6, columns]))
+
+
+def _by_place_at_minimum(
+    lens: LensVariable, placed: BlockByPlace, T_camera_lidar: Array
+) -> tuple[Array, Array]:
+    """(p, 6 + k, 6 + k) Hessians of the places with matches, and (f, 6 + k) gradients of frames.
+
+    Where all matches fit best with one pose and lens.
+    """
+    order = np.argsort(placed.place_of_frame, kind="stable")
+    place, edges = placed.place_of_frame[order], np.append(0, placed.count_of_frame[order].cumsum())
+    pose, values, weak = to_T_lidar_camera(T_camera_lidar), lens.values, weak_information(lens)
+    for _ in range(_MOST_STEPS):
+        T = to_T_camera_lidar(pose)[None]
+        sums = placed.block.summarize(T, to_runs(edges), lens.free, values)
+        pull = sums.gradient.sum(axis=0) + weak @ np.concatenate([np.zeros(6), values])
+        step = -np.linalg.solve(sums.hessian.sum(axis=0) + weak, pull)
+        if -step @ pull < _MINIMAL:
+            break
+        pose, values = pose.retract(step[:6]), values + step[6:]
+    return np.add.reduceat(sums.hessian, np.searchsorted(place, placed.places)), sums.gradient
 
 
 def lens_errors(at: FittedObjective) -> dict[int, Array]:
@@ -95,21 +120,18 @@ def lens_errors(at: FittedObjective) -> dict[int, Array]:
     for name, block in at.projections.items():
         camera = at.objective.rig.cameras[name]
         clock = _stated_clock(camera) if is_mount or block.motion is not None else []
-        parts = [*(_uncertain_lens(camera) if is_mount else ()), *clock]
-        lens = LensVariable.of(camera, parts, LensSigmas.calibrated(camera))
+        lens_of = _LENS if is_mount and camera.model != "equirectangular" else ()
+        lens = LensVariable.of(camera, [*lens_of, *clock], LensSigmas.calibrated(camera))
         estimated = at.objective.lenses[name].free.parameters if name in at.objective.lenses else ()
         names = enumerate(lens.free.parameters, start=6)
         rows = [row for row, parameter in names if parameter not in estimated]
         if rows:
-            sums = FreeLensBlock(block, lens.free).sums(at.T_camera_lidar[name], lens.values)
-            follows = np.linalg.solve(sums.hessian[:6, :6] + WEAK, sums.hessian[:6, rows])
-            found[at.cameras.index(name)] = follows @ follows.T + EXACT**2 * np.eye(6)
+            T = at.T_camera_lidar[name][None]
+            hessian = block.summarize(T, None, lens.free, lens.values).hessian[0]
+            hessian[:6, :6] += WEAK
+            follow = _given_in(hessian, rows)
+            found[at.cameras.index(name)] = follow @ follow.T + EXACT**2 * np.eye(6)
     return found
-
-
-def _uncertain_lens(camera: Camera) -> tuple[LensPart, ...]:
-    """Of a panorama the format determines the lens."""
-    return () if camera.model == "equirectangular" else _LENS
 
 
 def _stated_clock(camera: Camera) -> list[LensPart]:
@@ -121,50 +143,9 @@ def _stated_clock(camera: Camera) -> list[LensPart]:
     return [part for part, sigma in stated.items() if sigma]
 
 
-def _information_in_graph(
-    hessians: Array, of_poses: Array, least: float, lens: LensVariable
-) -> Array:
-    """(p, 6 + k, 6 + k) of m_c and s_c by the matches and the pose of each place.
-
-    Args:
-        hessians: (p, 6 + k, 6 + k) of independent matches at each place.
-        of_poses: (p, 6, 6) covariance of a_cp about m_c.
-        least: variance of the matches.
-        lens: of the camera.
-    """
-    own = np.linalg.inv(hessians / least + weak_information(lens))
-    own[:, :6, :6] += of_poses
-    return np.asarray(np.linalg.inv(own))
-
-
 def weak_information(lens: LensVariable | None) -> Array:
     """(6 + k, 6 + k) of a pose within sight and a lens, so that few matches have an inverse."""
     return WEAK if lens is None else block_diag(WEAK, _WEAK_PRIOR * np.eye(len(lens.free)))
-
-
-def _minimum(
-    by_place: FreeLensByPlace, T_camera_lidar: Array, lens: LensVariable
-) -> tuple[Array, Array]:
-    """(p, 4, 4) pose, the same at each place, and (k,) values where all matches fit best."""
-    pose, values, weak = to_T_lidar_camera(T_camera_lidar), lens.values, weak_information(lens)
-    each = len(by_place.places), 1, 1
-    for _ in range(_MOST_STEPS):
-        sums = by_place.sums(np.tile(to_T_camera_lidar(pose), each), values)
-        pull = sum(one.gradient for one in sums) + weak @ np.concatenate([np.zeros(6), values])
-        step = -np.linalg.solve(sum(one.hessian for one in sums) + weak, pull)
-        pose, values = pose.retract(step[:6]), values + step[6:]
-        if -step @ pull < _MINIMAL:
-            break
-    return np.tile(to_T_camera_lidar(pose), each), values
-
-
-def _frame_scatter(free: FreeLensBlock, placed: BlockByPlace, at: tuple[Array, Array]) -> Array:
-    """(6 + k, 6 + k) sum of the outer products of the gradients of frames."""
-    counts = placed.count_of_frame[np.argsort(placed.place_of_frame, kind="stable")]
-    columns = free.columns(at[0][0], at[1])
-    pulls = (columns[:-1] * (free.loss(columns)[1] * columns[-1])).sum(axis=1)
-    gradients = np.add.reduceat(pulls, np.cumsum(counts) - counts, axis=1).T
-    return np.asarray(gradients.T @ gradients)
 
 
 def _allow_for_few_frames(scatter: Array, hessian: Array, matches: float, frames: float) -> Array:
@@ -176,17 +157,87 @@ def _allow_for_few_frames(scatter: Array, hessian: Array, matches: float, frames
     return np.asarray(own * frames / (prior + frames - 1))
 
 
-def moved_lenses(lenses: Lenses, fit: LatentPoseFit | None) -> tuple[Lenses, float]:
+def moved_lenses(lenses: Lenses, fit: ErrorFit | None) -> tuple[Lenses, float]:
     """Lenses where a fit has them, and the largest change of a value in standard deviations."""
     if fit is None:
         return lenses, 0.0
     moved, largest = {**lenses}, 0.0
-    for number in fit.linear.model.lenses:
-        name, key = fit.linear.model.cameras[number], lens_key(number)
+    for number in fit.model.lenses:
+        name, key = fit.model.cameras[number], lens_key(number)
         values, sigmas = (
-            fit.linear.values.atVector(key),
+            fit.linear.shared.atVector(key),
             np.sqrt(np.diag(fit.linear.covariance_of([key]))),
         )
         moved[name] = lenses[name].moved_to(values)
         largest = max(largest, float((abs(values - lenses[name].values) / sigmas).max()))
     return moved, largest
+
+
+def lens_estimates(fit: ErrorFit) -> dict[str, tuple[LensEstimate, ...]]:
+    """Per camera whose lens is free, its parameters with their marginal."""
+    model, found = fit.model, {}
+    for number, term in model.lenses.items():
+        own = [lens_key(number), model.reported_keys[number]]
+        values, covariance = fit.linear.shared.atVector(own[0]), fit.linear.covariance_of(own)
+        sigmas = np.sqrt(np.diag(covariance))
+        with_pose = np.abs(covariance / np.outer(sigmas, sigmas))[:, len(values) :]
+        rows = zip(term.variable.free.parameters, sigmas, with_pose, strict=False)
+        found[model.cameras[number]] = tuple(
+            _estimate(term.variable, values, name, sigma, correlations=correlations)
+            for name, sigma, correlations in rows
+        )
+    return found
+
+
+def lens_covariances(fit: ErrorFit) -> dict[str, Array]:
+    """Per camera whose lens is free, the (6 + k, 6 + k) joint marginal of pose, lens and clock.
+
+    Of xi in T_camera_lidar = exp(xi) estimate, then of the parameters in the order and the units of
+    :func:`lens_estimates`.
+    """
+    model, found = fit.model, {}
+    for number, term in model.lenses.items():
+        joint = fit.linear.covariance_of([model.reported_keys[number], lens_key(number)])
+        units = [_unit(term.variable, name) for name in term.variable.free.parameters]
+        scale = np.array([-1.0] * 6 + units)  # of T_lidar_camera the tangent is -xi
+        found[model.cameras[number]] = joint * np.outer(scale, scale)
+    return found
+
+
+def _estimate(
+    lens: LensVariable, values: Array, name: str, sigma: float, *, correlations: Array
+) -> LensEstimate:
+    """One parameter, with standard deviation and correlation with the pose of its camera."""
+    most, unit = int(np.argmax(correlations)), _unit(lens, name)
+    before, after = (_in_its_unit(lens, name, v) for v in (np.zeros(len(values)), values))
+    return LensEstimate(
+        name=name,
+        unit=_UNITS.get(name, ""),
+        value=after,
+        sigma=float(sigma * unit),
+        prior=before,
+        prior_sigma=float(unit),
+        direction=_DIRECTIONS[most],
+        correlation=float(correlations[most]),
+    )
+
+
+def _unit(lens: LensVariable, name: str) -> float:
+    """The prior standard deviation of a parameter, in its unit."""
+    step = lens.free.sigmas[lens.free.parameters.index(name)]
+    of_rig = _in_its_unit(lens, name, np.zeros(len(lens.free)))
+    return step * of_rig if name == FOCAL else step
+
+
+def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
+    """A parameter at some values, as people state it."""
+    camera, clock = lens.put_into(lens.camera, values), lens.free.clock_at(values)
+    k = camera.intrinsics_px
+    known = {
+        OFFSET: clock.offset_s,
+        READOUT: clock.readout_s,
+        FOCAL: float(np.sqrt(k.fx * k.fy)),
+        CENTRE_X: k.cx,
+        CENTRE_Y: k.cy,
+    }
+    return known[name] if name in known else lens.free.coefficient(name, values)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
@@ -12,16 +13,23 @@ from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import (
     invert,
     local_coordinates,
+    pose_rows,
     relative_covariance,
     relative_transform,
     retract_all,
+    twist_between,
 )
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_pairs import PairTerm, pair_terms, usual_excess
-from calibgraph.solver.curvature import FittedObjective, rows_of_pair
-from calibgraph.solver.frame_poses import DAMPING
-from calibgraph.solver.objective import Objective
-from calibgraph.solver.optimizer import Optimum
+from calibgraph.solver.covariance import FittedObjective
+from calibgraph.solver.pairs import (
+    ENOUGH_SURFACES,
+    PairTerm,
+    pair_terms,
+    rows_of_pair,
+    usual_excess,
+)
+from calibgraph.solver.pnp import DAMPING
+from calibgraph.solver.two_pass import Objective, Optimum
 from factors import EpipolarBlock, pose_sigmas
 
 _NARROWINGS = 4  # steps from the spread at the estimate to the least one
@@ -172,3 +180,50 @@ def fit_pairs(rig: Rig, matches: CameraMatches, config: Config, held: Array) -> 
             own = relative_covariance(both, 0, 1, relative_transform(T[b], T[a]))
             fits.append(PairFit(a, b, terms, T, own + np.diag(pair_sigmas() ** 2)))
     return fits
+
+
+def shared_variance_ratio(
+    T_camera_lidar: Mapping[str, Array], covariance: Array, fits: Sequence[PairFit]
+) -> float:
+    """Variance of the shared error over its usual one, by what cameras see in common; at least 1.
+
+    The correspondences place each camera by itself; images place them relative to each other, much
+    better. The difference, over pairs that span each group of tied cameras, is chi-squared
+    distributed if the covariances are right, with six degrees of freedom per pair. The usual size
+    counts as six of them. It is never taken for less than usual: what displaces all cameras alike
+    is not seen between them.
+
+    Args:
+        T_camera_lidar: (4, 4) of all cameras, by their correspondences.
+        covariance: (6 N, 6 N) of these.
+        fits: where the images place them.
+    """
+    cameras, chosen = list(T_camera_lidar), _spanning(fits)
+    if not chosen:
+        return 1.0
+    apart, to_pairs, of_images = [], [], np.zeros((6 * len(chosen), 6 * len(chosen)))
+    for number, fit in enumerate(chosen):
+        T_b_a = relative_transform(T_camera_lidar[fit.b], T_camera_lidar[fit.a])
+        apart.append(twist_between(T_b_a, fit.T_b_a))
+        to_pair = np.zeros((6, len(covariance)))
+        to_pair[:, pose_rows(cameras.index(fit.a))] = -gtsam.Pose3(T_b_a).AdjointMap()
+        to_pair[:, pose_rows(cameras.index(fit.b))] = np.eye(6)
+        to_pairs.append(to_pair)
+        of_images[pose_rows(number), pose_rows(number)] = fit.covariance
+    jacobian, step = np.concatenate(to_pairs), np.concatenate(apart)
+    whole = jacobian @ covariance @ jacobian.T + of_images
+    chi_squared = float(step @ np.linalg.solve(whole, step))
+    usual_dof = error_components().shared_dof
+    return max(1.0, (usual_dof + chi_squared) / (usual_dof + len(step)))
+
+
+def _spanning(fits: Sequence[PairFit]) -> list[PairFit]:
+    """Pairs that tie each group of cameras once: those with the most features first."""
+    body: dict[str, str] = {}
+    chosen = []
+    for fit in sorted(fits, key=lambda fit: -fit.features):
+        one, two = (body.setdefault(name, name) for name in (fit.a, fit.b))
+        if one != two and fit.features >= ENOUGH_SURFACES:
+            chosen.append(fit)
+            body = {name: one if of == two else of for name, of in body.items()}
+    return chosen

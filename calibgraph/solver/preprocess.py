@@ -1,20 +1,21 @@
-"""The paper's correspondence preprocessing, with a count at every filter."""
+"""The paper's preprocessing, with a count at every filter; repeated frames count as one."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
-from calibgraph.io.correspondence_tables import parts_of_table
+from calibgraph.io.tables import parts_of_table
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate, rows_where
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Rig
-from calibgraph.solver.grid import best_in_cell, frame_edges
-from calibgraph.solver.repeats import number_repeats
-from calibgraph.solver.shared_error import with_common_error
+from factors.compiled import compiled
 
 FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped")
 """The stages at which a camera's correspondences are counted, in order."""
@@ -35,6 +36,29 @@ class Preprocessed:
     table: Correspondences
     counts: dict[str, dict[str, int]]
     repeated_frames: dict[str, int]
+
+
+def with_common_error(table: Correspondences, config: Config) -> Correspondences:
+    """The table with the common error of the settings in its metadata, if they have one.
+
+    Raises:
+        CorrespondenceError: if the table states another one.
+    """
+    if (config.common_deg, config.common_cm) == (None, None):
+        return table
+    rotation_rad, translation_m = np.radians(config.common_deg or 0), (config.common_cm or 0) / 100
+    wanted, found = (float(rotation_rad), translation_m), table.findings
+    if not found.states_common_error:
+        return table.with_findings(
+            MatcherFindings(systematic_rotation_rad=wanted[0], systematic_translation_m=wanted[1])
+        )
+    if found.systematic_sigmas != wanted:
+        rotation_rad, translation_m = found.systematic_sigmas
+        raise CorrespondenceError(
+            f"the table states that its frames share {np.degrees(rotation_rad):.3g} deg and "
+            f"{100 * translation_m:.3g} cm; leave common_deg and common_cm out"
+        )
+    return table
 
 
 def preprocess(rig: Rig, table: Correspondences | Path | str, config: Config) -> Preprocessed:
@@ -181,3 +205,190 @@ def _within_cap(
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order)) - edges[group]
     return np.flatnonzero(rank < config.matches_max)
+
+
+_MOST_CELLS = 1 << 20  # 8 MB of places; of more cells, those that are taken are numbered
+
+
+def best_in_cell(
+    rig: Rig,
+    table: Correspondences,
+    camera: NDArray[np.int64],
+    config: Config,
+    *,
+    among: NDArray[np.bool_] | None = None,
+) -> NDArray[np.int64]:
+    """The most confident match of each cell of the image grid, per camera and frame.
+
+    Of equally confident ones the first in the table is kept. So the best of two tables, one after
+    the other, are the best among the best of each.
+
+    Args:
+        rig: for the sizes of the images.
+        table: correspondences.
+        camera: (n,) index of each match's camera in the rig.
+        config: ``grid_columns``, ``grid_rows``.
+        among: (n,) which of them take part; None: all.
+
+    Returns:
+        (k,) the rows that are kept, sorted by camera and frame.
+    """
+    sizes = np.array([[c.width_px, c.height_px] for c in rig.cameras.values()], dtype=np.float64)
+    shape = np.array([config.grid_columns, config.grid_rows], dtype=np.float64)
+    among = np.ones(len(table), dtype=np.bool_) if among is None else among
+    cell, cells = np.empty(len(table), np.int64), config.grid_columns * config.grid_rows
+    _number_cells(camera, table.pixels_px, sizes, shape, cell)
+    if cells > _MOST_CELLS:
+        taken, cell = np.unique(cell, return_inverse=True)
+        cells = len(taken)
+    if _are_sorted(camera, table.frame):
+        edges = frame_edges(camera, table.frame)
+        return np.flatnonzero(_best_of_runs(edges, cells, cell, table.confidence, among))
+    order = np.lexsort((table.frame, camera))
+    edges = frame_edges(camera[order], table.frame[order])
+    return np.asarray(
+        order[_best_of_runs(edges, cells, cell[order], table.confidence[order], among[order])]
+    )
+
+
+def _are_sorted(camera: NDArray[np.int64], frame: NDArray[np.int64]) -> bool:
+    same, later = camera[1:] == camera[:-1], camera[1:] > camera[:-1]
+    return bool((later | (same & (frame[1:] >= frame[:-1]))).all())
+
+
+def frame_edges(camera: NDArray[np.integer[Any]], frame: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(g + 1,) where the runs of equal camera and frame begin, and the end."""
+    if not len(frame):
+        return np.zeros(1, dtype=np.int64)
+    new = (camera[1:] != camera[:-1]) | (frame[1:] != frame[:-1])
+    return np.concatenate([[0], np.flatnonzero(new) + 1, [len(frame)]])
+
+
+def _best_of_runs(
+    edges: NDArray[np.int64],
+    cells: int,
+    cell: NDArray[np.int64],
+    confidence: NDArray[np.floating[Any]],
+    among: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """(n,) which rows have the largest confidence, the first of them, of their run and cell."""
+    keep = np.zeros(len(cell), dtype=np.bool_)
+    _keep_best(edges, np.full(cells, -1), cell, confidence, among, keep)
+    return keep
+
+
+@compiled()
+def _number_cells(camera, pixels, sizes, shape, cells):  # type: ignore[no-untyped-def]
+    """Fill (n,) the cell that each pixel lies in; pixels outside belong to the edge cells."""
+    for i in range(len(camera)):
+        which, number = camera[i], np.int64(0)
+        for axis in (1, 0):
+            place = (pixels[i, axis] + 0.5) / sizes[which, axis] * shape[axis]
+            last = shape[axis] - 1.0
+            place = place if place > 0.0 else 0.0
+            number = number * np.int64(shape[axis]) + np.int64(place if place < last else last)
+        cells[i] = number
+
+
+@compiled()
+def _keep_best(edges, best, cell, confidence, among, keep):  # type: ignore[no-untyped-def]
+    """Set which rows are kept; ``best``: a place per cell, of the best row so far, -1 at first.
+
+    One of an earlier run counts as none.
+    """
+    for run in range(len(edges) - 1):
+        first = edges[run]
+        for row in range(first, edges[run + 1]):
+            if not among[row]:
+                continue
+            other = best[cell[row]]
+            taken = other >= first
+            if taken and not confidence[row] > confidence[other]:
+                continue
+            if taken:
+                keep[other] = False
+            best[cell[row]], keep[row] = row, True
+
+
+Numbers = NDArray[np.int64]
+Hashes = NDArray[np.uint64]
+
+REPEATED_SHARE = 0.5
+"""Of a frame's points or pixels, that are those of another one, to the last bit: two scans have
+none in common, nor have two images, where pixels are not of a grid."""
+GRID_SHARE = 0.5
+"""Distinct columns over distinct pixels of a table, below which its pixels are of a grid, as those
+of a dense matcher: every frame has the same."""
+
+_ODD = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
+
+
+def number_repeats(table: Correspondences, camera: Numbers) -> Numbers:
+    """(n,) frame numbers, with those of one place, cloud or image of a camera replaced.
+
+    Frames are of one cloud if more than half of their points are the same, of one image if more
+    than half of their pixels are: copies of a frame, also where they were matched anew.
+
+    Args:
+        table: sorted by camera and frame.
+        camera: (n,) of its rows.
+    """
+    if not len(table):
+        return table.frame
+    edges = frame_edges(camera, table.frame)
+    if (np.diff(camera[edges[:-1]]) > 0).all():  # one frame of each camera
+        return table.places.merge_stationary(table.frame)
+    of_camera, counts = camera.astype(np.uint64) * _ODD[0], np.diff(edges)
+    numbers = table.frame[edges[:-1]]
+    for values in (table.points_lidar_m, table.pixels_px):
+        hashes = point_hashes(values) + of_camera
+        if _have_repeats(hashes) and not _are_of_a_grid(values, hashes):
+            numbers = numbers[_first_of_same_content(hashes, counts)]
+    return table.places.merge_stationary(np.repeat(numbers, counts))
+
+
+def _are_of_a_grid(values: Array, hashes: Hashes) -> bool:
+    """Whether these are pixels of a grid."""
+    if values.shape[1] > len("uv"):
+        return False
+    return len(np.unique(values[:, 0])) < GRID_SHARE * len(np.unique(hashes))
+
+
+def _have_repeats(hashes: Hashes) -> bool:
+    ordered = np.sort(hashes)
+    return bool((ordered[1:] == ordered[:-1]).any())
+
+
+def _first_of_same_content(hashes: Hashes, counts: Numbers) -> Numbers:
+    """(f,) for each frame the first one that has more than half of the rows of either in common.
+
+    Args:
+        hashes: (n,) of the rows, frame by frame.
+        counts: (f,) of rows.
+    """
+    frame = np.repeat(np.arange(len(counts)), counts)
+    _, first, row = np.unique(hashes, return_index=True, return_inverse=True)
+    earlier = frame[first[row]]  # that has this row, too
+    pairs, common = np.unique(
+        np.column_stack([earlier, frame])[earlier < frame], axis=0, return_counts=True
+    )
+    alike = common > REPEATED_SHARE * counts[pairs].min(axis=1)
+    found = np.arange(len(counts))
+    for one, other in pairs[alike]:
+        found[other] = min(found[other], found[one])
+    return found
+
+
+def hash_numbers(points_lidar_m: Array) -> list[int]:
+    """:func:`point_hashes` as numbers: a set of some hundred is faster than arrays."""
+    numbers: list[int] = point_hashes(points_lidar_m).tolist()
+    return numbers
+
+
+def point_hashes(points: Array) -> Hashes:
+    """(n,) uint64 of the bits of each point of (n, 2) or (n, 3)."""
+    mixed = np.zeros(len(points), dtype=np.uint64)
+    for column, odd in zip(points.T, _ODD, strict=False):
+        mixed += np.ascontiguousarray(column, dtype=np.float64).view(np.uint64) * odd
+        mixed ^= mixed >> np.uint64(31)
+    return np.asarray(mixed * _ODD[0])

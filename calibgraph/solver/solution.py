@@ -1,26 +1,43 @@
-"""What the joint solve returns: the optimum, and everything that checks of it need."""
+"""What the joint solve returns: the optimum, its covariance, and all that checks of it need.
+
+With the preset ``auto`` the estimate is the optimum of the error model. With the paper's presets it
+is the minimum of Eq. 5, and the model serves for its covariance alone.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
+import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.error_sources import ErrorSources
+from calibgraph.model.geometry import pose_rows
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
-from calibgraph.solver.curvature import FittedObjective
-from calibgraph.solver.error_model import ErrorFit
-from calibgraph.solver.lens import moved_lenses, put_into
-from calibgraph.solver.lens_estimates import lens_covariances, lens_estimates
-from calibgraph.solver.marginals import Marginals
-from calibgraph.solver.objective import Objective, Scales, Transforms
-from calibgraph.solver.optimizer import Optimum
+from calibgraph.solver.covariance import FittedObjective, data_sigmas
+from calibgraph.solver.error_model import (
+    Conflict,
+    fit_errors,
+    fit_without_priors,
+    relative_pose_conflict,
+)
+from calibgraph.solver.lens import lens_covariances, lens_estimates, moved_lenses, put_into
+from calibgraph.solver.pair_refinement import PairFit, fit_pairs, shared_variance_ratio
+from calibgraph.solver.places import ErrorFit
+from calibgraph.solver.sources import predict_variances, sources_by_camera, variances_by_source
+from calibgraph.solver.two_pass import Objective, Optimum, Scales, Transforms
+from factors import pose_sigmas
+
+_HELD_SIGMAS = pose_sigmas(rotation_rad=np.radians(0.1), translation_m=0.02)
+"""Of a camera that a pair is fitted to, if its covariance is unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +54,9 @@ class Solution:
         counts: per camera, correspondences left after each filter and gate, and frames.
         timings_s: seconds per stage.
         camera_matches: what cameras see in common; None if it was not given.
-        before_pairs: the optimum without it; None if no pair of cameras had enough.
+        alone: the solution without it; None if no pair of cameras had enough.
         held: cameras that nothing determines; they stay where the rig has them.
         errors: the error model that the optimum is of; None where it is that of the objective.
-        errors_before_pairs: likewise, of ``before_pairs``.
     """
 
     rig: Rig
@@ -52,10 +68,9 @@ class Solution:
     counts: Mapping[str, Mapping[str, int]]
     timings_s: Mapping[str, float]
     camera_matches: CameraMatches | None = None
-    before_pairs: Optimum | None = None
+    alone: Solution | None = None
     held: tuple[str, ...] = ()
     errors: ErrorFit | None = None
-    errors_before_pairs: ErrorFit | None = None
 
     @property
     def T_camera_lidar(self) -> Transforms:
@@ -85,52 +100,103 @@ class Solution:
     @cached_property
     def solved_rig(self) -> Rig:
         """The rig with the estimated extrinsics, and lenses if these are estimated."""
-        fit = None if self.errors is None else self.errors.fit
-        lenses, _ = moved_lenses(self.inliers.lenses, fit)
+        lenses, _ = moved_lenses(self.inliers.lenses, self.errors)
         return put_into(self.rig.moved_to(self.T_camera_lidar), lenses)
 
     @property
     def lens(self) -> dict[str, tuple[LensEstimate, ...]]:
         """Per camera whose lens is estimated, its parameters."""
-        return {} if self.errors is None else lens_estimates(self.errors.fit)
+        return {} if self.errors is None else lens_estimates(self.errors)
 
     @property
     def lens_covariance(self) -> dict[str, Array]:
         """Per camera whose lens is estimated, (6 + k, 6 + k) of pose, lens and clock."""
-        return {} if self.errors is None else lens_covariances(self.errors.fit)
+        return {} if self.errors is None else lens_covariances(self.errors)
 
     @cached_property
-    def marginals(self) -> Marginals:
-        """Its covariance, and all that it is made of."""
-        alone = None if self.before_pairs is None else self.without_pairs().marginals
-        return Marginals(self.fitted, self.correspondences, self.errors, self.camera_matches, alone)
+    def error_fit(self) -> ErrorFit | None:
+        """The error model at the estimate: ``errors``, or for its covariance alone.
+
+        None as of ``fit_errors``. The shared error is at least as large as pairs of images show,
+        even if the loss rejects them.
+        """
+        table, least = self.correspondences, 1.0
+        found = self.errors or fit_errors(self.fitted, table.findings, table.places)
+        if self.alone is not None and (mount := self.alone.mount) is not None:
+            known = mount.T_camera_lidar, mount.covariance
+            least = shared_variance_ratio(*known, self.alone.pair_fits)
+        return None if found is None else found.with_shared_ratio(least)
 
     @property
     def covariance(self) -> Array | None:
         """(6 N, 6 N) of all extrinsics, in the rig's order; None if a direction is undetermined.
 
-        Of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation [rad], translation [m]).
+        Of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation [rad], translation [m]): the
+        marginal of the error model.
         """
-        return self.marginals.covariance
+        return None if self.error_fit is None else self.error_fit.covariance
+
+    @property
+    def mount(self) -> ErrorFit | None:
+        """The fit of the mounts, between which images and measurements show relative poses."""
+        return None if self.error_fit is None else self.error_fit.of_mount
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """The graph whose optimum and marginal are reported."""
-        return self.marginals.graph
+        """The graph whose optimum and marginal are reported; with the paper's presets, Eq. 5."""
+        if self.error_fit is not None and self.config.preset == "auto":
+            return latent_pose_graph(self.error_fit.model)
+        return self.inliers.graph(self.scales)
+
+    @cached_property
+    def data_sigmas(self) -> Array | None:
+        """(N, 6) standard deviations if every correspondence were independent."""
+        return data_sigmas(self.fitted) if self.objective.uses_correspondences else None
+
+    def error_sources(self, joint: Array) -> dict[str, ErrorSources]:
+        """Per camera with an error bar, the shares of its sources.
+
+        Args:
+            joint: (6 N, 6 N) the reported covariance, which may be wider than that of the matches.
+        """
+        if self.error_fit is None:
+            return {}
+        total, cameras = np.diag(self.error_fit.covariance), self.fitted.cameras
+        parts, forecast = variances_by_source(self.error_fit), predict_variances(self.error_fit)
+        numbers = {n: k for k, n in enumerate(cameras) if n not in self.held}
+        return sources_by_camera(joint, total, parts, forecast, numbers=numbers)
+
+    @cached_property
+    def pair_fits(self) -> list[PairFit]:
+        """The relative poses of pairs by images, the first camera held near its correspondences."""
+        if self.alone is not None:
+            return self.alone.pair_fits
+        if self.camera_matches is None:
+            return []
+        count, prior = len(self.fitted.cameras), _HELD_SIGMAS**2
+        joint = np.diag(np.tile(prior, count)) if self.covariance is None else self.covariance
+        held = [joint[pose_rows(number), pose_rows(number)] for number in range(count)]
+        rig = self.rig.moved_to(self.T_camera_lidar)
+        return fit_pairs(rig, self.camera_matches, self.config, np.array(held))
+
+    @cached_property
+    def conflicts(self) -> tuple[Conflict, ...]:
+        """The factors of relative poses between cameras that both have correspondences.
+
+        None where these determine no pose without the factors: then nothing contradicts them.
+        """
+        measured, cameras = self.inliers.rig.relative_poses, self.inliers.blocks
+        pairs = [pair for pair in measured if {pair.a, pair.b} <= cameras.keys()]
+        if not pairs:
+            return ()
+        free = None if self.error_fit is None else self.error_fit.without_priors
+        table = self.correspondences
+        free = free or fit_without_priors(self.fitted, table.findings, table.places)
+        if free is None:
+            return ()
+        mount = free.of_mount
+        names, T, covariance = mount.model.cameras, mount.T_camera_lidar, mount.covariance
+        return tuple(relative_pose_conflict(pair, names, T, covariance) for pair in pairs)
 
     def without_pairs(self) -> Solution:
         """The solution without what cameras see in common."""
-        return self._alone
-
-    @cached_property
-    def _alone(self) -> Solution:
-        if self.before_pairs is None:
-            return self
-        alone = replace(self.inliers, pairs=())
-        return replace(
-            self,
-            inliers=alone,
-            optimum=self.before_pairs,
-            before_pairs=None,
-            errors=self.errors_before_pairs,
-            errors_before_pairs=None,
-        )
+        return self.alone or self

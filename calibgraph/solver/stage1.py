@@ -3,37 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.model.clock import at_pixels
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import transform, twists_between
+from calibgraph.model.geometry import retract_all, twists_between
+from calibgraph.model.pose_kernel import logarithms
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import map_on_cores
-from calibgraph.solver.frame_poses import COARSE, Runs, fit_frames
-from calibgraph.solver.geodesic_median import geodesic_median
-from calibgraph.solver.grid import frame_edges
 from calibgraph.solver.pnp import (
+    COARSE,
+    Runs,
+    fit_frames,
     frame_pose,
     pose_near_guess,
     ransac_pnp,
     refine_frames,
-    select_evenly,
 )
+from calibgraph.solver.preprocess import frame_edges
 from factors import ProjectionBlock, to_runs
 
 _OUTLIER = 6.0  # median distances, 9 sigma of a Gaussian in three dimensions
 COMMON_SAMPLE = 1000
 """Matches of all frames, for a pose that single frames start from."""
 
+_MEDOID_OF = 500  # rotations at most: it is a start of the median, and its cost is quadratic
+_STEPS, _LEAST_RAD = 50, 1e-6  # of the median: far below any rotation that matters
 _ALIKE_RAD, _ALIKE_M = np.radians(0.05), 0.01  # frames that differ by less all count
 
 
@@ -71,19 +73,25 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
         return {name: CameraStage1(rig.cameras[name].T_camera_lidar) for name in named}
     cameras = [*rig.cameras.values()]
     rows = [at_pixels(camera, table.of_camera(name)) for name, camera in rig.cameras.items()]
-    common = map_on_cores(partial(_from_common_pose, config=config), cameras, rows)
-    left = [[*np.flatnonzero(~frames.found).tolist()] for frames in common]
+    runs = [to_runs(frame_edges(of.camera_index, of.frame)) for of in rows]
+    common = map_on_cores(partial(_from_common_pose, config=config), cameras, rows, runs)
+    left = [
+        (number, frame)
+        for number, (_, found) in enumerate(common)
+        for frame in np.flatnonzero(~found).tolist()
+    ]
     searched = map_on_cores(
         partial(frame_pose, config=config),
-        [camera for camera, numbers in zip(cameras, left, strict=True) for _ in numbers],
-        [f.rows_of(i) for f, numbers in zip(common, left, strict=True) for i in numbers],
+        [cameras[number] for number, _ in left],
+        [rows[number].select(slice(*runs[number][frame])) for number, frame in left],
     )
-    poses = iter(searched)
+    for (number, frame), T in zip(left, searched, strict=True):
+        if T is not None:
+            poses, found = common[number]
+            poses[frame], found[frame] = T, True
     return {
-        name: aggregate_frames(
-            *frames.with_poses({i: next(poses) for i in numbers}).solved, len(frames.runs)
-        )
-        for name, frames, numbers in zip(rig.cameras, common, left, strict=True)
+        name: aggregate_frames(poses[found], of.frame[own[found, 0]], len(own))
+        for name, (poses, found), of, own in zip(rig.cameras, common, rows, runs, strict=True)
     }
 
 
@@ -96,68 +104,27 @@ def T_hat(pairwise_estimates: Stage1) -> dict[str, Array]:
     }
 
 
-@dataclass(frozen=True, eq=False)
-class FramePoses:
-    """The frames of one camera.
-
-    Attributes:
-        rows: its correspondences.
-        runs: (f, 2) those of each frame.
-        T_camera_lidar: (f, 4, 4).
-        found: (f,) which of these hold.
-    """
-
-    rows: Correspondences
-    runs: Runs
-    T_camera_lidar: Array
-    found: NDArray[np.bool_]
-
-    def rows_of(self, frame: int) -> Correspondences:
-        """The correspondences of the frame of that place."""
-        return self.rows.select(slice(*self.runs[frame]))
-
-    @property
-    def solved(self) -> tuple[Array, NDArray[np.int64]]:
-        """(s, 4, 4) the poses that hold, and (s,) the numbers of their frames."""
-        return self.T_camera_lidar[self.found], self.rows.frame[self.runs[self.found, 0]]
-
-    def with_poses(self, poses: Mapping[int, Array | None]) -> FramePoses:
-        """With the poses of some frames, by their place; None where there is none."""
-        T_camera_lidar, found = self.T_camera_lidar.copy(), self.found.copy()
-        for frame, T in poses.items():
-            if T is not None:
-                T_camera_lidar[frame], found[frame] = T, True
-        return replace(self, T_camera_lidar=T_camera_lidar, found=found)
-
-
-def _from_common_pose(camera: Camera, rows: Correspondences, config: Config) -> FramePoses:
-    """The poses of all frames at once, from one for all of them together.
+def _from_common_pose(
+    camera: Camera, rows: Correspondences, runs: Runs, config: Config
+) -> tuple[Array, NDArray[np.bool_]]:
+    """(f, 4, 4) poses of all frames from one for all of them together, and (f,) which are found.
 
     Found are those that explain the majority of the frame's correspondences: no other pose can
     explain more. Three of them do not count, which any pose explains. So if all are found from a
     fit that starts at the guess, nothing is left for MAGSAC to find.
     """
-    sample = select_evenly(rows, COMMON_SAMPLE)
-    near = frames_from(pose_near_guess(camera, sample, config), camera, rows, config)
-    if near.found.all():
-        return near
-    return frames_from(ransac_pnp(camera, sample, config), camera, rows, config)
-
-
-def frames_from(
-    start: Array | None, camera: Camera, rows: Correspondences, config: Config
-) -> FramePoses:
-    """The poses of frames from one (4, 4) T_camera_lidar near all of them; None: none is found."""
-    runs = to_runs(frame_edges(rows.camera_index, rows.frame))
-    none = np.zeros(len(runs), dtype=np.bool_)
-    if start is None:
-        return FramePoses(rows, runs, np.tile(np.eye(4), (len(runs), 1, 1)), none)
+    sample = rows.select(slice(None, None, -(-len(rows) // COMMON_SAMPLE) or None))
     block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px)
+    poses, found = np.tile(np.eye(4), (len(runs), 1, 1)), np.zeros(len(runs), dtype=np.bool_)
     wide = block.rescale(scale=config.pnp_threshold_px / 2)
-    near = fit_frames(wide, runs, np.tile(start, (len(runs), 1, 1)), tolerance=COARSE)
-    refined = refine_frames(block, runs, near.T_camera_lidar, config)
-    majority = refined.inliers - 3 > (runs[:, 1] - runs[:, 0]) / 2
-    return FramePoses(rows, runs, refined.T_camera_lidar, refined.found & majority)
+    for start_of in (pose_near_guess, ransac_pnp):
+        if found.all() or (start := start_of(camera, sample, config)) is None:
+            break
+        near = fit_frames(wide, runs, np.tile(start, (len(runs), 1, 1)), tolerance=COARSE)
+        refined = refine_frames(block, runs, near.T_camera_lidar, config)
+        majority = refined.inliers - 3 > (runs[:, 1] - runs[:, 0]) / 2
+        poses, found = refined.T_camera_lidar, refined.found & majority
+    return poses, found
 
 
 def aggregate_frames(poses: Array, numbers: NDArray[np.int64], frames: int) -> CameraStage1:
@@ -204,6 +171,22 @@ def are_near_median(T_camera_lidar: Array, median: Array | None = None) -> NDArr
 
 
 def median_pose(T_camera_lidar: Array) -> Array:
-    """(4, 4) of (f, 4, 4): component-wise for the translation, geodesic L1 for the rotation."""
-    rotations = Rotation.from_matrix(T_camera_lidar[:, :3, :3])
-    return transform(geodesic_median(rotations), np.median(T_camera_lidar[:, :3, 3], axis=0))
+    """(4, 4) of (f, 4, 4): component-wise for the translation, geodesic L1 for the rotation.
+
+    That is the rotation with the least sum of angles to the others, by Weiszfeld's algorithm.
+    """
+    T, rotations = np.eye(4), T_camera_lidar[:, :3, :3]
+    some = rotations[:: -(-len(rotations) // _MEDOID_OF)]
+    cosines = np.einsum("aij,bij->ab", some, some) / 2 - 0.5
+    T[:3, :3] = some[np.argmin(np.arccos(cosines.clip(-1.0, 1.0)).sum(axis=0))]
+    turned = np.tile(np.eye(4), (len(rotations), 1, 1))
+    for _ in range(_STEPS):
+        turned[:, :3, :3] = rotations @ T[:3, :3].T
+        twists = logarithms(turned)
+        weights = 1.0 / np.maximum(np.linalg.norm(twists, axis=1), _LEAST_RAD)
+        step = weights @ twists / weights.sum()
+        T = retract_all(T[None], -step[None])[0]
+        if np.linalg.norm(step) < _LEAST_RAD:
+            break
+    T[:3, 3] = np.median(T_camera_lidar[:, :3, 3], axis=0)
+    return T

@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace, PairByPlace, place_of
 from calibgraph.model.findings import error_components
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.camera_pairs import PairTerm, usual_excess
-from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.curvature import FittedObjective, convex_hessian
-from calibgraph.solver.residual_scale import ResidualScale
+from calibgraph.solver.covariance import FittedObjective, convex_hessian, with_pseudo_frames
+from calibgraph.solver.matches import CameraBlock
+from calibgraph.solver.pairs import PairTerm, usual_excess
+from calibgraph.solver.robust import ResidualScale
 from factors import pose_sigmas
 
 _LEAST_VARIANCE, _LEAST_EXCESS = 0.1, 1e-3  # of independent matches; of what these are left with

@@ -1,4 +1,4 @@
-"""Bookkeeping of a frame in the state: absorbed, left out, or without usable matches."""
+"""Frames in the state: absorbed, left out, or without usable matches; and a camera's start."""
 
 from __future__ import annotations
 
@@ -6,285 +6,326 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from calibgraph.graph.variables import cloud_at_key, matched_at_key
-from calibgraph.model.correspondences import Correspondences
-from calibgraph.solver.camera_block import (
-    CameraBlock,
-    camera_blocks,
-)
-from calibgraph.solver.elimination import Linearization
+from calibgraph.arrays import Array
+from calibgraph.errors import CorrespondenceError
+from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.model.rig import Rig
+from calibgraph.pipeline import solve
+from calibgraph.solver.columns import distortion_evidence
+from calibgraph.solver.matches import BlockResiduals, CameraBlock, camera_blocks, merge
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.tracking.assessment import rig_at
+from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.cause import chance_limit
-from calibgraph.tracking.closed_places import ClosedPlaces
+from calibgraph.tracking.estimate import EpochGraph, states_places
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import PLACE, Incoming
-from calibgraph.tracking.frozen import changed
-from calibgraph.tracking.gated import Gated
-from calibgraph.tracking.live_frames import LiveFrame, OutlierFrame
-from calibgraph.tracking.outlier_frames import agrees, find_outlier_frame
-from calibgraph.tracking.place_model import states_places
-from calibgraph.tracking.start import count_residuals
-from calibgraph.tracking.state import State
-from calibgraph.tracking.sums import Sums, minimum, sums_of_matches
+from calibgraph.tracking.gate import Gated, agrees, find_outlier_frame
+from calibgraph.tracking.noise import add_residuals, median, scale_of
+from calibgraph.tracking.state import BEND, HISTORY, OutlierFrame, State
+from calibgraph.tracking.sums import Sums
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
 _TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
+_TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt to start
 
 
-def with_open_frames(state: State, *frames: LiveFrame) -> State:
-    """The state with frames in its open epoch, in the place of those of the same numbers."""
-    last, numbers = state.epochs[-1], {frame.number for frame in frames}
-    others = (f for f in last.frames if f.number not in numbers)
-    return changed(state, epochs=(*state.epochs[:-1], changed(last, frames=(*others, *frames))))
-
-
-def begin_frames(state: State, frames: Sequence[Incoming]) -> State:
-    """The state with frames begun, none of whose matches is absorbed."""
-    last, count = frames[-1], len(state.names)
+def begin_frames(state: State, frames: Sequence[Incoming]) -> None:
+    """Begin frames, none of whose matches is absorbed."""
+    last, n = frames[-1], len(state.names)
     found = [one.table.findings for one in frames if len(one.table)]
-    state = changed(
-        state,
-        frame=last.number,
-        stamp_ns=last.stamp_ns,
-        updates=state.updates + len(frames),
-        findings=found[-1] if found else state.findings,
-    )
-    empty = (LiveFrame.empty(f.number, count, f.table.metadata.get(PLACE, "")) for f in frames)
-    return with_open_frames(state, *empty)
+    state.frame, state.stamp_ns = last.number, last.stamp_ns
+    state.updates += len(frames)
+    if found and found[-1] != state.findings:
+        state.findings = found[-1]
+    numbers = np.array([one.number for one in frames], dtype=np.int64)
+    state.numbers = np.concatenate([state.numbers, numbers])
+    state.at = (*state.at, *(one.table.metadata.get(PLACE, "") for one in frames))
+    state.sizes = (*state.sizes[:-1], state.sizes[-1] + len(frames))
+    none = Sums.zeros(len(frames), n).packed
+    state.sums = Sums(np.concatenate([state.sums.packed, none]))
 
 
-def blocks_by_camera(state: State, table: Correspondences) -> dict[int, CameraBlock]:
-    """The preprocessed matches of each camera that has enough.
+def absorb(state: State, gated: Mapping[int, Gated]) -> list[dict[int, int]]:
+    """Take in the inliers of frames that have begun; of each open one, how many by camera.
 
-    Args:
-        state: before the frame.
-        table: of the frame.
+    Frames of a camera with too few are left out.
     """
-    if not len(table):
-        return {}
-    kept = preprocess(rig_at(state, state.T_lidar_camera), table, state.config)
-    blocks = camera_blocks(state.rig, kept.table, state.config)
-    return {state.names.index(name): block for name, block in blocks.items()}
-
-
-def at_minimum(state: State, closed: ClosedPlaces, more: Mapping[int, Sums] | None = None) -> State:
-    """The state with the last epoch's estimates at the minimum of Eq. 5, where frames are gated.
-
-    Args:
-        state: the tracker's.
-        closed: its closed epochs.
-        more: sums of further matches, per camera.
-    """
-    return state.at_poses(minimum(closed.equation_5(state, more), state.T_lidar_camera))
-
-
-def select_agreeing(
-    state: State, closed: ClosedPlaces, blocks: Mapping[int, CameraBlock]
-) -> tuple[State, dict[int, CameraBlock]]:
-    """The blocks of started cameras that agree with the estimate; the others are set aside.
-
-    One that agrees with the pose of its place does, too.
-    """
-    agreeing = {}
-    for camera, block in blocks.items():
-        one, T_lidar_camera = state.cameras[camera], state.T_lidar_camera[camera]
-        if not one.started:
+    used = [dict[int, int]() for _ in range(state.sizes[-1])]
+    packed, first = state.sums.packed.copy(), state.closed
+    for camera, every in gated.items():
+        one = every.select(every.enough)
+        numbers = one.raw.frame_numbers
+        if not len(numbers):
             continue
-        if agrees(block, T_lidar_camera, one):
-            agreeing[camera] = block
-            continue
-        own = find_outlier_frame(
-            state.frame or 0,
-            block,
-            T_lidar_camera,
-            camera=state.rig.cameras[state.names[camera]],
-            camera_state=one,
-            config=state.config,
-        )
-        if own is not None and agrees_at_its_place(state, closed, camera, own):
-            agreeing[camera] = block
-        else:
-            state = _set_aside(state, camera, own)
-    return state, agreeing
+        rows = np.searchsorted(state.numbers, numbers)
+        packed[rows, camera] = one.sums(state, camera, state.references[camera]).packed
+        for row, count in zip((rows - first).tolist(), one.counts.tolist(), strict=True):
+            used[row][camera] = int(count)
+        keep_matches(state, camera, one)
+        agreed = (*state.agreements[camera], *((number, True) for number in numbers.tolist()))
+        state.put(camera, agreements=agreed[-_LAST_FRAMES:])
+    state.sums = Sums(packed)
+    return used
 
 
-def agrees_at_its_place(state: State, closed: ClosedPlaces, camera: int, own: OutlierFrame) -> bool:
-    """Whether a frame that disagrees with a camera's estimate agrees with the pose of its place.
-
-    In the graph with this frame: if its place is displaced by no more than places are, and the
-    pose there explains it.
-
-    Args:
-        state: before the frame is absorbed; the last live frame has its place.
-        closed: its closed epochs.
-        camera: by its place in the rig.
-        own: the frame, with the T_lidar_camera that fits it.
-    """
-    one, frame = state.cameras[camera], state.live_frames[-1]
-    if one.summary.walk or not states_places(state):
-        return False
-    gated = Gated.at(own.T_lidar_camera, own.raw, one.scale, state.references[camera])
-    if not gated.sums.matches[0]:
-        return False
-    state = with_open_frames(state, frame.add(camera, gated))
-    window, _ = closed.with_open_epoch(state, None)
-    place = window.places.index(frame.place)
-    displaced = Linearization.at(window.model, window.values).distances[place, [0, 1 + camera]]
-    if displaced @ displaced > chance_limit():
-        return False
-    cloud, pose = window.T_lidar_camera([cloud_at_key(place), matched_at_key(place, camera)])
-    return agrees(own.raw, cloud.between(pose), one)
+def keep_matches(state: State, camera: int, gated: Gated) -> None:
+    """Keep the matches of absorbed frames, and count them."""
+    blocks, inliers = (*state.blocks[camera], gated.raw), (*state.inliers[camera], gated.inliers)
+    state.put(camera, blocks=blocks, inliers=inliers)
+    given, used = len(gated.inliers), int(gated.counts.sum())
+    state.count(camera, absorbed=gated.raw.frames, given=given, used=used)
 
 
-def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> State:
-    """The state with a camera's block counted as left out.
-
-    It is kept as an outlier frame if another T_lidar_camera explains it; otherwise the matching has
-    failed.
-    """
-    camera_state, number = state.cameras[camera], state.frame or 0
-    kept = camera_state.outlier_frames
-    camera_state = changed(
-        camera_state,
-        outlier_frames=kept if own is None else (*kept, own)[-_LAST_FRAMES:],
-        agreements=(*camera_state.agreements, (number, False))[-_LAST_FRAMES:],
-    )
-    return state.with_camera(camera, camera_state.count(left_out=1, failed=1 if own is None else 0))
+def count_residuals(state: State, camera: int, gated: Gated) -> None:
+    """Count the residuals of frames, and which of them are within the gate."""
+    raw, errors_px = gated.raw, gated.residuals.errors_px
+    medians = [median(part) for part in np.split(errors_px, raw.frame_edges[1:-1])]
+    new = np.column_stack([gated.counts / raw.frame_counts, medians])
+    recent = np.concatenate([state.recent[camera], new])[-HISTORY:]
+    histogram = add_residuals(state.histogram[camera], gated.residuals)
+    share = median(recent[~np.isnan(recent[:, 0]), 0])
+    state.put(camera, recent=recent, share=share, histogram=histogram, least=raw.least_spread)
 
 
-def absorb(
-    state: State, closed: ClosedPlaces, blocks: Mapping[int, CameraBlock], frames: int = 1
-) -> tuple[State, list[dict[int, int]]]:
-    """The state with the inliers of its last frames, and how many each has, per camera.
-
-    In two passes: the gate is drawn at the minimum with all matches of the blocks.
-    """
-    used = [dict[int, int]() for _ in range(frames)]
-    if not blocks:
-        return state, used
-    everything = {
-        camera: sums_of_matches(
-            block,
-            state.cameras[camera].scale,
-            state.T_lidar_camera[camera],
-            state.references[camera],
-        )
-        for camera, block in blocks.items()
-    }
-    state = at_minimum(state, closed, everything)
-    newest = [*state.epochs[-1].frames[-frames:]]
-    rows = {frame.number: row for row, frame in enumerate(newest)}
-    for camera, block in blocks.items():
-        gated = _gated(state, camera, block)
-        if gated is None:
-            continue
-        raw, counts = gated.residuals.block, gated.sums.matches.astype(np.int64).tolist()
-        for of_block, number in enumerate(raw.frame_numbers.tolist()):
-            row = rows[number]
-            newest[row] = newest[row].add(camera, gated, row=of_block)
-            used[row][camera] = counts[of_block]
-        state = _count_absorbed(state, camera, gated)
-    state = add_to_totals(with_open_frames(state, *newest), newest)
-    return at_minimum(state, closed), used
-
-
-def _gated(state: State, camera: int, block: CameraBlock) -> Gated | None:
-    """The frames of a block with enough matches within the gate; None if there are none."""
-    scale, reference = state.cameras[camera].scale, state.references[camera]
-    pose = state.T_lidar_camera[camera]
-    gated = Gated.at(pose, block, scale, reference)
-    enough = gated.sums.matches > 0
-    if enough.all():
-        return gated
-    if not enough.any():
-        return None
-    kept = block.select(np.repeat(enough, block.frame_counts))
-    return Gated.at(pose, kept, scale, reference)
-
-
-def _count_absorbed(state: State, camera: int, gated: Gated) -> State:
-    """The state with a camera's frames absorbed, and their residuals counted."""
-    one, numbers = state.cameras[camera], gated.residuals.block.frame_numbers.tolist()
-    one = count_residuals(one, gated.residuals, gated.inliers)
-    agreements = (*one.agreements, *((number, True) for number in numbers))[-_LAST_FRAMES:]
-    one = changed(one, agreements=agreements)
-    given, used = len(gated.inliers), int(gated.sums.matches.sum())
-    return state.with_camera(camera, one.count(absorbed=len(numbers), given=given, used=used))
-
-
-def add_to_totals(state: State, frames: Sequence[LiveFrame]) -> State:
-    """The state with frames added to the scatter of all frames, in their order.
+def add_to_totals(state: State, frames: Sums) -> None:
+    """Add (f, n) frames to the scatter of all frames, in their order.
 
     An unusual frame is down-weighted: it may come after a move that has not been detected yet.
     """
-    sums, kept = Sums.stack([frame.sums for frame in frames]), _TOTAL_KEPT ** len(frames)
-    scores = sums.score.copy()
-    for camera in range(len(state.cameras)):
+    count, scores = len(frames.packed), frames.score.copy()
+    for camera in range(len(state.names)):
         noise, own = state.frame_noise(camera), scores[:, camera]
         if noise is not None:
             unusual = (own * np.linalg.solve(noise, own.T).T).sum(axis=1)
             own *= np.sqrt(_UNUSUAL / np.maximum(unusual, _UNUSUAL))[:, None]
-    ages = _TOTAL_KEPT ** np.arange(len(frames) - 1.0, -1.0, -1.0)
-    flat = scores.reshape(len(frames), -1)
-    return changed(
-        state,
-        total=kept * state.total + (ages * flat.T) @ flat,
-        total_hessian=kept * state.total_hessian + np.tensordot(ages, sums.hessian, axes=1),
-        total_frames=kept * state.total_frames + ages @ sums.frames,
+    ages, kept = _TOTAL_KEPT ** np.arange(count - 1.0, -1.0, -1.0), _TOTAL_KEPT**count
+    flat = scores.reshape(count, -1)
+    state.total = kept * state.total + (ages * flat.T) @ flat
+    state.total_hessian = kept * state.total_hessian + np.tensordot(ages, frames.hessian, axes=1)
+    state.total_frames = kept * state.total_frames + ages @ frames.frames
+
+
+def select_agreeing(
+    state: State, graph: EpochGraph, gated: Mapping[int, Gated]
+) -> dict[int, Gated]:
+    """The matches of one frame in cameras where it agrees with the estimate; others are set aside.
+
+    One that agrees with the pose of its place does, too; it is gated there.
+    """
+    agreeing = {}
+    for camera, one in gated.items():
+        if one.agree(state, camera).all():
+            agreeing[camera] = one
+            continue
+        own = find_outlier_frame(state, camera, one.raw)
+        there = None if own is None else _at_its_place(state, graph, camera, own)
+        if there is None:
+            _set_aside(state, camera, own)
+        else:
+            agreeing[camera] = there
+    return agreeing
+
+
+def _at_its_place(state: State, graph: EpochGraph, camera: int, own: OutlierFrame) -> Gated | None:
+    """A frame that disagrees with a camera's estimate, if it agrees with the pose of its place.
+
+    In the graph with this frame: if its place is displaced by no more than places are, and the
+    pose there explains it.
+    """
+    if state.walk[camera] or not states_places(state):
+        return None
+    scale = state.scales[camera]
+    gated = Gated.at(own.T_camera_lidar, own.raw, scale)
+    if not gated.enough.all():
+        return None
+    tried = state.draft()
+    (sums,) = gated.sums(state, camera, state.references[camera]).packed
+    tried.sums = state.sums.replace_at((-1, camera), Sums(sums))
+    squared, T = graph.at_its_place(tried)
+    if squared[0] + squared[1 + camera] > chance_limit():
+        return None
+    return gated if agrees(state, camera, own.raw, T[camera]) else None
+
+
+def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> None:
+    """Count a camera's frame as left out.
+
+    It is kept as an outlier frame if another T_camera_lidar explains it; otherwise the matching has
+    failed.
+    """
+    kept = state.outliers[camera]
+    state.put(
+        camera,
+        outliers=kept if own is None else (*kept, own)[-_LAST_FRAMES:],
+        agreements=(*state.agreements[camera], (state.frame or 0, False))[-_LAST_FRAMES:],
     )
+    state.count(camera, left_out=1, failed=1 if own is None else 0)
 
 
-def count_repeats(state: State, given: Correspondences, new: Correspondences) -> State:
-    """The state with the frames in a row counted, per camera, that repeat the one before them.
+def count_repeats(state: State, given: Correspondences, new: Correspondences) -> None:
+    """Count the frames in a row, per camera, that repeat the one before them.
 
     Args:
         state: of the tracker.
         given: the correspondences of a frame.
         new: those of cameras that do not repeat.
     """
-    if given is new and not any(one.counts.get("repeated") for one in state.cameras):
-        return state
+    if given is new and not any(state.counted(c, "repeated") for c in range(len(state.names))):
+        return
     again = np.setdiff1d(given.camera_index, new.camera_index)
     for number in np.unique(given.camera_index).tolist():
-        name = given.cameras[number]
-        camera = state.names.index(name)
-        counts = state.cameras[camera].counts
-        before = counts.get("repeated", 0)
-        repeated = before + 1 if number in again else 0
-        if repeated != before:
-            one = changed(state.cameras[camera], counts={**counts, "repeated": repeated})
-            state = state.with_camera(camera, one)
-    return state
+        camera = state.names.index(given.cameras[number])
+        before = state.counted(camera, "repeated")
+        state.count(camera, repeated=1 if number in again else -before)
 
 
-def count_absent(state: State, used: Collection[int], frame: Incoming) -> tuple[State, list[Event]]:
-    """The state with the frames without usable matches counted; events ``blind`` and ``back``.
+def count_absent(state: State, used: Collection[int], frame: Incoming) -> list[Event]:
+    """Count the frames without usable matches; the events ``blind`` and ``back``.
 
     Args:
         state: after a frame, or more.
         used: the cameras whose matches of the frame were absorbed, by their places in the rig.
         frame: this one.
     """
-    events = []
-    limit, number, stamp_ns = state.config.tracking.blind_frames, frame.number, frame.stamp_ns
-    for camera, camera_state in enumerate(state.cameras):
-        if not camera_state.started:
-            continue
-        absent = 0 if camera in used else camera_state.absent + 1
+    events, limit, number = [], state.config.tracking.blind_frames, frame.number
+    absent = np.where(state.started, state.absent + 1, state.absent)
+    absent[[*used]] = 0
+    for camera in np.flatnonzero(state.started & (absent != state.absent)).tolist():
         name = state.names[camera]
-        if absent == limit:
-            since = _number_of_frame_ago(state, limit, number)
-            events.append(Event("blind", name, since, number, stamp_ns))
-        if absent == 0 and camera_state.absent >= limit:
-            events.append(Event("back", name, number, number, stamp_ns))
-        if absent != camera_state.absent:
-            state = state.with_camera(camera, changed(camera_state, absent=absent))
-    return state, events
+        if absent[camera] == limit:
+            numbers = state.numbers[state.numbers <= number]
+            since = int(numbers[-min(limit, len(numbers))])
+            events.append(Event("blind", name, since, number, frame.stamp_ns))
+        if absent[camera] == 0 and state.absent[camera] >= limit:
+            events.append(Event("back", name, number, number, frame.stamp_ns))
+    state.absent = absent
+    return events
 
 
-def _number_of_frame_ago(state: State, frames: int, last: int) -> int:
-    """Number of the frame so many frames before and with the last; at least a live one."""
-    numbers = [frame.number for frame in state.live_frames if frame.number <= last]
-    return numbers[-min(frames, len(numbers))]
+# A camera's first estimate: the batch solve of its first frames.
+
+
+def start_cameras(state: State, table: Correspondences, seen: Collection[int]) -> list[Event]:
+    """Try to start the cameras that have no estimate yet, after one more frame.
+
+    Args:
+        state: of the tracker.
+        table: the correspondences of the frame.
+        seen: the cameras that have enough of them.
+    """
+    events = []
+    for camera in seen:
+        if not state.started[camera]:
+            _try_to_start(state, camera, table)
+            if state.started[camera]:
+                name, number = state.names[camera], state.frame or 0
+                events.append(Event("started", name, number, number, state.stamp_ns))
+    return events
+
+
+def _try_to_start(state: State, camera: int, table: Correspondences) -> None:
+    name = state.names[camera]
+    waiting = (*state.waiting[camera], table.of_camera(name))
+    count, waiting = len(waiting), waiting[-HISTORY:]
+    state.put(camera, waiting=waiting)
+    if not _is_attempt_due(count, state.config.tracking.start_frames):
+        return
+    rig = Rig(lidar=state.rig.lidar, cameras={name: state.rig.cameras[name]})
+    try:
+        result = solve(rig, concatenate(waiting), state.config)
+    except CorrespondenceError as error:
+        _wait_longer(state, camera, (str(error),))
+        return
+    if result.verdict.status == "FAIL":
+        _wait_longer(state, camera, result.camera_verdicts[name].reasons)
+        return
+    _start_camera(state, camera, result.T_camera_lidar[name])
+
+
+def _is_attempt_due(frames: int, first: int) -> bool:
+    """At the first frames, then at growing intervals, then with every new window of frames."""
+    attempts = first * _TRY_AGAIN ** np.arange(10)
+    return frames in attempts.astype(int) or frames >= HISTORY
+
+
+def _wait_longer(state: State, camera: int, reasons: tuple[str, ...]) -> None:
+    state.put(camera, refused=reasons)
+    if len(state.waiting[camera]) >= HISTORY:  # tried with a full window: the older half is dropped
+        state.put(camera, waiting=state.waiting[camera][HISTORY // 2 :])
+
+
+def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
+    """Absorb a camera's first frames at its first estimate."""
+    found = [_camera_block(state, camera, table) for table in state.waiting[camera]]
+    usable = [block for block in found if block is not None]
+    histogram = state.histogram[camera]
+    for block in usable:
+        histogram = add_residuals(histogram, BlockResiduals.at(T_camera_lidar, block))
+    scale = scale_of(histogram, usable[-1].least_spread, state.config)
+    curvature = Gated.at(T_camera_lidar, merge(usable), scale).curvature(scale)
+    state.put(camera, scales=scale, curvature=curvature, started=True, waiting=(), refused=())
+    for block in usable:
+        count_residuals(state, camera, Gated.at(T_camera_lidar, block, scale))
+    absorb_again(state, camera, usable, T_camera_lidar)
+
+
+def absorb_again(
+    state: State, camera: int, blocks: Sequence[CameraBlock], T_camera_lidar: Array
+) -> None:
+    """Absorb frames that are kept, with the camera at a new estimate."""
+    poses = state.poses.copy()
+    poses[:, camera] = T_camera_lidar
+    state.poses = poses
+    state.put(camera, references=T_camera_lidar)
+    state.settled, state.steps = (), state.steps[:0]
+    state.weights, state.shared = state.weights[:0], np.zeros_like(state.shared)
+    if blocks:
+        raw, scale = merge(blocks), state.scales[camera]
+        raw = raw.select(np.argsort(raw.frame, kind="stable"))
+        raw = raw.select(np.isin(raw.frame, state.numbers))
+        gated = Gated.at(T_camera_lidar, raw, scale)
+        gated = gated.select(gated.enough)
+        if len(gated.raw):
+            rows = np.searchsorted(state.numbers, gated.raw.frame_numbers)
+            sums = gated.sums(state, camera, T_camera_lidar)
+            state.sums = state.sums.replace_at((rows, camera), sums)
+            keep_matches(state, camera, gated)
+    if any(state.findings.bend_sigmas):
+        for epoch in range(len(state.sizes)):
+            bend_epoch(state, epoch, camera)
+
+
+def bend_epoch(state: State, epoch: int, camera: int) -> None:
+    """Compute anew an epoch's evidence of the scan distortion.
+
+    At each place the camera has a pose of its own. What no such pose can follow is left in the
+    residuals, at whatever estimate: so it holds on when a camera moves or drifts.
+    """
+    found, own = np.zeros(BEND), state.matches_of(camera)
+    first, end = state.edges[epoch : epoch + 2]
+    numbers = state.numbers[first:end]
+    if own is not None:
+        raw, inliers = own
+        block = raw.select(inliers & np.isin(raw.frame, numbers))
+        at: dict[str, list[int]] = {}
+        for number, name in zip(numbers.tolist(), state.at[first:end], strict=True):
+            at.setdefault(name, []).append(number)
+        if len(block):
+            places = [np.array(of_place, dtype=np.int64) for of_place in at.values()]
+            pose = to_T_lidar_camera(state.poses[epoch, camera])
+            scale = state.scales[camera]
+            one = distortion_evidence(block, scale, pose, WEAK, places=places).as_of_one_place()
+            pulled = one.hessian @ one.jacobian
+            parts = one.hessian, pulled, one.information, one.vector
+            found = np.concatenate([part.ravel() for part in parts])
+    bends = state.bends.copy()
+    bends[1 + epoch, camera] = found
+    state.bends = bends
+
+
+def _camera_block(state: State, camera: int, table: Correspondences) -> CameraBlock | None:
+    """The preprocessed matches of one camera's frame, None if there are too few."""
+    kept = preprocess(state.rig, table, state.config)
+    return camera_blocks(state.rig, kept.table, state.config).get(state.names[camera])

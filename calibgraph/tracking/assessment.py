@@ -1,32 +1,30 @@
-"""Assessment of the present estimate: its verdicts, and the result as a calibration."""
+"""Assessment of the present estimate: verdicts, updates of frames, the result as a calibration."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration, Residuals
-from calibgraph.model.geometry import pair_covariances, pose_rows, to_T_camera_lidar
-from calibgraph.model.rig import RelativePose, Rig
+from calibgraph.model.geometry import invert_each, pair_covariances, pose_rows
+from calibgraph.model.pose_kernel import logarithms
+from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Status, Verdict
-from calibgraph.solver.conflicts import Conflict
-from calibgraph.solver.covariance import ENOUGH_FRAMES
-from calibgraph.tracking.camera_state import CameraState
-from calibgraph.tracking.closed_places import ClosedPlaces
-from calibgraph.tracking.contradictions import contradicting, pairs_without
+from calibgraph.report.as_json import finite
+from calibgraph.solver.error_model import Conflict
+from calibgraph.tracking.estimate import EpochGraph, Estimate, error_sources, pairs_that_count
+from calibgraph.tracking.events import Event
+from calibgraph.tracking.frame_order import Incoming
 from calibgraph.tracking.noise import median
-from calibgraph.tracking.optimum import Optimum
-from calibgraph.tracking.shown_frames import groups_by_frames
-from calibgraph.tracking.sources import error_sources
 from calibgraph.tracking.state import State
-from calibgraph.tracking.sums import Sums, step_between
-from calibgraph.tracking.window import Window
-from calibgraph.trust.evidence import Estimate
+from calibgraph.trust.evidence import Estimate as Checked
 from calibgraph.trust.pose_posterior import (
+    MAX_FRAMES,
     ImagePosteriors,
     PosePosterior,
     group_tied,
@@ -44,74 +42,32 @@ MeasureOnFrames = Callable[
 NOT_COMPARED = "its images were not compared with the clouds: no frame that is at hand shows it"
 
 
-@dataclass(frozen=True, eq=False)
-class Assessment:
-    """All estimates, their covariance and verdicts.
-
-    Attributes:
-        T_lidar_camera: per camera.
-        joint_covariance: (6 n, 6 n) of xi in T_camera_lidar = exp(xi) estimate; NaN for cameras
-            with too few frames.
-        verdicts: per camera.
-        window: the graph at its optimum, until the next frame.
-        pairs: the relative poses that take part.
-    """
-
-    T_lidar_camera: tuple[gtsam.Pose3, ...]
-    joint_covariance: Array
-    verdicts: dict[str, Verdict]
-    window: Window
-    pairs: tuple[RelativePose, ...] = ()
-
-    def newest(self, optimum: Optimum | None) -> Optimum | None:
-        """The optimum of closed epochs, with the newer poses of this one."""
-        newer = Optimum.of(self.window.model, self.window.values, self.window.places, ())
-        return None if optimum is None else optimum.updated(newer)
-
-
-def assess(state: State, closed: ClosedPlaces, window: Window | None) -> Assessment:
-    """Assess the present estimates.
-
-    A relative pose that contradicts the correspondences of both its cameras takes no part, as in a
-    batch.
-
-    Args:
-        state: the tracker's.
-        closed: its closed epochs.
-        window: of the frame before, if of the same epoch.
-    """
-    sums = closed.all_sums(state)
-    window, conflicts = closed.with_open_epoch(state, window)
-    keys, estimates = window.model.reported_keys, state.T_lidar_camera
-    if state.config.preset == "auto":
-        estimates = window.T_lidar_camera(keys)
-    covariance, few = window.covariance(keys), np.repeat(sums.frames < ENOUGH_FRAMES, 6)
-    covariance[few], covariance[:, few] = np.nan, np.nan
+def assess(state: State, estimate: Estimate) -> Estimate:
+    """The present estimates with their verdicts."""
     verdicts = {}
     for camera, name in enumerate(state.names):
-        own = tuple(c for c in conflicts.values() if name in (c.pair.a, c.pair.b))
-        verdicts[name] = _verdict(state, sums, camera, covariance, conflicts=own)
-    pairs = pairs_without(state, contradicting(conflicts))
-    return Assessment(estimates, covariance, verdicts, window, pairs)
+        own = tuple(c for c in estimate.conflicts.values() if name in (c.pair.a, c.pair.b))
+        verdicts[name] = _verdict(state, estimate, camera, conflicts=own)
+    return replace(estimate, verdicts=verdicts)
 
 
 def with_images(
-    state: State, assessment: Assessment, measure: MeasureOnFrames | None
-) -> tuple[Assessment, ImagePosteriors]:
-    """The assessment with error bars and verdicts by the posteriors of cameras with error bars.
+    state: State, estimate: Estimate, measure: MeasureOnFrames | None
+) -> tuple[Estimate, ImagePosteriors]:
+    """Error bars and verdicts by the posteriors of cameras with error bars, too.
 
-    Without ``measure`` it stays as it is.
+    Without ``measure`` they stay as they are.
     """
-    own = covariance_by_camera(assessment, state.names)
+    own = covariance_by_camera(estimate, state.names)
     known = {name: covariance for name, covariance in own.items() if covariance is not None}
-    groups = group_tied(tuple(known), measured_pairs(assessment.pairs))
+    groups = group_tied(tuple(known), measured_pairs(pairs_that_count(state)))
     posteriors: dict[str, PosePosterior] = {}
     if measure is not None:
         for frames, of_frames in groups_by_frames(state, groups).items():
             posteriors |= measure(frames, known, of_frames)
-    images = ImagePosteriors(state.names, assessment.joint_covariance, posteriors)
+    images = ImagePosteriors(state.names, estimate.covariance, posteriors)
     row, flatness, verdicts = threshold("beyond_tolerance"), images.check_flatness(), {}
-    for name, verdict in assessment.verdicts.items():
+    for name, verdict in estimate.verdicts.items():
         more = []
         if name in flatness:
             beyond = images.probability_beyond(name, state.config.tolerance)
@@ -119,26 +75,20 @@ def with_images(
         elif measure is not None and name in known:
             more = [Check("image evidence", "WARN", NOT_COMPARED)]
         verdicts[name] = Verdict((*verdict.checks, *more))
-    joint = images.widen(assessment.joint_covariance)
-    return replace(assessment, joint_covariance=joint, verdicts=verdicts), images
+    covariance = images.widen(estimate.covariance)
+    return replace(estimate, covariance=covariance, verdicts=verdicts), images
 
 
 def _verdict(
-    state: State,
-    sums: Sums,
-    camera: int,
-    covariance: Array,
-    *,
-    conflicts: tuple[Conflict, ...],
+    state: State, estimate: Estimate, camera: int, *, conflicts: tuple[Conflict, ...]
 ) -> Verdict:
-    one = state.cameras[camera]
-    if not one.started:
-        return _start_check(state, one)
-    rows = pose_rows(camera)
-    own = covariance[rows, rows]
-    estimate = Estimate(
+    if not state.started[camera]:
+        return _start_check(state, camera)
+    rows, sums = pose_rows(camera), estimate.sums
+    own = estimate.covariance[rows, rows]
+    found = Checked(
         has_matches=True,
-        used=int(one.counts.get("used", 0)),
+        used=state.counted(camera, "used"),
         frames=int(sums.frames[camera]),
         covariance=None if np.isnan(own).any() else own,
         data_sigmas=sigmas_of_hessian(sums.hessian[camera]),
@@ -146,116 +96,259 @@ def _verdict(
         scatter_only=not state.findings.states_common_error,
         tolerance=state.config.tolerance,
     )
-    return Verdict((*check_estimate(estimate), *_recent_checks(state, one)))
+    return Verdict((*check_estimate(found), *_recent_checks(state, camera)))
 
 
-def _stuck_check(one: CameraState, status: Status) -> Check:
-    text = f"the last {one.counts['repeated'] + 1} frames with matches have the same points"
+def _stuck_check(repeated: int, status: Status) -> Check:
+    text = f"the last {repeated + 1} frames with matches have the same points"
     return Check("stuck", status, f"{text}: its stream is stuck, or sends them again")
 
 
-def _start_check(state: State, one: CameraState) -> Verdict:
-    needed = state.config.tracking.start_frames
-    if one.counts.get("repeated", 0) >= state.config.tracking.blind_frames:
-        return Verdict((_stuck_check(one, "FAIL"),))
-    waiting = (f"{len(one.waiting)} of {needed} frames with matches",)
-    reasons = (f"no estimate yet: {reason}" for reason in one.refused or waiting)
+def _start_check(state: State, camera: int) -> Verdict:
+    needed, repeated = state.config.tracking.start_frames, state.counted(camera, "repeated")
+    if repeated >= state.config.tracking.blind_frames:
+        return Verdict((_stuck_check(repeated, "FAIL"),))
+    waiting = (f"{len(state.waiting[camera])} of {needed} frames with matches",)
+    reasons = (f"no estimate yet: {reason}" for reason in state.refused[camera] or waiting)
     return Verdict(tuple(Check(START, "WARN", reason) for reason in reasons))
 
 
-def _recent_checks(state: State, one: CameraState) -> list[Check]:
+def _recent_checks(state: State, camera: int) -> list[Check]:
     """Checks of a camera's last frames."""
-    checks = []
-    limit = state.config.tracking.blind_frames
-    repeated = one.counts.get("repeated", 0)
-    if repeated >= limit > one.absent - repeated:
-        checks.append(_stuck_check(one, "WARN"))
-    elif one.absent >= limit:
-        text = f"no usable matches in the last {one.absent} frames"
-        checks.append(Check("blind frames", "WARN", text, one.absent))
-    if one.summary.walk:
+    checks, absent = [], int(state.absent[camera])
+    limit, repeated = state.config.tracking.blind_frames, state.counted(camera, "repeated")
+    if repeated >= limit > absent - repeated:
+        checks.append(_stuck_check(repeated, "WARN"))
+    elif absent >= limit:
+        text = f"no usable matches in the last {absent} frames"
+        checks.append(Check("blind frames", "WARN", text, absent))
+    if state.walk[camera]:
         text = "drifts: the estimate follows, over fewer frames"
         checks.append(Check("drift", "WARN", text))
-    agreements = [good for _, good in one.agreements]
+    agreements = [good for _, good in state.agreements[camera]]
     if agreements:
-        share = 1 - float(np.mean(agreements))
+        share = 1 - sum(agreements) / len(agreements)
         name = f"share of the last {len(agreements)} frames that disagree with the estimate"
         checks.append(threshold("disagreeing_frames").check(share, name=name))
     return checks
 
 
-def recent_residuals(one: CameraState) -> Residuals:
+def recent_residuals(state: State, camera: int) -> Residuals:
     """Residuals of the recent frames."""
+    scale = state.scales[camera]
     return Residuals(
-        median_px=median(one.recent[:, 1]),
-        inlier_share=one.inlier_share,
-        sigma_px=one.scale.sigma_px,
-        loss_scale_px=one.scale.loss_scale,
-        gate_px=one.scale.gate_px,
+        median_px=median(state.known_recent(camera)[:, 1]),
+        inlier_share=float(state.share[camera]),
+        sigma_px=scale.sigma_px,
+        loss_scale_px=scale.loss_scale,
+        gate_px=scale.gate_px,
     )
 
 
-def covariance_by_camera(assessment: Assessment, names: tuple[str, ...]) -> dict[str, Array | None]:
+def covariance_by_camera(estimate: Estimate, names: tuple[str, ...]) -> dict[str, Array | None]:
     """Per camera (6, 6); None with too few frames."""
     covariance: dict[str, Array | None] = {}
     for camera, name in enumerate(names):
         rows = pose_rows(camera)
-        own = assessment.joint_covariance[rows, rows]
+        own = estimate.covariance[rows, rows]
         covariance[name] = None if np.isnan(own).any() else own
     return covariance
 
 
-def _counts(one: CameraState) -> dict[str, int]:
+def _counts(state: State, camera: int) -> dict[str, int]:
     """Correspondences and frames, by what became of them."""
-    counts = {key: one.counts.get(key, 0) for key in ("given", "used", "left_out", "failed")}
-    used, waiting = one.counts.get("absorbed", 0), len(one.waiting)
+    counts = {key: state.counted(camera, key) for key in ("given", "used", "left_out", "failed")}
+    used, waiting = state.counted(camera, "absorbed"), len(state.waiting[camera])
     frames = used + counts["left_out"] + waiting
     return {**counts, "frames": frames, "frames_used": used, "frames_waiting": waiting}
 
 
-def rig_at(state: State, T_lidar_camera: Sequence[gtsam.Pose3]) -> Rig:
-    """The rig with these estimates."""
-    estimates = zip(state.names, T_lidar_camera, strict=True)
-    return state.rig.moved_to({name: to_T_camera_lidar(T) for name, T in estimates})
-
-
-def second_moments(assessment: Assessment) -> Array:
+def second_moments(estimate: Estimate) -> Array:
     """(6 n, 6 n) of the mounts about the estimates."""
-    window, keys = assessment.window, assessment.window.model.camera_keys
-    steps = zip(window.T_lidar_camera(keys), assessment.T_lidar_camera, strict=True)
-    away = np.concatenate([step_between(pose, estimate) for pose, estimate in steps])
+    window, keys = estimate.window, estimate.window.model.camera_keys
+    away = logarithms(estimate.T_camera_lidar @ invert_each(window.T_camera_lidar(keys))).ravel()
     return np.asarray(window.covariance(keys) + np.outer(away, away))
+
+
+def _frames_of(state: State, name: str) -> tuple[int, ...]:
+    """Numbers of the frames that show a camera at its present pose, as of a drift the last."""
+    camera = state.names.index(name)
+    frames = tuple(state.numbers[state.sums.frames[:, camera] > 0].tolist())
+    return frames[-MAX_FRAMES:] if state.walk[camera] else frames
+
+
+def groups_by_frames(
+    state: State, groups: Sequence[tuple[str, ...]]
+) -> dict[tuple[int, ...], list[tuple[str, ...]]]:
+    """Groups of cameras by the numbers of the kept frames that show all of a group.
+
+    For the comparison of their images with the clouds. If these are less than half of a camera's
+    own, or of those that are scored, each camera of the group is alone, with its own frames. Those
+    that no frame shows are left out.
+    """
+    found: dict[tuple[int, ...], list[tuple[str, ...]]] = {}
+    for group in groups:
+        own = [_frames_of(state, name) for name in group]
+        common = tuple(number for number in own[0] if all(number in each for each in own))
+        parts = [(common, group)]
+        if any(2 * len(common) < min(len(each), MAX_FRAMES) for each in own):
+            parts = [(each, (name,)) for each, name in zip(own, group, strict=True)]
+        for frames, part in parts:
+            if frames:
+                found.setdefault(frames, []).append(part)
+    return found
 
 
 def to_calibration(
     state: State,
-    assessment: Assessment,
+    graph: EpochGraph,
+    estimate: Estimate,
     measure: MeasureOnFrames | None = None,
     *,
     sources: bool = False,
 ) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
-    assessment, images = with_images(state, assessment, measure)
-    joint = assessment.joint_covariance
+    estimate, images = with_images(state, estimate, measure)
+    joint = estimate.covariance
     known = None if np.isnan(joint).any() else joint
-    mounts = None if known is None else images.widen(second_moments(assessment))
-    rig = rig_at(state, assessment.T_lidar_camera)
+    mounts = None if known is None else images.widen(second_moments(estimate))
+    rig, cameras = state.rig_at(estimate.T_camera_lidar), [*enumerate(state.names)]
     return Calibration(
         rig=rig,
         initial_rig=state.rig,
-        covariance=covariance_by_camera(assessment, state.names),
+        covariance=covariance_by_camera(estimate, state.names),
         joint_covariance=known,
         pair_covariance=pair_covariances(mounts, rig.T_camera_lidar),
-        camera_verdicts=assessment.verdicts,
-        residuals={
-            name: recent_residuals(one)
-            for name, one in zip(state.names, state.cameras, strict=True)
-            if one.started
-        },
-        counts={n: _counts(one) for n, one in zip(state.names, state.cameras, strict=True)},
+        camera_verdicts=dict(estimate.verdicts),
+        residuals={n: recent_residuals(state, c) for c, n in cameras if state.started[c]},
+        counts={name: _counts(state, camera) for camera, name in cameras},
         timings_s={},
         terms="full",
         config=state.config,
-        error_sources=error_sources(state, known) if sources else {},
+        error_sources=error_sources(state, graph, known) if sources else {},
         moves=tuple(map(str, state.moves)),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """The estimates after a frame.
+
+    Frames that are taken in at once share their arrays, which are read-only.
+
+    Attributes:
+        frame: its number.
+        stamp_ns: its time, or that of the last frame that had one, or None.
+        T_camera_lidar: per camera, (4, 4): p_camera = T_camera_lidar * p_lidar. The guess, as long
+            as the camera has no estimate.
+        covariance: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
+            [rad], translation [m]) in the camera's axes; None until the camera has enough frames.
+        verdicts: per camera, whether its estimate can be used now, with reasons.
+        events: the events detected with this frame.
+        used: per camera whose matches were absorbed, how many.
+        left_out: cameras whose matches disagree with the estimate, and were not absorbed.
+    """
+
+    frame: int
+    stamp_ns: int | None
+    T_camera_lidar: dict[str, Array]
+    covariance: dict[str, Array | None]
+    verdicts: dict[str, Verdict]
+    events: tuple[Event, ...]
+    used: dict[str, int]
+    left_out: tuple[str, ...]
+
+
+def make_updates(
+    state: State,
+    estimate: Estimate,
+    taken: Sequence[tuple[Incoming, Sequence[Event], Mapping[int, int]]],
+) -> list[Update]:
+    """The updates after the last frames of a state.
+
+    Args:
+        state: after the frames.
+        estimate: with its verdicts.
+        taken: the frames that were taken in at once; the events detected with each, and per camera,
+            by its place in the rig, how many of its matches were absorbed.
+    """
+    names = state.names
+    poses = dict(zip(names, estimate.T_camera_lidar, strict=True))
+    covariance = covariance_by_camera(estimate, names)
+    for array in (*poses.values(), *covariance.values()):
+        if array is not None:
+            array.setflags(write=False)  # the updates share them
+    last = {n: own[-1:] for n, own in zip(names, state.agreements, strict=True)}
+    return [
+        Update(
+            frame=one.number,
+            stamp_ns=one.stamp_ns,
+            T_camera_lidar=dict(poses),
+            covariance=dict(covariance),
+            verdicts=dict(estimate.verdicts),
+            events=tuple(events),
+            used={names[camera]: count for camera, count in used.items()},
+            left_out=tuple(n for n in names if last[n] == ((one.number, False),)),
+        )
+        for one, events, used in taken
+    ]
+
+
+def shared_parts(update: Update) -> tuple[int, ...]:
+    """Identities of what frames that are taken in at once share."""
+    parts = update.T_camera_lidar, update.covariance, update.verdicts
+    return tuple(id(value) for part in parts for value in part.values())
+
+
+def json_lines(updates: Sequence[Update]) -> list[str]:
+    """A line of JSON of each update; units are in the keys, matrices row by row.
+
+    What frames that were taken in at once share is encoded once.
+    """
+    estimates: dict[tuple[int, ...], dict[str, str]] = {}
+    lines = []
+    for update in updates:
+        if (shared := shared_parts(update)) not in estimates:
+            estimates[shared] = {name: _estimate(update, name) for name in update.T_camera_lidar}
+        cameras = ", ".join(
+            f"{text}, {_of_frame(update, name)}}}" for name, text in estimates[shared].items()
+        )
+        stamp = "null" if update.stamp_ns is None else update.stamp_ns
+        head = f'"frame": {update.frame}, "stamp_ns": {stamp}'
+        events = _json([*map(_event, update.events)]) if update.events else "[]"
+        lines.append(f'{{{head}, "cameras": {{{cameras}}}, "events": {events}}}')
+    return lines
+
+
+def _json(content: Any) -> str:
+    try:
+        return json.dumps(content, allow_nan=False)
+    except ValueError:  # of numbers that JSON does not have
+        return json.dumps(finite(content), allow_nan=False)
+
+
+def _estimate(update: Update, name: str) -> str:
+    """A camera's name, and the first members of its object: those that hold for all frames."""
+    covariance, verdict = update.covariance[name], update.verdicts[name]
+    sigmas = None if covariance is None else np.sqrt(np.diag(covariance))
+    content = {
+        "T_camera_lidar": update.T_camera_lidar[name].tolist(),
+        "covariance": None if covariance is None else covariance.tolist(),
+        "rotation_sigma_deg": None if sigmas is None else np.degrees(sigmas[:3]).tolist(),
+        "translation_sigma_cm": None if sigmas is None else (100 * sigmas[3:]).tolist(),
+        "verdict": verdict.status,
+        "cannot_tell": verdict.cannot_tell,
+        "reasons": list(verdict.reasons),
+        "actions": list(summarize({name: verdict}).actions),
+    }
+    return f"{_json(name)}: {_json(content)[:-1]}"
+
+
+def _of_frame(update: Update, name: str) -> str:
+    """The other members."""
+    return f'"used": {update.used.get(name, 0)}, "left_out": {str(name in update.left_out).lower()}'
+
+
+def _event(event: Event) -> dict[str, Any]:
+    size = {} if event.size is None else vars(event.size)
+    return {**vars(event), "size": size or None, "text": str(event)}

@@ -24,9 +24,8 @@ from calibgraph.pipeline import calibrate
 from calibgraph.progress import no_progress
 from calibgraph.solver.joint import solve_joint
 from calibgraph.tracking.frame_order import with_place
-from calibgraph.tracking.place_sums import MOST_PLACES
-from calibgraph.tracking.run import Stop
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
+from calibgraph.tracking.sums import MOST_PLACES
 from calibgraph.tracking.tracker import IncrementalCalibrator
 from calibgraph.trust.pose_posterior import PosePosterior, measure_posteriors
 
@@ -35,6 +34,23 @@ _UNSCORED = (CalibrationError, OSError, np.linalg.LinAlgError, cv2.error, Runtim
 
 MOST_AGAIN = 200
 """Frames that a restart looks at again, at 0.1 s each, to find where the vehicle is."""
+
+
+@dataclass
+class Stop:
+    """Whether a signal to stop has come; called for the answer.
+
+    Attributes:
+        received: set by the first signal.
+        interrupts: whether that signal is raised, too, as KeyboardInterrupt.
+    """
+
+    received: bool = False
+    interrupts: bool = False
+
+    def __call__(self) -> bool:
+        """Whether it has come."""
+        return self.received
 
 
 @dataclass(frozen=True, eq=False)

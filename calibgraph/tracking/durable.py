@@ -14,6 +14,7 @@ from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
+from calibgraph.tracking.assessment import Update
 from calibgraph.tracking.frame_order import (
     require_number,
     with_metadata_per_frame,
@@ -21,9 +22,8 @@ from calibgraph.tracking.frame_order import (
 )
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.state_database import StateDatabase
-from calibgraph.tracking.stream_tables import StreamFrame
+from calibgraph.tracking.streams import StreamFrame
 from calibgraph.tracking.tracker import IncrementalCalibrator
-from calibgraph.tracking.update import Update
 
 _SNAPSHOT_EVERY = 50  # updates: a restart repeats up to so many, and those of two writes
 

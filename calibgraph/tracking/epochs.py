@@ -1,170 +1,212 @@
-"""The end of an epoch: the oldest live one is summarized, a new one begins."""
+"""The end of an epoch: a new gate and linearization at the newest estimate, and a new epoch."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from operator import add
-
-import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import pose_rows, to_T_camera_lidar
-from calibgraph.solver.camera_block import merge
-from calibgraph.tracking.camera_state import CameraState
-from calibgraph.tracking.drift import follow_drift, report_drift
-from calibgraph.tracking.epoch_summary import STRENGTHS
+from calibgraph.model.geometry import (
+    invert_each,
+    local_coordinates,
+    retract_all,
+    to_T_camera_lidar,
+    to_T_lidar_camera,
+)
+from calibgraph.model.pose_kernel import logarithms
+from calibgraph.solver.matches import merge
+from calibgraph.solver.within_place import WEAK
+from calibgraph.tracking.absorption import add_to_totals, bend_epoch, count_residuals
+from calibgraph.tracking.estimate import EpochGraph, locate_places
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frozen import changed
-from calibgraph.tracking.live_frames import Epoch, LiveFrame, inliers_of
-from calibgraph.tracking.place_sums import sums_by_place
-from calibgraph.tracking.regate import regate
-from calibgraph.tracking.state import State
-from calibgraph.tracking.steps import shift_between
-from calibgraph.tracking.sums import Sums, step_between, sums_of_matches
+from calibgraph.tracking.gate import Gated, frame_sums
+from calibgraph.tracking.moves import report_drift, select_walk, shift_between, update_evidence
+from calibgraph.tracking.noise import scale_of
+from calibgraph.tracking.state import STRENGTHS, State
+from calibgraph.tracking.sums import Numbers, Sums
 from factors import to_runs
 
+_GATE_STEPS = 4  # by the Hessian by weights, which descend: each leaves a third of the way
 
-def close_epoch(state: State) -> tuple[State, list[Event]]:
-    """The state with its open epoch closed and a new one begun.
+
+def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
+    """Close the open epoch and begin a new one.
 
     A camera that drifts keeps the estimate of each epoch; any other has the newest in all of them.
-    """
-    epochs = tuple(_at_newest(state, epoch) for epoch in state.epochs)
-    state = changed(state, epochs=epochs)
-    if len(epochs) > state.config.tracking.live_epochs:
-        state = _summarize_oldest(state)
-    state = _with_references(state, state.T_lidar_camera)
-    cameras = tuple(
-        changed(one, scale=one.residuals.scale(state.config)) if one.started else one
-        for one in state.cameras
-    )
-    state = changed(state, cameras=cameras)
-    state = regate(state)
-    epochs = state.epochs
-    following = Epoch.empty(state.T_lidar_camera)
-    epochs = (*epochs[:-1], _with_distortion(state, epochs[-1]), following)
-    return report_drift(changed(state, epochs=epochs))
-
-
-def _at_newest(state: State, epoch: Epoch) -> Epoch:
-    estimates = zip(state.cameras, epoch.T_lidar_camera, state.T_lidar_camera, strict=True)
-    poses = tuple(own if one.summary.walk else newest for one, own, newest in estimates)
-    return changed(epoch, T_lidar_camera=poses)
-
-
-def _with_distortion(state: State, epoch: Epoch) -> Epoch:
-    """The epoch with the evidence of the scan distortion, if its size is stated."""
-    if any(state.findings.bend_sigmas):
-        for camera, one in enumerate(state.cameras):
-            epoch = epoch.with_distortion(camera, one.scale)
-    return epoch
-
-
-def _with_references(state: State, references: tuple[gtsam.Pose3, ...]) -> State:
-    """The state with its sums about other references, but those of live frames."""
-    steps = np.array([*map(step_between, state.references, references)])
-    cameras = tuple(
-        changed(camera_state, summary=camera_state.summary.shift_reference(step))
-        for camera_state, step in zip(state.cameras, steps, strict=True)
-    )
-    drift = state.drift
-    if drift is not None:
-        drift = changed(drift, anchors=drift.anchors.shift_reference(steps))
-    places = state.places.shift_reference(steps)
-    return changed(state, cameras=cameras, references=references, places=places, drift=drift)
-
-
-def _summarize_oldest(state: State) -> State:
-    """The state with its oldest epoch added to the summaries."""
-    epoch, *younger = state.epochs
-    drifted = [one.summary.walk > 0 for one in state.cameras]
-    by_places = shift_between(state, (), epoch.frames)
-    cameras = range(len(state.cameras))
-    evidence = tuple(_update_evidence(state, camera, epoch, by_places) for camera in cameras)
-    state = _select_walks(changed(state, cameras=evidence))
-    for camera, one in enumerate(state.cameras):
-        summary = one.summary
-        if epoch.sums.frames[camera]:
-            summary = summary.add(epoch.sums[camera], _ungated(state, epoch, camera))
-        variance = state.walk_variance(STRENGTHS, len(epoch.frames))
-        summary = summary.propagate(variance, state.overconfidence(camera))
-        state = state.with_camera(camera, changed(one, summary=summary))
-    distortion = tuple(map(add, state.distortion, epoch.distortion))
-    state = changed(state, epochs=tuple(younger), distortion=distortion)
-    return _with_places(state, epoch, drifted)
-
-
-def _at_places(state: State, epoch: Epoch) -> list[LiveFrame]:
-    """The frames of an epoch, linearized at the poses of their places at the optimum."""
-    frames = [changed(frame, sums=frame.sums.copy()) for frame in epoch.frames]
-    for camera, (estimate, reference) in enumerate(
-        zip(epoch.T_lidar_camera, state.references, strict=True)
-    ):
-        own = [frame for frame in frames if camera in frame.raw]
-        inliers = inliers_of(own, camera)
-        if inliers is None:
-            continue
-        poses = [state.pose_at(frame.place, camera) or estimate for frame in own]
-        block, runs = inliers.with_scale(state.cameras[camera].scale), to_runs(inliers.frame_edges)
-        here = block.run_sums(np.array([*map(to_T_camera_lidar, poses)]), runs)
-        for row, (frame, pose) in enumerate(zip(own, poses, strict=True)):
-            step = step_between(pose, reference)
-            frame.sums.gradient[camera] = here.gradient[row] + frame.sums.hessian[camera] @ step
-            frame.sums.reweighted[camera] = here.hessian[row]
-    return frames
-
-
-def _ungated(state: State, epoch: Epoch, camera: int) -> Sums:
-    """All matches of a camera in an epoch, whatever the gate."""
-    raw = merge([frame.raw[camera] for frame in epoch.frames if camera in frame.raw])
-    scale, pose = state.cameras[camera].scale, epoch.T_lidar_camera[camera]
-    return sums_of_matches(raw, scale, pose, state.references[camera])
-
-
-def _with_places(state: State, epoch: Epoch, drifted: Sequence[bool]) -> State:
-    """The state with an epoch's sums added to those of its places.
-
-    Of a camera that drifts there are only the sums that are discounted by its walk. When the drift
-    has ended, what these hold counts as of one place.
 
     Args:
-        state: with the epoch summarized.
-        epoch: the epoch.
-        drifted: per camera, whether it drifted before the epoch was summarized.
+        state: of the tracker.
+        graph: of the epoch.
     """
-    parts = sums_by_place(_at_places(state, epoch))
-    places = state.places.add(parts).bounded()
-    for camera, (one, before) in enumerate(zip(state.cameras, drifted, strict=True)):
-        if one.summary.walk:
-            places = places.without(camera)
-        elif before and parts:
-            places = places.with_camera_at([*parts][-1], camera, one.summary.selected)
-    return changed(state, places=places)
+    locate_places(state, graph)
+    add_to_totals(state, state.sums[state.closed :])
+    newest = _newest(state, graph)
+    steady, poses = state.walk == 0, state.poses.copy()
+    poses[-1] = newest
+    poses[:, steady] = newest[steady]
+    state.poses = poses
+    if len(state.sizes) > state.config.tracking.live_epochs:
+        _summarize_oldest(state)
+    _set_references(state, newest)
+    for camera in np.flatnonzero(state.started).tolist():
+        _count_epoch(state, camera)
+        scale = scale_of(state.histogram[camera], float(state.least[camera]), state.config)
+        state.put(camera, scales=scale)
+    for camera in range(len(state.names)):
+        _regate(state, camera)
+        if any(state.findings.bend_sigmas):
+            bend_epoch(state, len(state.sizes) - 1, camera)
+    state.sizes, state.poses = (*state.sizes, 0), np.concatenate([state.poses, newest[None]])
+    state.bends = np.concatenate([state.bends, np.zeros_like(state.bends[:1])])
+    return report_drift(state)
 
 
-def _update_evidence(state: State, camera: int, epoch: Epoch, by_places: Array) -> CameraState:
-    """The camera with the evidence of its walks updated by how well they predict an epoch.
+def _newest(state: State, graph: EpochGraph) -> Array:
+    """(n, 4, 4) T_camera_lidar at the minimum of each camera's matches, where the gate is drawn.
 
-    The scatter of epochs is updated here too: by now, a move within the epoch has been detected.
+    Of all of them, as in a batch: that of the matches within a gate is drawn to where the gate was
+    before. Of a camera that drifts, or has none, that of Eq. 5, which later epochs have a part in.
     """
-    one, alone = state.cameras[camera], state.scatter_of_frames(camera)
-    sums = epoch.sums[camera]
-    noise = state.frame_noise(camera)
-    if noise is None or alone is None or not sums.frames:
-        return one
-    groups = tuple(group.add(sums.score, int(sums.frames), alone) for group in one.groups)
-    rows = pose_rows(camera)
-    noise = noise * sums.frames + sums.hessian @ by_places[rows, rows] @ sums.hessian
-    return changed(one, summary=one.summary.update_evidence(sums, noise), groups=groups)
+    newest = retract_all(state.references, graph.equation_5(state.all_sums()))
+    for camera in np.flatnonzero(state.walk == 0).tolist():
+        own, pose = state.matches_of(camera), to_T_lidar_camera(state.references[camera])
+        if own is None:
+            continue
+        block, older = own[0].with_scale(state.scales[camera]), state.ungated[camera]
+        reference = pose
+        for _ in range(_GATE_STEPS):
+            sums, step = block.sums(pose), reference.localCoordinates(pose)
+            pull = sums.gradient + older.gradient + older.hessian @ step
+            whole = sums.hessian + older.hessian + WEAK
+            pose = pose.retract(-np.linalg.solve(whole, pull))
+        newest[camera] = to_T_camera_lidar(pose)
+    return newest
 
 
-def _select_walks(state: State) -> State:
-    """The state with each camera's walk selected by the evidence."""
-    for camera, camera_state in enumerate(state.cameras):
-        summary = camera_state.summary.select_walk()
-        if summary.walk > 0 == camera_state.summary.walk:
-            state = follow_drift(state, camera, summary.walk)
-        else:
-            state = state.with_camera(camera, changed(camera_state, summary=summary))
-    return state
+def _count_epoch(state: State, camera: int) -> None:
+    """Count the residuals of a camera's frames in the last epoch."""
+    first, own = int(state.numbers[state.closed]), state.blocks[camera]
+    recent = [raw.select(raw.frame >= first) for raw in own if raw.frame[-1] >= first]
+    if recent:
+        pose, scale = state.references[camera], state.scales[camera]
+        count_residuals(state, camera, Gated.at(pose, merge(recent), scale))
+
+
+def _set_references(state: State, references: Array) -> None:
+    """Take all sums about other references."""
+    steps = logarithms(state.references @ invert_each(references))
+    state.references = references
+    state.sums = state.sums.shift_reference(
+        np.broadcast_to(steps, (len(state.numbers), *steps.shape))
+    )
+    state.places = state.places.shift_reference(steps)
+    state.walks = state.walks.shift_reference(
+        np.broadcast_to(steps[:, None], (*state.evidence.shape, 6))
+    )
+    state.ungated = state.ungated.shift_reference(steps)
+    state.steps, state.shared = state.steps - steps, state.shared - steps
+    if state.drift is not None:
+        state.drift = state.drift.about(steps)
+
+
+def _regate(state: State, camera: int) -> None:
+    """Gate and linearize a camera's frames at the newest estimates.
+
+    Each at the pose that its place has, if that is known; of a drifting camera, at its epoch's.
+    Frames with too few matches within the gate keep those that were.
+    """
+    own, scale = state.matches_of(camera), state.scales[camera]
+    if own is None:
+        return
+    raw, within = own
+    rows = np.searchsorted(state.numbers, raw.frame_numbers)
+    epochs = np.repeat(np.arange(len(state.sizes)), state.sizes)[rows]
+    groups = np.where(state.walk[camera] > 0, epochs, 0)  # that are gated at one pose
+    for group in np.unique(groups).tolist():
+        of_group = np.repeat(groups == group, raw.frame_counts)
+        some = raw.select(of_group)
+        gated = Gated.at(state.poses[group, camera], some, scale)
+        few = np.repeat(~gated.enough, some.frame_counts)
+        within[of_group] = np.where(few, within[of_group], gated.inliers)
+        if gated.enough.any():
+            state.put(camera, curvature=gated.curvature(scale))
+    counts = np.add.reduceat(within, raw.frame_edges[:-1], dtype=np.int64)
+    steps = _linearized_at(state, camera, rows, epochs)
+    poses = retract_all(np.tile(state.references[camera], (len(steps), 1, 1)), steps)
+    runs = to_runs(np.concatenate([[0], counts.cumsum()]))
+    here = raw.with_scale(scale).select(within).run_sums(poses, runs)
+    sums = frame_sums(here, state.curvature[camera], -steps, counts.astype(np.float64))
+    state.put(camera, blocks=(raw,), inliers=(within,))
+    state.sums = state.sums.replace_at((rows, camera), sums)
+
+
+def _linearized_at(state: State, camera: int, rows: Numbers, epochs: Numbers) -> Array:
+    """(f, 6) steps from a camera's reference to where the matches of frames are linearized."""
+    if state.walk[camera]:
+        poses = invert_each(state.poses[epochs, camera])
+        return local_coordinates(state.references[camera], poses)
+    if state.config.preset != "auto":  # Eq. 5 knows no places
+        return np.zeros((len(rows), 6))
+    row_of = {name: row for row, name in enumerate(state.settled)}
+    places = [row_of.get(state.at[row], -1) for row in rows]
+    return np.concatenate([state.steps[:, camera], np.zeros((1, 6))])[places]
+
+
+# The summary of older epochs.
+
+
+def _summarize_oldest(state: State) -> None:
+    """Add the oldest epoch to the summaries."""
+    size = state.sizes[0]
+    frames, names = state.sums[:size], state.at[:size]
+    epoch = frames.total()
+    drifted = state.walk > 0
+    by_places = shift_between(state, 0, size)
+    for camera in range(len(state.names)):
+        update_evidence(state, camera, epoch[camera], by_places)
+    for camera in range(len(state.names)):
+        select_walk(state, camera)
+    ungated = Sums.stack([_ungated(state, camera) for camera in range(len(state.names))])
+    walks = state.walks + Sums(np.repeat(epoch.packed[:, None], len(STRENGTHS), axis=1))
+    variance = state.walk_variance(STRENGTHS, size)
+    over = np.repeat(state.overconfidence[:, None], len(STRENGTHS), axis=1)
+    state.walks, kept = walks.after_walk(np.broadcast_to(variance, (*over.shape, 6)), over)
+    each = np.arange(len(state.walk))
+    state.ungated = (state.ungated + ungated) * kept[each, state.walk]
+    state.places = state.places.add(names, frames).bounded()
+    for camera, before in enumerate(drifted):
+        if state.walk[camera]:
+            state.places = state.places.without(camera)
+        elif before:  # what is left of the drift counts as of one place
+            own = state.walks[camera, 0]
+            state.places = state.places.with_camera_at(names[-1], camera, own)
+    bends = state.bends.copy()
+    bends[1] += bends[0]
+    state.bends = bends[1:]
+    state.numbers, state.at = state.numbers[size:], state.at[size:]
+    state.sums, state.sizes, state.poses = state.sums[size:], state.sizes[1:], state.poses[1:]
+    for camera in range(len(state.names)):
+        _drop_before(state, camera, int(state.numbers[0]))
+
+
+def _drop_before(state: State, camera: int, number: int) -> None:
+    """Drop the matches of frames before a number."""
+    own = state.matches_of(camera)
+    if own is None:
+        return
+    rows = own[0].frame >= number
+    raw, inliers = own[0].select(rows), own[1][rows]
+    state.put(camera, blocks=(raw,) if len(raw) else (), inliers=(inliers,) if len(raw) else ())
+
+
+def _ungated(state: State, camera: int) -> Sums:
+    """All matches of a camera in the oldest epoch, whatever the gate."""
+    own, found = state.matches_of(camera), Sums.zeros()
+    if own is None:
+        return found
+    raw = own[0].select(own[0].frame <= state.numbers[state.sizes[0] - 1])
+    if not len(raw):
+        return found
+    pose = to_T_lidar_camera(state.poses[0, camera])
+    here = raw.with_scale(state.scales[camera]).sums(pose)
+    step = pose.localCoordinates(to_T_lidar_camera(state.references[camera]))
+    return found.change(hessian=here.hessian, gradient=here.gradient + here.hessian @ step)

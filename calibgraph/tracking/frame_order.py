@@ -14,8 +14,13 @@ from calibgraph.model.clock import OF_IMAGES, OF_TABLES, unused_times
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.places import PLACES
 from calibgraph.model.rig import Rig
-from calibgraph.solver.repeats import REPEATED_SHARE, Hashes, hash_numbers, point_hashes
-from calibgraph.solver.shared_error import with_common_error
+from calibgraph.solver.preprocess import (
+    REPEATED_SHARE,
+    Hashes,
+    hash_numbers,
+    point_hashes,
+    with_common_error,
+)
 from calibgraph.tracking.state import State
 
 _LAST = 2**63 - 1  # other programs write it for "none"
@@ -279,11 +284,11 @@ def _repeats(last: list[int] | None, hashes: Hashes) -> bool:
 
 def _last_hashes(state: State, camera: int) -> list[int] | None:
     """Of the last frame's matches, absorbed ones or, before the camera has started, waiting."""
-    waiting = state.cameras[camera].waiting
-    if waiting:
-        rows = waiting[-1].of_camera(state.names[camera])
-        return hash_numbers(rows.points_lidar_m)
-    for frame in reversed(state.live_frames):
-        if camera in frame.raw:
-            return frame.raw[camera].point_hashes
-    return None
+    if waiting := state.waiting[camera]:
+        return hash_numbers(waiting[-1].of_camera(state.names[camera]).points_lidar_m)
+    if not state.blocks[camera]:
+        return None
+    last = state.blocks[camera][-1]
+    if last.frames == 1:
+        return last.point_hashes
+    return hash_numbers(last.block.points_lidar_m[last.frame_edges[-2] :])

@@ -1,58 +1,54 @@
 """Noise in constant memory: the residuals of all frames, and the scatter of epochs.
 
 Frames of a car that stands, or passes the same wall for a while, share errors. Clustering by frames
-does not show it, but the sums of groups of frames do: they scatter more than the scatter of their
-frames adds up to, in some directions of the extrinsic. Groups of one epoch and of eight are
-compared, each with the one before: what lasts longer is a move or a drift, not scatter.
+does not show it, but the sums of epochs do: they scatter more than the scatter of their frames adds
+up to. Each is compared with the one before: what lasts longer is a move or a drift, not scatter.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.config import Config
-from calibgraph.solver.block_residuals import BlockResiduals
-from calibgraph.solver.residual_scale import ResidualScale, iterate_spread, scale_from
-from calibgraph.tracking.cause import squared_sigmas
+from calibgraph.solver.matches import BlockResiduals
+from calibgraph.solver.robust import ResidualScale, iterate_spread, scale_from
 
 _EDGES = np.concatenate([[0.0], np.geomspace(1e-5, 1e5, 2304)])  # 1 % wide
+BINS = len(_EDGES) - 1
 _RESIDUALS_KEPT = 1 - 1 / 2000  # from frame to frame
 
 
-@dataclass(frozen=True, eq=False)
-class ResidualHistogram:
-    """Histogram of the sizes of a camera's residuals, slowly forgotten.
+def add_residuals(histogram: Array, residuals: BlockResiduals) -> Array:
+    """(2, b) numbers of unweighted and of whitened residuals by size, slowly forgotten.
 
-    Attributes:
-        counts: (2, b) of the unweighted ones [px], and of the whitened ones.
-        least: lower bound of the whitened spread.
+    Args:
+        histogram: before.
+        residuals: of one or more frames, in their order.
     """
+    (sizes_px, sizes), frames = residuals.sizes, residuals.block.frames
+    kept = _RESIDUALS_KEPT ** np.arange(frames - 1.0, -1.0, -1.0)
+    weights = np.repeat(kept, residuals.block.frame_counts)[residuals.projectable]
+    counted = _counted(sizes_px, weights)
+    new = [counted, counted if sizes is sizes_px else _counted(sizes, weights)]
+    return np.asarray(_RESIDUALS_KEPT**frames * histogram + new)
 
-    counts: Array = field(default_factory=lambda: np.zeros((2, len(_EDGES) - 1)))
-    least: float = 0.0
 
-    def add(self, residuals: BlockResiduals) -> ResidualHistogram:
-        """The histogram with the residuals of one or more frames counted, in their order."""
-        (sizes_px, sizes), frames = residuals.sizes, residuals.block.frames
-        kept = _RESIDUALS_KEPT ** np.arange(frames - 1.0, -1.0, -1.0)
-        weights = np.repeat(kept, residuals.block.frame_counts)[residuals.projectable]
-        counted = _counted(sizes_px, weights)
-        new = [counted, counted if sizes is sizes_px else _counted(sizes, weights)]
-        before = _RESIDUALS_KEPT**frames * self.counts
-        return ResidualHistogram(before + new, residuals.block.least_spread)
+def scale_of(histogram: Array, least: float, config: Config) -> ResidualScale:
+    """The scale of all the residuals, as by :meth:`CameraBlock.scale`.
 
-    def scale(self, config: Config) -> ResidualScale:
-        """The scale of all the residuals, as by :meth:`CameraBlock.scale`."""
-        of_px, whitened = self.counts
-        sigma_px = spread = iterate_spread(_Quantiles(of_px))
-        if not np.array_equal(of_px, whitened):
-            spread = iterate_spread(_Quantiles(whitened))
-        return scale_from(sigma_px, max(spread, self.least), config)
+    Args:
+        histogram: (2, b) of them.
+        least: lower bound of the whitened spread.
+        config: may fix either scale.
+    """
+    of_px, whitened = histogram
+    sigma_px = spread = iterate_spread(_Quantiles(of_px))
+    if not np.array_equal(of_px, whitened):
+        spread = iterate_spread(_Quantiles(whitened))
+    return scale_from(sigma_px, max(spread, least), config)
 
 
 def median(values: Array) -> float:
@@ -78,103 +74,34 @@ class _Quantiles:
         return float(np.interp(share * below, self._cumulative, _EDGES)) if below else math.nan
 
 
-SPANS = (1, 8)
-"""Epochs of a group."""
-
 _FREEDOM = 6
-_LEAST_GROUPS = 6.0  # for a scatter direction by direction
-_KEPT = 0.995  # from group to group
-_CHANCE = 1.25  # times what the largest eigenvalue reaches by chance
-_UNUSUAL = 30.0  # squared sigmas of a six-vector: a group across a move counts for no more
+_KEPT = 0.995  # from epoch to epoch
+_UNUSUAL = 30.0  # squared sigmas of a six-vector: an epoch across a move counts for no more
 
 
-@dataclass(frozen=True, eq=False)
-class GroupScatter:
-    """Sums of the gradients of groups of frames.
+def add_epoch(group: Array, score: Array, frames: float, noise: Array) -> Array:
+    """(2,) number of a camera's epochs, and their squares over their frames' scatter, forgotten.
 
-    Attributes:
-        span: epochs of a group.
-        scatter: (6, 6) of one frame's gradient, from groups: sum, over pairs of neighbours, of the
-            outer product of their difference, each over the root of its frames.
-        count: of pairs, slowly forgotten.
-        last: (6,) of the last complete group, or None.
-        size: sum of the groups' own squares, in units of their frames' scatter.
-        open_sum: (6,) of the incomplete group.
-        open_frames, open_epochs: its size.
+    Args:
+        group: before.
+        score: (6,) sum of the gradients of an epoch's frames.
+        frames: how many.
+        noise: (6, 6) covariance of one frame's.
     """
-
-    span: int
-    scatter: Array = field(default_factory=lambda: np.zeros((6, 6)))
-    count: float = 0.0
-    last: Array | None = None
-    size: float = 0.0
-    open_sum: Array = field(default_factory=lambda: np.zeros(6))
-    open_frames: int = 0
-    open_epochs: int = 0
-
-    def add(self, score: Array, frames: int, noise: Array) -> GroupScatter:
-        """The sums with an epoch's (6,) gradient; noise: (6, 6) covariance of one frame's."""
-        total, number = self.open_sum + score, self.open_frames + frames
-        if self.open_epochs + 1 < self.span:
-            more = self.open_epochs + 1
-            return replace(self, open_sum=total, open_frames=number, open_epochs=more)
-        scaled = total / np.sqrt(max(number, 1))
-        size = _KEPT * self.size + min(squared_sigmas(scaled, noise), _UNUSUAL) / len(noise)
-        if self.last is None:
-            return replace(GroupScatter(self.span), last=scaled, size=size)
-        apart = (scaled - self.last) / np.sqrt(2)
-        apart = apart * min(1.0, np.sqrt(_UNUSUAL / max(squared_sigmas(apart, noise), 1e-12)))
-        return GroupScatter(
-            self.span,
-            scatter=_KEPT * self.scatter + np.outer(apart, apart),
-            count=_KEPT * self.count + 1,
-            last=scaled,
-            size=size,
-        )
+    squared = float(score @ np.linalg.solve(noise, score)) / max(frames, 1.0)
+    return np.asarray(_KEPT * group + [1.0, min(squared, _UNUSUAL) / _FREEDOM])
 
 
-def no_groups() -> tuple[GroupScatter, ...]:
-    """No sums, for each span."""
-    return tuple(GroupScatter(span) for span in SPANS)
-
-
-def inflation(groups: Sequence[GroupScatter]) -> float:
+def inflation(group: Array) -> float:
     """Ratio of the epochs' scatter to that of their frames, on average; at least 1.
 
     For alarms: after few epochs it has little bias.
     """
-    epochs = groups[0]
-    return max(1.0, epochs.size / (epochs.count + 1)) if epochs.last is not None else 1.0
+    epochs, squared = group.tolist()
+    return max(1.0, squared / epochs) if epochs else 1.0
 
 
-def _sure_inflation(groups: Sequence[GroupScatter]) -> float:
-    """The lower end of the 2-sigma interval of the inflation."""
-    count = groups[0].count + 1
-    return max(1.0, inflation(groups) * (1 - 2 * math.sqrt(2 / (_FREEDOM * count))))
-
-
-def widening(groups: Sequence[GroupScatter], noise: Array) -> Array:
-    """(6, 6) T that scales gradients so that T noise T^T is the scatter of groups.
-
-    For the error bar, only what exceeds chance: in all directions alike, or direction by direction
-    for one of the spans, whichever has the largest determinant.
-
-    Args:
-        groups: of one camera.
-        noise: (6, 6) covariance of one frame's gradient, by the scatter of frames.
-    """
-    root = np.linalg.cholesky(noise)
-    inverse = np.linalg.inv(root)
-    alike = _sure_inflation(groups)
-    widest, most = np.eye(_FREEDOM) * np.sqrt(alike), alike ** (_FREEDOM / 2)
-    for one in groups:
-        if one.count < _LEAST_GROUPS:
-            continue
-        ratio = inverse @ (one.scatter / one.count) @ inverse.T
-        values, vectors = np.linalg.eigh((ratio + ratio.T) / 2)
-        chance = _CHANCE * (1 + np.sqrt(_FREEDOM / one.count)) ** 2
-        factors = np.sqrt(np.maximum(values / chance, 1.0))
-        if np.prod(factors) > most:
-            most = float(np.prod(factors))
-            widest = root @ (vectors * factors) @ vectors.T @ inverse
-    return np.asarray(widest)
+def sure_inflation(group: Array) -> float:
+    """The lower end of the 2-sigma interval of the inflation, for the error bar."""
+    epochs = max(float(group[0]), 1.0)
+    return max(1.0, inflation(group) * (1 - 2 * math.sqrt(2 / (_FREEDOM * epochs))))

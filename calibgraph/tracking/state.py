@@ -1,38 +1,62 @@
-"""The state of the tracker, whole and immutable: a restart needs nothing else."""
+"""The state of the tracker: a few arrays, whole; a restart needs nothing else.
+
+``n`` is the number of cameras, ``R`` that of the frames whose matches are kept, ``E`` that of the
+epochs they are of. An array of a state is never written to: an update works on a shallow copy
+of the state, whose arrays it replaces, and what fails leaves the state before it as it was.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import reduce
-from itertools import chain
-from operator import add
-from typing import TypeVar
+import copy
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from itertools import accumulate, chain
+from typing import Any, TypeVar
 
-import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
-from calibgraph.arrays import Array
+from calibgraph.arrays import Array, Mask
+from calibgraph.graph.components import VarianceRatios
 from calibgraph.model.config import Config
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows
 from calibgraph.model.rig import Rig
-from calibgraph.solver.scan_distortion import DistortionEvidence
-from calibgraph.solver.variance_components import VarianceRatios
-from calibgraph.tracking.camera_state import CameraState
+from calibgraph.solver.matches import CameraBlock, merge
+from calibgraph.solver.robust import ResidualScale
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frozen import changed
-from calibgraph.tracking.live_frames import NO_DISTORTION, Epoch, LiveFrame
-from calibgraph.tracking.noise import inflation, widening
-from calibgraph.tracking.optimum import Optimum
-from calibgraph.tracking.place_sums import PlaceSums
-from calibgraph.tracking.sums import Sums
+from calibgraph.tracking.noise import BINS, inflation
+from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
 
 Item = TypeVar("Item")
 
 LEAST_FRAMES = 15  # for the scatter of a six-vector
 HISTORY = 50  # frames over which the residuals' size and the share of inliers are taken
+STRENGTHS = np.array([0.0, 0.2, 1.0, 5.0])
+"""The walks of a camera, in units of the configured one; the first is static."""
+COUNTS = "given", "used", "left_out", "failed", "absorbed", "repeated"
+"""What is counted of each camera: correspondences given and used; frames left out, of these those
+whose matching failed, absorbed, and in a row that repeat the one before them."""
+BEND = 66
+"""Numbers of a camera's matches in the scan distortion: (6, 6) Hessian, (6, 3) the same times the
+displacement by a unit of each, (3, 3) information and (3,) vector of the residuals."""
 _MOST_MOVES = 100  # that are kept
+
+
+@dataclass(frozen=True, eq=False)
+class OutlierFrame:
+    """A frame that disagrees with a camera's estimate but fits another T_camera_lidar.
+
+    Attributes:
+        number: of the frame.
+        raw: its matches.
+        T_camera_lidar: (4, 4) that fits them.
+    """
+
+    number: int
+    raw: CameraBlock
+    T_camera_lidar: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,27 +75,93 @@ class DriftWatch:
     frame: int
     anchors: Sums
 
+    def about(self, steps: Array) -> DriftWatch:
+        """With the sums about references that are moved by (n, 6) tangent steps."""
+        return replace(self, anchors=self.anchors.shift_reference(steps))
+
 
 @dataclass(frozen=True, eq=False)
+class Spread:
+    """What the frames of each camera show of their errors, as ``calibgraph.solver.within_place``.
+
+    Attributes:
+        least: (n,) k, variance of matches of what they do not share, over that of independent ones.
+        excess: (n, 6, 6) K - k.
+        efficiency: (n,) of independent matches: their true variance over that of H, in the mean.
+    """
+
+    least: Array
+    excess: Array
+    efficiency: Array
+
+    @staticmethod
+    def unknown(cameras: int) -> Spread:
+        """Of independent matches."""
+        excess = np.tile(1e-3 * np.eye(6), (cameras, 1, 1))
+        return Spread(np.ones(cameras), excess, np.ones(cameras))
+
+    def mean_variance(self, place_variance: float, alike: Array) -> Array:
+        """(n,) of all matches of a camera, in units of independent ones, in the mean over a pose.
+
+        Args:
+            place_variance: of the matcher.
+            alike: (n,) frames of a place.
+        """
+        within = self.least + np.trace(self.excess, axis1=1, axis2=2) / 6
+        return np.asarray(within + place_variance * self.efficiency * alike)
+
+
+@dataclass(eq=False)
 class State:
     """The whole state of the tracker.
 
     Attributes:
         rig: the initial guess.
         config: settings.
-        cameras: per camera of the rig.
-        references: per camera, T_lidar_camera about which sums are taken.
-        epochs: the live ones; the last is open.
+        references: (n, 4, 4) T_camera_lidar about which sums are taken, and at which the frames of
+            an epoch are gated: the minimum of Eq. 5 at its begin.
+        numbers: (R,) of the frames.
+        at: (R,) names of their places; empty: not known.
+        sizes: (E,) frames of each epoch; the last is open.
+        sums: (R, n) of their inliers.
+        blocks: per camera, its matches that were absorbed, in order, in some blocks.
+        inliers: which of them are within the gate.
+        poses: (E, n, 4, 4) T_camera_lidar of each epoch; that of a drifting camera is its own.
+        places: sums of the older frames, place by place, of cameras that do not drift.
+        settled: names of the places whose optimum is known, as of the begin of the epoch.
+        steps: (P, n, 6) from the references to where matches at these show the cameras.
+        weights: (P, 1 + n) of the cloud and the cameras there in the robust loss.
+        shared: (n, 6) from the references to where matches show the cameras at all places.
+        bends: (E + 1, n, 66) of matches in the scan distortion, of older epochs and of each.
+        walks: (n, 4) sums of older epochs, each discounted by its walk.
+        evidence: (n, 4) log-likelihoods of the epochs, forgotten slowly.
+        walk: (n,) which of the walks is selected.
+        ungated: (n,) of all matches of older epochs, outliers too: Hessian by weights, gradient.
+        groups: (n, 2) number of epochs, and how much these scatter.
+        spread: of the frames of closed epochs.
+        curvature: (n, 6, 6) M of :meth:`calibgraph.tracking.gate.Gated.curvature`.
         total: sum over all absorbed frames, slowly forgotten: (6 n, 6 n) scatter.
         total_hessian: (n, 6, 6) and of Hessians.
         total_frames: (n,) and of frames.
+        started: (n,) whether a camera has an estimate of its own.
+        scales: of each camera's residuals.
+        histogram: (n, 2, b) of their sizes.
+        least: (n,) lower bounds of their whitened spread.
+        recent: (n, 50, 2) of the last absorbed frames, NaN before: share of inliers, median [px].
+        share: (n,) median of these shares.
+        absent: (n,) frames since the last usable one.
+        moved_at: (n,) number of updates when a camera last moved, or -1.
+        drift_reported_at: (n,) number of updates when its drift was last reported, or -1.
+        counts: (n, 6) see COUNTS.
+        waiting: per camera, before it has started, the frames it may start from.
+        refused: why it has not started from them.
+        outliers: its last frames that disagree with the estimate but fit another one.
+        agreements: of its last frames, the number, and whether it agreed.
         dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has invalidated.
+        contradicting: of those that contradict the correspondences, and take no part.
         drift: whose cause is not clear yet, or None.
-        places: sums of the older frames, place by place, of cameras that do not drift.
-        distortion: per camera, of its matches in older epochs in the scan distortion.
         findings: of the errors that frames share, by their matcher.
-        sizes: of these, as the data show them, over what the matcher states.
-        optimum: of the graph of the closed epochs; None where it is not known.
+        ratios: of these, as the data show them, over what the matcher states.
         frame: number of the last frame, or None.
         stamp_ns: its time, or None.
         updates: number of updates.
@@ -80,19 +170,49 @@ class State:
 
     rig: Rig
     config: Config
-    cameras: tuple[CameraState, ...]
-    references: tuple[gtsam.Pose3, ...]
-    epochs: tuple[Epoch, ...]
+    references: Array
+    numbers: Numbers
+    at: tuple[str, ...]
+    sizes: tuple[int, ...]
+    sums: Sums
+    blocks: tuple[tuple[CameraBlock, ...], ...]
+    inliers: tuple[tuple[Mask, ...], ...]
+    poses: Array
+    places: PlaceSums
+    settled: tuple[str, ...]
+    steps: Array
+    weights: Array
+    shared: Array
+    bends: Array
+    walks: Sums
+    evidence: Array
+    walk: Numbers
+    ungated: Sums
+    groups: Array
+    spread: Spread
+    curvature: Array
     total: Array
     total_hessian: Array
     total_frames: Array
-    places: PlaceSums
-    distortion: tuple[DistortionEvidence, ...]
+    started: Mask
+    scales: tuple[ResidualScale, ...]
+    histogram: Array
+    least: Array
+    recent: Array
+    share: Array
+    absent: Numbers
+    moved_at: Numbers
+    drift_reported_at: Numbers
+    counts: Numbers
+    waiting: tuple[tuple[Correspondences, ...], ...]
+    refused: tuple[tuple[str, ...], ...]
+    outliers: tuple[tuple[OutlierFrame, ...], ...]
+    agreements: tuple[tuple[tuple[int, bool], ...], ...]
     dropped_pairs: tuple[int, ...] = ()
+    contradicting: tuple[int, ...] = ()
     drift: DriftWatch | None = None
-    findings: MatcherFindings = MatcherFindings()
-    sizes: VarianceRatios = VarianceRatios()
-    optimum: Optimum | None = None
+    findings: MatcherFindings = field(default_factory=MatcherFindings)
+    ratios: VarianceRatios = VarianceRatios()
     frame: int | None = None
     stamp_ns: int | None = None
     updates: int = 0
@@ -106,20 +226,78 @@ class State:
             ValueError: if a lens or clock is to be estimated.
         """
         require_poses_alone(config)
-        n = len(rig.cameras)
-        guess = tuple(to_T_lidar_camera(T) for T in rig.T_camera_lidar.values())
+        n, walks = len(rig.cameras), len(STRENGTHS)
+        guess = np.array([*rig.T_camera_lidar.values()])
+        none: tuple[tuple[Any, ...], ...] = ((),) * n
         return State(
             rig=rig,
             config=config,
-            cameras=tuple(CameraState() for _ in range(n)),
             references=guess,
-            epochs=(Epoch.empty(guess),),
+            numbers=np.zeros(0, np.int64),
+            at=(),
+            sizes=(0,),
+            sums=Sums.zeros(0, n),
+            blocks=none,
+            inliers=none,
+            poses=guess[None],
+            places=PlaceSums.empty(n),
+            settled=(),
+            steps=np.zeros((0, n, 6)),
+            weights=np.ones((0, 1 + n)),
+            shared=np.zeros((n, 6)),
+            bends=np.zeros((2, n, BEND)),
+            walks=Sums.zeros(n, walks),
+            evidence=np.zeros((n, walks)),
+            walk=np.zeros(n, np.int64),
+            ungated=Sums.zeros(n),
+            groups=np.zeros((n, 2)),
+            spread=Spread.unknown(n),
+            curvature=np.tile(np.eye(6), (n, 1, 1)),
             total=np.zeros((6 * n, 6 * n)),
             total_hessian=np.zeros((n, 6, 6)),
             total_frames=np.zeros(n),
-            places=PlaceSums.empty(n),
-            distortion=(NO_DISTORTION,) * n,
+            started=np.zeros(n, np.bool_),
+            scales=(ResidualScale(1.0, 1.0, 1.0, 1.0),) * n,
+            histogram=np.zeros((n, 2, BINS)),
+            least=np.zeros(n),
+            recent=np.full((n, HISTORY, 2), np.nan),
+            share=np.ones(n),
+            absent=np.zeros(n, np.int64),
+            moved_at=np.full(n, -1),
+            drift_reported_at=np.full(n, -1),
+            counts=np.zeros((n, len(COUNTS)), np.int64),
+            waiting=none,
+            refused=none,
+            outliers=none,
+            agreements=none,
         )
+
+    def draft(self) -> State:
+        """A copy whose arrays may be replaced."""
+        return copy.copy(self)
+
+    def put(self, camera: int, **values: Any) -> None:
+        """Replace one camera's part of some arrays or tuples."""
+        for name, value in values.items():
+            before = getattr(self, name)
+            if isinstance(before, tuple):
+                after: Any = (*before[:camera], value, *before[camera + 1 :])
+            elif isinstance(before, Sums):
+                after = before.replace_at(camera, value)
+            else:
+                after = before.copy()
+                after[camera] = value
+            setattr(self, name, after)
+
+    def count(self, camera: int, **more: int) -> None:
+        """Raise some counts of a camera."""
+        self.counts = self.counts.copy()
+        for name, number in more.items():
+            self.counts[camera, COUNTS.index(name)] += number
+
+    def counted(self, camera: int, name: str) -> int:
+        """A count of a camera."""
+        return int(self.counts[camera, COUNTS.index(name)])
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -127,56 +305,54 @@ class State:
         return tuple(self.rig.cameras)
 
     @property
-    def T_lidar_camera(self) -> tuple[gtsam.Pose3, ...]:
-        """Per camera, the present estimate."""
-        return self.epochs[-1].T_lidar_camera
+    def closed(self) -> int:
+        """How many of the frames are of closed epochs: the first ones."""
+        return len(self.numbers) - self.sizes[-1]
 
     @property
-    def live_frames(self) -> tuple[LiveFrame, ...]:
-        """The frames of all live epochs."""
-        return tuple(chain.from_iterable(epoch.frames for epoch in self.epochs))
+    def edges(self) -> list[int]:
+        """(E + 1,) first row of each epoch's frames, and the end."""
+        return [*accumulate(self.sizes, initial=0)]
 
     @property
     def knows_motion(self) -> bool | None:
         """Whether that of the frames whose matches are kept is known; None if there are none."""
-        for one in self.cameras:
-            for table in one.waiting:
-                if len(table):
-                    return table.twist_per_s is not None
-        absorbed = (raw for frame in self.live_frames for raw in frame.raw.values())
-        set_aside = (frame.raw for one in self.cameras for frame in one.outlier_frames)
-        kept = next(chain(absorbed, set_aside), None)
+        tables = (table for own in self.waiting for table in own if len(table))
+        first = next(tables, None)
+        if first is not None:
+            return first.twist_per_s is not None
+        set_aside = (one.raw for own in self.outliers for one in own)
+        kept = next(chain(chain.from_iterable(self.blocks), set_aside), None)
         return None if kept is None else kept.block.motion is not None
-
-    @property
-    def all_distortion(self) -> tuple[DistortionEvidence, ...]:
-        """Per camera, of its matches in all epochs in the scan distortion."""
-        every = zip(self.distortion, *(epoch.distortion for epoch in self.epochs), strict=True)
-        return tuple(reduce(add, parts) for parts in every)
 
     @property
     def drifting(self) -> list[int]:
         """The cameras that are followed by a random walk, by their places in the rig."""
-        return [camera for camera, one in enumerate(self.cameras) if one.summary.walk]
+        return np.flatnonzero(self.walk).tolist()
 
-    def pose_at(self, place: str, camera: int) -> gtsam.Pose3 | None:
-        """Of a place at the optimum; None if it is not known, a camera drifts, or was not there."""
-        if self.optimum is None or self.cameras[camera].summary.walk:
+    def matches_of(self, camera: int) -> tuple[CameraBlock, Mask] | None:
+        """A camera's matches in all frames, and which are within the gate; None if it has none."""
+        own = self.blocks[camera]
+        if not own:
             return None
-        return self.optimum.pose_at(place, camera)
+        return own[0] if len(own) == 1 else merge(own), np.concatenate(self.inliers[camera])
 
-    def at_poses(self, T_lidar_camera: tuple[gtsam.Pose3, ...]) -> State:
-        """The state with other estimates in its open epoch."""
-        last = changed(self.epochs[-1], T_lidar_camera=T_lidar_camera)
-        return changed(self, epochs=(*self.epochs[:-1], last))
+    def first_row(self, number: int) -> int:
+        """The first of the frames that is not before a number."""
+        return int(np.searchsorted(self.numbers, number))
 
-    def with_camera(self, index: int, camera: CameraState) -> State:
-        """The state with one camera replaced."""
-        return changed(self, cameras=replace_item(self.cameras, index, camera))
+    def with_moves(self, events: Sequence[Event]) -> None:
+        """Keep further moves."""
+        self.moves = (*self.moves, *events)[-_MOST_MOVES:]
 
-    def with_moves(self, events: Sequence[Event]) -> State:
-        """The state with further moves."""
-        return changed(self, moves=(*self.moves, *events)[-_MOST_MOVES:])
+    def rig_at(self, T_camera_lidar: Array) -> Rig:
+        """The rig with (n, 4, 4) estimates."""
+        return self.rig.moved_to(dict(zip(self.names, T_camera_lidar, strict=True)))
+
+    def known_recent(self, camera: int) -> Array:
+        """(f, 2) of the last absorbed frames."""
+        own = self.recent[camera]
+        return np.asarray(own[~np.isnan(own[:, 0])])
 
     def walk_variance(self, strengths: Array, frames: int) -> Array:
         """(w, 6) variance of walks of (w,) strengths, in units of the configured one."""
@@ -185,47 +361,79 @@ class State:
         whole = np.repeat([rotation, tracking.walk_translation_m**2], 3) * frames
         return np.outer(strengths**2, whole)
 
-    def frame_noise(self, index: int) -> Array | None:
-        """(6, 6) scatter of one frame's gradient of a camera; None while it is unknown.
-
-        That of the frames alone, times the inflation.
-        """
-        noise = self.scatter_of_frames(index)
-        return None if noise is None else noise * self.inflation(index)
-
-    def inflation(self, index: int) -> float:
+    def inflation(self, camera: int) -> float:
         """Ratio of the scatter of a camera's epochs to that of their frames, at least 1."""
-        return inflation(self.cameras[index].groups)
+        return inflation(self.groups[camera])
 
-    def widen(self, index: int, scatter: Array) -> Array:
-        """(6, 6) scatter of a camera's gradients, widened by the scatter of groups."""
-        noise = self.scatter_of_frames(index)
-        if noise is None:
-            return scatter
-        by = widening(self.cameras[index].groups, noise)
-        return np.asarray(by @ scatter @ by.T)
-
-    def scatter_of_frames(self, index: int) -> Array | None:
+    def scatter_of_frames(self, camera: int) -> Array | None:
         """(6, 6) scatter of one frame's gradient, by frames alone; None while it is unknown."""
-        frames = self.total_frames[index]
+        frames = self.total_frames[camera]
         if frames < LEAST_FRAMES:
             return None
-        rows = pose_rows(index)
+        rows = pose_rows(camera)
         return np.asarray(self.total[rows, rows] / (frames - 1))
 
-    def overconfidence(self, index: int) -> float:
-        """Mean ratio of a camera's Hessian to its information, at least 1."""
-        frames = self.total_frames[index]
-        if frames < LEAST_FRAMES:
-            return 1.0
-        rows = pose_rows(index)
-        share = np.linalg.solve(self.total_hessian[index], self.total[rows, rows])
-        return max(1.0, float(np.trace(share)) / 6)
+    def frame_noise(self, camera: int) -> Array | None:
+        """The same times the inflation."""
+        noise = self.scatter_of_frames(camera)
+        return None if noise is None else noise * self.inflation(camera)
 
     @property
-    def all_overconfidence(self) -> Array:
-        """(n,) of all cameras."""
-        return np.array([self.overconfidence(camera) for camera in range(len(self.cameras))])
+    def overconfidence(self) -> Array:
+        """(n,) mean ratio of each camera's Hessian to its information, at least 1."""
+        found = np.ones(len(self.names))
+        for camera in np.flatnonzero(self.total_frames >= LEAST_FRAMES).tolist():
+            rows = pose_rows(camera)
+            share = np.linalg.solve(self.total_hessian[camera], self.total[rows, rows])
+            found[camera] = max(1.0, float(np.trace(share)) / 6)
+        return found
+
+    # Sums over epochs, older ones discounted by the random walk of a camera that drifts.
+
+    def sums_before_epochs(self, before: int | None = None) -> list[Sums]:
+        """(n,) over the frames before each epoch, the older ones too; and over all of them.
+
+        Args:
+            before: number of a frame from which on none counts.
+        """
+        sums = self.walks[np.arange(len(self.walk)), self.walk]
+        end = len(self.numbers) if before is None else self.first_row(before)
+        found, edges = [sums], np.minimum(self.edges, end)
+        for size, first, last in zip(self.sizes[:-1], edges[:-2], edges[1:-1], strict=True):
+            sums = sums + self.sums[first:last].total()
+            if self.walk.any():
+                variance = self.walk_variance(STRENGTHS[self.walk], size)
+                sums = sums.after_walk(variance, self.overconfidence)[0]
+            found.append(sums)
+        return [*found, sums + self.sums[edges[-2] : edges[-1]].total()]
+
+    def all_sums(self, before: int | None = None) -> Sums:
+        """(n,) over all frames, or those before a frame's number."""
+        return self.sums_before_epochs(before)[-1]
+
+    def require_consistent(self) -> None:
+        """Check that the parts of a state that was read fit together.
+
+        Raises:
+            ValueError: with the first that does not.
+        """
+        n, rows, places = len(self.names), len(self.numbers), len(self.settled)
+        epochs, blank = len(self.sizes), State.initial(self.rig, self.config)
+        first = {"numbers": rows, "sums": rows, "poses": epochs, "bends": 1 + epochs,
+                 "steps": places, "weights": places}  # fmt: skip
+        for one in fields(State):
+            found, known = getattr(self, one.name), getattr(blank, one.name)
+            if isinstance(known, Sums):
+                found, known = found.packed, known.packed
+            if not isinstance(known, np.ndarray):
+                continue
+            shape = first.get(one.name, len(known)), *known.shape[1:]
+            if (found.shape, found.dtype) != (shape, known.dtype):
+                raise ValueError(f"{one.name} has the shape {found.shape}, expected {shape}")
+        by_camera = self.blocks, self.inliers, self.scales, self.waiting, self.refused
+        cameras = {*map(len, (*by_camera, self.outliers, self.agreements))}
+        if cameras != {n} or {len(self.at), sum(self.sizes)} != {rows}:
+            raise ValueError("its cameras or frames differ in number")
 
 
 def require_poses_alone(config: Config) -> None:
@@ -241,14 +449,6 @@ def require_poses_alone(config: Config) -> None:
         )
 
 
-def block_diagonal(blocks: Array) -> Array:
-    """(6 n, 6 n) from (n, 6, 6)."""
-    n = len(blocks)
-    matrix = np.zeros((n, 6, n, 6))
-    matrix[np.arange(n), :, np.arange(n)] = blocks
-    return matrix.reshape(6 * n, 6 * n)
-
-
-def replace_item(items: tuple[Item, ...], index: int, item: Item) -> tuple[Item, ...]:
-    """The tuple with one item replaced."""
-    return (*items[:index], item, *items[index + 1 :])
+def rows_of(cameras: Iterable[int]) -> NDArray[np.intp]:
+    """The rows of some cameras in a joint vector or matrix of all."""
+    return np.add.outer(6 * np.array([*cameras], dtype=np.intp), np.arange(6)).ravel()

@@ -13,7 +13,6 @@ from dataclasses import fields
 from itertools import takewhile
 from typing import Annotated, Any, Literal
 
-import gtsam
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
@@ -21,39 +20,29 @@ from pydantic import Field, InstanceOf, TypeAdapter, ValidationError
 
 from calibgraph.errors import CalibrationError, in_words
 from calibgraph.files import describe
+from calibgraph.graph.components import VarianceRatios
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Rig
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.solver.scan_distortion import DistortionEvidence
-from calibgraph.solver.variance_components import VarianceRatios
-from calibgraph.tracking.camera_state import CameraState
-from calibgraph.tracking.epoch_arrays import from_arrays, to_arrays
-from calibgraph.tracking.epoch_summary import EpochSummary
+from calibgraph.solver.matches import CameraBlock
+from calibgraph.solver.robust import ResidualScale
 from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.frame_order import Incoming
-from calibgraph.tracking.live_frames import Epoch, OutlierFrame
-from calibgraph.tracking.noise import GroupScatter, ResidualHistogram
-from calibgraph.tracking.optimum import Optimum
-from calibgraph.tracking.place_sums import PlaceSums
-from calibgraph.tracking.state import DriftWatch, State
-from calibgraph.tracking.sums import Sums
+from calibgraph.tracking.state import DriftWatch, OutlierFrame, Spread, State
+from calibgraph.tracking.sums import PlaceSums, Sums
 from factors import Lens, ProjectionBlock
 
-Kind = Literal["state", "input", "history"]
+Kind = Literal["state", "input"]
 
-_VERSION = 12
+_VERSION = 13
 """Earlier ones held other sums, or were of another encoding."""
 
 _DIGEST = hashlib.sha256().digest_size
 _TREES: dict[Kind, TypeAdapter[Any]] = {
-    "state": TypeAdapter(tuple[InstanceOf[State], tuple[tuple[InstanceOf[Incoming], ...], ...]]),
+    "state": TypeAdapter(InstanceOf[State]),
     "input": TypeAdapter(
         Annotated[tuple[tuple[int | None, InstanceOf[Correspondences]], ...], Field(min_length=1)]
     ),
-    "history": TypeAdapter(dict[str, Any]),
 }
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
 
@@ -78,7 +67,7 @@ def encode(content: Any, kind: Kind) -> bytes:
 
 
 def decode(data: bytes, kind: Kind) -> Any:
-    """The tree that :func:`encode` has written: of a state, an input or a history.
+    """The tree that :func:`encode` has written: of a state or an input.
 
     Raises:
         StateError: if the bytes are damaged, of another format or of another kind.
@@ -146,14 +135,11 @@ def _fields_of(kind: type) -> Callable[[Any], dict[str, Any]]:
 
 _KINDS: tuple[tuple[type, Callable[[Any], Any], Callable[[Any], Any]], ...] = (
     (np.ndarray, _array, _to_array),
-    (gtsam.Pose3, gtsam.Pose3.matrix, gtsam.Pose3),
     *((kind, lambda model: model.model_dump(mode="json"), kind.model_validate)
       for kind in (Rig, Config)),
-    (Epoch, to_arrays, from_arrays),
     *((kind, _fields_of(kind), lambda held, kind=kind: kind(**held))
-      for kind in (State, CameraState, DriftWatch, OutlierFrame, GroupScatter, EpochSummary,
-                   Sums, PlaceSums, Optimum, DistortionEvidence, MatcherFindings,
-                   VarianceRatios, ResidualHistogram, ResidualScale, Correspondences, CameraBlock,
-                   ProjectionBlock, Lens, Event, Size, Incoming)),
+      for kind in (State, DriftWatch, OutlierFrame, Spread, Sums, PlaceSums, MatcherFindings,
+                   VarianceRatios, ResidualScale, Correspondences, CameraBlock, ProjectionBlock,
+                   Lens, Event, Size)),
 )  # fmt: skip
 _CODES = {kind: code for code, (kind, _, _) in enumerate(_KINDS)}

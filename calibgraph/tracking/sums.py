@@ -1,4 +1,4 @@
-"""Sums over frames: the one statistic that is left of matches, of epochs, places and halves alike.
+"""Sums over frames: the one statistic that is left of matches, of epochs and places alike.
 
 Near a reference T_lidar_camera, half the cost of a block of correspondences is
 ``d^T H d / 2 + b^T d + c`` for the tangent step d from the reference. Such sums add: thousands of
@@ -12,35 +12,41 @@ If the extrinsic may have walked by a covariance Q since, then
 
 so that ``H'^-1 B' H'^-1 = H^-1 B H^-1 + Q`` exactly, whatever the gain. k, the mean eigenvalue of
 ``H^-1 B`` per frame, is the overconfidence of H: matches of a frame share errors.
+
+Place by place they are what the error model is made from. The places that were visited last are
+kept apart, so that whoever comes back adds to the same one. Older ones are one row: its frames'
+errors count as those of as many places as are in it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.arrays import Array
-from calibgraph.graph.objective import join
-from calibgraph.graph.variables import camera_key
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.curvature import convex_hessian
-from calibgraph.solver.residual_scale import ResidualScale
-from factors import smallest_scaled_eigenvalue, smallest_scaled_eigenvalues
+from calibgraph.arrays import Array, Mask
+from calibgraph.solver.covariance import positive_part
+from factors import smallest_scaled_eigenvalues
+
+Numbers = NDArray[np.int64]
 
 _POSE = 6
-_SQUARE, _SIZE = _POSE * _POSE, _POSE * (3 * _POSE + 2) + 2
-_STEPS = 2  # of Gauss-Newton on quadratics: the second is of rounding, but for priors far away
+_SQUARE = _POSE * _POSE
+_PARTS = {
+    "hessian": _SQUARE, "reweighted": _SQUARE, "scatter": _SQUARE,
+    "gradient": _POSE, "score": _POSE, "frames": 1, "matches": 1,
+}  # fmt: skip
+_SIZE = sum(_PARTS.values())
 _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Sums over frames. The leading axes (...), of cameras, places or others, are alike in all.
+    """Sums over frames. The leading axes (...), of frames, cameras or others, are alike in all.
 
     What is summed are views of one array, so that adding is one operation.
 
@@ -53,7 +59,9 @@ class Sums:
     @staticmethod
     def of(**values: Array) -> Sums:
         """Of all the properties."""
-        return Sums.zeros(*values["frames"].shape).change(**values)
+        shape = values["frames"].shape
+        parts = [values[name].reshape(*shape, size) for name, size in _PARTS.items()]
+        return Sums(np.concatenate(parts, axis=-1))
 
     @staticmethod
     def zeros(*shape: int) -> Sums:
@@ -114,13 +122,9 @@ class Sums:
         """The sums along a new first axis."""
         return Sums(np.array([part.packed for part in parts]))
 
-    def copy(self) -> Sums:
-        """The same, to be filled in."""
-        return Sums(self.packed.copy())
-
     def change(self, **values: Array) -> Sums:
         """The sums with other values of some properties."""
-        found = self.copy()
+        found = Sums(self.packed.copy())
         for name, value in values.items():
             getattr(found, name)[...] = value
         return found
@@ -138,9 +142,9 @@ class Sums:
 
     def replace_at(self, index: Any, item: Sums) -> Sums:
         """The sums with a part of the leading axes replaced."""
-        found = self.copy()
-        found.packed[index] = item.packed
-        return found
+        packed = self.packed.copy()
+        packed[index] = item.packed
+        return Sums(packed)
 
     def total(self) -> Sums:
         """The sum over the first axis."""
@@ -151,20 +155,14 @@ class Sums:
         moved = (self.hessian @ steps[..., None])[..., 0]
         return self.change(gradient=self.gradient + moved)
 
-    def after_walk(self, variance: Array, overconfidence: Array | float) -> tuple[Sums, Array]:
+    def after_walk(self, variance: Array, overconfidence: Array) -> tuple[Sums, Array]:
         """The sums after a random walk, and (...) which share of them is left.
-
-        A Hessian that is no covariance's inverse, as of frames far from the estimate, is replaced
-        by the one by weights: the gain of a negative eigenvalue has a pole.
 
         Args:
             variance: (..., 6) of the walk.
             overconfidence: (...) k of the module's description.
         """
-        by, hessian = variance / np.asarray(overconfidence)[..., None], self.hessian
-        values = np.linalg.eigvalsh(hessian)
-        bad = (values[..., 0] < -_LEAST_EIGENVALUE * values[..., -1]) & variance.any(axis=-1)
-        hessian = np.where(bad[..., None, None], self.reweighted, hessian)
+        by, hessian = variance / overconfidence[..., None], self.hessian
         gain = np.linalg.inv(np.eye(_POSE) + hessian * by[..., None, :])
         hessian, back = gain @ hessian, gain.swapaxes(-1, -2)
         hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
@@ -177,60 +175,127 @@ class Sums:
         return walked, kept
 
     @property
-    def are_determined(self) -> NDArray[np.bool_]:
+    def are_determined(self) -> Mask:
         """(...) whether all directions of the pose are."""
         hessians = self.hessian
         values = smallest_scaled_eigenvalues(hessians.reshape(-1, _POSE, _POSE))
         return (values > _LEAST_EIGENVALUE).reshape(hessians.shape[:-2])
 
-    def step(self, camera: int) -> Array | None:
-        """(6,) from a camera's reference to the minimum of its sums; None if undetermined."""
-        if not is_determined(self.hessian[camera]):
-            return None
-        return np.linalg.solve(self.hessian[camera], -self.gradient[camera])
+
+MOST_PLACES = 24
+"""Places that are kept apart."""
+
+_OLDER = "\0"  # name of the first row, which no place has
 
 
-def is_determined(hessian: Array) -> bool:
-    """Whether all six directions are determined."""
-    return smallest_scaled_eigenvalue(hessian) > _LEAST_EIGENVALUE
+@dataclass(frozen=True, eq=False)
+class PlaceSums:
+    """Sums of all cameras' frames, a row per place; the first row is of all older places.
 
+    Attributes:
+        names: (P,) of the places, the last visited last.
+        rows: (P, n) sums; of older places without score, their scatter about their own means.
+        means: (n,) how many such means.
+        older_squared: (n,) sum of the squares of the older places' numbers of frames.
+    """
 
-def step_between(one: gtsam.Pose3, two: gtsam.Pose3) -> Array:
-    """(6,) tangent step from one T_lidar_camera to another."""
-    return np.asarray(one.localCoordinates(two))
+    names: tuple[str, ...]
+    rows: Sums
+    means: Array
+    older_squared: Array
 
+    @staticmethod
+    def empty(cameras: int) -> PlaceSums:
+        """Of no frames."""
+        return PlaceSums((_OLDER,), Sums.zeros(1, cameras), np.zeros(cameras), np.zeros(cameras))
 
-def equation_5(
-    priors: gtsam.NonlinearFactorGraph, references: Sequence[gtsam.Pose3], sums: Sums
-) -> gtsam.NonlinearFactorGraph:
-    """Eq. 5 of the paper: priors, and (n,) sums of all matches as a quadratic per camera."""
-    graph, at = join(priors), gtsam.Values()
-    for camera, reference in enumerate(references):
-        own, key = sums[camera], camera_key(camera)
-        if own.hessian.any():
-            at.insert(key, reference)
-            hessian = convex_hessian(own.hessian, own.reweighted)
-            factor = gtsam.HessianFactor(key, hessian, -own.gradient, 0.0)
-            graph.add(gtsam.LinearContainerFactor(factor, at))
-    return graph
+    @property
+    def frames(self) -> Array:
+        """(P, n) how many."""
+        return self.rows.frames
 
+    @cached_property
+    def count(self) -> float:
+        """Number of places."""
+        older = self.places[0].max() if self.frames[0].any() else 0.0
+        return float(np.count_nonzero(self.frames[1:].any(axis=1)) + older)
 
-def minimum(
-    graph: gtsam.NonlinearFactorGraph, start: Sequence[gtsam.Pose3]
-) -> tuple[gtsam.Pose3, ...]:
-    """T_lidar_camera of all cameras at the minimum of :func:`equation_5`, by Gauss-Newton."""
-    values, keys = gtsam.Values(), range(len(start))
-    for camera in keys:
-        values.insert(camera_key(camera), start[camera])
-    for _ in range(_STEPS):
-        values = values.retract(graph.linearize(values).optimize())
-    return tuple(values.atPose3(camera_key(camera)) for camera in keys)
+    @cached_property
+    def places(self) -> Array:
+        """(P, n) as how many places with equally many frames each row counts."""
+        counts = np.ones_like(self.frames)
+        squared = np.maximum(self.older_squared, 1e-300)
+        counts[0] = np.where(self.older_squared > 0, self.frames[0] ** 2 / squared, 1.0)
+        return counts
 
+    @property
+    def alike(self) -> Array:
+        """(n,) frames of a place, in the mean over frames."""
+        squared = self.older_squared + np.square(self.frames[1:]).sum(axis=0)
+        return np.asarray(squared / np.maximum(self.frames.sum(axis=0), 1.0))
 
-def sums_of_matches(
-    block: CameraBlock, scale: ResidualScale, T_lidar_camera: gtsam.Pose3, reference: gtsam.Pose3
-) -> Sums:
-    """Hessian by their weights, and gradient at a reference, of matches in and out of the gate."""
-    here = block.with_scale(scale).sums(T_lidar_camera)
-    sums = Sums.zeros().change(hessian=here.hessian, gradient=here.gradient)
-    return sums.shift_reference(step_between(T_lidar_camera, reference))
+    @property
+    def within_places(self) -> tuple[Array, Array]:
+        """(n, 6, 6) scatter of the frames' gradients about the means of their places.
+
+        Further (n,) the number of frames that the means leave.
+        """
+        about_means = self.rows[1:].scatter_about_mean.sum(axis=0) + self.rows.scatter[0]
+        means = np.count_nonzero(self.frames[1:], axis=0) + self.means
+        return about_means, np.maximum(self.frames.sum(axis=0) - means, 0.0)
+
+    def shift_reference(self, steps: Array) -> PlaceSums:
+        """The sums about references that are moved by (n, 6) tangent steps."""
+        return replace(self, rows=self.rows.shift_reference(steps))
+
+    def add(self, places: Sequence[str], sums: Sums) -> PlaceSums:
+        """The sums with those of (f, n) frames at their places added, these the last visited."""
+        visited = tuple(reversed(dict.fromkeys(reversed(places))))
+        names = (*(name for name in self.names if name not in visited), *visited)
+        row_of = {name: row for row, name in enumerate(names)}
+        packed = np.zeros((len(names), *self.rows.packed.shape[1:]))
+        packed[[row_of[name] for name in self.names]] = self.rows.packed
+        if len(visited) == 1:
+            packed[-1] += sums.packed.sum(axis=0)
+        else:
+            np.add.at(packed, [row_of[name] for name in places], sums.packed)
+        return replace(self, names=names, rows=Sums(packed))
+
+    def bounded(self, most: int = MOST_PLACES) -> PlaceSums:
+        """The sums with no more places kept apart: those not visited longest are older."""
+        sums = self
+        while len(sums.names) > 1 + most:
+            sums = sums._merge_second()
+        return sums
+
+    def _merge_second(self) -> PlaceSums:
+        """The second row added to the first."""
+        second = self.rows[1]
+        second = second.change(score=0.0 * second.score, scatter=second.scatter_about_mean)
+        return PlaceSums(
+            (_OLDER, *self.names[2:]),
+            self.rows.replace_at(1, self.rows[0] + second)[1:],
+            self.means + (second.frames > 0),
+            self.older_squared + second.frames**2,
+        )
+
+    def without(self, camera: int) -> PlaceSums:
+        """The sums without those of a camera."""
+        rows = self.rows.replace_at((slice(None), camera), Sums.zeros())
+        kept = np.arange(len(self.means)) != camera
+        return replace(
+            self, rows=rows, means=self.means * kept, older_squared=self.older_squared * kept
+        )
+
+    def with_camera_at(self, name: str, camera: int, own: Sums) -> PlaceSums:
+        """The sums with all of a camera's frames at one place, as if about their mean.
+
+        Args:
+            name: of the place.
+            camera: by its place in the rig.
+            own: its sums, discounted by its walk.
+        """
+        reweighted = positive_part(own.hessian)
+        part = own.change(score=np.zeros_like(own.score), reweighted=reweighted)
+        none = Sums.zeros(1, len(self.means))
+        return self.without(camera).add([name], none.replace_at((0, camera), part))

@@ -1,77 +1,153 @@
-"""The graph that is reported, in iSAM2: what all places share, and the places of the open epoch.
+"""What all places share, in iSAM2: priors and relative poses, errors of sensor and matcher.
 
-    held        summary of the other closed places: one marginal on the cloud and the cameras;
-                priors and relative poses of the cameras
-    errors      of what all places share, the scan distortion among them: as in a batch
-    places      those of the open epoch, with their data
-
-Every frame exchanges errors and places: their covariances depend on all frames. What is reported is
-iSAM2's estimate and its joint marginal. Whatever else changes the graph, such as the end of an
-epoch or a place that is entered, begins another window.
+The places are one factor on the cloud and on the cameras as matches show them; every update
+exchanges it. The graph is linear but for its priors, and linearized at the references of the epoch.
+Two exchanges of a blank factor come first: from then on iSAM2 eliminates in one order, so that its
+numbers depend on the last factor alone, to the last bit, and a restart gives the same.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.latent_poses import LatentPoseModel, data_graph
-from calibgraph.graph.objective import join
+from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.variables import CLOUD, DISTORTION, aligned_key, camera_key, matched_key
+from calibgraph.model.geometry import adjoints, to_T_lidar_camera
 
-_RELINEARIZE = 1e-5  # rad and m: far below any sigma
-_MOST_STEPS = 20  # of Gauss-Newton: from frame to frame one or two do
+_RELINEARIZE = 0.1  # rad and m: beyond all that an epoch may move
+_ROUNDING = 1e-11  # of the diagonal: what cloud and cameras share leaves a quadratic open
+_POSE = 6
 
 
 class Window:
-    """iSAM2 on the graph of an open epoch.
+    """iSAM2 on the graph of an epoch.
 
     Args:
-        model: the graph.
-        places: names of its places.
-        start: values of all its variables.
+        model: the graph; of its data and places nothing is used.
+        references: (n, 4, 4) T_camera_lidar at which it is linearized.
 
     Raises:
         RuntimeError: if a variable is not determined.
     """
 
-    def __init__(self, model: LatentPoseModel, places: Sequence[str], start: gtsam.Values) -> None:
+    def __init__(self, model: LatentPoseModel, references: Array) -> None:
+        self.model = model
+        self._start = gtsam.Values()
+        self._start.insert(CLOUD, gtsam.Pose3())
+        poses = [*map(to_T_lidar_camera, references)]
+        for camera, pose in enumerate(poses):
+            self._start.insert(matched_key(camera), pose)
+        others = gtsam.Values()
+        for camera, pose in enumerate(poses):
+            others.insert(camera_key(camera), pose)
+            if camera in model.aligned:
+                others.insert(aligned_key(camera), pose)
+        if model.is_distorted:
+            size = model.components.distortion_jacobian.shape[2]
+            others.insert(DISTORTION, np.zeros(size))
+        self._keys = [CLOUD, *map(matched_key, range(len(poses)))]
+        self.adjoint = adjoints(references)
+        cameras = len(poses)
+        self._chain = np.hstack([-self.adjoint.reshape(-1, _POSE), np.eye(_POSE * cameras)])
+        self._poses = poses
         parameters = gtsam.ISAM2Params()
         parameters.setFactorization("QR")  # Cholesky takes sigmas 4096 times apart for singular
         parameters.setRelinearizeThreshold(_RELINEARIZE)
         parameters.relinearizeSkip = 1
         parameters.findUnusedFactorSlots = True
         self._isam = gtsam.ISAM2(parameters)
-        self.places = tuple(places)
-        self._exchanged: list[int] = []
-        self._update(model, model.pose_graph, start)
+        others.insert(self._start)
+        self._all = others
+        self._isam.update(model.shared_graph, others)
+        self._slots: list[int] = []
+        for _ in range(2):
+            self.exchange(np.eye(_POSE * cameras), np.zeros(_POSE * cameras))
 
-    def has_graph_of(self, model: LatentPoseModel, places: Sequence[str]) -> bool:
-        """Whether a model has the variables and the held factors of this one."""
-        same = self.model.pose_graph is model.pose_graph and self.places == tuple(places)
-        return same and self.model.matched_places == model.matched_places
+    def exchange(self, information: Array, vector: Array) -> None:
+        """Put a quadratic on the cameras, as matches show them, in the place of the one before.
 
-    def exchange(self, model: LatentPoseModel) -> None:
-        """Put the errors and places of a model in the place of those before."""
-        self._update(model, gtsam.NonlinearFactorGraph(), gtsam.Values())
+        Args:
+            information: (6 n, 6 n).
+            vector: (6 n,) the information times the minimum.
+        """
+        hessian = self._chain.T @ information @ self._chain
+        hessian[np.diag_indices(len(hessian))] *= 1.0 + _ROUNDING
+        graph, whole = gtsam.NonlinearFactorGraph(), self._factor(hessian, self._chain.T @ vector)
+        graph.add(gtsam.LinearContainerFactor(whole, self._start))
+        result = self._isam.update(graph, gtsam.Values(), self._slots)
+        self._slots = [*result.getNewFactorsIndices()]
+        self.values = self._isam.calculateBestEstimate()  # by all changes, however small
 
-    def _update(
-        self, model: LatentPoseModel, held: gtsam.NonlinearFactorGraph, start: gtsam.Values
-    ) -> None:
-        graph = join(held, model.error_graph, model.place_graph, data_graph(model))
-        result = self._isam.update(graph, start, self._exchanged)
-        self._exchanged = [*result.getNewFactorsIndices()][held.size() :]
-        for _ in range(_MOST_STEPS):
-            if not self._isam.update().getVariablesRelinearized():
-                break
-        self.model, self.values = model, self._isam.calculateEstimate()
+    def _factor(self, hessian: Array, vector: Array) -> gtsam.HessianFactor:
+        """The quadratic as one factor, from those of single variables and of pairs."""
+        parts, keys = gtsam.GaussianFactorGraph(), self._keys
+        rows = [slice(_POSE * i, _POSE * i + _POSE) for i in range(len(keys))]
+        none, zero = np.zeros((_POSE, _POSE)), np.zeros(_POSE)
+        for key, own in zip(keys, rows, strict=True):
+            parts.push_back(gtsam.HessianFactor(key, hessian[own, own], vector[own], 0.0))
+        for (a, one), (b, two) in combinations(zip(keys, rows, strict=True), 2):
+            parts.push_back(
+                gtsam.HessianFactor(a, b, none, hessian[one, two], zero, none, zero, 0.0)
+            )
+        return gtsam.HessianFactor(parts)
 
-    def T_lidar_camera(self, keys: Sequence[int]) -> tuple[gtsam.Pose3, ...]:
-        """The estimates of some poses."""
-        return tuple(map(self.values.atPose3, keys))
+    @property
+    def shown(self) -> Array:
+        """(n, 6) from the references to where matches show the cameras at all places."""
+        cloud = self.values.atPose3(CLOUD)
+        at = (cloud.between(self.values.atPose3(key)) for key in self._keys[1:])
+        pairs = zip(self._poses, at, strict=True)
+        return np.array([one.localCoordinates(other) for one, other in pairs])
+
+    def steps(self, keys: Sequence[int]) -> Array:
+        """(6 n,) from the references to the estimates of some poses, one of each camera."""
+        pairs = zip(self._poses, keys, strict=True)
+        return np.concatenate(
+            [pose.localCoordinates(self.values.atPose3(key)) for pose, key in pairs]
+        )
+
+    def T_camera_lidar(self, keys: Sequence[int]) -> Array:
+        """(n, 4, 4) of some estimates."""
+        return np.array([self.values.atPose3(key).inverse().matrix() for key in keys])
 
     def covariance(self, keys: Sequence[int]) -> Array:
         """Joint marginal of some variables, in their tangents."""
         return np.asarray(self._isam.jointMarginalCovariance(keys).fullMatrix())
+
+    @property
+    def covariance_of_shown(self) -> Array:
+        """(6 n, 6 n) of :attr:`shown`."""
+        return np.asarray(self._chain @ self.covariance(self._keys) @ self._chain.T)
+
+    @property
+    def squared_errors(self) -> float:
+        """Twice GTSAM's error of the shared errors, linearized as iSAM2 does."""
+        linear = self.model.error_graph.linearize(self._all)
+        return 2.0 * float(linear.error(self._all.localCoordinates(self.values)))
+
+    def undetermined(self) -> float:
+        """Degrees of freedom of the shared errors that the data leave open."""
+        parts, cameras = self.model.components, len(self._poses)
+        seen = aligned_key if self.model.is_distorted else camera_key
+        keys = [*self._keys, *map(seen, range(cameras))]
+        own = self.covariance(keys)
+        found = float(np.trace(np.linalg.solve(parts.cloud, own[:_POSE, :_POSE])))
+        half = own[_POSE:, _POSE:].reshape(2, cameras, _POSE, 2, cameras, _POSE)
+        for camera in range(cameras):
+            both = half[:, camera, :, :, camera]
+            apart = both[0, :, 0] + both[1, :, 1] - both[0, :, 1] - both[1, :, 0]
+            found += float(np.trace(np.linalg.solve(parts.camera, apart)))
+        if self.model.is_distorted:
+            distortion = gtsam.NonlinearFactorGraph()
+            for index in range(self.model.error_graph.size()):
+                factor = self.model.error_graph.at(index)
+                if [*factor.keys()] == [DISTORTION]:
+                    distortion.add(factor)
+            known = distortion.linearize(self.values).hessian(gtsam.Ordering([DISTORTION]))[0]
+            found += float(np.trace(known @ self.covariance([DISTORTION])))
+        return found

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import place_of
@@ -20,9 +19,8 @@ from calibgraph.model.geometry import (
     twist_between,
 )
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import Check, Threshold
-from calibgraph.solver.camera_block import CameraBlock, camera_block
-from calibgraph.solver.error_model import ErrorFit
+from calibgraph.model.verdict import Check
+from calibgraph.solver.matches import camera_block
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
 from calibgraph.solver.solution import Solution
@@ -37,12 +35,11 @@ BLAME_SIGMAS = 1.0
 one with its own, to be taken for the one that is wrong."""
 
 
-@dataclass(frozen=True)
-class PairAgreement:
+class PairAgreement(NamedTuple):
     """The relative pose of cameras a and b from images against the calibration.
 
-    ``degrees`` and ``centimetres`` are between the two T_b_a. ``sigmas`` is the largest difference
-    along an axis of b, in standard deviations; NaN where the calibration has no covariance.
+    Degrees and centimetres are between the two T_b_a; sigmas the largest difference along an axis
+    of b, in standard deviations.
     """
 
     a: str
@@ -54,21 +51,54 @@ class PairAgreement:
 
 def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
     """Whether the correspondences place the cameras relative to each other as the images do."""
-    own = evidence.of_correspondences
-    if evidence.solution.camera_matches is None or evidence.solution.before_pairs is None:
+    solution, alone = evidence.solution, evidence.solution.without_pairs()
+    if solution.camera_matches is None or solution.alone is None or alone.mount is None:
         return {}
-    if (mount := own.solution.marginals.mount) is None:  # they determine no pose
-        return {}
-    rig, covariance = own.solution.rig.moved_to(mount.T_camera_lidar), mount.covariance
+    rig, covariance = solution.rig.moved_to(alone.mount.T_camera_lidar), alone.mount.covariance
     found = [
         pair_agreement(rig, fit, covariance)
-        for fit in own.pair_fits
-        if own.fitted_blocks.keys() >= {fit.a, fit.b}
+        for fit in alone.pair_fits
+        if evidence.fitted_blocks.keys() >= {fit.a, fit.b}
     ]
     return {
         name: [check_agreement(one, name, found) for one in found if name in (one.a, one.b)]
-        for name in own.cameras
+        for name in evidence.cameras
     }
+
+
+def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairAgreement]) -> Check:
+    """The check of one camera of a pair, which other pairs may show to be the other's fault."""
+    row, name = threshold("pair_agreement"), f"relative pose of {found.a} and {found.b} by images"
+    status, other = row.grade(found.sigmas), found.b if camera == found.a else found.a
+    text = (
+        f"images and correspondences contradict each other on the pose of {found.a} to {found.b} "
+        f"by {found.degrees:.2g} deg, {found.centimetres:.2g} cm, {found.sigmas:.3g} sigma"
+    )
+    own, of_other = (  # by which each disagrees with the cameras outside the pair
+        max((o.sigmas for o in all_found if o is not found and one in (o.a, o.b)), default=0.0)
+        for one in (camera, other)
+    )
+    if status == "PASS" or not of_other > max(row.warn, own + BLAME_SIGMAS):
+        text += "" if status == "PASS" else f": {row.advice}"
+        return row.describe(found.sigmas, status, text, name=name)
+    text += f": by its other pairs ({of_other:.3g} sigma) it is {other} that is wrong"
+    return row.describe(own, "WARN", text, name=name)
+
+
+def pair_agreement(rig: Rig, fit: PairFit, covariance: Array) -> PairAgreement:
+    """A pair by its images, A held near the calibration, against one that has not used them.
+
+    Args:
+        rig: mounts at the calibration.
+        fit: of the pair.
+        covariance: (6 N, 6 N) of the calibration, in the rig's order.
+    """
+    first, second = (tuple(rig.cameras).index(name) for name in (fit.a, fit.b))
+    T_b_a = relative_transform(rig.T_camera_lidar[fit.b], rig.T_camera_lidar[fit.a])
+    own = relative_covariance(covariance, first, second, T_b_a)
+    sigmas = np.sqrt(np.diag(own) + np.diag(fit.covariance))
+    largest = float(np.max(np.abs(twist_between(fit.T_b_a, T_b_a)) / sigmas))
+    return PairAgreement(fit.a, fit.b, *pose_difference(fit.T_b_a, T_b_a), largest)
 
 
 def one_pose_checks(evidence: Evidence) -> dict[str, list[Check]]:
@@ -98,62 +128,23 @@ def _is_one_pose(T_a_b: Array) -> bool:
     return degrees <= ONE_POSE_DEG and centimetres <= ONE_POSE_CM
 
 
-def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairAgreement]) -> Check:
-    """The check of one camera of a pair, which other pairs may show to be the other's fault."""
-    row, name = threshold("pair_agreement"), f"relative pose of {found.a} and {found.b} by images"
-    status, other = row.grade(found.sigmas), found.b if camera == found.a else found.a
-    text = (
-        f"images and correspondences contradict each other on the pose of {found.a} to {found.b} "
-        f"by {found.degrees:.2g} deg, {found.centimetres:.2g} cm, {found.sigmas:.3g} sigma"
-    )
-    own, of_other = (_elsewhere(one, found, all_found) for one in (camera, other))
-    if status == "PASS" or not of_other > max(row.warn, own + BLAME_SIGMAS):
-        text += "" if status == "PASS" else f": {row.advice}"
-        return row.describe(found.sigmas, status, text, name=name)
-    text += f": by its other pairs ({of_other:.3g} sigma) it is {other} that is wrong"
-    return row.describe(own, "WARN", text, name=name)
-
-
-def _elsewhere(camera: str, pair: PairAgreement, found: Sequence[PairAgreement]) -> float:
-    """Sigmas by which a camera disagrees with the cameras outside a pair; 0 without others."""
-    others = [one for one in found if one is not pair and camera in (one.a, one.b)]
-    return max((one.sigmas for one in others), default=0.0)
-
-
-def pair_agreement(rig: Rig, fit: PairFit, covariance: Array | None) -> PairAgreement:
-    """A pair by its images, A held near the calibration, against one that has not used them.
-
-    Args:
-        rig: mounts at the calibration.
-        fit: of the pair.
-        covariance: (6 N, 6 N) of the calibration, in the rig's order; None if unknown.
-    """
-    before = rig.T_camera_lidar
-    T_b_a = relative_transform(before[fit.b], before[fit.a])
-    degrees, centimetres = pose_difference(fit.T_b_a, T_b_a)
-    sigmas = float("nan")
-    if covariance is not None:
-        first, second = (tuple(rig.cameras).index(name) for name in (fit.a, fit.b))
-        own = relative_covariance(covariance, first, second, T_b_a)
-        variances = np.diag(own) + np.diag(fit.covariance)
-        sigmas = float(np.max(np.abs(twist_between(fit.T_b_a, T_b_a)) / np.sqrt(variances)))
-    return PairAgreement(fit.a, fit.b, degrees, centimetres, sigmas)
-
-
 _FEWEST_ITERATIONS = 50  # of MAGSAC, which also polishes its result
 _MISSED = 1e-6  # probability that no sample of a competing solution large enough to count is clean
 
 
 def competing_solution_checks(evidence: Evidence) -> Checks:
     """Whether the matches that a solution leaves out agree on another extrinsic."""
-    solution = evidence.of_correspondences.solution
+    solution = evidence.solution.without_pairs()
     return {name: [check_competing_solution(solution, name)] for name in evidence.fitted_blocks}
 
 
 def check_competing_solution(solution: Solution, camera: str) -> Check:
     """Ratio of the matches that agree on another extrinsic alone to those on this one alone."""
     row, tolerance = threshold("competing_solution"), solution.config.tolerance
-    block, gate_px = _of_all_frames(solution, camera), solution.scales[camera].gate_px
+    block, gate_px = solution.objective.blocks[camera], solution.scales[camera].gate_px
+    if solution.counts[camera]["outlier_frames"]:  # which may agree on another pose
+        rows = solution.correspondences.of_camera(camera)
+        block = camera_block(solution.rig.cameras[camera], rows, solution.config)
     ours = block.within_gate(solution.T_camera_lidar[camera], gate_px)
     left_out = block.block.select(~ours)
     T, seen_by = None, solution.rig.cameras[camera]
@@ -172,14 +163,6 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
     return row.check(share, advice=advice)
 
 
-def _of_all_frames(solution: Solution, camera: str) -> CameraBlock:
-    """All matches of a camera, outlier frames included: they may agree on another pose."""
-    if not solution.counts[camera]["outlier_frames"]:
-        return solution.objective.blocks[camera]
-    rows = solution.correspondences.of_camera(camera)
-    return camera_block(solution.rig.cameras[camera], rows, solution.config)
-
-
 def _ransac_iterations(fewest: float, matches: int) -> int:
     """Samples of 4 matches that find a competing solution if it is large enough for a warning."""
     share = min(fewest / 2 / matches, 0.99)
@@ -188,46 +171,40 @@ def _ransac_iterations(fewest: float, matches: int) -> int:
 
 
 def place_checks(evidence: Evidence) -> Checks:
-    """Whether any place contradicts the others, where there are enough to tell which."""
-    errors = evidence.solution.marginals.errors
-    if errors is None or len(errors.places) < error_components().robust_places:
-        return {}
-    return {name: _check_places(evidence, errors, name) for name in errors.model.blocks}
+    """Whether any place contradicts the others, where there are enough to tell which.
 
-
-def _check_places(evidence: Evidence, errors: ErrorFit, camera: str) -> list[Check]:
-    """The place that agrees least: by its distance, and by its inliers.
-
-    The distance is that of the camera or of the cloud there from where they are elsewhere; the
-    share of the matches within the gate counts over its median at the other places.
+    Of the place that agrees least, by its distance: that of the camera or of the cloud there from
+    where they are elsewhere; and by its inliers: the share of the matches within the gate over its
+    median at the other places.
     """
-    before, after = evidence.fitted_blocks[camera], evidence.solution.inliers.blocks[camera]
-    cameras = tuple(errors.model.cameras)
-    distances = errors.fit.linear.distances[:, [0, 1 + cameras.index(camera)]].max(axis=1)
-    kept, given = (_count(block, errors.places) for block in (after, before))
-    seen = np.flatnonzero(given)
-    if len(seen) < 2:  # noqa: PLR2004
-        return []
-    shares = kept[seen] / given[seen]
-    others = [max(np.median(np.delete(shares, index)), 1e-9) for index in range(len(seen))]
-    worst = (
-        ("place_distance", int(np.argmax(distances[seen])), distances[seen]),
-        ("place_inliers", int(np.argmin(shares / others)), shares / others),
-    )
-    return [
-        _check_place(threshold(key), float(values[at]), int(seen[at]), errors.places[seen[at]])
-        for key, at, values in worst
-    ]
-
-
-def _count(block: CameraBlock, places: Sequence[NDArray[np.int64]]) -> Array:
-    """(P,) correspondences at each place."""
-    place = place_of(block.frame_numbers, places)
-    return np.asarray(np.bincount(place, block.frame_counts, len(places)), dtype=np.float64)
-
-
-def _check_place(row: Threshold, value: float, place: int, frames: NDArray[np.int64]) -> Check:
-    first, last = int(frames[0]), int(frames[-1])
-    which = f"frame {first}" if first == last else f"frames {first} to {last}"
-    number = f"{value:.2g} {row.unit}".rstrip()
-    return row.check_in_words(value, f"{row.name}: {number} at place {place + 1} ({which})")
+    errors, checks = evidence.solution.error_fit, dict[str, list[Check]]()
+    if errors is None or len(errors.model.frames) < error_components().robust_places:
+        return {}
+    cameras, of_place = tuple(errors.model.cameras), errors.linear.distances
+    frames = errors.model.frames
+    for name in errors.model.blocks:
+        kept, given = (
+            np.bincount(
+                place_of(b.frame_numbers, errors.model.frames), b.frame_counts, len(of_place)
+            )
+            for b in (evidence.solution.inliers.blocks[name], evidence.fitted_blocks[name])
+        )
+        seen = np.flatnonzero(given)
+        if len(seen) < 2:  # noqa: PLR2004
+            continue
+        shares = kept[seen] / given[seen]
+        others = [max(np.median(np.delete(shares, at)), 1e-9) for at in range(len(seen))]
+        distances = of_place[seen][:, [0, 1 + cameras.index(name)]].max(axis=1)
+        worst = (
+            ("place_distance", distances, int(np.argmax(distances))),
+            ("place_inliers", shares / others, int(np.argmin(shares / others))),
+        )
+        checks[name] = []
+        for key, values, at in worst:
+            row, value, place = threshold(key), float(values[at]), int(seen[at])
+            first, last = int(frames[place][0]), int(frames[place][-1])
+            which = f"frame {first}" if first == last else f"frames {first} to {last}"
+            number = f"{value:.2g} {row.unit}".rstrip()
+            text = f"{row.name}: {number} at place {place + 1} ({which})"
+            checks[name].append(row.check_in_words(value, text))
+    return checks

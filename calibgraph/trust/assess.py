@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from calibgraph.matching.run import MatchingRun
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import ABOUT_THE_DATA, BRIGHTNESS, Check
@@ -21,7 +22,7 @@ from calibgraph.trust import (
     solution_checks,
 )
 from calibgraph.trust.conventions import likely_intended_guess
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence, concatenate
+from calibgraph.trust.evidence import Checks, Evidence, concatenate
 from calibgraph.trust.image_record import RunChecks
 from calibgraph.trust.inputs import describe_brightness
 from calibgraph.trust.lens_parameter import advise_together
@@ -49,7 +50,7 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
 )  # fmt: skip
 """Checks of a solution, from correspondences alone; those that name a cause come first."""
 
-RUN_CHECKS: tuple[Callable[[RunEvidence], Checks], ...] = (
+RUN_CHECKS: tuple[Callable[[MatchingRun], Checks], ...] = (
     matcher_checks.last_round_checks,      # have the rounds of matching converged?
     guess.range_checks,                    # is the result within the matcher's range?
     matcher_checks.repeated_file_checks,   # are the frames independent?
@@ -68,31 +69,17 @@ def assess(evidence: Evidence) -> dict[str, list[Check]]:
     return {name: advise_together(each) for name, each in checks.items()}
 
 
-def assess_run(evidence: RunEvidence) -> RunChecks:
+def assess_run(run: MatchingRun, evidence: Evidence) -> RunChecks:
     """The checks of a run and of its solution; if it failed, with the likely cause."""
-    cameras = evidence.solution.cameras
-    of_solution = assess(evidence.solution)
-    of_run = concatenate([check(evidence) for check in RUN_CHECKS], cameras)
-    checks = concatenate([of_solution, of_run], cameras)
-    convention = _intended_guess_checks(evidence, checks)
-    implausible = implausible_checks(evidence.run.guess, checks)
-    dark = _brightness_checks(evidence, checks)
-    causes = concatenate([dark, convention, implausible], cameras)
-    return RunChecks(of_solution, of_run, causes)
-
-
-def _brightness_checks(evidence: RunEvidence, checks: Checks) -> Checks:
-    """Images too dark or bright to show structure, at cameras with which something is wrong."""
-    found: dict[str, list[Check]] = {}
-    data = evidence.run.dataset.spread_out(_LOOKED_AT)
-    for name, of_camera in checks.items():
-        wrong = [c for c in of_camera if c.status != "PASS" and c.kind not in ABOUT_THE_DATA]
-        camera = evidence.run.guess.cameras[name]
-        grays = [frame.load_gray(name, camera).mean() for frame in data.frames if wrong]
-        if wrong and (text := describe_brightness(name, grays)):
-            decided = any(check.decisive for check in wrong)
-            found[name] = [Check(BRIGHTNESS, "FAIL" if decided else "WARN", text)]
-    return found
+    of_solution = assess(evidence)
+    of_run = concatenate([check(run) for check in RUN_CHECKS], evidence.cameras)
+    checks = concatenate([of_solution, of_run], evidence.cameras)
+    causes = (
+        _brightness_checks(run, checks),
+        _intended_guess_checks(run, checks),
+        implausible_checks(run.guess, checks),
+    )
+    return RunChecks(of_solution, of_run, concatenate(causes, evidence.cameras))
 
 
 def in_order(checks: RunChecks, cameras: Sequence[str]) -> dict[str, list[Check]]:
@@ -101,13 +88,25 @@ def in_order(checks: RunChecks, cameras: Sequence[str]) -> dict[str, list[Check]
     return {name: advise_together(each) for name, each in joined.items()}
 
 
-def _intended_guess_checks(evidence: RunEvidence, checks: Checks) -> Checks:
+def _brightness_checks(run: MatchingRun, checks: Checks) -> Checks:
+    """Images too dark or bright to show structure, at cameras with which something is wrong."""
+    found: dict[str, list[Check]] = {}
+    data = run.dataset.spread_out(_LOOKED_AT)
+    for name, of_camera in checks.items():
+        wrong = [c for c in of_camera if c.status != "PASS" and c.kind not in ABOUT_THE_DATA]
+        camera = run.guess.cameras[name]
+        grays = [frame.load_gray(name, camera).mean() for frame in data.frames if wrong]
+        if wrong and (text := describe_brightness(name, grays)):
+            found[name] = [_cause(BRIGHTNESS, text, wrong)]
+    return found
+
+
+def _intended_guess_checks(run: MatchingRun, checks: Checks) -> Checks:
     """Whether a convention error in the guess explains the failure of cameras.
 
     It takes seconds, so that a time limit that has passed does not prevent it.
     """
     failed = [n for n, each in checks.items() if any(check.status == "FAIL" for check in each)]
-    run = evidence.run
     error = likely_intended_guess(run.dataset, run.guess) if failed else None
     found = [] if error is None else [Check("convention of the guess", "FAIL", error)]
     return dict.fromkeys(failed, found)
@@ -120,7 +119,10 @@ def implausible_checks(rig: Rig, checks: Checks) -> Checks:
         name, _, text = line.partition(": ")
         of_camera = checks.get(name, ())
         if any(check.status == "FAIL" for check in of_camera):
-            decided = any(check.decisive for check in of_camera)
-            check = Check("values of the rig", "FAIL" if decided else "WARN", text)
-            found.setdefault(name, []).append(check)
+            found.setdefault(name, []).append(_cause("values of the rig", text, of_camera))
     return found
+
+
+def _cause(name: str, text: str, explained: Sequence[Check]) -> Check:
+    """A cause of other checks: a FAIL, which is decisive, only if one of these is."""
+    return Check(name, "FAIL" if any(check.decisive for check in explained) else "WARN", text)

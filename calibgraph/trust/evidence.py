@@ -1,29 +1,25 @@
-"""The values that checks share, each computed once, when the first check needs it."""
+"""What checks share of a solution: its error bars, made once."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import partial
 
 import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.matching.run import MatchingRun
-from calibgraph.model.calibration import Residuals
 from calibgraph.model.config import Terms
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import MatcherFindings, error_components
-from calibgraph.model.geometry import pose_rows, twist_between
+from calibgraph.model.geometry import pair_covariances, pose_rows, twist_between
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import TOLERANCE, Check
-from calibgraph.progress import Progress, no_progress
-from calibgraph.solver.block_residuals import BlockResiduals
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.conflicts import Conflict
 from calibgraph.solver.covariance import bootstrap_covariances
-from calibgraph.solver.pair_refinement import PairFit
+from calibgraph.solver.error_model import Conflict
+from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.observability import prior_shares
 from calibgraph.trust.pose_posterior import (
@@ -75,222 +71,147 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A solution, the rig as it was first guessed, and the values that checks compute from them.
+    """A solution and what its checks share, by :func:`gather`.
 
-    ``excluded`` are the cameras that the user excluded; the solution may have excluded more.
+    Attributes:
+        solution: with its marginals.
+        guess: the rig as it was first guessed.
+        excluded: cameras that the user excluded; the solution may have excluded more.
+        tied: the free cameras, in groups that can only be elsewhere together.
+        bars: the error bar of the matches beside the posteriors by the images; None where the
+            matches determine none.
+        joint_covariance: (6 N, 6 N) of both, the wider one; cameras that are held are unknown by a
+            radian and a metre.
+        bootstrap: per camera (6, 6) scatter of re-solves from frames drawn again; empty if not
+            wanted.
+        prior_shares: per camera, which share of its result comes from priors and relative poses.
     """
 
     solution: Solution
     guess: Rig
-    measure_posteriors: MeasurePosteriors = no_posteriors
-    excluded: tuple[str, ...] = ()
+    excluded: tuple[str, ...]
+    tied: Sequence[tuple[str, ...]]
+    bars: ImagePosteriors | None
+    joint_covariance: Array | None
+    bootstrap: dict[str, Array]
+    prior_shares: dict[str, float]
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """Their names, in the rig's order."""
         return tuple(self.solution.T_camera_lidar)
 
-    @cached_property
-    def of_correspondences(self) -> Evidence:
-        """The evidence of the solution without camera-to-camera matches."""
-        if self.solution.before_pairs is None:
-            return self
-        return Evidence(self.solution.without_pairs(), self.guess, excluded=self.excluded)
-
     @property
     def findings(self) -> MatcherFindings:
         """The findings of the matcher."""
         return self.solution.correspondences.findings
 
-    @cached_property
+    @property
     def fitted_blocks(self) -> Mapping[str, CameraBlock]:
         """Per camera, the correspondences of pass 1, before the gate; none of outlier frames."""
         objective = self.solution.objective
         return objective.blocks if objective.uses_correspondences else {}
 
-    @cached_property
-    def residuals(self) -> dict[str, Residuals]:
-        """Per camera that has correspondences, of all of them, not only the inliers."""
-        poses, scales = self.solution.T_camera_lidar, self.solution.scales
-        blocks = self.solution.objective.blocks.items()
-        return {n: BlockResiduals.at(poses[n], block).summary(scales[n]) for n, block in blocks}
-
-    @cached_property
-    def joint_covariance(self) -> Array | None:
-        """(6 N, 6 N): of the matches, widened where the images' evidence is flat.
-
-        Cameras that are held are unknown by a radian and a metre.
-        """
-        known = self.covariance_of_matches
-        return None if known is None else self._beside_images.widen(known)
-
     @property
-    def mount_covariance(self) -> Array | None:
-        """(6 N, 6 N) second moments of the mounts about the solution, widened alike."""
-        mount = self.solution.marginals.mount
-        if mount is None:
-            return None
-        of, T = mount.T_camera_lidar, self.solution.T_camera_lidar
-        away = np.concatenate([twist_between(of[name], T[name]) for name in T])
-        return self._beside_images.widen(mount.covariance + np.outer(away, away))
-
-    @property
-    def _beside_images(self) -> ImagePosteriors:
-        known = self.covariance_of_matches
-        assert known is not None  # asked by those who have one
-        return ImagePosteriors(self.cameras, known, self.posteriors)
-
-    @property
-    def flatness(self) -> dict[str, Check]:
-        """Per camera with a posterior, the check whether the images leave its pose more open."""
-        return self._beside_images.check_flatness() if self.posteriors else {}
-
-    @cached_property
     def posteriors(self) -> Mapping[str, PosePosterior]:
         """Per free camera, its posterior by the images' evidence."""
-        if (known := self.covariance_of_matches) is None:
-            return {}
-        own = {name: self._rows_of(known, name) for group in self.tied for name in group}
-        return self.measure_posteriors(own, self.tied)
-
-    @cached_property
-    def tied(self) -> list[tuple[str, ...]]:
-        """The free cameras, in groups that can only be elsewhere together.
-
-        A measured relative pose that contradicts the correspondences ties nothing.
-        """
-        free = [name for name in self.cameras if name not in self.solution.held]
-        limit, known = error_components().contradiction_sigmas, self.solution.marginals
-        wrong = {(one.pair.a, one.pair.b) for one in known.conflicts if one.largest > limit}
-        poses = self.solution.inliers.rig.relative_poses
-        right = [one for one in poses if (one.a, one.b) not in wrong]
-        by_images = [(fit.a, fit.b, fit.covariance) for fit in known.pair_fits]
-        return group_tied(free, [*by_images, *measured_pairs(right)])
-
-    def probability_beyond(self, camera: str) -> float:
-        """The probability that its error is beyond the tolerance, by its posterior."""
-        if camera in self.solution.held or self.covariance_of_matches is None:
-            return 0.0
-        return self._beside_images.probability_beyond(camera, self.solution.config.tolerance)
-
-    @property
-    def covariance_of_matches(self) -> Array | None:
-        """(6 N, 6 N): the marginal of the solution's graph."""
-        return self.solution.marginals.covariance
+        return {} if self.bars is None else self.bars.posteriors
 
     @property
     def error_sources(self) -> dict[str, ErrorSources]:
         """Per camera with an error bar, the shares of its sources."""
         joint = self.joint_covariance
-        return {} if joint is None else self.solution.marginals.error_sources(joint)
+        return {} if joint is None else self.solution.error_sources(joint)
 
-    @cached_property
-    def pair_fits(self) -> list[PairFit]:
-        """The relative poses of pairs by images, the first camera held near the solution."""
-        marginals, joint = self.solution.marginals, self.joint_covariance
-        return marginals.pair_fits if not self.posteriors else marginals.fit_pairs_near(joint)
+    def probability_beyond(self, camera: str) -> float:
+        """The probability that its error is beyond the tolerance, by its posterior."""
+        if camera in self.solution.held or self.bars is None:
+            return 0.0
+        return self.bars.probability_beyond(camera, self.solution.config.tolerance)
 
     def covariance_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, with the error that all the matcher's frames share."""
-        return self._block(self.joint_covariance, camera)
+        return self._rows_of(self.joint_covariance, camera)
 
     def covariance_by_matches(self, camera: str) -> Array | None:
         """(6, 6) of one camera, not widened by what the images leave open."""
-        return self._block(self.covariance_of_matches, camera)
+        return self._rows_of(None if self.bars is None else self.bars.by_matches, camera)
 
-    @property
-    def lens_covariance(self) -> dict[str, Array]:
-        """Per camera whose lens is estimated, (6 + k, 6 + k): the pose's part is ``covariance_of``.
-
-        What widens that beyond the solution's graph is not correlated with the lens.
-        """
-        found = self.solution.lens_covariance
-        for name, joint in found.items():
-            if (own := self.covariance_of(name)) is not None:
-                joint[:6, :6] = own
-        return found
-
-    def _block(self, joint: Array | None, camera: str) -> Array | None:
-        held = camera in self.solution.held
-        return None if joint is None or held else self._rows_of(joint, camera)
-
-    def _rows_of(self, joint: Array, camera: str) -> Array:
-        """(6, 6) of one camera, of the (6 N, 6 N) of all."""
+    def _rows_of(self, joint: Array | None, camera: str) -> Array | None:
+        if joint is None or camera in self.solution.held:
+            return None
         rows = pose_rows(self.cameras.index(camera))
         return joint[rows, rows]
 
-    @cached_property
-    def bootstrap(self) -> dict[str, Array]:
-        """Per camera (6, 6) scatter of re-solves from frames drawn again; empty if not wanted."""
-        config = self.solution.config
-        return bootstrap_covariances(self.solution.fitted, config.bootstrap, config.seed)
-
-    @cached_property
-    def prior_shares(self) -> dict[str, float]:
-        """Per camera, which share of its result comes from priors and relative poses."""
-        return prior_shares(self.solution)
-
-    def estimate(self, camera: str) -> Estimate:
-        """The input of the checks of one camera's estimate.
-
-        Of the matches alone: where the images are flat, the error bar says so, and no check fails.
-        """
-        solution, block = self.solution, self.solution.inliers.blocks.get(camera)
-        sigmas, conflicts = solution.marginals.data_sigmas, solution.marginals.conflicts
-        return Estimate(
-            has_matches=camera in solution.objective.blocks,
-            used=0 if block is None else len(block.frame),
-            frames=0 if block is None else len(block.frame_edges) - 1,
-            covariance=self.covariance_by_matches(camera),
-            data_sigmas=None if sigmas is None else sigmas[self.cameras.index(camera)],
-            conflicts=tuple(c for c in conflicts if camera in (c.pair.a, c.pair.b)),
-            converged=solution.optimum.converged,
-            terms=solution.terms,
-            held=camera in solution.held,
-            excluded=camera in self.excluded,
-            scatter_only=not self.findings.states_common_error,
-            tolerance=solution.config.tolerance,
-            lens=solution.lens.get(camera, ()),
-        )
+    def pair_covariances(self) -> dict[str, Array]:
+        """Per pair "A->B", (6, 6): by second moments of the mounts about the solution, widened."""
+        mount, T = self.solution.mount, self.solution.T_camera_lidar
+        if mount is None or self.bars is None:
+            return {}
+        away = np.concatenate([twist_between(mount.T_camera_lidar[name], T[name]) for name in T])
+        joint = self.bars.widen(mount.covariance + np.outer(away, away))
+        return pair_covariances(joint, T, self.solution.held)
 
 
-@dataclass(frozen=True, eq=False)
-class RunEvidence:
-    """All rounds of matching and solving, and the SHA-256 of the files they read.
+def gather(
+    solution: Solution,
+    guess: Rig,
+    measure: MeasurePosteriors = no_posteriors,
+    *,
+    excluded: tuple[str, ...] = (),
+) -> Evidence:
+    """The evidence of a solution.
+
+    Args:
+        solution: of a table.
+        guess: the rig as it was first guessed.
+        measure: gives the posteriors by the images.
+        excluded: cameras that the user excluded.
+    """
+    cameras, config = tuple(solution.T_camera_lidar), solution.config
+    tied, known = _tied(solution), solution.covariance
+    bars, joint = None, None
+    if known is not None:
+        rows = {name: pose_rows(number) for number, name in enumerate(cameras)}
+        own = {name: known[rows[name], rows[name]] for group in tied for name in group}
+        bars = ImagePosteriors(cameras, known, measure(own, tied))
+        joint = bars.widen(known)
+    drawn = bootstrap_covariances(solution.fitted, config.bootstrap, config.seed)
+    return Evidence(solution, guess, excluded, tied, bars, joint, drawn, prior_shares(solution))
+
+
+def _tied(solution: Solution) -> list[tuple[str, ...]]:
+    """The free cameras in groups; a measured pose that contradicts the matches ties nothing."""
+    free = [name for name in solution.T_camera_lidar if name not in solution.held]
+    limit, known = error_components().contradiction_sigmas, solution
+    wrong = {(one.pair.a, one.pair.b) for one in known.conflicts if one.largest > limit}
+    poses = solution.inliers.rig.relative_poses
+    right = [one for one in poses if (one.a, one.b) not in wrong]
+    by_images = [(fit.a, fit.b, fit.covariance) for fit in known.pair_fits]
+    return group_tied(free, [*by_images, *measured_pairs(right)])
+
+
+def gather_of_run(run: MatchingRun, *, asks_guess: bool = False) -> Evidence:
+    """The evidence of a run's solution, with posteriors if its matcher uses what these scores do.
 
     ``asks_guess``: whether the guess is a pose in question, as in ``check``.
     """
+    measure: MeasurePosteriors = no_posteriors
+    if run.matcher.image_checks_can_fail and not run.out_of_time:
+        asked = run.guess.T_camera_lidar if asks_guess else None
+        rig, seed = run.solution.solved_rig, run.solution.config.seed
+        measure = partial(measure_posteriors, run.dataset, rig, asked=asked, seed=seed)
+    return gather(run.solution, run.guess, measure, excluded=run.excluded)
 
-    run: MatchingRun
-    hashes: Mapping[str, str]
-    progress: Progress = no_progress
-    asks_guess: bool = False
 
-    @cached_property
-    def solution(self) -> Evidence:
-        """The evidence of the last round's solution."""
-        run = self.run
-        return Evidence(run.solution, run.guess, self._measure_posteriors, run.excluded)
-
-    def grade_by_images(self, checks: Checks) -> Checks:
-        """Checks on images, without a FAIL where those of the run's matcher WARN at most."""
-        if self.run.matcher.image_checks_can_fail:
-            return checks
-        return {
-            name: [replace(c, status="WARN") if c.status == "FAIL" else c for c in of_camera]
-            for name, of_camera in checks.items()
-        }
-
-    def _measure_posteriors(
-        self, covariances: Mapping[str, Array], groups: Sequence[Sequence[str]]
-    ) -> Mapping[str, PosePosterior]:
-        """By the images; empty with matchers that may use what these scores do not."""
-        run = self.run
-        if run.out_of_time or not run.matcher.image_checks_can_fail:
-            return {}
-        asked = run.guess.T_camera_lidar if self.asks_guess else None
-        data, rig, seed = run.dataset, run.solution.solved_rig, run.solution.config.seed
-        return measure_posteriors(data, rig, covariances, groups, asked=asked, seed=seed)
+def grade_by_images(run: MatchingRun, checks: Checks) -> Checks:
+    """Checks on images, without a FAIL where those of the run's matcher WARN at most."""
+    if run.matcher.image_checks_can_fail:
+        return checks
+    return {
+        name: [replace(c, status="WARN") if c.status == "FAIL" else c for c in of_camera]
+        for name, of_camera in checks.items()
+    }
 
 
 def concatenate(parts: Sequence[Checks], cameras: Sequence[str]) -> dict[str, list[Check]]:

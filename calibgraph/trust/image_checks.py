@@ -7,17 +7,18 @@ from collections.abc import Mapping, Sequence
 
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
+from calibgraph.matching.run import MatchingRun
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.progress import Progress
-from calibgraph.trust.evidence import Checks, RunEvidence
+from calibgraph.trust.evidence import Checks, grade_by_images
 from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
 from calibgraph.trust.lens_parameter import IMAGES, check_parameter
 from calibgraph.trust.thresholds import limit, threshold
 
 
-def image_checks(evidence: RunEvidence) -> Checks:
+def image_checks(run: MatchingRun) -> Checks:
     """Whether the images agree with a result; nothing if there is no time left for them.
 
     They are scored as by the matcher ``structure``, which does not use all that other matchers use:
@@ -25,19 +26,18 @@ def image_checks(evidence: RunEvidence) -> Checks:
     camera pairs, the one without them is checked: next to a camera with a wrong lens, a right one
     is moved, and at the wrong one's place the lens cannot be measured.
     """
-    run = evidence.run
     if run.out_of_time:
         return {}
     rig, config = run.solution.without_pairs().solved_rig, run.solution.config
     try:
         checks = check_images(
             run.dataset, rig, run.correspondences,
-            tolerance=config.tolerance, seed=config.seed, progress=evidence.progress,
+            tolerance=config.tolerance, seed=config.seed, progress=run.progress,
         )  # fmt: skip
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
         text = f"the images could not be checked: {error}"
         return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
-    return evidence.grade_by_images(checks)
+    return grade_by_images(run, checks)
 
 
 def check_images(
@@ -100,23 +100,14 @@ def evidence_checks(
             "image and cloud"
         )
         return (Check("image evidence", "WARN", text, found.groups),)
-    displaced = threshold("displaced_z_score").check(found.displaced_z_score)
-    frames = _check_frames(found, names)
-    mispaired = found.frames_best <= threshold("frames_best").fail
+    row, advice, lost = threshold("displaced_z_score"), "", found.frames_lost
+    if found.frames_best < limit("frames_best"):
+        advice = f"{row.advice}; frames {', '.join(names[n] for n in lost[:5])} fit another better"
+    displaced = row.check(found.displaced_z_score, advice=advice)
+    mispaired = found.frames_best <= limit("lens_frames_best")
     if found.displaced_z_score < limit("lens_z_score") or mispaired:
-        return displaced, frames  # at a wrong extrinsic the lens cannot be measured
-    lens = (check_parameter(each, IMAGES, tolerance) for each in found.lens)
-    return displaced, frames, *lens
-
-
-def _check_frames(found: ImageEvidence, names: Mapping[int, str]) -> Check:
-    numbers = found.frames_lost
-    lost = ", ".join(f"{n} ({names[n]})" for n in numbers[:5]) + (", ..." if numbers[5:] else "")
-    advice = (
-        f"frames {lost} have higher scores at displaced extrinsics; do their images and clouds "
-        "belong together?"
-    )
-    return threshold("frames_best").check(found.frames_best, advice=advice)
+        return (displaced,)  # at a wrong extrinsic the lens cannot be measured
+    return displaced, *(check_parameter(each, IMAGES, tolerance) for each in found.lens)
 
 
 def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:

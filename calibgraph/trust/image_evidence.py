@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import cv2
 import numpy as np
@@ -40,15 +39,13 @@ from calibgraph.matching.structure.shift_scores import (
     crop_grids,
     score_frame,
 )
-from calibgraph.model.clock import at_pixels, clock_of
+from calibgraph.model.clock import clock_of
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress, no_progress
-from calibgraph.solver.camera_twist import apply_twist
-from calibgraph.solver.linear_fit import LinearFit, block_of, fit_camera
-from calibgraph.solver.scan_distortion import distortion_fields_px
+from calibgraph.solver.columns import ColumnFit, apply_twist, block_of, fit_columns
 from calibgraph.trust.lens_parameter import (
     NAMES,
     Free,
@@ -58,7 +55,8 @@ from calibgraph.trust.lens_parameter import (
     units_of,
 )
 from calibgraph.trust.thresholds import limit
-from factors import displace
+from factors import Columns, displace
+from factors.columns import DISTORTION
 
 Images = Sequence[PreparedImage]
 """Images of one camera, one per frame."""
@@ -157,12 +155,19 @@ def measure_image_evidence(
             scores = concatenate_scores([one for one in each if one is not None])
             if len(scores.weights) < MIN_GROUPS:
                 return ImageEvidence(len(scores.weights))
-            found = ImageEvidence(len(scores.weights), **_compare_with_displaced(scores))
+            numbers, per_frame = score_displaced(scores)  # over the same windows
+            best = per_frame[:, 0] > per_frame[:, 1:].max(axis=1)
+            found = ImageEvidence(
+                len(scores.weights),
+                displaced_z_score=displaced_z_score(per_frame),
+                frames_best=float(best.mean()),
+                frames_lost=tuple(numbers[~best].tolist()),
+            )
             if extrinsics_only:
                 return found
             lens = measure_lens(scorer, images, camera, scores, seed=seed, places=places)
-            with_neighbours = _compare_with_neighbours(scorer, images, camera, each)
-            return replace(found, lens=lens, **with_neighbours)
+            offset, margin = _compare_with_neighbours(scorer, images, camera, each)
+            return replace(found, lens=lens, pair_offset=offset, pair_margin=margin)
 
         measured = pool.map(measure, rig.cameras, rig.cameras.values())
         for index, name in enumerate(rig.cameras):
@@ -171,21 +176,10 @@ def measure_image_evidence(
     return evidence
 
 
-def _compare_with_displaced(scores: ShiftScores) -> dict[str, Any]:
-    """Compare the score at the result with displaced poses, over the same windows."""
-    frames, per_frame = score_displaced(scores)
-    best = per_frame[:, 0] > per_frame[:, 1:].max(axis=1)
-    return {
-        "displaced_z_score": displaced_z_score(per_frame),
-        "frames_best": float(best.mean()),
-        "frames_lost": tuple(frames[~best].tolist()),
-    }
-
-
 def _compare_with_neighbours(
     scorer: FrameScorer, images: Images, camera: Camera, wide: Sequence[ShiftScores | None]
-) -> dict[str, Any]:
-    """Compare each image's agreement with its own cloud, at ``WIDE``, and its neighbours'."""
+) -> tuple[int, float]:
+    """Offset and margin of each image's agreement with its own cloud, at ``WIDE``, and others'."""
     before, after = (scorer.score(images, camera, PAIR_LEVEL, offset=offset) for offset in (-1, 1))
     own = [one and crop_grids(one, camera, PAIR_LEVEL) for one in wide]
     values = np.array([  # (3, frames) z-scores at the result; NaN where there is no such cloud
@@ -194,16 +188,14 @@ def _compare_with_neighbours(
     ])  # fmt: skip
     comparable = np.isfinite(values[1]) & np.isfinite(values[[0, 2]]).any(axis=0)
     if not comparable.any():
-        return {}
+        return 0, math.nan
     before_z, own_z, after_z = values[:, comparable]
     margins = [own_z - before_z, own_z - after_z]
     worse = int(np.argmin([np.nanmean(m) if np.isfinite(m).any() else np.inf for m in margins]))
     there = np.isfinite(margins[worse])
-    sums = own_z[there].sum(), (before_z, after_z)[worse][there].sum()
-    return {
-        "pair_offset": 0 if sums[0] >= sums[1] else (-1, 1)[worse],
-        "pair_margin": float((sums[0] - sums[1]) / (max(abs(sums[0]), abs(sums[1])) + 1e-12)),
-    }
+    own_sum, other = own_z[there].sum(), (before_z, after_z)[worse][there].sum()
+    margin = float((own_sum - other) / (max(abs(own_sum), abs(other)) + 1e-12))
+    return 0 if own_sum >= other else (-1, 1)[worse], margin
 
 
 SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)
@@ -286,21 +278,21 @@ def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: in
 
 def _fit_at_peaks(
     scorer: FrameScorer, camera: Camera, scores: ShiftScores, start: Array, *, places: Places
-) -> LinearFit | None:
+) -> ColumnFit | None:
     """Fit pose and lens to the groups' peaks next to a start, (11,); the scan may be distorted."""
     if not len(scores.weights):
         return None
     table = extract_correspondences(scores, start, "camera")
-    table = at_pixels(camera, with_motion(table, scorer.dataset))
+    table = with_motion(table, scorer.dataset)
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
     usual = MatcherFindings.from_metadata({"matcher": "structure"})
-    points = block.block.points_lidar_m
     of_place = usual.place_variance * places.frames_per_place(block.frame_numbers)
-    bends = distortion_fields_px(camera, points) * np.reshape(usual.bend_sigmas, (3, 1, 1))
-    return fit_camera(
-        camera,
+    lens = lens_variable(camera).free
+    names, sigmas = (*lens.parameters, *DISTORTION), (*lens.sigmas, *usual.bend_sigmas)
+    return fit_columns(
         block,
-        np.concatenate([lens_fields_px(camera, points), bends]),
+        camera.T_camera_lidar,
+        Columns(camera.lens, names, sigmas),
         shared_variance=max(of_place, limit("lens_match_share") * len(block)),
-        considered=len(bends),
+        considered=len(DISTORTION),
     )

@@ -26,7 +26,7 @@ from calibgraph.model.lens import has_other_lens, lens_difference
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.trust.evidence import Checks, Evidence
-from calibgraph.trust.pose_posterior import MeasurePosteriors, PosePosterior
+from calibgraph.trust.pose_posterior import PosePosterior
 
 _SAME_SIGMAS = 1.0  # along every axis: at such a pose the images say the same
 _SAME_PX, _GRID = 0.5, 9  # all over the image, so many pixels a side: such a lens is the same
@@ -58,27 +58,21 @@ class _Posterior(BaseModel):
     elsewhere: _Samples
     share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
+    def about(self, seen: Camera, camera: Camera) -> PosePosterior:
+        """The posterior of a camera that has another pose than the one that was seen."""
+        away = twist_between(seen.T_camera_lidar, camera.T_camera_lidar)
+        return PosePosterior(self.near + away, self.elsewhere + away, self.share)
+
 
 class _Seen(BaseModel):
     """One camera: how it was when its images were looked at, and what they said."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(extra="forbid")
 
     camera: Camera
     causes: tuple[Check, ...] = ()
     checks: tuple[Check, ...] = ()
     posterior: _Posterior | None = None
-
-
-class _Record(BaseModel):
-    """Of a run; of joined tables, the cameras that several runs have looked at."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    format: Literal["calibgraph-images/1"] = "calibgraph-images/1"
-    tolerance: tuple[float, float] = TOLERANCE
-    cameras: dict[str, _Seen] = {}
-    joined: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -93,6 +87,94 @@ class RunChecks:
     of_run: Checks = field(default_factory=dict)
     causes: Checks = field(default_factory=dict)
     unseen: Collection[str] = ()
+
+
+class ImageRecord(BaseModel):
+    """Of a run; of joined tables, the cameras that several runs have looked at; else empty."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    format: Literal["calibgraph-images/1"] = "calibgraph-images/1"
+    tolerance: tuple[float, float] = TOLERANCE
+    cameras: dict[str, _Seen] = {}
+    joined: tuple[str, ...] = ()
+
+    @staticmethod
+    def from_metadata(metadata: Mapping[str, Any]) -> ImageRecord:
+        """Read the key of a table's metadata.
+
+        Raises:
+            CorrespondenceError: if it is malformed.
+        """
+        try:
+            return ImageRecord.model_validate(metadata.get(IMAGES) or {})
+        except ValidationError as error:
+            raise CorrespondenceError(f"metadata {IMAGES!r}: {describe(error)}") from error
+
+    def posteriors_of(
+        self, cameras: Mapping[str, Camera], groups: Sequence[Sequence[str]]
+    ) -> dict[str, PosePosterior]:
+        """The posteriors about solved cameras that have the lens that was looked at."""
+        return {
+            name: seen.posterior.about(seen.camera, cameras[name])
+            for name, seen in self.cameras.items()
+            if any(name in group for group in groups)
+            and seen.posterior
+            and _same_lens(seen.camera, cameras[name])
+        }
+
+    def checks(self, evidence: Evidence, of_solution: Checks) -> RunChecks:
+        """Those of a solution of the table, with what was recorded of the cameras as they are."""
+        if not self.cameras and not self.joined:
+            return RunChecks(of_solution, unseen=evidence.cameras)
+        other = {name: self._compare(evidence, name) for name in evidence.cameras}
+        seen = {name: self.cameras[name] for name, check in other.items() if check is None}
+        same = evidence.solution.config.tolerance == self.tolerance
+        wider = [] if same else [_not_compared(self._judged)]
+        of_run = {name: [*of.checks, *wider] for name, of in seen.items()}
+        told = {name: [check] for name, check in other.items() if check is not None}
+        causes = {name: of.causes for name, of in seen.items()}
+        return RunChecks(of_solution, {**of_run, **told}, causes, [*told])
+
+    @property
+    def _judged(self) -> str:
+        return "its images were judged for a tolerance of {:g} deg, {:g} cm".format(*self.tolerance)
+
+    def _compare(self, evidence: Evidence, name: str) -> Check | None:
+        """Why nothing that was seen is of this camera of a solution; None if it is.
+
+        A FAIL if the recorded posterior excludes the pose of a camera with the same lens.
+        """
+        if name in self.joined or name not in self.cameras:
+            several = "the joined tables are of several runs"
+            unseen = "its images were not compared with clouds"
+            return _not_compared(several if name in self.joined else unseen)
+        of, camera = self.cameras[name], evidence.solution.solved_rig.cameras[name]
+        seen, tolerance = of.camera, evidence.solution.config.tolerance
+        same_lens, same_clock = _same_lens(seen, camera), _same_clock(seen, camera)
+        away = twist_between(camera.T_camera_lidar, seen.T_camera_lidar)
+        degrees, cm = pose_difference(camera.T_camera_lidar, seen.T_camera_lidar)
+        apart = f"{degrees:.2g} deg, {cm:.2g} cm"
+        near = degrees <= tolerance[0] and cm <= tolerance[1]
+        if (covariance := evidence.covariance_by_matches(name)) is not None:
+            near = bool((np.abs(away) <= _SAME_SIGMAS * np.sqrt(np.diag(covariance))).all())
+        wider = tolerance[0] > self.tolerance[0] or tolerance[1] > self.tolerance[1]
+        differences = (
+            (wider, self._judged),
+            (not same_lens, "another lens was compared with its images"),
+            (not same_clock, "another time of its images was compared"),
+            (not near, f"a pose {apart} from this one was compared with its images"),
+        )
+        why = next((text for differs, text in differences if differs), "")
+        if why and of.posterior and same_lens and same_clock and covariance is not None:
+            total = of.posterior.about(seen, seen).moments + covariance
+            if away @ np.linalg.solve(total, away) >= _EXCLUDED_SIGMAS**2:
+                text = (
+                    f"its images exclude this pose: with them it was {apart} away; the table was "
+                    "changed since, or is of another rig"
+                )
+                return Check("images", "FAIL", text)
+        return _not_compared(why) if why else None
 
 
 def to_metadata(evidence: Evidence, checks: RunChecks) -> dict[str, Any]:
@@ -112,106 +194,8 @@ def to_metadata(evidence: Evidence, checks: RunChecks) -> dict[str, Any]:
         for name in evidence.cameras
     }
     tolerance = evidence.solution.config.tolerance
-    record = _Record.model_construct(tolerance=tolerance, cameras=seen)
+    record = ImageRecord.model_construct(tolerance=tolerance, cameras=seen)
     return {IMAGES: record.model_dump(mode="json")}
-
-
-@dataclass(frozen=True)
-class ImageRecord:
-    """The record of a table, which may be empty: of a table that no run has left."""
-
-    content: _Record
-
-    @staticmethod
-    def from_metadata(metadata: Mapping[str, Any]) -> ImageRecord:
-        """Read the key of a table's metadata.
-
-        Raises:
-            CorrespondenceError: if it is malformed.
-        """
-        try:
-            return ImageRecord(_Record.model_validate(metadata.get(IMAGES) or {}))
-        except ValidationError as error:
-            raise CorrespondenceError(f"metadata {IMAGES!r}: {describe(error)}") from error
-
-    def posteriors_of(self, cameras: Mapping[str, Camera]) -> MeasurePosteriors:
-        """What gives the posteriors about solved cameras that have the lens that was looked at."""
-        known = self.content.cameras
-
-        def measure(_: Any, groups: Sequence[Sequence[str]]) -> dict[str, PosePosterior]:
-            found = {}
-            for name in (name for group in groups for name in group if name in known):
-                seen, camera = known[name], cameras[name]
-                if seen.posterior is None or not _same_lens(seen.camera, camera):
-                    continue
-                away = twist_between(seen.camera.T_camera_lidar, camera.T_camera_lidar)
-                near, elsewhere = seen.posterior.near + away, seen.posterior.elsewhere + away
-                found[name] = PosePosterior(near, elsewhere, seen.posterior.share)
-            return found
-
-        return measure
-
-    def checks(self, evidence: Evidence, of_solution: Checks) -> RunChecks:
-        """Those of a solution of the table, with what was recorded of the cameras as they are."""
-        if not self.content.cameras and not self.content.joined:
-            return RunChecks(of_solution, unseen=evidence.cameras)
-        other = {name: self._other_than_seen(evidence, name) for name in evidence.cameras}
-        seen = {name: self.content.cameras[name] for name, text in other.items() if not text}
-        (deg, cm), wanted = self.content.tolerance, evidence.solution.config.tolerance
-        judged = f"its images were judged for a tolerance of {deg:g} deg, {cm:g} cm"
-        wider = [] if wanted == self.content.tolerance else [_not_compared(judged)]
-        of_run = {name: [*of.checks, *wider] for name, of in seen.items()}
-        told = {
-            name: [self._contradiction(evidence, name) or _not_compared(text)]
-            for name, text in other.items()
-            if text
-        }
-        causes = {name: of.causes for name, of in seen.items()}
-        return RunChecks(of_solution, {**of_run, **told}, causes, [*told])
-
-    def _contradiction(self, evidence: Evidence, name: str) -> Check | None:
-        """A FAIL if the recorded posterior excludes the pose of a camera with the same lens."""
-        seen, covariance = self.content.cameras.get(name), evidence.covariance_by_matches(name)
-        camera = evidence.solution.solved_rig.cameras[name]
-        if seen is None or seen.posterior is None or covariance is None:
-            return None
-        if not (_same_lens(seen.camera, camera) and _same_clock(seen.camera, camera)):
-            return None
-        of = seen.posterior
-        moments = PosePosterior(of.near, of.elsewhere, of.share).moments
-        away = twist_between(camera.T_camera_lidar, seen.camera.T_camera_lidar)
-        if away @ np.linalg.solve(moments + covariance, away) < _EXCLUDED_SIGMAS**2:
-            return None
-        degrees, cm = pose_difference(camera.T_camera_lidar, seen.camera.T_camera_lidar)
-        text = (
-            f"its images exclude this pose: with them it was {degrees:.2g} deg, {cm:.2g} cm away; "
-            "the table was changed since, or is of another rig"
-        )
-        return Check("images", "FAIL", text)
-
-    def _other_than_seen(self, evidence: Evidence, name: str) -> str:
-        """Why nothing that was seen is of this camera of a solution; empty if it is."""
-        if name in self.content.joined:
-            return "the joined tables are of several runs"
-        if name not in self.content.cameras:
-            return "its images were not compared with clouds"
-        seen, camera = self.content.cameras[name].camera, evidence.solution.solved_rig.cameras[name]
-        (deg, cm), tolerance = self.content.tolerance, evidence.solution.config.tolerance
-        if tolerance[0] > deg or tolerance[1] > cm:
-            return f"its images were judged for a tolerance of {deg:g} deg, {cm:g} cm"
-        if not _same_lens(seen, camera):
-            return "another lens was compared with its images"
-        if not _same_clock(seen, camera):
-            return "another time of its images was compared"
-        covariance = evidence.covariance_by_matches(name)
-        away = pose_difference(camera.T_camera_lidar, seen.T_camera_lidar)
-        if covariance is None:
-            near = away[0] <= tolerance[0] and away[1] <= tolerance[1]
-        else:
-            twist = twist_between(camera.T_camera_lidar, seen.T_camera_lidar)
-            near = bool((np.abs(twist) <= _SAME_SIGMAS * np.sqrt(np.diag(covariance))).all())
-        words = f"a pose {away[0]:.2g} deg, {away[1]:.2g} cm from this one"
-        return "" if near else f"{words} was compared with its images"
 
 
 def _not_compared(why: str) -> Check:

@@ -19,17 +19,15 @@ from calibgraph.errors import CalibrationError
 from calibgraph.io.bags import is_bag
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import seconds_between
-from calibgraph.io.kept_frames import KeptFrame
 from calibgraph.matching.run import MatchingRun, with_motion
-from calibgraph.model.clock import at_pixels, clock_of
+from calibgraph.model.clock import clock_of
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import map_on_cores
-from calibgraph.solver.camera_twist import free_fields_px
-from calibgraph.solver.linear_fit import Freed, LinearFit, block_of, fit_camera
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
+from calibgraph.solver.columns import ColumnFit, Marginal, block_of, fit_columns
+from calibgraph.trust.evidence import Checks, Evidence, grade_by_images
 from calibgraph.trust.inputs import INTERVAL_S, MAX_FRAMES, registered_twists
 from calibgraph.trust.lens_parameter import (
     IMAGES,
@@ -38,12 +36,12 @@ from calibgraph.trust.lens_parameter import (
     Free,
     LensParameter,
     check_parameter,
-    lens_fields_px,
+    lens_variable,
     units_of,
 )
 from calibgraph.trust.thresholds import limit, threshold
-from factors import FreeLens
-from factors.free_lens import CLOCK, OFFSET
+from factors import Columns
+from factors.columns import CLOCK, OFFSET
 
 USUAL_SIGMA_S = 0.002  # of an offset, where the rig states none: of sensors that are synchronised
 MIN_FRAMES = 4  # with fewer, a single frame decides
@@ -66,12 +64,12 @@ def asks_offset(run: MatchingRun) -> bool:
     return bool(run.matcher.tracking_rounds) and not (run.out_of_time or is_free)
 
 
-def image_offset_checks(evidence: RunEvidence) -> Checks:
+def image_offset_checks(run: MatchingRun) -> Checks:
     """The offset of each camera by matches that are made for it, unless it is estimated.
 
     By a matcher made for them, since that of the run has been released.
     """
-    run, config = evidence.run, evidence.run.solution.config
+    config = run.solution.config
     if not asks_offset(run):
         return {}
     rig, moved, registered = run.solution.without_pairs().solved_rig, None, False
@@ -85,7 +83,7 @@ def image_offset_checks(evidence: RunEvidence) -> Checks:
         cameras = {name: each.model_copy(update=none) for name, each in rig.cameras.items()}
         rig = rig.model_copy(update={"cameras": cameras})
     table = matcher.match(
-        moved, rig, round_index=matcher.tracking_rounds[-1], progress=evidence.progress
+        moved, rig, round_index=matcher.tracking_rounds[-1], progress=run.progress
     )
     matcher.release()
     table = with_motion(table, moved).with_places(run.correspondences.places)
@@ -95,7 +93,7 @@ def image_offset_checks(evidence: RunEvidence) -> Checks:
     if registered and seconds_between(*moved.frames[:2]) is None:
         taken = f"; successive clouds are taken to be {INTERVAL_S:g} s apart"
         checks = {n: [replace(c, text=c.text + taken) for c in of] for n, of in checks.items()}
-    return evidence.grade_by_images(checks)
+    return grade_by_images(run, checks)
 
 
 def _motion_options(dataset: Dataset) -> str:
@@ -136,17 +134,15 @@ def fit_offset(
 
     ``place_variance`` is what the matches of a place share, over that of independent ones.
     """
-    table = at_pixels(camera, table.select(np.argsort(table.frame, kind="stable")))
     if len(np.unique(table.frame)) < MIN_FRAMES or table.twist_per_s is None:
         return None
     sigma_s = camera.time_offset_sigma_s or USUAL_SIGMA_S
-    free = FreeLens(camera.lens, (OFFSET,), (sigma_s,), clock_of(camera))
-    fields = free_fields_px(camera, free, table.points_lidar_m, table.twist_per_s)
+    free = Columns(camera.lens, (OFFSET,), (sigma_s,), clock_of(camera))
     places = table.places
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
     of_place = place_variance * places.frames_per_place(block.frame_numbers)
     shared = max(of_place, limit("lens_match_share") * len(block))
-    fit = fit_camera(camera, block, fields, shared_variance=shared)
+    fit = fit_columns(block, camera.T_camera_lidar, free, shared_variance=shared)
     return None if fit is None else LensParameter.of(TIME, np.array([sigma_s]), fit.free(0))
 
 
@@ -155,9 +151,7 @@ def _with_known_motion(dataset: Dataset) -> tuple[Dataset | None, bool]:
     found = registered_twists(dataset)
     chosen = spread_out(dataset.frames, MAX_FRAMES)
     frames = [
-        replace(frame, twist=found[frame.index])
-        if isinstance(frame, KeptFrame) and frame.index in found
-        else frame
+        replace(frame, twist=found[frame.index]) if frame.kept and frame.index in found else frame
         for frame in chosen
         if frame.index in found or frame.twist_per_s is not None
     ]
@@ -178,23 +172,22 @@ def intrinsics_checks(evidence: Evidence) -> Checks:
     is taken for at least that of a small share of each match. Of a panorama the format determines
     the lens.
     """
-    evidence = evidence.of_correspondences
-    cameras = evidence.solution.solved_rig.cameras
+    cameras = evidence.solution.without_pairs().solved_rig.cameras
     names = [n for n in evidence.fitted_blocks if cameras[n].model != "equirectangular"]
     checks = map_on_cores(lambda name: _check_camera(evidence, name), names)
     return dict(zip(names, checks, strict=True))
 
 
 def _check_camera(evidence: Evidence, name: str) -> list[Check]:
-    solution, block = evidence.solution, evidence.fitted_blocks[name]
+    solution, block = evidence.solution.without_pairs(), evidence.fitted_blocks[name]
     camera, places = solution.solved_rig.cameras[name], solution.correspondences.places
     of_place = places.frames_per_place(block.frame_numbers) * evidence.findings.place_variance
     some = block.select_evenly(_MAX_MATCHES)
     seen = some.select(some.errors_px(camera.T_camera_lidar)[1])
-    fit = fit_camera(
-        camera,
+    fit = fit_columns(
         seen,
-        lens_fields_px(camera, seen.block.points_lidar_m),
+        camera.T_camera_lidar,
+        lens_variable(camera).free,
         loss_scale=solution.scales[name].loss_scale,
         shared_variance=max(of_place, limit("lens_match_share") * len(some)),
     )
@@ -211,9 +204,9 @@ def _check_camera(evidence: Evidence, name: str) -> list[Check]:
     return [*checks, row.check(100 * moved_m)]
 
 
-def _free_each(fit: LinearFit) -> dict[str, Freed]:
+def _free_each(fit: ColumnFit) -> dict[str, Marginal]:
     """The fit of each parameter; those of as many numbers together."""
-    freed: dict[str, Freed] = {}
+    freed: dict[str, Marginal] = {}
     for count in (1, 2):
         names = [name for name, numbers in _NUMBERS.items() if len(numbers) == count]
         freed |= zip(names, fit.free_each([_NUMBERS[name] for name in names]), strict=True)

@@ -24,10 +24,10 @@ from calibgraph.model.config import LensPart
 from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Check, Status
-from calibgraph.solver.linear_fit import Freed
+from calibgraph.solver.columns import Marginal
 from calibgraph.trust.thresholds import limit, threshold
-from factors import FreeLens
-from factors.free_lens import ASPECT, CENTRE_X, CENTRE_Y, FOCAL
+from factors import Columns, fields_px
+from factors.columns import ASPECT, CENTRE_X, CENTRE_Y, FOCAL
 
 
 class Free(IntEnum):
@@ -72,7 +72,7 @@ def lens_variable(camera: Camera) -> LensVariable:
     """The lens of a camera with the parameters that are checked, at its calibration."""
     all_of = LensVariable.of(camera, _PARTS, LensSigmas.calibrated(camera)).free
     sigmas = dict(zip(all_of.parameters, all_of.sigmas, strict=True)) | {ASPECT: _ASPECT_SIGMA}
-    free = FreeLens(camera.lens, _NAMES, tuple(sigmas[name] for name in _NAMES))
+    free = Columns(camera.lens, _NAMES, tuple(sigmas[name] for name in _NAMES))
     return LensVariable(camera, free, np.zeros(len(free)))
 
 
@@ -83,11 +83,8 @@ def units_of(camera: Camera) -> Array:
 
 def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
     """(5, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
-    free, T = lens_variable(camera).free, camera.T_camera_lidar
-    points = (T[:3, :3] @ points_lidar_m.T + T[:3, 3:]).T
-    fields = np.empty((len(Free), 2, len(points)))
-    free.fill_columns(camera.lens, points, fields)
-    return fields
+    free = lens_variable(camera).free
+    return fields_px(points_lidar_m, camera.T_camera_lidar, free)[1][6:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +106,7 @@ class LensParameter:
     units: Array
 
     @staticmethod
-    def of(name: str, units: Array, freed: Freed) -> LensParameter:
+    def of(name: str, units: Array, freed: Marginal) -> LensParameter:
         """Of a fit whose last unknowns have these units; others may be free before them."""
         count = len(units)
         values, covariance = _beside_others(name, freed, len(freed.values) - count)
@@ -180,7 +177,7 @@ class LensParameter:
         return (less if less and self.values[0] < 0 else more).format(numbers)
 
 
-def _beside_others(name: str, freed: Freed, others: int) -> tuple[Array, Array]:
+def _beside_others(name: str, freed: Marginal, others: int) -> tuple[Array, Array]:
     """(m,) values and (m, m) covariance of unknowns beside others, the first of a fit.
 
     A focal length that is 1 % off is no less rare beside a distortion than alone. So the other

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from calibgraph.io.dataset import Dataset
-from calibgraph.matching.run import Rematch
+from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.structure.acceptance import FEW_FRAMES, SEARCH, probability_by_chance
 from calibgraph.matching.structure.global_search import ALONE
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_difference
 from calibgraph.model.verdict import FAIL_ABOVE, TOLERANCE, WENT_ON, Check
-from calibgraph.trust.evidence import Checks, Evidence, RunEvidence
+from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.inputs import describe_copies, describe_repeats
 from calibgraph.trust.solution_checks import check_sigmas
 from calibgraph.trust.thresholds import threshold
@@ -24,52 +22,46 @@ _OF_FEW_FRAMES = replace(SEARCH, sigma=0.0)  # in which the search has measured 
 
 
 def matcher_checks(evidence: Evidence) -> Checks:
-    """The checks of every camera's matches.
+    """The checks of every camera's matches, by what its matcher states.
 
     The error that all frames share is part of the error bar, with which it is checked; where there
     is no error bar it is checked alone.
     """
     table, findings = evidence.solution.correspondences, evidence.findings
-    few = {  # in more frames no search measures what is found by chance
-        name: chance
-        for name, chance in findings.chance.items()
-        if len(np.unique(table.of_camera(name).frame)) <= FEW_FRAMES
-    }
-    findings = replace(findings, chance=few)
     known = evidence.joint_covariance is not None
     sigmas = None if known else np.repeat(findings.systematic_sigmas, 3)
     what, tolerance = "error that the matcher's frames share", evidence.solution.config.tolerance
-    return {
-        name: [
-            *_search_checks(findings, name),
+    checks = {}
+    for name in evidence.cameras:
+        chance = findings.chance.get(name)
+        if chance is not None and len(np.unique(table.of_camera(name).frame)) > FEW_FRAMES:
+            chance = None  # in so many no search measures what is found by chance
+        checks[name] = [
+            *_search_checks(findings, name, chance),
             *_share_checks(findings, name),
             *check_sigmas(what, sigmas, tolerance),
-            *_agreement_checks(findings, name),
+            *_agreement_checks(findings, name, chance),
         ]
-        for name in evidence.cameras
-    }
+    return checks
 
 
-def _agreement_checks(findings: MatcherFindings, camera: str) -> list[Check]:
+def _agreement_checks(findings: MatcherFindings, camera: str, chance: float | None) -> list[Check]:
     """Whether image and cloud agree better than by chance.
 
     A search in few frames measures that; its finding stands unless the rounds have lost the pose.
     """
-    z_score, chance = findings.z_score.get(camera), findings.chance.get(camera)
-    if chance is not None and camera in findings.missed:
+    z_score = findings.z_score.get(camera)
+    if z_score is None or (chance is not None and camera in findings.missed):
         return []  # the check of the search has it
-    if z_score is None:
-        return []
     is_lost = probability_by_chance(z_score, ALONE, _OF_FEW_FRAMES) > FAIL_ABOVE
     if chance is not None and not is_lost:
         return [threshold("chance").check(chance)]
     return [threshold("z_score").check(z_score)]
 
 
-def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:
+def _search_checks(findings: MatcherFindings, camera: str, chance: float | None) -> list[Check]:
     """Whether the matcher's global search found the camera, and what it has in common agrees."""
     missed, found = findings.missed.get(camera), findings.found.get(camera)
-    chance = findings.chance.get(camera)
     if missed is not None and chance is not None:
         text = (
             f"not found: where image and cloud agree best (z-score {missed:.1f}), a search with "
@@ -87,18 +79,17 @@ def _search_checks(findings: MatcherFindings, camera: str) -> list[Check]:
     if found is None:
         return []
     text = f"z-score {found:.1f} of image and cloud where the rounds began"
-    search, other = Check("search", "PASS", text, found), findings.contradicted.get(camera)
-    if other is None:
-        return [search]
-    text = (
-        f"its image and cloud agree at its pose, but features that it has in common with {other} "
-        "place the two cameras elsewhere: do both images show the same thing that is no part of "
-        "the scene, as a text, a logo or a part of the vehicle? Else one of the two is wrong"
-    )
-    return [
-        search,
-        Check(f"features in common with {other}", "WARN", text, kind="contradiction"),
-    ]
+    checks = [Check("search", "PASS", text, found)]
+    if (other := findings.contradicted.get(camera)) is not None:
+        text = (
+            "its image and cloud agree at its pose, but features that it has in common with "
+            f"{other} place the two cameras elsewhere: do both images show the same thing that is "
+            "no part of the scene, as a text, a logo or a part of the vehicle? Else one of the two "
+            "is wrong"
+        )
+        name = f"features in common with {other}"
+        checks.append(Check(name, "WARN", text, kind="contradiction"))
+    return checks
 
 
 def _share_checks(findings: MatcherFindings, camera: str) -> list[Check]:
@@ -124,65 +115,50 @@ REMATCH_DEG, REMATCH_M = 0.5, 0.08
 """How far the start of matching again is displaced from the result."""
 
 
-def last_round_checks(evidence: RunEvidence) -> Checks:
+def last_round_checks(run: MatchingRun) -> Checks:
     """How far the last of several rounds of matching still moved the cameras."""
-    rounds, tolerance = evidence.run.rounds, evidence.run.solution.config.tolerance
-    if len(rounds) == 1:
+    if len(run.rounds) == 1:
         return {}
     keys = ("last_round_rotation", "moved_deg"), ("last_round_translation", "moved_cm")
-    return {
-        name: [threshold(key, tolerance).check(moved[of]) for key, of in keys]
-        for name, moved in rounds[-1].items()
-    }
+    rows = [(threshold(key, run.solution.config.tolerance), of) for key, of in keys]
+    return {n: [row.check(moved[of]) for row, of in rows] for n, moved in run.rounds[-1].items()}
 
 
-def repeated_file_checks(evidence: RunEvidence) -> Checks:
-    """Which frames were copies, and whether others have the same cloud or image of a camera."""
-    run, cameras = evidence.run, evidence.solution.cameras
-    checks = check_repeated_files(run.dataset, evidence.hashes, cameras)
-    if run.copies:
-        check = Check("copies", "WARN", describe_copies(run.copies), len(run.copies))
-        checks = {name: [check, *each] for name, each in checks.items()}
-    return checks
-
-
-def check_repeated_files(
-    dataset: Dataset, hashes: Mapping[str, str], cameras: Sequence[str]
-) -> dict[str, list[Check]]:
-    """Per camera, a check of the first kind of file that frames have in common, if any."""
-    frames = [(f.name, f.image_paths, hashes[str(f.cloud_path)]) for f in dataset.frames]
+def repeated_file_checks(run: MatchingRun) -> Checks:
+    """Which frames were copies, and the first kind of file that others have in common, if any."""
+    frames = [(f.name, f.image_paths, run.hashes[str(f.cloud_path)]) for f in run.dataset.frames]
     of_clouds = describe_repeats("cloud", [(name, digest) for name, _, digest in frames])
-    checks: dict[str, list[Check]] = {}
-    for camera in cameras:
-        images = [(n, hashes[str(paths[camera])]) for n, paths, _ in frames if camera in paths]
+    copied = Check("copies", "WARN", describe_copies(run.copies), len(run.copies))
+    checks = {}
+    for camera in run.guess.cameras:
+        images = [(n, run.hashes[str(paths[camera])]) for n, paths, _ in frames if camera in paths]
         text = describe_repeats(f"image of {camera}", images) or of_clouds
-        checks[camera] = [Check("equal files", "WARN", text)] if text else []
+        repeated = [Check("equal files", "WARN", text)] if text else []
+        checks[camera] = [copied, *repeated] if run.copies else repeated
     return checks
 
 
-def rematch_checks(evidence: RunEvidence) -> Checks:
+def rematch_checks(run: MatchingRun) -> Checks:
     """Whether matching again from a displaced start ended at the same result."""
-    return compare_ends(evidence.run.rematch, evidence.run.solution.config.tolerance)
+    return compare_ends(run, run.solution.config.tolerance)
 
 
-def compare_ends(rematch: Rematch | None, tolerance: tuple[float, float] = TOLERANCE) -> Checks:
+def compare_ends(run: MatchingRun, tolerance: tuple[float, float] = TOLERANCE) -> Checks:
     """Per camera, the difference between both ends, for a tolerance [deg, cm]."""
-    if rematch is None:
-        return {}
     start = f"matching again from a start {REMATCH_DEG:g} deg, {100 * REMATCH_M:g} cm off"
-    if rematch.again is None:
-        check = Check("matching again", "FAIL", f"{start} failed: {rematch.failure}")
-        return {name: [check] for name in rematch.first.cameras}
-    again, words = rematch.again.T_camera_lidar, f"{start}: difference"
+    if run.rematch_failure:
+        check = Check("matching again", "FAIL", f"{start} failed: {run.rematch_failure}")
+        return {name: [check] for name in run.rematch}
+    words = f"{start}: difference"
     rows = [threshold(f"rematch_{part}", tolerance) for part in ("rotation", "translation")]
-    apart = {n: pose_difference(T, again[n]) for n, T in rematch.first.T_camera_lidar.items()}
+    apart = {name: pose_difference(*ends) for name, ends in run.rematch.items()}
     return {
         name: [row.check(value, name=words) for row, value in zip(rows, values, strict=True)]
         for name, values in apart.items()
     }
 
 
-def going_on_checks(evidence: RunEvidence) -> Checks:
+def going_on_checks(run: MatchingRun) -> Checks:
     """Which rounds ended elsewhere than the images allow, and went on from there."""
     text = (
         "rounds of matching ended {:.2g} deg, {:.2g} cm away, where the images agree less, and "
@@ -190,16 +166,15 @@ def going_on_checks(evidence: RunEvidence) -> Checks:
     )
     return {
         name: [Check("rounds that went on", "WARN", text.format(*moved), moved[0], kind=WENT_ON)]
-        for name, moved in evidence.run.went_on.items()
+        for name, moved in run.went_on.items()
     }
 
 
-def time_limit_checks(evidence: RunEvidence) -> Checks:
+def time_limit_checks(run: MatchingRun) -> Checks:
     """Whether the time limit left something out."""
-    run = evidence.run
     if not run.out_of_time:
         return {}
     missed = f"{run.missed_rounds} rounds of matching and " if run.missed_rounds else ""
     text = f"partial: there was no time for {missed}the checks against the images"
     check = Check("time limit", "WARN", text, run.missed_rounds)
-    return {name: [check] for name in evidence.solution.cameras}
+    return {name: [check] for name in run.guess.cameras}

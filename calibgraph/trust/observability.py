@@ -7,9 +7,9 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import camera_center, pose_rows
 from calibgraph.model.rig import Camera
-from calibgraph.solver.camera_block import CameraBlock
-from calibgraph.solver.curvature import pose_hessian
-from calibgraph.solver.residual_scale import quantile
+from calibgraph.solver.covariance import pose_equations
+from calibgraph.solver.matches import CameraBlock
+from calibgraph.solver.robust import quantile
 from calibgraph.solver.solution import Solution
 from factors.conditioning import invert_or_none
 
@@ -84,10 +84,10 @@ def prior_shares(solution: Solution) -> dict[str, float]:
     C H_prior: 0 if the matches decide alone, 1 if there are none. C is the (6 N, 6 N) marginal of
     the error model; without one, of independent matches.
     """
-    T_camera_lidar, errors = solution.T_camera_lidar, solution.marginals.errors
+    T_camera_lidar, errors = solution.T_camera_lidar, solution.error_fit
     cameras = list(T_camera_lidar)
-    priors = pose_hessian(solution.inliers.pose_graph, cameras, T_camera_lidar)
-    known = None if errors is None else errors.fit.of_mount.covariance
+    priors = pose_equations(solution.inliers.pose_graph, cameras, T_camera_lidar)[0]
+    known = None if errors is None else errors.of_mount.covariance
     if known is None:
         hessian = priors.copy()
         for name, of_camera in solution.fitted.robust_hessians.items():

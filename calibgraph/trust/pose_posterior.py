@@ -13,7 +13,7 @@ mean, not the sum: with that the truth is as likely under it as by one camera al
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import gtsam
@@ -67,8 +67,7 @@ class PosePosterior:
     @property
     def moments(self) -> Array:
         """(6, 6) second moments of both together."""
-        near, elsewhere = (_moments(samples) for samples in (self.near, self.elsewhere))
-        return (1.0 - self.share) * near + self.share * elsewhere
+        return (1.0 - self.share) * _moments(self.near) + self.share * _moments(self.elsewhere)
 
     def widest(self, covariance: Array) -> Array:
         """(6, 6): a covariance that is at least that of the poses elsewhere."""
@@ -117,56 +116,41 @@ def measure_posteriors(
     with core_pool() as cores, Threads(max(len(groups), 1)) as pool:
         scorer = FrameScorer(dataset, spread_out(dataset.frames, MAX_FRAMES), cores)
 
-        def likelihood_of(name: str) -> Callable[[Array], Array]:
-            camera = rig.cameras[name]
-            return log_likelihood(
-                scorer.score_together(scorer.load_images(name, camera), camera, FAR)
-            )
-
         def measure(group: Sequence[str]) -> dict[str, PosePosterior]:
-            to_first = rig.T_camera_lidar[group[0]]
-            adjoints = [
-                gtsam.Pose3(relative_transform(rig.T_camera_lidar[name], to_first)).AdjointMap()
-                for name in group
-            ]
-            terms = list(zip([*map(likelihood_of, group)], adjoints, strict=True))
+            T, terms = rig.T_camera_lidar, []
+            for name in group:
+                camera = rig.cameras[name]
+                scores = scorer.score_together(scorer.load_images(name, camera), camera, FAR)
+                Ad = gtsam.Pose3(relative_transform(T[name], T[group[0]])).AdjointMap()
+                terms.append((log_likelihood(scores), Ad))
 
             def likelihood(twists: Array) -> Array:
-                found = [of(twists @ moved.T) for of, moved in terms]
-                return np.asarray(np.mean(found, axis=0))
+                return np.asarray(np.mean([of(twists @ Ad.T) for of, Ad in terms], axis=0))
 
-            found = _posterior_of(likelihood, covariances[group[0]], seed)
-            posteriors = {}
-            for name, adjoint in zip(group, adjoints, strict=True):
-                near, elsewhere = found.near @ adjoint.T, found.elsewhere @ adjoint.T
-                of_camera = PosePosterior(near, elsewhere, found.share)
+            near, elsewhere, share = _sample_both(likelihood, covariances[group[0]], seed)
+            found = {}
+            for name, (_, Ad) in zip(group, terms, strict=True):
+                ratio = np.inf
                 if asked is not None:
-                    away = twist_between(asked[name], rig.T_camera_lidar[name])
-                    of_first = np.asarray(np.linalg.solve(adjoint, away), np.float64)
-                    ratio = _log_ratio(likelihood, found.elsewhere, of_first)
-                    of_camera = replace(of_camera, log_ratio=ratio)
-                posteriors[name] = of_camera
-            return posteriors
+                    of_first = np.linalg.solve(Ad, twist_between(asked[name], T[name]))
+                    twists = np.vstack([of_first, elsewhere])
+                    density = likelihood(twists) - 0.5 * ((twists / REACH) ** 2).sum(axis=1)
+                    ratio = float(2.0 * (density.max() - density[0]))
+                found[name] = PosePosterior(near @ Ad.T, elsewhere @ Ad.T, share, ratio)
+            return found
 
         return {name: each for of in pool.map(measure, groups) for name, each in of.items()}
 
 
-def _posterior_of(
+def _sample_both(
     likelihood: Callable[[Array], Array], by_matches: Array, seed: int
-) -> PosePosterior:
-    """Near the result or elsewhere, weighed by the evidence of both."""
+) -> tuple[Array, Array, float]:
+    """(n, 6) samples near the result and elsewhere; by their evidence, the share of the latter."""
     sample = partial(sample_posterior, likelihood, samples=SAMPLES, seed=seed)
     with core_pool() as pool:
         priors = NEAR**2 * by_matches, np.diag(REACH**2)
         (near, of_near), (far, of_far) = pool.map(sample, priors)
-    return PosePosterior(near, far, float(expit(np.log(ODDS_ELSEWHERE) + of_far - of_near)))
-
-
-def _log_ratio(likelihood: Callable[[Array], Array], elsewhere: Array, asked: Array) -> float:
-    """Twice the log of the highest density of samples elsewhere over that at a twist (6,)."""
-    twists = np.vstack([asked, elsewhere])
-    density = likelihood(twists) - 0.5 * ((twists / REACH) ** 2).sum(axis=1)
-    return float(2.0 * (density.max() - density[0]))
+    return near, far, float(expit(np.log(ODDS_ELSEWHERE) + of_far - of_near))
 
 
 def group_tied(
@@ -186,7 +170,7 @@ def group_tied(
     return [*dict.fromkeys(named)]
 
 
-def no_posteriors(*_: object) -> dict[str, PosePosterior]:
+def no_posteriors(*_: object, **__: object) -> dict[str, PosePosterior]:
     """Of no camera: where there are no images."""
     return {}
 

@@ -14,7 +14,6 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
-from operator import mul
 from typing import Any
 
 import numpy as np
@@ -109,16 +108,14 @@ def contributions(
     severities: Mapping[str, float], weights: Mapping[str, Sequence[float]], other: Sequence[float]
 ) -> dict[str, float]:
     """Per kind of check, its contribution to the log odds; never negative."""
-    return {
-        kind: sum(map(mul, steps(severity), weights.get(kind, other)))
-        for kind, severity in severities.items()
-    }
+    each = np.array([weights.get(kind, other) for kind in severities]).reshape(-1, 3)
+    sums = (steps(np.array([*severities.values()])) * each).sum(axis=1)
+    return dict(zip(severities, sums.tolist(), strict=True))
 
 
-def steps(severity: float) -> tuple[float, float, float]:
-    """How far a severity is through PASS, WARN and FAIL, each 0 to 1."""
-    through = [min(max(severity - status, 0.0), 1.0) for status in range(3)]
-    return through[0], through[1], through[2]
+def steps(severities: Array) -> Array:
+    """(n, 3): how far each of (n,) severities is through PASS, WARN and FAIL, 0 to 1."""
+    return np.clip(severities[:, None] - np.arange(3.0), 0.0, 1.0)
 
 
 def probability_beyond(covariance: Array | None, tolerance: tuple[float, float]) -> float:

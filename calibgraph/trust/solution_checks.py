@@ -7,18 +7,42 @@ from dataclasses import replace
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.model.calibration import Residuals
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.verdict import COMMON_ERROR, Check
-from calibgraph.solver.conflicts import Conflict
-from calibgraph.solver.residual_scale import CAUCHY_SCALE_SIGMAS
+from calibgraph.solver.error_model import Conflict
+from calibgraph.solver.matches import BlockResiduals
+from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS
+from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Estimate, Evidence
 from calibgraph.trust.thresholds import threshold
-from factors.free_lens import CLOCK
+from factors.columns import CLOCK
 
 
 def estimate_checks(evidence: Evidence) -> Checks:
     """The checks of every camera's estimate."""
-    return {name: check_estimate(evidence.estimate(name)) for name in evidence.cameras}
+    return {name: check_estimate(_estimate_of(evidence, name)) for name in evidence.cameras}
+
+
+def _estimate_of(evidence: Evidence, camera: str) -> Estimate:
+    """By the matches alone: flat images widen the error bar, and fail no check."""
+    solution, block = evidence.solution, evidence.solution.inliers.blocks.get(camera)
+    sigmas, conflicts = solution.data_sigmas, solution.conflicts
+    return Estimate(
+        has_matches=camera in solution.objective.blocks,
+        used=0 if block is None else len(block.frame),
+        frames=0 if block is None else len(block.frame_edges) - 1,
+        covariance=evidence.covariance_by_matches(camera),
+        data_sigmas=None if sigmas is None else sigmas[evidence.cameras.index(camera)],
+        conflicts=tuple(c for c in conflicts if camera in (c.pair.a, c.pair.b)),
+        converged=solution.optimum.converged,
+        terms=solution.terms,
+        held=camera in solution.held,
+        excluded=camera in evidence.excluded,
+        scatter_only=not evidence.findings.states_common_error,
+        tolerance=solution.config.tolerance,
+        lens=solution.lens.get(camera, ()),
+    )
 
 
 def _check_unmeasured(estimate: Estimate) -> Check:
@@ -103,7 +127,8 @@ def _check_lens_prior(one: LensEstimate) -> Check:
 
 def flat_evidence_checks(evidence: Evidence) -> Checks:
     """Whether the images leave a pose more open than the matches, where images are known."""
-    return {name: [check] for name, check in evidence.flatness.items()}
+    flatness = {} if evidence.bars is None else evidence.bars.check_flatness()
+    return {name: [check] for name, check in flatness.items()}
 
 
 def outlier_frame_checks(evidence: Evidence) -> Checks:
@@ -129,11 +154,18 @@ def assumed_spread_checks(evidence: Evidence) -> Checks:
     loss_scale_px = evidence.solution.config.loss_scale_px
     if loss_scale_px is None:
         return {}
-    row = threshold("assumed_spread")
+    row, residuals = threshold("assumed_spread"), residuals_of(evidence.solution)
     return {
-        name: [row.check(CAUCHY_SCALE_SIGMAS * evidence.residuals[name].sigma_px / loss_scale_px)]
+        name: [row.check(CAUCHY_SCALE_SIGMAS * residuals[name].sigma_px / loss_scale_px)]
         for name in evidence.fitted_blocks
     }
+
+
+def residuals_of(solution: Solution) -> dict[str, Residuals]:
+    """Per camera that has correspondences, of all of them, not only the inliers."""
+    poses, scales = solution.T_camera_lidar, solution.scales
+    blocks = solution.objective.blocks.items()
+    return {n: BlockResiduals.at(poses[n], block).summary(scales[n]) for n, block in blocks}
 
 
 def bootstrap_checks(evidence: Evidence) -> Checks:

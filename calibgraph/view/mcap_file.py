@@ -1,24 +1,27 @@
 """An MCAP file of a result for Foxglove, with Foxglove's own message types."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from calibgraph.errors import needs_extra
 from calibgraph.files import write_atomically
-from calibgraph.io.rotations import quaternion_xyzw
+from calibgraph.io.rig_parts import quaternion_xyzw
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
 from calibgraph.progress import Progress, no_progress
 from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
 
-if TYPE_CHECKING:
-    from foxglove.messages import Timestamp
+with needs_extra("view", "--mcap needs foxglove-sdk"):
+    import foxglove
+    from foxglove import channels
+    from foxglove import messages as m
+
+SECONDS_PER_FRAME = 1
+"""Results have no stamps: frames are shown one after another."""
 
 LIDAR_FRAME = "lidar"
 _DISTORTIONS = {"fisheye": "kannala_brandt"}
@@ -39,9 +42,7 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
     Raises:
         CalibrationError: if foxglove-sdk is missing, or an image or cloud cannot be read.
     """
-    with needs_extra("view", "--mcap needs foxglove-sdk"):
-        import foxglove.channels
-    path, context, channels = Path(path), foxglove.Context(), dict[str, Any]()
+    path, context, opened = Path(path), foxglove.Context(), dict[str, Any]()
 
     def write(temporary: Path) -> None:
         options = foxglove.mcap.MCAPWriteOptions(profile="calibgraph")
@@ -51,45 +52,37 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
         ):
             for done, frame in enumerate(read_frames(result)):
                 progress(f"frame {frame.name}", done, len(result.frames))
-                for topic, message in _messages(frame, result):
-                    if topic not in channels:
-                        kind = getattr(foxglove.channels, f"{type(message).__name__}Channel")
-                        channels[topic] = kind(topic, context=context)
-                    channels[topic].log(message, log_time=_nanoseconds(frame))
+                at = m.Timestamp(done * SECONDS_PER_FRAME, 0)
+                for topic, message in _messages(frame, at, result):
+                    if topic not in opened:
+                        kind = getattr(channels, f"{type(message).__name__}Channel")
+                        opened[topic] = kind(topic, context=context)
+                    opened[topic].log(message, log_time=at.sec * 10**9)
 
     write_atomically(path, write)
     return path
 
 
-def _nanoseconds(frame: ViewFrame) -> int:
-    return round(frame.time_s * 1e9)
-
-
-def _messages(frame: ViewFrame, result: Calibration) -> Iterator[tuple[str, Any]]:
+def _messages(frame: ViewFrame, at: m.Timestamp, result: Calibration) -> Iterator[tuple[str, Any]]:
     """The topics and messages of a frame."""
-    from foxglove import messages as m
-
-    at = m.Timestamp(*divmod(_nanoseconds(frame), 10**9))
     level = getattr(m.LogLevel, _LEVELS[result.verdict.status])
     text = state_verdict(result)
     yield "/tf", _transforms(result, at)
     yield "/lidar", _cloud(frame, at)
     yield "/verdict", m.Log(timestamp=at, level=level, message=text, name="calibgraph")
-    for name, image in frame.images.items():
+    for name, jpeg in frame.images.items():
         camera, optical = result.rig.cameras[name], f"{name}_optical_frame"
         yield (
             f"/{name}/image",
-            m.CompressedImage(timestamp=at, frame_id=optical, format="jpeg", data=image.jpeg),
+            m.CompressedImage(timestamp=at, frame_id=optical, format="jpeg", data=jpeg),
         )
         if camera.model in ("pinhole", "fisheye"):  # Foxglove has no others
             yield f"/{name}/calibration", _lens(camera, optical, at)
-        for when, points in (("before", image.before), ("after", image.after)):
+        for when, points in frame.projected[name].items():
             yield f"/{name}/{when}", _annotations(points, at)
 
 
-def _cloud(frame: ViewFrame, at: Timestamp) -> Any:
-    from foxglove import messages as m
-
+def _cloud(frame: ViewFrame, at: m.Timestamp) -> Any:
     packed = np.empty(len(frame.points_lidar_m), _XYZ_RGBA)
     packed["xyz"], packed["rgba"][:, :3] = frame.points_lidar_m, frame.colours
     packed["rgba"][:, 3] = 255
@@ -109,9 +102,7 @@ def _cloud(frame: ViewFrame, at: Timestamp) -> Any:
     )
 
 
-def _transforms(result: Calibration, at: Timestamp) -> Any:
-    from foxglove import messages as m
-
+def _transforms(result: Calibration, at: m.Timestamp) -> Any:
     return m.FrameTransforms(
         transforms=[
             m.FrameTransform(
@@ -127,9 +118,7 @@ def _transforms(result: Calibration, at: Timestamp) -> Any:
     )
 
 
-def _lens(camera: Camera, frame_id: str, at: Timestamp) -> Any:
-    from foxglove import messages as m
-
+def _lens(camera: Camera, frame_id: str, at: m.Timestamp) -> Any:
     K = camera.matrix_px
     rational = len(camera.distortion) == _RATIONAL
     pinhole = "rational_polynomial" if rational else "plumb_bob"
@@ -146,15 +135,16 @@ def _lens(camera: Camera, frame_id: str, at: Timestamp) -> Any:
     )
 
 
-def _annotations(points: Projected, at: Timestamp) -> Any:
-    from foxglove import messages as m
-
-    colours = (points.colours / 255.0).tolist()
+def _annotations(points: Projected, at: m.Timestamp) -> Any:
+    pixels_px, colours = points
     one = m.PointsAnnotation(
         timestamp=at,
         type=m.PointsAnnotationType.Points,
-        points=[m.Point2(x=u, y=v) for u, v in points.pixels_px.tolist()],
-        outline_colors=[m.Color(r=red, g=green, b=blue, a=1.0) for red, green, blue in colours],
+        points=[m.Point2(x=u, y=v) for u, v in pixels_px.tolist()],
+        outline_colors=[
+            m.Color(r=red, g=green, b=blue, a=1.0)
+            for red, green, blue in (colours / 255.0).tolist()
+        ],
         thickness=_DOT_PX,
     )
     return m.ImageAnnotations(timestamp=at, points=[one])

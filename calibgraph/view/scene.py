@@ -9,35 +9,18 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.io.frame import Frame, frame_of_entry
+from calibgraph.io.frame import frame_of_entry
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.clock import when_taken
 from calibgraph.model.rig import Camera
-from calibgraph.report.point_overlay import depth_colours, visible_points
+from calibgraph.report.page_overlays import depth_colours, visible_points
 
 Colours = NDArray[np.uint8]
+Projected = tuple[Array, Colours]
+"""Points in an image: (n, 2) pixels, and (n, 3) RGB colours by distance."""
 
-SECONDS_PER_FRAME = 1.0
-"""Results have no stamps: frames are shown one after another."""
 _MAX_POINTS = 20_000  # on an image: viewers draw each
 _JPEG_QUALITY = 90
-
-
-@dataclass(frozen=True, eq=False)
-class Projected:
-    """Points in an image: (n, 2) pixels, and (n, 3) RGB colours by distance."""
-
-    pixels_px: Array
-    colours: Colours
-
-
-@dataclass(frozen=True, eq=False)
-class ViewImage:
-    """One camera in one frame."""
-
-    jpeg: bytes
-    before: Projected
-    after: Projected
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,18 +29,18 @@ class ViewFrame:
 
     Attributes:
         number: of the frame in its dataset.
-        time_s: when it is shown.
         points_lidar_m: (n, 3) float32 in the LiDAR frame.
         colours: (n, 3) RGB by distance from the LiDAR.
-        images: by camera.
+        images: by camera, a JPEG.
+        projected: by camera, the points in its image ``before`` and ``after``.
     """
 
     number: int
     name: str
-    time_s: float
     points_lidar_m: NDArray[np.float32]
     colours: Colours
-    images: Mapping[str, ViewImage]
+    images: Mapping[str, bytes]
+    projected: Mapping[str, Mapping[str, Projected]]
 
 
 def read_frames(result: Calibration) -> Iterator[ViewFrame]:
@@ -71,39 +54,27 @@ def read_frames(result: Calibration) -> Iterator[ViewFrame]:
             "the result names no images and clouds, as that of a table; give those that the table "
             "was made from with --dataset"
         )
-    for number, frame in enumerate(map(frame_of_entry, result.frames)):
+    rigs = {"before": result.initial_rig, "after": result.rig}
+    for frame in map(frame_of_entry, result.frames):
         points = frame.load_cloud()[:, :3]
         points = np.ascontiguousarray(points[np.isfinite(points).all(axis=1)], np.float32)
-        yield ViewFrame(
-            number=frame.index,
-            name=frame.name,
-            time_s=number * SECONDS_PER_FRAME,
-            points_lidar_m=points,
-            colours=_by_distance(points),
-            images={
-                name: _view_image(frame, points, name, result)
-                for name in frame.image_paths
-                if name in result.rig.cameras
-            },
-        )
-
-
-def _view_image(
-    frame: Frame, points: NDArray[np.float32], name: str, result: Calibration
-) -> ViewImage:
-    rigs = result.initial_rig, result.rig
-    guess, camera = (when_taken(rig.cameras[name], frame.twist_per_s) for rig in rigs)
-    image = frame.load_image(name, camera)
-    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    before = project_cloud(guess, points)
-    return ViewImage(data.tobytes(), before, project_cloud(camera, points))
+        images, projected = dict[str, bytes](), dict[str, dict[str, Projected]]()
+        for name in filter(frame.image_paths.__contains__, result.rig.cameras):
+            image = frame.load_image(name, result.rig.cameras[name])
+            _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+            images[name] = data.tobytes()
+            projected[name] = {
+                when: project_cloud(when_taken(rig.cameras[name], frame.twist_per_s), points)
+                for when, rig in rigs.items()
+            }
+        yield ViewFrame(frame.index, frame.name, points, _by_distance(points), images, projected)
 
 
 def project_cloud(camera: Camera, points_lidar_m: NDArray[np.float32]) -> Projected:
     """The points of a cloud (n, 3) on a camera's image, an even choice of very many."""
     points, pixels = visible_points(points_lidar_m.astype(np.float64), camera)
     step = max(1, -(-len(pixels) // _MAX_POINTS))
-    return Projected(pixels[::step], _by_distance(points[::step]))
+    return pixels[::step], _by_distance(points[::step])
 
 
 def _by_distance(points: NDArray[np.floating]) -> Colours:

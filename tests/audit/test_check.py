@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,10 @@ import pytest
 
 import calibgraph
 from calibgraph import Audit, Correspondences, Dataset, Rig, simulate_correspondences
-from calibgraph.audit.check import provenance
-from calibgraph.audit.matching import match_from_deployed
-from calibgraph.io.frame import Frame
-from calibgraph.io.kept_frames import KeptFrame, keep_frames
+from calibgraph.audit.check import match_from_deployed, provenance
+from calibgraph.io.clouds import load_cloud
+from calibgraph.io.dataset import keep_frames
+from calibgraph.io.images import load_image
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.structure.matcher import StructureMatcher
 from calibgraph.model.config import Config
@@ -228,19 +229,17 @@ def test_a_camera_without_matches_does_not_confirm_the_deployed_rig() -> None:
 def test_files_are_decoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
     data, camera = calibgraph.load_dataset(SAMPLE, TRUTH), TRUTH.cameras["left"]
     plain = [(f.load_cloud(), f.load_gray("left", camera)) for f in data.frames]
-    read = Counter[str]()
+    read = Counter[Path]()
 
-    def counted(name: str) -> None:
-        load = getattr(Frame, name)
+    def counted(load: Callable[..., Any]) -> Callable[..., Any]:
+        def load_and_count(path: Path, *of: Any) -> Any:
+            read[path] += 1
+            return load(path, *of)
 
-        def load_and_count(frame: Frame, *of: Any) -> Any:
-            read[f"{name} {frame.name}"] += 1
-            return load(frame, *of)
+        return load_and_count
 
-        monkeypatch.setattr(Frame, name, load_and_count)
-
-    counted("load_cloud")
-    counted("load_gray")
+    for load in (load_cloud, load_image):
+        monkeypatch.setattr(f"calibgraph.io.frame.{load.__name__}", counted(load))
     kept = keep_frames(data)
     for _ in range(2):
         for frame, (cloud, gray) in zip(kept.frames, plain, strict=True):
@@ -252,7 +251,7 @@ def test_files_are_decoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_an_audit_keeps_no_decoded_frames() -> None:
     audit = check_by_table(TRUTH)
-    assert not isinstance(audit.shown, KeptFrame)
+    assert audit.shown is not None and audit.shown.kept is None
 
 
 def test_the_recording_of_a_result_is_known_by_its_content_wherever_it_lies(

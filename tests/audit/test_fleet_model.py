@@ -10,12 +10,18 @@ import pyarrow as pa
 import pytest
 
 from calibgraph.audit.findings import Finding, find_changes, moved_lidars
-from calibgraph.audit.fleet_model import FleetModel, Mount, fit_fleet, solve_centers
+from calibgraph.audit.fleet_model import (
+    FleetModel,
+    Mount,
+    fit_fleet,
+    newest_rows,
+    observe,
+    solve_centers,
+)
 from calibgraph.audit.model import Limits, compare, poses_of, weigh, weighted_mean
-from calibgraph.audit.observations import newest_rows, observe
 from calibgraph.errors import CalibrationError
+from calibgraph.fleet.files import SCHEMA
 from calibgraph.fleet.page import STATES, report_of
-from calibgraph.fleet.rows import SCHEMA
 from calibgraph.model.geometry import retract_all, to_T_lidar_camera, twists_between
 from tests.draws.fleets import CAMERAS, SPREAD, Fleet, errors_of, simulate_fleet
 

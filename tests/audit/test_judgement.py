@@ -3,14 +3,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibgraph.audit.judgement import judge_deviation
-from calibgraph.audit.significance import POWER, Quantiles, Tolerance, detectable, tail_of_axis
+from calibgraph.audit.judgement import (
+    POWER,
+    detectable,
+    judge_deviation,
+    quantiles_in_part,
+    student_quantiles,
+    tail_of_axis,
+    tolerance_twist,
+)
 
-TOLERANCE = Tolerance(0.5, 10.0).twist
+TOLERANCE = tolerance_twist(0.5, 10.0)
 SIGMA = np.repeat([np.radians(0.09), 0.02], 3)
 COVARIANCE = np.diag(SIGMA**2)
-KNOWN = Quantiles.from_freedom(np.inf, tail_of_axis(3))
-QUANTILE = KNOWN.significant[0]
+KNOWN = student_quantiles(np.inf, tail_of_axis(3))
+QUANTILE = KNOWN[0, 0]
 
 
 def deviation(axis: int, value: float) -> np.ndarray:
@@ -96,12 +103,13 @@ def test_at_most_one_of_a_thousand_has_one_if_sigma_is_of_few_frames(share: floa
     rng, rigs, freedom = np.random.default_rng(0), 50_000, 10
     estimated = share * rng.chisquare(freedom, (rigs, 6)) / freedom
     variance = estimated + 1 - share
-    known, own = (Quantiles.from_freedom(nu, tail_of_axis(1)) for nu in (np.inf, freedom))
-    limit = own.beside_known(estimated / variance, known).significant * np.sqrt(variance)
+    known, own = (student_quantiles(nu, tail_of_axis(1)) for nu in (np.inf, freedom))
+    shares = (estimated / variance)[:, None]
+    limit = quantiles_in_part(shares, own, known)[:, 0] * np.sqrt(variance)
     draws = np.abs(rng.standard_normal(variance.shape))
     assert np.count_nonzero((draws > limit).any(axis=1)) < 50 + 4 * np.sqrt(50)  # Poisson
     if share >= 0.5:  # by the normal distribution they would be too many
-        by_normal = draws > known.significant * np.sqrt(variance)
+        by_normal = draws > known[0] * np.sqrt(variance)
         assert np.count_nonzero(by_normal.any(axis=1)) > 100
 
 
@@ -115,13 +123,13 @@ def test_the_smallest_detectable_change_is_significant_with_the_stated_power() -
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_a_tolerance_must_be_positive_and_finite(value: float) -> None:
     with pytest.raises(ValueError, match="tolerance_cm must be positive"):
-        Tolerance(0.5, value)
+        tolerance_twist(0.5, value)
 
 
 @pytest.mark.parametrize("times", [0.3, 0.9, 0.99, 1.01, 1.1, 3.0])
 def test_ok_never_stands_beside_a_detectable_change_above_the_tolerance(times: float) -> None:
     """Not even where the deviation itself is zero."""
-    largest = np.repeat(TOLERANCE, 3) / detectable(np.ones(6), KNOWN.confident)
+    largest = np.repeat(TOLERANCE, 3) / detectable(np.ones(6), KNOWN[1])
     covariance = np.diag((times * largest) ** 2)
     status, reason = judge_deviation(np.zeros(6), covariance, KNOWN, TOLERANCE)
     assert (status == "OK") == (times < 1)

@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 from calibgraph import MatcherErrors, load_rig, simulate_correspondences, solve
-from calibgraph.io.formats.names import EXPORT_FORMATS
+from calibgraph.io.formats import EXPORT_FORMATS
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call, make_pair
 from tests.io.formats.readers import READERS

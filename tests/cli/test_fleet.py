@@ -6,10 +6,10 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from calibgraph.fleet.job import execute
+from calibgraph.child_process import Outcome
+from calibgraph.fleet.files import read_rows
+from calibgraph.fleet.job import Limits, execute
 from calibgraph.fleet.manifest import Job
-from calibgraph.fleet.rows import read_rows
-from calibgraph.fleet.task import Limits, Outcome
 from tests.cli.conftest import error_line
 from tests.conftest import Call
 from tests.draws.fleets import write_fleet

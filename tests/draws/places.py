@@ -14,8 +14,7 @@ from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
 from calibgraph.model.places import Places, as_groups
 from calibgraph.model.rig import Camera, Intrinsics, RelativePose, Rig
 from calibgraph.simulation.correspondences import MatcherErrors, simulate_correspondences
-from calibgraph.solver.optimizer import optimize
-from calibgraph.solver.scan_distortion import distortions_at
+from calibgraph.solver.two_pass import optimize
 from factors import ProjectionBlock, block_factor
 
 Rng = np.random.Generator
@@ -40,6 +39,20 @@ class Drawn:
     rig: Rig
     table: Correspondences
     aligned: Mapping[str, Array] = field(default_factory=dict)
+
+
+def distortions_at(points_lidar_m: Array) -> Array:
+    """(3, n, 3) displacements in the LiDAR frame, by a unit of each scan distortion.
+
+    Elevations that are all a radian higher; elevations twice as far from the horizon; a metre of
+    motion ahead, over a turn that begins and ends behind.
+    """
+    x, y, z = points_lidar_m.T
+    level, heading = np.hypot(x, y), np.arctan2(y, x)
+    elevation = np.column_stack([-z * np.cos(heading), -z * np.sin(heading), level])
+    motion = np.zeros_like(points_lidar_m)
+    motion[:, 0] = heading / (2 * np.pi)
+    return np.stack([elevation, elevation * np.arctan2(z, level)[:, None], motion])
 
 
 def draw_places(

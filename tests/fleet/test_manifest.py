@@ -23,17 +23,17 @@ def test_csv_and_parquet_give_the_same_jobs(tmp_path: Path) -> None:
              "settings": ["{seed: 3, search_deg: 5}"], "mileage_km": [12.5]}  # fmt: skip
     parquet.write_table(pa.table(cells), tmp_path / "fleet.parquet")
     found = [load_manifest(uri) for uri in (csv, str(tmp_path / "fleet.parquet"))]
-    assert found[0].jobs == found[1].jobs
-    (job,) = found[0].jobs
+    assert found[0][0] == found[1][0]
+    (job,) = found[0][0]
     assert job.vehicle == "001"
     assert job.recordings == (f"{tmp_path}/a", f"{tmp_path}/b")
     assert (job.settings.config.seed, job.settings.search_deg) == (3, 5.0)
-    assert all(each.others.to_pylist() == [{"mileage_km": 12.5}] for each in found)
+    assert all(others.to_pylist() == [{"mileage_km": 12.5}] for _, others in found)
 
 
 def test_settings_may_be_a_file(tmp_path: Path) -> None:
     write(tmp_path, "preset: kitti\nframes: '0:4'\n", "settings.yaml")
-    (job,) = load_manifest(write(tmp_path, HEAD + "a,b,,settings.yaml,1\n")).jobs
+    (job,) = load_manifest(write(tmp_path, HEAD + "a,b,,settings.yaml,1\n"))[0]
     assert job.settings.config.preset == "kitti"
     assert job.settings.config.gate_px == 3.0
     assert job.settings.frames == "0:4"
@@ -93,12 +93,12 @@ def test_the_input_hash_changes_with_every_input(tmp_path: Path, change: str) ->
     cloud.write_bytes(b"cloud")
     (tmp_path / "rig.yaml").write_text("a")
     uri = write(tmp_path, HEAD + "a,drive,rig.yaml,,1\n")
-    before = load_manifest(uri).jobs[0].input_hash()
-    assert load_manifest(uri).jobs[0].input_hash() == before
+    before = load_manifest(uri)[0][0].input_hash()
+    assert load_manifest(uri)[0][0].input_hash() == before
     if change == "recording":
         cloud.write_bytes(b"others")
     elif change == "rig":
         (tmp_path / "rig.yaml").write_text("b")
     else:
         write(tmp_path, HEAD + "a,drive,rig.yaml,{seed: 1},1\n")
-    assert load_manifest(uri).jobs[0].input_hash() != before
+    assert load_manifest(uri)[0][0].input_hash() != before

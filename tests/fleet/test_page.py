@@ -12,8 +12,8 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
+from calibgraph.fleet.files import ROWS, Store
 from calibgraph.fleet.page import STATES, report_of, write_fleet_report
-from calibgraph.fleet.rows import ROWS, Store
 from tests.draws.fleets import SPREAD, simulate_fleet
 from tests.report.browsing import browser, render
 

@@ -15,9 +15,18 @@ import pytest
 from pyarrow import parquet
 
 from calibgraph import CalibrationError, FileError
-from calibgraph.fleet.rows import ROWS, SCHEMA, Store, read_rows
+from calibgraph.fleet.files import (
+    ROWS,
+    SCHEMA,
+    Store,
+    fetch,
+    fingerprint,
+    in_arrow,
+    join,
+    read_bytes,
+    read_rows,
+)
 from calibgraph.fleet.run import run_fleet
-from calibgraph.fleet.uris import fetch, fingerprint, in_arrow, join, read_bytes
 from tests.draws.fleets import write_fleet
 
 

@@ -21,11 +21,10 @@ import pytest
 
 from calibgraph import load_correspondences, load_rig, solve
 from calibgraph.errors import CalibrationError, FileError
-from calibgraph.fleet.job import run_job
+from calibgraph.fleet.files import Store, read_rows
+from calibgraph.fleet.job import Limits, release, run_job
 from calibgraph.fleet.manifest import load_manifest
-from calibgraph.fleet.rows import Store, read_rows
 from calibgraph.fleet.run import Summary, dask_executor, run_fleet, thread_executor
-from calibgraph.fleet.task import Limits, release
 from tests.draws.fleets import write_fleet
 
 POISON = Path(__file__).parent / "poison"
@@ -161,7 +160,7 @@ def test_rows_and_workers_of_another_version_are_refused(
 ) -> None:
     manifest = str(folder / "fleet.csv")
     with pytest.raises(CalibrationError, match=f"a worker has calibgraph {release()}, the command"):
-        run_job(load_manifest(manifest).jobs[0], Limits(), "9.9")
+        run_job(load_manifest(manifest)[0][0], Limits(), "9.9")
     monkeypatch.setattr("calibgraph.fleet.run.release", lambda: "9.9")
     with pytest.raises(FileError, match=r"holds rows of calibgraph .*, this is 9.9; choose"):
         run_fleet(manifest, str(folder / "alone"))

@@ -12,8 +12,8 @@ from calibgraph import Config, MatcherErrors, Rig, perturb, simulate_corresponde
 from calibgraph.graph.objective import objective_graph
 from calibgraph.model.config import TERMS
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.solver.camera_block import camera_blocks
-from calibgraph.solver.optimizer import optimize, to_values
+from calibgraph.solver.matches import camera_blocks
+from calibgraph.solver.two_pass import optimize, to_values
 from factors import ProjectionBlock
 
 CONFIG = Config(prior_weight=2.0, relative_prior_weight=5.0, confidence_weights=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibgraph import CalibrationError, RigError, export_calibration, guess_rig, load_rig
-from calibgraph.guessing import heading_search
+from calibgraph.guessing import guess as guessing
 from calibgraph.guessing.guess import FILE_DEG, FOUND_DEG
 from calibgraph.guessing.mounting import (
     HEADINGS,
@@ -127,7 +127,7 @@ def test_a_camera_with_nothing_is_found_from_some_heading(lenses: Path) -> None:
 def test_a_camera_that_is_not_found_is_no_guess(
     lenses: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(heading_search, "HEADINGS_DEG", (150, 180, 210))
+    monkeypatch.setattr(guessing, "HEADINGS_DEG", (150, 180, 210))
     with pytest.raises(CalibrationError, match=r"not found at any heading: 'left' \(5\.0\)"):
         guess_rig([lenses], mountings={n: MOUNTED[n] for n in MOUNTED if n != "left"}, data=SAMPLE)
 

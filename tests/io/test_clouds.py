@@ -19,9 +19,8 @@ from pyarrow import feather
 
 from calibgraph import FileError, Rig, load_dataset
 from calibgraph.io import clouds
-from calibgraph.io.clouds import load_cloud, read_cloud, read_cloud_notes
+from calibgraph.io.clouds import load_cloud, read_cloud, unpack_lzf
 from calibgraph.io.frame import Frame, frame_of_entry
-from calibgraph.io.pcd import unpack_lzf
 from tests.conftest import SAMPLE, make_camera
 from tests.io.written import CLOUD, fields_of, lzf_of_literals, padded, pcd, pcd_of, ply, ply_of
 
@@ -338,15 +337,15 @@ def test_an_intensity_of_another_field_is_left_out_with_a_note(
 ) -> None:
     path = written(tmp_path / "cloud.npy", with_intensity(kind))
     assert np.isnan(load_cloud(path)[:, 3]).all() == ("left out" in note)
-    notes = read_cloud_notes(path)
+    notes = Frame(0, "0", path, {}).describe_cloud()
     assert len(notes) == bool(note) and all(note in each for each in notes)
 
 
 def test_a_cloud_without_intensity_is_noted_with_its_fields(tmp_path: Path) -> None:
     (tmp_path / "cloud.pcd").write_bytes(changed(pcd(), b"z intensity", b"z height"))
-    (note,) = read_cloud_notes(tmp_path / "cloud.pcd")
+    (note,) = Frame(0, "0", tmp_path / "cloud.pcd", {}).describe_cloud()
     assert "no intensity among its fields x y z height; the error bars become about twice" in note
-    assert read_cloud_notes(tmp_path / "missing.pcd") == []
+    assert Frame(0, "0", tmp_path / "missing.pcd", {}).describe_cloud() == []
     assert load_dataset(SAMPLE).notes == ()
 
 

@@ -25,10 +25,8 @@ from pyarrow import feather, parquet
 
 from calibgraph import CalibrationError
 from calibgraph.io.bags.messages import Bag
-from calibgraph.io.camera_match_tables import load_camera_matches
 from calibgraph.io.clouds import load_cloud
-from calibgraph.io.correspondence_tables import load_correspondences
-from calibgraph.io.feather import read_feather
+from calibgraph.io.tables import load_camera_matches, load_correspondences, read_feather
 from calibgraph.model.camera_matches import NAMES, NUMBERS, PLANES
 from calibgraph.model.correspondences import COORDINATES
 from tests.io.written import CLOUD, pcd, ply

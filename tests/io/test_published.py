@@ -18,7 +18,7 @@ from pyarrow import feather
 
 from calibgraph import CalibrationError, Dataset, Rig, calibrate, load_dataset, load_rig
 from calibgraph.io.formats.rig_import import read_rig_parts
-from calibgraph.io.rotations import quaternion_xyzw
+from calibgraph.io.rig_parts import quaternion_xyzw
 from calibgraph.model.geometry import invert
 from tests.conftest import SAMPLE, make_camera
 from tests.io.written import (
@@ -171,9 +171,7 @@ def copied(folders: dict[str, Path], name: str, to: Path) -> Path:
     return Path(shutil.copytree(folders[name], to / name))
 
 
-def test_the_extrinsics_of_a_sequence_use_the_whole_fourth_column(
-    folders: dict[str, Path],
-) -> None:
+def test_the_extrinsics_of_a_sequence_use_the_whole_fourth_column(folders: dict[str, Path]) -> None:
     rig = load_rig(folders["sequence"])
     assert list(rig.cameras) == ["image_2", "image_3"]
     for k in (2, 3):

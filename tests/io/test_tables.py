@@ -17,8 +17,7 @@ from calibgraph import (
     load_correspondences,
     simulate_correspondences,
 )
-from calibgraph.io.camera_match_tables import load_camera_matches
-from calibgraph.io.correspondence_tables import from_arrow
+from calibgraph.io.tables import from_arrow, load_camera_matches
 from calibgraph.model.camera_matches import COLUMNS, CameraMatches
 from tests.conftest import make_pair
 from tests.model.tables import camera_matches, table, to_arrow
@@ -217,9 +216,11 @@ def test_names_of_cameras_may_be_any_text(cameras: pa.Array | pa.ChunkedArray) -
 def test_a_column_whose_name_is_no_utf8_is_named_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_bytes(b"camera,fr\xffame,u_px,v_px,x_m,y_m,z_m\nleft,1,1,2,3,4,5\n")
-    with pytest.raises(FileError, match="table.csv: a column's name is not UTF-8") as caught:
-        load_correspondences(path)
-    assert "\n" not in str(caught.value)
+    for load, said in ((load_correspondences, "a column's name is not UTF-8"),
+                       (load_camera_matches, "holds a wrong value: 'utf-8' codec")):  # fmt: skip
+        with pytest.raises(FileError, match=f"table.csv: {said}") as caught:
+            load(path)
+        assert "\n" not in str(caught.value)
 
 
 def test_a_long_name_does_not_take_its_memory_for_every_row(tmp_path: Path) -> None:

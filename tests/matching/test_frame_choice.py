@@ -11,8 +11,13 @@ import pytest
 
 import calibgraph
 from calibgraph import Dataset, Frame, Rig, dataset_from_arrays
-from calibgraph.matching.frame_choice import CANDIDATES, choose_frames, without_copies
-from calibgraph.matching.standstill import View, find_stationary_frames
+from calibgraph.matching.frame_choice import (
+    CANDIDATES,
+    View,
+    choose_frames,
+    find_stationary_frames,
+    without_copies,
+)
 from tests.conftest import SAMPLE, make_camera
 
 

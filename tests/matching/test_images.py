@@ -14,7 +14,7 @@ import pytest
 import calibgraph
 from calibgraph import Dataset, DatasetError, dataset_from_arrays
 from calibgraph.matching.burnt_in import describe_burnt_in, find_burnt_in, hide_burnt_in
-from calibgraph.matching.camera_pairs.features import features_of, match_features
+from calibgraph.matching.camera_pairs.find import features_of, match_features
 from calibgraph.matching.same_images import find_same_images, require_different_images
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds

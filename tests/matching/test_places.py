@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph import Dataset, Rig
+from calibgraph.io.dataset import keep_frames
 from calibgraph.io.frame import Frame
-from calibgraph.io.kept_frames import keep_frames
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching import places
 from calibgraph.matching.cloud_similarity import Z_UP, UprightCloud, align_with_any, find_up

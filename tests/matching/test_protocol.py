@@ -143,7 +143,7 @@ def test_every_member_is_used_in_its_turn(truth: Rig, guess: Rig) -> None:
     assert (near[0], last[0]) == ("match 1", "match 2")  # tracking_rounds, then the last round
     assert near[2] > 0.05 > last[2]  # from a displaced start
     assert end[0] == "release"
-    assert run.rematch is not None and run.rematch.again is not None
+    assert run.rematch.keys() == truth.cameras.keys() and not run.rematch_failure
     assert run.matcher.image_checks_can_fail
 
 

@@ -41,7 +41,7 @@ def test_presets_use_the_papers_numbers() -> None:
 def check_of(
     name: str, value: float, direction: Direction, *limits: float, unit: str = ""
 ) -> Check:
-    return Threshold(name, name, direction, *limits, unit, "", "").check(value)
+    return Threshold(name, name, direction, *limits, unit, "").check(value)
 
 
 def test_the_worst_check_decides_and_its_reason_comes_first() -> None:

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from calibgraph import Rig, evaluate, load_dataset, load_rig, perturb
-from calibgraph.pick.server import PickServer
-from calibgraph.pick.workspace import Workspace
+from calibgraph.pick.server import PickServer, Workspace
 from tests.chromium import CHROMIUM, axe, in_chromium, sync_api
 from tests.conftest import SAMPLE
 

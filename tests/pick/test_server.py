@@ -19,10 +19,8 @@ import pytest
 
 from calibgraph import CalibrationError, Rig, evaluate, load_dataset, load_rig
 from calibgraph.model.geometry import twist_between
-from calibgraph.pick.estimate import MIN_PAIRS, estimate_from_pairs, reference_rig
-from calibgraph.pick.server import PickServer
-from calibgraph.pick.session import Pair
-from calibgraph.pick.workspace import Workspace, visible_points
+from calibgraph.pick.estimate import MIN_PAIRS, Pair, estimate_from_pairs, reference_rig
+from calibgraph.pick.server import PickServer, Workspace, visible_points
 from calibgraph.simulation.rigs import rig_of
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
@@ -209,10 +207,10 @@ def test_the_error_bar_is_the_scatter_of_pickers(count: int) -> None:
 def test_a_wrong_pair_is_marked_and_a_right_one_is_not() -> None:
     rig, rng = rig_of("kitti"), np.random.default_rng(3)
     pairs = draw_pairs(rig, "image_2", 12, rng, 1.0)
-    assert not any(estimate_from_pairs(rig, pairs).cameras["image_2"].wrong)
+    assert not any(estimate_from_pairs(rig, pairs)[1]["image_2"].wrong)
     u, v = pairs[4].pixel_px
     pairs[4] = pairs[4].model_copy(update={"pixel_px": (u + 60.0, v - 25.0)})
-    wrong = estimate_from_pairs(rig, pairs).cameras["image_2"].wrong
+    wrong = estimate_from_pairs(rig, pairs)[1]["image_2"].wrong
     assert wrong[4]
 
 
@@ -220,8 +218,8 @@ def test_too_few_pairs_and_pairs_on_one_line_give_no_camera() -> None:
     rig, rng = rig_of("kitti"), np.random.default_rng(1)
     few = draw_pairs(rig, "image_2", MIN_PAIRS - 1, rng, 0.0)
     estimate = estimate_from_pairs(rig, few)
-    assert estimate.cameras["image_2"].problem == "5 of 6 pairs"
-    assert np.abs(estimate.cameras["image_2"].residuals_px).max() < 1e-6  # of the guess
+    assert estimate[1]["image_2"].problem == "5 of 6 pairs"
+    assert np.abs(estimate[1]["image_2"].residuals_px).max() < 1e-6  # of the guess
     line = [
         few[0].model_copy(update={"point_lidar_m": (4.0 + k, 0.5, 0.1)}) for k in range(MIN_PAIRS)
     ]

@@ -17,11 +17,15 @@ import calibgraph
 from calibgraph import Calibration, Check, Rig, Verdict, perturb
 from calibgraph.errors import DatasetError
 from calibgraph.model.lens import LensEstimate
-from calibgraph.report.camera_section import worked_point
-from calibgraph.report.frames import relocate_frames
-from calibgraph.report.plots import ARROW_COLUMNS, arrow_factor, mean_residuals
-from calibgraph.report.reprojection_errors import constrained, reprojection_errors
-from calibgraph.solver.whitening import constrained_error_px
+from calibgraph.report.html import relocate_frames, worked_point
+from calibgraph.report.plots import (
+    ARROW_COLUMNS,
+    arrow_factor,
+    constrained,
+    mean_residuals,
+    reprojection_errors,
+)
+from calibgraph.solver.robust import constrained_error_px
 from tests.conftest import SAMPLE, CommandRun
 from tests.report.browsing import render
 from tests.report.conftest import read_page, solve_simulated, write_page

@@ -15,7 +15,7 @@ from rich.table import Table
 import calibgraph
 from calibgraph import Rig, simulate_correspondences
 from calibgraph.audit import Audit, CameraAudit, Drift, Trend
-from calibgraph.audit import tables as audit_tables
+from calibgraph.audit import page as audit_tables
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.metrics import Deviation, Evaluation, PoseError

@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 from starlette.testclient import TestClient
 
-from calibgraph.service.access import Scope, add_token
 from calibgraph.service.app import create_app
-from calibgraph.service.settings import Settings
+from calibgraph.service.request_guard import TokenScope, add_token
+from calibgraph.service.requests import Settings
 from tests.cli.conftest import save_problem
 
 URL = "http://localhost"
@@ -78,7 +78,7 @@ def bearer(token: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {token}"}
 
 
-def make_tokens(path: Path, *scopes: Scope) -> list[dict[str, str]]:
+def make_tokens(path: Path, *scopes: TokenScope) -> list[dict[str, str]]:
     """Headers with new tokens."""
     return [bearer(add_token(path, scope)) for scope in scopes]
 

@@ -9,12 +9,10 @@ from typing import Any
 import pytest
 
 from calibgraph.errors import CalibrationError, FileError
-from calibgraph.service.access import add_token, load_tokens
-from calibgraph.service.app import create_app
-from calibgraph.service.places import open_roots
-from calibgraph.service.request_guard import STRICT_HEADERS
-from calibgraph.service.serve import require_safe
-from calibgraph.service.settings import Settings
+from calibgraph.service.app import create_app, require_safe
+from calibgraph.service.folders import open_roots
+from calibgraph.service.request_guard import STRICT_HEADERS, add_token, load_tokens
+from calibgraph.service.requests import Settings
 from tests.service.conftest import Make, Problem, make_tokens
 
 

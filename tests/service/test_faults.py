@@ -13,9 +13,9 @@ from starlette.testclient import TestClient
 
 from calibgraph.errors import CalibrationError
 from calibgraph.service.app import create_app
-from calibgraph.service.data_folder import DataFolder
+from calibgraph.service.folders import DataFolder
 from calibgraph.service.jobs import DATABASE
-from calibgraph.service.settings import Settings
+from calibgraph.service.requests import Settings
 from tests.service.conftest import URL, Make, Problem, service_folder
 
 

@@ -10,12 +10,10 @@ from typing import Any
 import psutil
 import pytest
 
-from calibgraph.child_process import memory_limit
+from calibgraph.child_process import Outcome, memory_limit
 from calibgraph.errors import FileError
 from calibgraph.io.dataset import load_dataset
-from calibgraph.service.archives import open_upload
-from calibgraph.service.job_process import run_job
-from calibgraph.service.job_requests import JobOutcome
+from calibgraph.service.job_process import open_upload, run_job
 from tests.conftest import SAMPLE
 from tests.service.conftest import Make, Problem, service_folder
 from tests.service.hostile import Hostile, as_form, hostile_uploads, zipped
@@ -49,7 +47,7 @@ def what_is_wrong(client: Any, upload: Hostile, small: Problem, monkeypatch: Any
     files, fields = as_form(upload, small.rig, small.table)
     start = time.perf_counter()
     answer = client.post(f"/v1/jobs/{upload.kind}", files=files, data=fields)
-    outcome = JobOutcome(error_kind="bad input", error=answer.json().get("detail"))
+    outcome = Outcome(error_kind="bad input", error=answer.json().get("detail"))
     if answer.status_code not in REFUSED:
         if answer.status_code != 202:
             return str(answer.text)
@@ -58,12 +56,12 @@ def what_is_wrong(client: Any, upload: Hostile, small: Problem, monkeypatch: Any
     is_one_line = "\n" not in detail and len(detail) < MOST_LETTERS
     has_path = str(service_folder(client)) in detail
     is_refused = outcome.error_kind in ("bad input", "out of memory") and bool(detail)
-    is_done = outcome.verdict is not None and upload.is_harmless
+    is_done = outcome.result is not None and upload.is_harmless
     good = is_one_line and not has_path and seconds < MOST_S and (is_refused or is_done)
     return "" if good else f"{outcome} after {seconds:.1f} s"
 
 
-def run(client: Any, id: str, monkeypatch: Any) -> JobOutcome:
+def run(client: Any, id: str, monkeypatch: Any) -> Outcome:
     """Run a job as its process does, with its limit of memory."""
     task = client.app.state.service.runner.task(client.app.state.service.jobs.get(id))
     monkeypatch.chdir(os.getcwd())  # it goes back there

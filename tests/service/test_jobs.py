@@ -13,7 +13,7 @@ from starlette.testclient import TestClient
 
 from calibgraph import load_rig, solve
 from calibgraph.service.app import create_app
-from calibgraph.service.settings import Settings
+from calibgraph.service.requests import Settings
 from tests.conftest import SAMPLE, CommandRun
 from tests.service.conftest import URL, Make, Problem, service_folder
 from tests.service.hostile import zipped

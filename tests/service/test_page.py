@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from calibgraph.service.access import add_token
+from calibgraph.service.request_guard import add_token
 from tests.chromium import CHROMIUM, axe, in_chromium, sync_api
 from tests.service.conftest import Problem, bearer
 from tests.service.test_server import Server

@@ -28,8 +28,8 @@ HALF_REQUESTS = (
     b"\r\n\r\n",
 )
 SHORT = (
-    "from calibgraph.service import request_guard, serve;"
-    "request_guard.BODY_S = serve.IDLE_S = 2.0;"
+    "from calibgraph.service import app, request_guard;"
+    "request_guard.BODY_S = app.IDLE_S = 2.0;"
     "from calibgraph.cli.app import main; main()"
 )
 """The command with shorter waits."""

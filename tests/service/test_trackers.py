@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import io
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from starlette.testclient import TestClient
@@ -44,6 +47,47 @@ def test_updates_are_those_of_the_command(working: TestClient) -> None:
     found = send(working, "/v1/trackers/other", as_lines(tables))["updates"]
     assert found == [json.loads(line) for line in expected_lines(guess, tables, together=10)]
     assert working.delete("/v1/trackers/other").status_code == 200
+
+
+def arrow_stream(table: pa.Table) -> bytes:
+    sink = io.BytesIO()
+    with pa.ipc.new_stream(sink, table.schema) as writer:
+        writer.write_table(table)
+    return sink.getvalue()
+
+
+def test_frames_of_an_arrow_stream_give_the_updates_of_lines(
+    working: TestClient, small: Problem, at: str
+) -> None:
+    """Of columns out of the order of their frames, too."""
+    columns = ["camera", "frame", "u_px", "v_px", "x_m", "y_m", "z_m"]
+    table = pq.read_table(io.BytesIO(small.table), columns=columns).replace_schema_metadata(None)
+    frames = len(table["frame"].unique())
+    body = arrow_stream(table.sort_by([("frame", "descending")]))
+    assert working.put("/v1/trackers/arrow", content=small.rig).status_code == 200
+    found = send(working, "/v1/trackers/arrow", body)
+    assert found == send(working, at, *frames_as_lines(small.table))
+    assert (found["refused"], found["known"], len(found["updates"])) == ([], 0, frames)
+    assert send(working, "/v1/trackers/arrow", body)["known"] == frames
+    working.delete("/v1/trackers/arrow")
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda table: arrow_stream(table)[:-700], "not a whole Arrow IPC stream"),
+        (lambda table: b"\xff\xff\xff\xff" + 100 * b"a", "not a whole Arrow IPC stream"),
+        (lambda table: arrow_stream(table.drop_columns(["u_px"])), "u_px"),
+        (lambda table: arrow_stream(table.set_column(1, "frame", table["camera"])), "frame"),
+    ],
+)
+def test_an_arrow_stream_that_is_damaged_is_refused_in_words(
+    working: TestClient, small: Problem, at: str, damage: Callable[[pa.Table], bytes], words: str
+) -> None:
+    answer = working.post(at, content=damage(pq.read_table(io.BytesIO(small.table))))
+    assert answer.status_code == 422
+    assert words in answer.json()["detail"]
+    assert working.get(at).json()["frame"] is None
 
 
 def test_what_cannot_be_read_is_refused_in_words(working: TestClient, at: str) -> None:

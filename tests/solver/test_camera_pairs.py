@@ -20,10 +20,10 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
     twist_between,
 )
-from calibgraph.solver.camera_pairs import MIN_PAIR_MATCHES, PairTerm, pair_graph, pair_terms
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.optimizer import optimize
+from calibgraph.solver.pairs import MIN_PAIR_MATCHES, PairTerm, pair_graph, pair_terms
 from calibgraph.solver.solution import Solution
+from calibgraph.solver.two_pass import optimize
 from factors import EpipolarBlock, pose_sigmas
 
 FRAMES = 8

@@ -17,7 +17,8 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
-from calibgraph.graph.latent_poses import to_ordering
+from calibgraph.graph.components import VarianceRatios
+from calibgraph.graph.latent_poses import data_graph, latent_pose_graph, to_ordering
 from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.config import Config, preset
 from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES
@@ -25,20 +26,19 @@ from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.verdict import COMMON_ERROR
 from calibgraph.simulation.correspondences import PoseSpread
-from calibgraph.solver.camera_block import camera_blocks
 from calibgraph.solver.covariance import with_pseudo_frames
-from calibgraph.solver.elimination import join_linear
-from calibgraph.solver.error_model import ErrorFit, fit_errors
-from calibgraph.solver.error_shares import variances_by_source
+from calibgraph.solver.error_model import fit_errors
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.pair_refinement import PairFit, fit_pairs
-from calibgraph.solver.residual_scale import ResidualScale
-from calibgraph.solver.shared_error import shared_variance_ratio
-from calibgraph.solver.variance_components import VarianceRatios
+from calibgraph.solver.matches import camera_blocks
+from calibgraph.solver.pair_refinement import PairFit, fit_pairs, shared_variance_ratio
+from calibgraph.solver.places import ErrorFit
+from calibgraph.solver.robust import ResidualScale
+from calibgraph.solver.sources import variances_by_source
 from calibgraph.solver.within_place import block_by_place
-from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.evidence import Evidence, gather
 from factors import pose_sigmas
 from tests.draws.places import displaced
+from tests.solver.latent import all_values
 from tests.solver.test_camera_pairs import simulated_pairs
 
 ZERO = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
@@ -136,7 +136,7 @@ def table_of_places(rig: Rig, places: int, stated: dict[str, Any]) -> Correspond
 
 
 def evidence(rig: Rig, found: Correspondences, config: Config | None = None) -> Evidence:
-    return Evidence(solve_joint(rig, found, config or Config()), rig)
+    return gather(solve_joint(rig, found, config or Config()), rig)
 
 
 @pytest.mark.parametrize("config", [Config(), preset("kitti")])
@@ -151,9 +151,9 @@ def test_what_all_frames_share_is_the_share_that_its_size_has(pair: Rig, config:
 
 def test_the_shares_are_those_of_independent_errors_and_add_up(pair: Rig) -> None:
     """The part that is left to the matches is the one that their own equations give."""
-    errors = evidence(pair, table_of_places(pair, 3, OF_A_SENSOR)).solution.marginals.errors
+    errors = evidence(pair, table_of_places(pair, 3, OF_A_SENSOR)).solution.error_fit
     parts = variances_by_source(errors)
-    whole = np.diag(errors.fit.covariance)  # of which the matches are 3e-4 to 7e-3
+    whole = np.diag(errors.covariance)  # of which the matches are 3e-4 to 7e-3
     np.testing.assert_allclose((sum(parts.values()) + of_matches(errors)) / whole, 1, atol=1e-8)
 
 
@@ -162,23 +162,28 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
 
     From the dense covariance C: C G C, with G the information of each of these.
     """
-    linear, weight = (
-        errors.fit.linear,
-        errors.fit.place_weights(errors.model.components.robust_scale),
+    linear = errors.linear
+    weight, values, parts = linear.weights, all_values(linear), errors.model.components
+    cameras = weight[:, 1:, None, None]
+    parts = replace(
+        parts,
+        cloud_at_place=parts.cloud_at_place / weight[:, 0, None, None],
+        at_place=parts.at_place / cameras,
+        scatter_at_place=parts.scatter_at_place / cameras,
+        robust_scale=np.inf,
     )
-    parts = errors.model.components.with_fixed_weights(weight)
     model = replace(errors.model, components=parts)
-    order = to_ordering([*model.reported_keys, *model.shared_keys[: -len(model.cameras)],
-                         *model.place_keys])  # fmt: skip
+    others = [key for key in model.shared_keys if key not in model.reported_keys]
+    order = to_ordering([*model.reported_keys, *others, *model.place_keys])
     starts, end = {}, 0
     for number in range(order.size()):
         starts[order.at(number)] = end
         end += 3 if order.at(number) == DISTORTION else 6
-    graph = join_linear(linear.shared, linear.placed)
+    graph, data = (of(model).linearize(values) for of in (latent_pose_graph, data_graph))
     moved = np.linalg.inv(graph.hessian(order)[0])[: 6 * len(model.cameras)]
     information = np.zeros((end, end))
-    for number in range(linear.data.graph.size()):
-        factor = linear.data.graph.at(number)
+    for number in range(data.size()):
+        factor = data.at(number)
         rows = np.concatenate([starts[key] + np.arange(6) for key in list(factor.keys())])
         information[np.ix_(rows, rows)] += factor.information()
     shown = np.einsum("pn,pnij->ij", parts.distortion_weight, parts.distortion_information)
@@ -187,7 +192,7 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
     for number, (place, camera) in enumerate(model.matched_places):
         edge = model.place_graph.at(model.places + number)
         root = edge.noiseModel().R()
-        whitened, _ = edge.linearize(linear.values).jacobian()
+        whitened, _ = edge.linearize(values).jacobian()
         rows = np.concatenate([starts[key] + np.arange(6) for key in list(edge.keys())])
         scatter = root @ parts.scatter_at_place[place, camera] @ root.T
         information[np.ix_(rows, rows)] += whitened.T @ scatter @ whitened
@@ -262,7 +267,7 @@ def test_a_displaced_camera_widens_the_error_bars(pair: Rig) -> None:
     for points in (table.points_lidar_m, moved):
         given = replace(table, points_lidar_m=points, metadata=metadata)
         solution = solve_joint(pair, given, camera_matches=simulated_pairs(pair))
-        evidence = Evidence(solution, guess=pair)
+        evidence = gather(solution, pair)
         covariance = evidence.covariance_of("right")
         widths.append(float(np.sqrt(covariance[3, 3])))
         errors = [

@@ -22,7 +22,7 @@ from calibgraph import (
 )
 from calibgraph.model.config import TERMS
 from calibgraph.model.findings import error_components
-from calibgraph.solver import objective
+from calibgraph.solver import two_pass
 from calibgraph.solver.joint import require_in_reach, solve_joint
 from calibgraph.trust.thresholds import threshold
 from tests.conftest import make_camera, make_pair, stereo_relative_pose
@@ -241,7 +241,7 @@ def test_without_pnp_a_narrowing_loss_leads_to_where_matches_are_densest(
     found = solve_joint(start, table, Config(stage1="rig"))
     degrees, centimetres = worst(found.solved_rig, pair)
     assert degrees < 0.1 and centimetres < 5
-    monkeypatch.setattr(objective, "_NARROWINGS", 0)
+    monkeypatch.setattr(two_pass, "_NARROWINGS", 0)
     stuck, _ = worst(solve_joint(start, table, Config(stage1="rig")).solved_rig, pair)
     assert stuck > 1
 

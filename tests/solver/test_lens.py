@@ -24,9 +24,10 @@ from calibgraph.model.geometry import twist_between
 from calibgraph.model.rig import IntrinsicsSigma
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.lens_estimates import lens_estimates
+from calibgraph.solver.lens import lens_estimates
 from calibgraph.solver.solution import Solution
 from tests.draws.lenses import put_lens_error
+from tests.solver.latent import all_values
 from tests.solver.test_elimination import STATED, minimize
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
@@ -121,7 +122,7 @@ def test_an_uncertain_lens_widens_the_error_bar(drawn: Drawn) -> None:
         ahead = 6 * number + 5
         assert unknown.covariance[ahead, ahead] > 1.1 * known.covariance[ahead, ahead]
         assert known.lens[name][0].describe().startswith("not determined by these data")
-        assert known.marginals.error_sources(known.covariance)[name]
+        assert known.error_sources(known.covariance)[name]
 
 
 def test_the_lens_is_part_of_an_alignment_and_an_error_of_a_mount(drawn: Drawn) -> None:
@@ -140,15 +141,15 @@ def test_the_lens_is_part_of_an_alignment_and_an_error_of_a_mount(drawn: Drawn) 
         np.testing.assert_allclose(
             mounts[1].T_camera_lidar[name], alignments[1].T_camera_lidar[name]
         )
-        shares = mounts[1].marginals.error_sources(mounts[1].covariance)[name].translation
+        shares = mounts[1].error_sources(mounts[1].covariance)[name].translation
         assert shares["uncertain lenses and clocks"] > 0.9
 
 
 def test_the_covariance_of_a_mount_is_that_of_its_graph(drawn: Drawn) -> None:
     truth, table = drawn
     found = solve_joint(truth, table, Config(of="mount"))
-    fit = found.marginals.errors.fit
-    marginals = gtsam.Marginals(found.graph(), fit.linear.values)
+    fit = found.error_fit
+    marginals = gtsam.Marginals(found.graph(), all_values(fit.linear))
     for number in range(len(truth.cameras)):
         own = found.covariance[6 * number : 6 * number + 6, 6 * number : 6 * number + 6]
         sigmas = np.sqrt(np.diag(marginals.marginalCovariance(body_key(number))))
@@ -161,9 +162,9 @@ def test_estimate_and_sigma_are_those_of_the_whole_graph(drawn: Drawn) -> None:
     stated = table.with_findings(replace(table.findings, **STATED))
     wrong = put_lens_error(truth, "focal", 0.01)
     found = solve_joint(wrong, stated, Config(estimate=("focal", "centre")))
-    fit, graph = found.errors.fit, latent_pose_graph(found.errors.model)
-    values = minimize(graph, fit.linear.values)
-    assert 2 * graph.error(fit.linear.values) == pytest.approx(fit.cost, rel=1e-9)
+    fit, graph = found.errors, latent_pose_graph(found.errors.model)
+    values = minimize(graph, all_values(fit.linear))
+    assert 2 * graph.error(all_values(fit.linear)) == pytest.approx(fit.cost, rel=1e-9)
     assert 2 * graph.error(values) == pytest.approx(fit.cost, rel=1e-5)  # its tolerance is 1e-6
     marginals = gtsam.Marginals(graph, values)
     for number, (name, estimates) in enumerate(lens_estimates(fit).items()):
@@ -174,7 +175,7 @@ def test_estimate_and_sigma_are_those_of_the_whole_graph(drawn: Drawn) -> None:
         sigmas = np.sqrt(np.diag(own))
         relative = [one.sigma / one.prior_sigma for one in estimates]
         np.testing.assert_allclose(relative, sigmas, rtol=0.01)
-        assert np.abs((fit.linear.values.atVector(lens_key(number)) - lens) / sigmas).max() < 0.02
+        assert np.abs((fit.linear.shared.atVector(lens_key(number)) - lens) / sigmas).max() < 0.02
         pose = marginals.marginalCovariance(aligned_key(number))
         rows = slice(6 * number, 6 * number + 6)
         np.testing.assert_allclose(

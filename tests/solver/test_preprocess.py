@@ -21,17 +21,18 @@ from calibgraph import (
     Rig,
     simulate_correspondences,
 )
-from calibgraph.io import correspondence_tables
+from calibgraph.io import tables as correspondence_tables
 from calibgraph.solver import preprocess
 from calibgraph.solver.preprocess import Preprocessed
-from calibgraph.solver.residual_scale import (
+from calibgraph.solver.robust import (
+    constrained_error_px,
     iterate_spread,
     quantile,
     quantiles,
     robust_spread,
     robust_spreads,
+    sqrt_information,
 )
-from calibgraph.solver.whitening import constrained_error_px, sqrt_information
 from tests.model.tables import table as small_table
 
 to_arrow = Correspondences.to_arrow

@@ -19,9 +19,8 @@ from calibgraph import (
     MatcherErrors,
     Rig,
 )
-from calibgraph.tracking.frame_group import in_groups, update_all
-from calibgraph.tracking.stream_tables import StreamFrame
-from calibgraph.tracking.update import json_lines
+from calibgraph.tracking.assessment import json_lines
+from calibgraph.tracking.streams import StreamFrame, in_groups, update_all
 from calibgraph.trust.pose_posterior import PosePosterior
 from factors import pose_sigmas
 from tests.conftest import make_camera

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from calibgraph.errors import FileError
-from calibgraph.tracking.state_database import DATABASE, StateDatabase
-from calibgraph.tracking.state_recovery import Recovered
+from calibgraph.tracking.state_database import DATABASE, Recovered, StateDatabase
 
 INPUT_BYTES = 3
 LOG = f"{DATABASE}-wal"

@@ -27,7 +27,7 @@ from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.model.config import Tracking as Settings
 from calibgraph.tracking import command, dataset_frames
 from calibgraph.tracking.command import Tracking, track
-from calibgraph.trust.evidence import RunEvidence
+from calibgraph.trust import evidence
 from calibgraph.trust.pose_posterior import PosePosterior, no_posteriors
 from tests.conftest import stereo_relative_pose
 from tests.tracking.drives import FRAMES, Crashed, World, drive, flat, pair_of
@@ -127,7 +127,7 @@ def test_flat_images_widen_the_result_at_the_end_and_its_verdict(
         wanted = Tracking(rig=recorded.rig, config=Config(), out=tmp_path / name, matcher=matcher)
         return track(wanted, recorded.folders, notify=lambda _: None)[0]
 
-    monkeypatch.setattr(RunEvidence, "_measure_posteriors", no_posteriors)
+    monkeypatch.setattr(evidence, "measure_posteriors", no_posteriors)
     monkeypatch.setattr(dataset_frames, "measure_posteriors", measure)
     monkeypatch.setattr(Given, "image_checks_can_fail", True, raising=False)
     wide = run("wide", Given(concatenate(world.tables)))

@@ -23,9 +23,9 @@ from calibgraph import (
     perturb,
 )
 from calibgraph.tracking import durable, tracker
+from calibgraph.tracking.assessment import json_lines
 from calibgraph.tracking.state_bytes import Kind, encode
 from calibgraph.tracking.state_database import DATABASE, StateDatabase
-from calibgraph.tracking.update import json_lines
 from tests.conftest import KANNALA, Call
 from tests.tracking.drives import (
     World,
@@ -204,7 +204,7 @@ def test_a_saved_tracker_continues_with_the_same_numbers(pair: Rig, tmp_path: Pa
 
 def sealed(body: bytes, kind: Kind = "state") -> bytes:
     """With the mark and the checksum of a whole file of this version."""
-    mark = encode({}, "history").partition(b"\n")[0].replace(b"history", kind.encode())
+    mark = encode((), kind).partition(b"\n")[0]
     return mark + b"\n" + sha256(body).digest() + body
 
 

@@ -25,17 +25,14 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
     twist_between,
 )
-from calibgraph.solver.elimination import fit_latent_poses, start_values
 from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.places import start_values
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
-from calibgraph.tracking.contradictions import pose_priors
-from calibgraph.tracking.place_model import FrameSpread, PlaceData, place_model
-from calibgraph.tracking.place_sums import sums_by_place
-from calibgraph.tracking.quadratics import quadratics_of
-from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.evidence import gather
 from tests.conftest import stereo_relative_pose
 from tests.draws.lenses import with_known_lenses
 from tests.draws.places import Drawn, draw_places, tied
+from tests.solver.latent import all_values
 from tests.tracking.drives import drive, pair_of, track_draw
 
 Array = np.ndarray
@@ -53,7 +50,7 @@ STATED = {
 
 def batch_of(drawn: Drawn, **config: object) -> tuple[dict[str, Array], Array]:
     solved = solve_joint(drawn.rig, drawn.table, Config(learnt_weights=False, **config))
-    joint = Evidence(solved, guess=drawn.rig).joint_covariance
+    joint = gather(solved, drawn.rig).joint_covariance
     return solved.T_camera_lidar, joint
 
 
@@ -121,6 +118,24 @@ def test_standing_for_long_moves_the_estimate_no_more_than_passing() -> None:
     assert 0.25 < turned[:3] @ whole[:3] / (whole[:3] @ whole[:3]) < 0.5
 
 
+def test_a_wrong_place_among_many_hardly_counts() -> None:
+    """The cloud is turned by six sigmas at one of ten places."""
+    rig, tables = pair_of(), []
+    for place in range(10):
+        shown = cloud_turned(rig, 0.0042 if place == 4 else 0.0)
+        for table in drive(shown, 4, seed=place, matches=100):
+            frame = np.full(len(table), 4 * place) + table.frame
+            tables.append(states(replace(table, frame=frame)))
+    tracker = IncrementalCalibrator(rig)
+    for frame, table in enumerate(tables):
+        update = tracker.update(table, place=frame // 4)
+    turned = twist_between(update.T_camera_lidar["left"], rig.T_camera_lidar["left"])
+    assert np.linalg.norm(turned[:3]) < 0.04 * 0.0042 + 3 * 0.0007 / np.sqrt(9)
+    weights = dict(zip(tracker._state.settled, tracker._state.weights[:, 0], strict=True))
+    assert weights.pop("4") < 0.3
+    assert min(weights.values()) > 0.6
+
+
 def test_relative_poses_share_the_error_of_the_cloud() -> None:
     """Of 0.0015 rad, 60 % of the variance is the cameras' own: twice that is left of the pair."""
     tables = [states(table) for table in drive(pair_of(), 40)]
@@ -168,23 +183,23 @@ def tracked_at_three_places(frames: int, **config: object) -> tuple[IncrementalC
 
 
 def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:
-    """By GTSAM's LM and Marginals: within 0.01 sigma, and a thousandth of the covariance."""
+    """By GTSAM's LM and Marginals: within 0.02 sigma, and half a percent of the covariance.
+
+    Places have the weights in their robust loss that they had at the end of the last epoch.
+    """
     tracker, update = tracked_at_three_places(24)
-    linear, graph = tracker._assess().window, tracker.graph
-    start, keys = linear.values, linear.model.reported_keys
+    model, graph = tracker._graph.whole_model(tracker._state), tracker.graph
+    start = all_values(start_values(model, update.T_camera_lidar))
     values = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     marginals = gtsam.Marginals(graph, values)
-    for camera, name in enumerate(("left", "right")):
+    for key, name in zip(model.reported_keys, ("left", "right"), strict=True):
         reported = update.covariance[name]
-        found = marginals.marginalCovariance(keys[camera])
-        np.testing.assert_allclose(
-            found,
-            reported,
-            atol=1e-3 * np.sqrt(np.outer(np.diag(reported), np.diag(reported))).max(),
-        )
-        T = to_T_camera_lidar(values.atPose3(keys[camera]))
+        found = marginals.marginalCovariance(key)
+        units = np.sqrt(np.outer(np.diag(reported), np.diag(reported)))
+        np.testing.assert_allclose(found / units, reported / units, atol=5e-3)
+        T = to_T_camera_lidar(values.atPose3(key))
         apart = twist_between(update.T_camera_lidar[name], T) / np.sqrt(np.diag(reported))
-        assert np.abs(apart).max() < 0.01
+        assert np.abs(apart).max() < 0.02
 
 
 def test_with_a_preset_of_the_paper_the_graph_is_equation_5() -> None:
@@ -200,26 +215,6 @@ def test_with_a_preset_of_the_paper_the_graph_is_equation_5() -> None:
             update.covariance[name],
         )
         assert np.abs(twist_between(own, T) / np.sqrt(np.diag(covariance))).max() < 0.01
-
-
-def test_an_update_is_the_optimum_of_the_graph_with_all_places() -> None:
-    """Places that the open epoch does not touch are one factor there.
-
-    Within 0.02 sigma: their losses have the weights of the optimum at the end of the last epoch.
-    """
-    tracker, update = tracked_at_three_places(24)
-    state, closed, joint = tracker._state, tracker._closed, tracker._assess()
-    places = closed.sums.add(sums_by_place(state.epochs[-1].frames))
-    rows = {places.names[row]: row for row in (1, 2, 3)}
-    data = PlaceData.of(state, quadratics_of(state, state.places), state.live_frames, rows)
-    model = place_model(state, places, FrameSpread.of(state, places), data)
-    model = replace(model, pose_graph=pose_priors(state))
-    whole = fit_latent_poses(model, start_values(model, update.T_camera_lidar))
-    sigmas = np.sqrt(np.diag(whole.covariance)).reshape(2, 6)
-    for own, (name, T) in zip(sigmas, whole.T_camera_lidar.items(), strict=True):
-        apart = twist_between(update.T_camera_lidar[name], T)
-        assert np.abs(apart / own).max() < 0.02
-    np.testing.assert_allclose(np.sqrt(np.diag(joint.joint_covariance)), sigmas.ravel(), rtol=0.01)
 
 
 def test_a_camera_that_is_blind_at_new_places_stops_nothing() -> None:

@@ -20,8 +20,7 @@ from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_a
 from hypothesis.strategies import booleans, floats, integers, lists, sampled_from
 
 from calibgraph.errors import FileError
-from calibgraph.tracking.state_database import DATABASE, StateDatabase
-from calibgraph.tracking.state_recovery import Recovered
+from calibgraph.tracking.state_database import DATABASE, Recovered, StateDatabase
 from tests.tracking.state_data import (
     LOG,
     Files,

@@ -17,7 +17,7 @@ import pytest
 from pyarrow import parquet
 
 from calibgraph import Correspondences, FileError
-from calibgraph.tracking import stream_lines, streams
+from calibgraph.tracking import streams
 from calibgraph.tracking.streams import Refused, StreamFrame, frames_of
 
 to_arrow = Correspondences.to_arrow
@@ -239,7 +239,7 @@ def test_a_wrong_line_is_refused_and_the_next_one_read(wrong: bytes, message: st
 def test_a_line_that_is_too_long_is_refused_without_being_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(stream_lines, "MAX_LINE_BYTES", 100_000)
+    monkeypatch.setattr(streams, "MAX_LINE_BYTES", 100_000)
     long = b'{"frame": "' + b"x" * 1_000_000 + b'"}'
     assert "is longer than 100000 bytes" in refusal(long)
     # Neither does one byte too many pass, nor is one that just fits refused.

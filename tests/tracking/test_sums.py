@@ -7,40 +7,46 @@ import numpy as np
 import pytest
 
 from calibgraph import Config, Correspondences, MatcherErrors, Rig, simulate_correspondences
-from calibgraph.solver.block_residuals import BlockResiduals
-from calibgraph.solver.camera_block import CameraBlock, camera_blocks
+from calibgraph.solver.matches import BlockResiduals, CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.tracking.epoch_summary import STRENGTHS, EpochSummary
-from calibgraph.tracking.noise import ResidualHistogram
-from calibgraph.tracking.place_sums import MOST_PLACES, PlaceSums
-from calibgraph.tracking.sums import Sums
+from calibgraph.tracking.eliminate import eliminate
+from calibgraph.tracking.noise import BINS, add_residuals, scale_of
+from calibgraph.tracking.state import STRENGTHS
+from calibgraph.tracking.sums import MOST_PLACES, PlaceSums, Sums
 
 Array = np.ndarray
 
 
-def part(name: str, seed: int, frames: int = 3) -> dict[str, Sums]:
+def part(name: str, seed: int, frames: int = 3) -> tuple[str, Sums]:
     """Sums of two cameras at a place."""
     rng = np.random.default_rng(seed)
     roots, scores = rng.standard_normal((2, 6, 6)), rng.standard_normal((frames, 2, 6))
     hessian = roots @ roots.swapaxes(1, 2)
-    return {
-        name: Sums.of(
-            hessian=hessian,
-            gradient=rng.standard_normal((2, 6)),
-            reweighted=hessian,
-            score=scores.sum(axis=0),
-            scatter=np.einsum("fni,fnj->nij", scores, scores),
-            frames=np.full(2, float(frames)),
-            matches=np.full(2, 100.0 * frames),
-        )
-    }
+    return name, Sums.of(
+        hessian=hessian,
+        gradient=rng.standard_normal((2, 6)),
+        reweighted=hessian,
+        score=scores.sum(axis=0),
+        scatter=np.einsum("fni,fnj->nij", scores, scores),
+        frames=np.full(2, float(frames)),
+        matches=np.full(2, 100.0 * frames),
+    )
 
 
-def sums_of(*parts: dict[str, Sums]) -> PlaceSums:
+def sums_of(*parts: tuple[str, Sums]) -> PlaceSums:
     found = PlaceSums.empty(2)
-    for one in parts:
-        found = found.add(one)
+    for name, one in parts:
+        found = found.add([name], Sums.stack([one]))
     return found
+
+
+def test_frames_of_several_places_are_added_to_theirs_the_last_visited_last() -> None:
+    frames = [part(name, seed) for seed, name in enumerate("abac")]
+    names, sums = zip(*frames, strict=True)
+    found = PlaceSums.empty(2).add([names[0]], Sums.stack(sums[:1]))
+    found = found.add(names[1:], Sums.stack(sums[1:]))
+    assert found.names[1:] == ("b", "a", "c")
+    np.testing.assert_allclose(found.rows.packed[2], sums[0].packed + sums[2].packed)
 
 
 def test_older_places_are_one_row_that_counts_as_many() -> None:
@@ -89,34 +95,69 @@ def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
         scatter=C @ C.T,
         frames=np.array(10.0),
     )
-    memory = EpochSummary.empty().add(epoch, Sums.zeros())
+    walks = Sums.stack([epoch] * len(STRENGTHS))
     variance = np.linspace(0.1, 0.6, 6)
-    after = memory.propagate(np.outer(STRENGTHS**2, variance), overconfidence=3.0)
+    after, _ = walks.after_walk(np.outer(STRENGTHS**2, variance), np.full(len(STRENGTHS), 3.0))
     for walk, strength in enumerate(STRENGTHS):
-        expected = inverse_sandwich(memory, walk) + strength**2 * np.diag(variance)
-        np.testing.assert_allclose(inverse_sandwich(after, walk), expected, rtol=1e-9)
-    np.testing.assert_array_equal(after.walks.hessian[0], memory.walks.hessian[0])  # it stands
-    for walk in range(len(STRENGTHS)):
-        np.testing.assert_allclose(after.walks.step(walk), memory.walks.step(walk))
+        expected = inverse_sandwich(epoch) + strength**2 * np.diag(variance)
+        np.testing.assert_allclose(inverse_sandwich(after[walk]), expected, rtol=1e-9)
+        steps = [np.linalg.solve(sums.hessian, sums.gradient) for sums in (after[walk], epoch)]
+        np.testing.assert_allclose(*steps)
+    np.testing.assert_allclose(after.hessian[0], epoch.hessian, rtol=1e-12)  # it stands
 
 
-def inverse_sandwich(memory: EpochSummary, walk: int) -> Array:
-    inverse = np.linalg.inv(memory.walks.hessian[walk])
-    return np.asarray(inverse @ memory.walks.scatter[walk] @ inverse)
+def inverse_sandwich(sums: Sums) -> Array:
+    inverse = np.linalg.inv(sums.hessian)
+    return np.asarray(inverse @ sums.scatter @ inverse)
 
 
-def test_a_walk_does_not_magnify_sums_of_a_hessian_that_is_not_definite() -> None:
-    """Frames far from the estimate give one: the gain has a pole at -k / Q."""
-    variance, weights = np.full(6, 0.5), np.diag([3.0, 2, 2, 2, 2, 2])
-    for least in (-1.0, -5.99, -6.01, -40.0):  # k / Q is 6
-        sums = Sums.zeros().change(
-            hessian=np.diag([5.0, 2, 2, 2, 2, least]), reweighted=weights, gradient=np.ones(6)
-        )
-        after, kept = sums.after_walk(variance, 3.0)
-        assert 0.5 < kept < 1 and np.linalg.eigvalsh(after.hessian)[0] > 0
-        assert np.abs(after.gradient).max() < 1
-        standing, _ = sums.after_walk(np.zeros(6), 3.0)
-        np.testing.assert_array_equal(standing.packed, sums.packed)
+def test_places_are_eliminated_as_by_one_system_of_all_poses() -> None:
+    """Three cameras at four places, one of which a camera has not seen: by dense algebra."""
+    rng, P, n = np.random.default_rng(0), 4, 3
+
+    def definite(*shape: int) -> Array:
+        root = rng.standard_normal((*shape, 6, 6))
+        return root @ root.swapaxes(-1, -2) + 0.1 * np.eye(6)
+
+    known, at_place, cloud, shared = definite(P, n), definite(P, n), definite(P), definite(n)
+    minimum, adjoint = rng.standard_normal((P, n, 6)), rng.standard_normal((n, 6, 6))
+    seen = np.ones((P, n), dtype=np.bool_)
+    seen[1, 2] = False
+    weight = np.linalg.inv(np.linalg.inv(known) + at_place) * seen[..., None, None]
+    found = eliminate(weight, minimum, np.linalg.inv(cloud), adjoint)
+    size = 6 * (n + P + P * n)
+    hessian, vector = np.zeros((size, size)), np.zeros(size)
+
+    def add(parts: dict[int, Array], information: Array, value: Array) -> None:
+        jacobian = np.zeros((6, size))
+        for index, block in parts.items():
+            jacobian[:, 6 * index : 6 * index + 6] = block
+        hessian[...] += jacobian.T @ information @ jacobian
+        vector[...] += jacobian.T @ information @ value
+
+    for p in range(P):
+        add({n + p: np.eye(6)}, np.linalg.inv(cloud[p]), np.zeros(6))
+        for c in range(n):
+            v = n + P + p * n + c
+            add({v: np.eye(6)}, np.linalg.inv(at_place[p, c]), np.zeros(6))
+            if seen[p, c]:
+                parts = {c: np.eye(6), n + p: -adjoint[c], v: np.eye(6)}
+                add(parts, known[p, c], minimum[p, c])
+    k = 6 * n
+    gain = hessian[:k, k:] @ np.linalg.inv(hessian[k:, k:])
+    np.testing.assert_allclose(found.information, hessian[:k, :k] - gain @ hessian[k:, :k])
+    np.testing.assert_allclose(found.vector, vector[:k] - gain @ vector[k:])
+    for camera in range(n):  # with what all places share, the poses of places
+        rows = slice(6 * camera, 6 * camera + 6)
+        hessian[rows, rows] += shared[camera]
+    optimum, covariance = np.linalg.solve(hessian, vector), np.linalg.inv(hessian)
+    u, v = found.displacements(optimum[:k].reshape(n, 6), at_place)
+    np.testing.assert_allclose(np.concatenate([u.ravel(), v.ravel()]), optimum[k:])
+    of_u, of_v = found.covariances(covariance[:k, :k], at_place)
+    blocks = np.concatenate([of_u, of_v.reshape(-1, 6, 6)])
+    for index, block in enumerate(blocks):
+        rows = slice(k + 6 * index, k + 6 * index + 6)
+        np.testing.assert_allclose(block, covariance[rows, rows], atol=1e-12)
 
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
@@ -131,12 +172,12 @@ def test_the_histogram_finds_the_scale_of_all_frames(pair: Rig) -> None:
     """Its bins are 1 % wide and values within them are taken as even: 0.3 % is a third of one."""
     table = simulate_correspondences(pair, frames=40, matches=300, errors=ERRORS, seed=5)
     T = pair.T_camera_lidar["left"]
-    spread = ResidualHistogram()
+    histogram = np.zeros((2, BINS))
     for frame in range(40):
         block = matches_of(pair, table.select(table.frame == frame), "left")
-        spread = spread.add(BlockResiduals.at(T, block))
+        histogram = add_residuals(histogram, BlockResiduals.at(T, block))
     expected = matches_of(pair, table, "left").scale(T, Config())
-    found = spread.scale(Config())
+    found = scale_of(histogram, block.least_spread, Config())
     assert found.sigma_px == pytest.approx(expected.sigma_px, rel=3e-3)
     assert found.gate_px == pytest.approx(expected.gate_px, rel=3e-3)
 

@@ -23,8 +23,8 @@ from calibgraph import (
     solve,
 )
 from calibgraph.tracking import tracker as tracker_module
+from calibgraph.tracking.assessment import json_lines
 from calibgraph.tracking.cause import Steps, find_cause
-from calibgraph.tracking.update import json_lines
 from tests.conftest import KANNALA, make_camera, stereo_relative_pose
 from tests.tracking.drives import ERRORS, drive, drive_at, moved, pair_of, step_of
 
@@ -324,6 +324,7 @@ def degenerate(number: int, good: Correspondences, rng: np.random.Generator) -> 
         ("one", 1.0, 34),
         pytest.param("fisheye", 0.4, 50, marks=pytest.mark.slow),
         ("fisheye", 1.0, 34),
+        ("mirror", 0.4, 34),
         ("tied", 0.4, 50),
         ("tied", 1.0, 34),
     ],
@@ -334,6 +335,7 @@ def test_nonsense_neither_throws_nor_harms(kind: str, share: float, frames: int)
     rig = {
         "one": Rig(cameras={"only": make_camera()}),
         "fisheye": pair_of(model="fisheye", distortion=KANNALA),
+        "mirror": pair_of(model="omnidirectional", distortion=(1.2, 0.02, -0.01, 1e-3, -1e-3)),
         "tied": tied.model_copy(update={"relative_poses": (stereo_relative_pose(tied),)}),
     }[kind]
     rng = np.random.default_rng(3)

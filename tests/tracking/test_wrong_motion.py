@@ -12,8 +12,8 @@ import pytest
 from calibgraph import Config, Correspondences, DurableCalibrator, Rig, concatenate
 from calibgraph.errors import MotionError
 from calibgraph.simulation.rigs import rig_of
+from calibgraph.tracking.command import MOTION_FRAMES, Run
 from calibgraph.tracking.history import History
-from calibgraph.tracking.run import MOTION_FRAMES, Run
 from calibgraph.tracking.streams import Item, Refused, StreamFrame
 from factors import Clock
 from tests.conftest import Call

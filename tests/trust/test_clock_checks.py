@@ -13,15 +13,14 @@ import pytest
 
 from calibgraph import Config, Correspondences, Dataset, Frame, Rig, solve
 from calibgraph.io.bags import MESSAGE_SUFFIX
-from calibgraph.io.kept_frames import keep_frames
-from calibgraph.io.motion import ScanMotion
+from calibgraph.io.dataset import keep_frames
+from calibgraph.io.frame import ScanMotion
 from calibgraph.matching.protocol import FullMatcher, Matcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.geometry import invert
 from calibgraph.model.verdict import Check
 from calibgraph.progress import Stopwatch
 from calibgraph.solver.joint import solve_joint
-from calibgraph.trust.evidence import RunEvidence
 from calibgraph.trust.inputs import motion_doubts
 from calibgraph.trust.lens_checks import (
     _with_known_motion,
@@ -111,13 +110,12 @@ class Recorder:
 
 def run_of(
     matcher: Matcher, rig: Rig, frames: Sequence[Frame], found: Correspondences
-) -> RunEvidence:
+) -> MatchingRun:
     data = Dataset(rig=rig, frames=tuple(frames), folders=())
     solution = solve_joint(rig, found, Config())
-    run = MatchingRun(
+    return MatchingRun(
         data, FullMatcher(matcher), rig, found, solution, rounds=(), watch=Stopwatch()
     )
-    return RunEvidence(run, {})
 
 
 def moving_frames(twists: np.ndarray) -> list[Frame]:
@@ -139,8 +137,7 @@ def test_the_times_of_a_rig_stand_where_the_motion_of_a_bag_is_known() -> None:
     cameras = {n: c.model_copy(update={"time_offset_s": 0.04}) for n, c in rig.cameras.items()}
     stated = rig.model_copy(update={"cameras": cameras})
     matcher = Recorder(replace(table, twist_per_s=None))
-    evidence = run_of(matcher, stated, moving_frames(twists), table)
-    checks = image_offset_checks(evidence)
+    checks = image_offset_checks(run_of(matcher, stated, moving_frames(twists), table))
     assert matcher.offsets_s == [0.04] * len(rig.cameras)
     assert {check.status for of in checks.values() for check in of} == {"PASS"}
 

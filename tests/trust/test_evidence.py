@@ -27,7 +27,7 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pair_refinement import fit_pairs
 from calibgraph.trust.agreement import PairAgreement, check_agreement, pair_agreement
-from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.evidence import gather
 from factors import pose_sigmas
 from tests.conftest import stereo_relative_pose
 from tests.solver.test_camera_pairs import simulated_pairs
@@ -90,8 +90,7 @@ def test_an_error_shared_by_all_frames_moves_a_camera_without_correspondences_wi
     table = simulated(pair, frames=10).of_camera("left")
     findings = table.metadata | {"systematic_rotation_rad": 0.01, "systematic_translation_m": 0.1}
     table = table.with_metadata(findings)
-    evidence = Evidence(solve_joint(rig, table), guess=rig)
-    covariance = evidence.joint_covariance
+    covariance = gather(solve_joint(rig, table), rig).joint_covariance
     sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 6)
     assert sigmas[1, :3] == pytest.approx([0.01] * 3, rel=0.05)  # not more: the pair is rigid
     assert sigmas[1, 3:] == pytest.approx([0.1] * 3, rel=0.05)
@@ -111,19 +110,16 @@ def test_a_relative_pose_ties_cameras_unless_matches_contradict_it(
         seen.append(found)
         return {}
 
-    evidence = Evidence(solve_joint(rig, simulated(rig, frames=10), Config()), rig, measure)
-    assert not evidence.posteriors
+    assert not gather(solve_joint(rig, simulated(rig, frames=10)), rig, measure).posteriors
     assert seen == [groups or [("left",), ("right",)]]
 
 
 SIGMAS = pose_sigmas(rotation_rad=np.radians(0.05), translation_m=0.01)
-COVARIANCE = np.diag(np.tile(SIGMAS**2, 2))
 
 
-def agreement(rig: Rig, table: CameraMatches, covariance: np.ndarray | None) -> PairAgreement:
-    each = np.diag(SIGMAS**2) if covariance is None else covariance[:6, :6]
-    (fit,) = fit_pairs(rig, table, Config(), np.array([each, each]))
-    return pair_agreement(rig, fit, covariance)
+def agreement(rig: Rig, table: CameraMatches) -> PairAgreement:
+    (fit,) = fit_pairs(rig, table, Config(), np.array([np.diag(SIGMAS**2)] * 2))
+    return pair_agreement(rig, fit, np.diag(np.tile(SIGMAS**2, 2)))
 
 
 def test_a_right_calibration_agrees(pair: Rig) -> None:
@@ -137,7 +133,7 @@ def test_a_right_calibration_agrees(pair: Rig) -> None:
             name: gtsam.Pose3.Expmap(twist).matrix() @ T
             for twist, (name, T) in zip(twists, pair.T_camera_lidar.items(), strict=True)
         }
-        found = agreement(pair.moved_to(moved), table, COVARIANCE)
+        found = agreement(pair.moved_to(moved), table)
         sigmas.append(found.sigmas)
         assert found.degrees < 0.4 and found.centimetres < 6
     # The largest of six standard Gaussians is 0.5 to 3 in 99 of 100 draws.
@@ -146,7 +142,7 @@ def test_a_right_calibration_agrees(pair: Rig) -> None:
 
 def test_a_moved_camera_disagrees_by_its_motion(pair: Rig) -> None:
     moved = perturb(pair, rotation_deg=0.5, translation_m=0.1, seed=4).T_camera_lidar["right"]
-    found = agreement(pair.moved_to({"right": moved}), simulated_pairs(pair), COVARIANCE)
+    found = agreement(pair.moved_to({"right": moved}), simulated_pairs(pair))
     assert found.degrees == pytest.approx(0.5, abs=0.1)
     assert found.sigmas > 4
 
@@ -154,7 +150,7 @@ def test_a_moved_camera_disagrees_by_its_motion(pair: Rig) -> None:
 def test_swapped_images_disagree_by_twice_the_baseline(pair: Rig) -> None:
     table = simulated_pairs(pair)
     swapped = replace(table, pixels_px=np.ascontiguousarray(table.pixels_px[:, ::-1]))
-    found = agreement(pair, swapped, COVARIANCE)
+    found = agreement(pair, swapped)
     assert found.centimetres == pytest.approx(100, abs=10)
     assert found.sigmas > 10
 

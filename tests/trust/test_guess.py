@@ -6,6 +6,7 @@ import logging
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from calibgraph import Intrinsics, MatcherErrors, Rig, load_calibration, load_ri
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import T_OPTICAL_LINK
 from calibgraph.model.verdict import Check
+from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import implausible_checks
 from calibgraph.trust.conventions import (
     convention_error_between,
@@ -25,11 +27,12 @@ from calibgraph.trust.conventions import (
     likely_intended_guess,
     undo_convention_errors,
 )
+from calibgraph.trust.evidence import gather
 from calibgraph.trust.guess import (
-    compare_with_guess,
     compare_with_other_guesses,
-    compare_with_range,
     describe_other_frame,
+    guess_checks,
+    range_checks,
 )
 from calibgraph.trust.inputs import check_inputs
 from tests.conftest import SAMPLE, Call, make_camera
@@ -116,9 +119,9 @@ def test_an_inverted_guess_is_named_though_the_result_is_right(pair: Rig) -> Non
 
 def test_a_near_guess_passes(pair: Rig) -> None:
     guess = calibgraph.perturb(pair, rotation_deg=10, translation_m=1, seed=1)
-    for name, T in pair.T_camera_lidar.items():
-        checks = compare_with_guess(guess.T_camera_lidar[name], T, MatcherFindings())
-        assert all(check.status == "PASS" for check in checks)
+    evidence = gather(solve_joint(pair, simulated(pair)), guess)
+    for checks in guess_checks(evidence).values():
+        assert [check.status for check in checks] == ["PASS"]
 
 
 def test_swapped_cameras_are_named(pair: Rig) -> None:
@@ -126,19 +129,22 @@ def test_swapped_cameras_are_named(pair: Rig) -> None:
     right = pair.T_camera_lidar
     swapped = dict(zip(right, reversed(right.values()), strict=True))
     guess = calibgraph.perturb(pair, rotation_deg=2, translation_m=0.2, seed=3).T_camera_lidar
-    for name in right:
-        (check,) = compare_with_other_guesses(name, guess, right)
+    for (check,) in compare_with_other_guesses(guess, right).values():
         assert check.status == "PASS"
-        (check,) = compare_with_other_guesses(name, guess, swapped)
+    for (check,) in compare_with_other_guesses(guess, swapped).values():
         assert check.status != "PASS" and "are their images swapped" in check.text
+    # Of one of them alone, whose own guess is as far away as the other's is near.
+    good = calibgraph.perturb(pair, rotation_deg=0.5, translation_m=0.05, seed=3).T_camera_lidar
+    found = compare_with_other_guesses(good, {"left": swapped["left"]})
+    assert [*found] == ["left"] and found["left"][0].status == "FAIL"
     # Lenses of one housing, and results that are off by more than these are apart.
     near = {"left": np.eye(4), "right": np.eye(4)}
     near["right"][0, 3] = 0.02
     for results in (near, dict(zip(near, reversed(near.values()), strict=True))):
-        (check,) = compare_with_other_guesses("left", near, results)
+        (check,) = compare_with_other_guesses(near, results)["left"]
         assert check.status == "PASS"
-    alone = {"left": guess["left"]}, {"left": right["left"]}
-    assert compare_with_other_guesses("left", *alone) == []
+    for guesses, results in (({"left": guess["left"]}, {"left": right["left"]}), (guess, {})):
+        assert compare_with_other_guesses(guesses, results) == {}
 
 
 @pytest.mark.parametrize(
@@ -156,7 +162,7 @@ def test_a_swap_is_named_as_far_as_the_guesses_can_show_it(
             pair, rotation_deg=degrees, translation_m=metres, seed=seed, uniform=True
         )
         for is_swapped, results in ((False, right), (True, swapped)):
-            (check,) = compare_with_other_guesses("left", drawn.T_camera_lidar, results)
+            (check,) = compare_with_other_guesses(drawn.T_camera_lidar, results)["left"]
             statuses[is_swapped].append(check.status)
     assert statuses[False].count("FAIL") <= false_fails * 300
     assert statuses[True].count("FAIL") >= named * 300
@@ -184,10 +190,11 @@ def test_guesses_from_another_frame_of_the_vehicle_are_named(pair: Rig) -> None:
     apart = from_base | {"right": pair.T_camera_lidar["right"]}
     assert describe_other_frame(apart, pair.T_camera_lidar) == ""
     assert describe_other_frame(rough.T_camera_lidar, pair.T_camera_lidar) == ""
-    (check,) = compare_with_range(
-        exact["left"], left["left"], MatcherFindings(range_translation_m=0.3), text
-    )
-    assert check.status == "FAIL" and text in check.text
+    table = simulated(pair, frames=2).with_findings(MatcherFindings(range_translation_m=0.3))
+    guess = pair.moved_to({name: T @ T_lidar_base for name, T in pair.T_camera_lidar.items()})
+    run = SimpleNamespace(correspondences=table, guess=guess, solution=pair)
+    for (check,) in range_checks(run).values():
+        assert check.status == "FAIL" and "all cameras are moved as if" in check.text
 
 
 SLOW = pytest.mark.slow

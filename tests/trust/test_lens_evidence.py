@@ -13,7 +13,7 @@ import calibgraph
 from calibgraph import Camera, Dataset, Rig
 from calibgraph.io.frame import Frame
 from calibgraph.model.places import Places
-from calibgraph.solver.camera_twist import apply_twist
+from calibgraph.solver.columns import apply_twist
 from calibgraph.trust import image_evidence
 from calibgraph.trust.image_checks import evidence_checks
 from calibgraph.trust.image_evidence import WIDE, FrameScorer, ImageEvidence, measure_lens

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from calibgraph.solver.linear_fit import Freed
+from calibgraph.solver.columns import Marginal
 from calibgraph.trust.lens_parameter import (
     IMAGES,
     RESIDUALS,
@@ -39,9 +39,9 @@ def test_the_tolerance_of_the_user_decides_how_far_is_wrong() -> None:
     assert check_parameter(found, IMAGES, (0.5, 2.0)).value == by_tolerance[0]
 
 
-def freed(*values: float, covariance: list[list[float]]) -> Freed:
+def freed(*values: float, covariance: list[list[float]]) -> Marginal:
     compensating = np.ones((6, len(values)))
-    return Freed(np.zeros(6), np.array(values), np.array(covariance), compensating)
+    return Marginal(np.zeros(6), np.array(values), np.array(covariance), compensating)
 
 
 @pytest.mark.parametrize("other", [0.0, -2.0, -5.0, 8.0, 30.0])

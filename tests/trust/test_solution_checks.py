@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gtsam
 import numpy as np
@@ -20,11 +22,13 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
+from calibgraph.io.frame import Frame
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import twist_between
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.agreement import check_competing_solution
-from calibgraph.trust.matcher_checks import check_repeated_files
+from calibgraph.trust.evidence import Checks
+from calibgraph.trust.matcher_checks import repeated_file_checks
 from calibgraph.trust.observability import weakest_direction
 from tests.conftest import SAMPLE
 from tests.trust.conftest import named, simulated
@@ -101,21 +105,30 @@ def test_frames_that_are_left_out_alike_are_a_competing_solution(pair: Rig) -> N
 def test_frames_with_the_same_cloud_or_image_are_reported() -> None:
     data = calibgraph.load_dataset(SAMPLE).select("0:3")
     hashes = {path: digest for frame in data.frames for path, digest in frame.hashes().items()}
-    assert check_repeated_files(data, hashes, ["left"]) == {"left": []}
+
+    def check(frames: Sequence[Frame], copies: Sequence[tuple[str, str]] = ()) -> Checks:
+        return repeated_file_checks(
+            SimpleNamespace(
+                dataset=replace(data, frames=tuple(frames)), hashes=hashes, copies=copies,
+                guess=data.rig,
+            )
+        )  # fmt: skip
+
+    assert check(data.frames) == {"left": [], "front_left": [], "front_right": []}
     copy = replace(data.frames[0], index=3, name="copy")
-    copied = replace(data, frames=(*data.frames, copy))
-    (check,) = check_repeated_files(copied, hashes, ["left"])["left"]
-    assert (check.name, check.status) == ("equal files", "WARN")
-    assert "000000 and copy have the same image of left" in check.text
+    (found,) = check([*data.frames, copy])["left"]
+    assert (found.name, found.status) == ("equal files", "WARN")
+    assert "000000 and copy have the same image of left" in found.text
     image = {"left": data.frames[0].image_paths["left"]}
-    frozen = [replace(frame, image_paths=frame.image_paths | image) for frame in data.frames]
-    found = check_repeated_files(replace(data, frames=frozen), hashes, ["left", "front_left"])
-    (check,) = found["left"]
-    assert check.text == (
+    frozen = check([replace(frame, image_paths=frame.image_paths | image) for frame in data.frames])
+    (found,) = frozen["left"]
+    assert found.text == (
         "frames 000000 and 000001 have the same image of left, and 1 more repeat one; leave "
         "repeats out"
     )
-    assert found["front_left"] == []
+    assert frozen["front_left"] == []
+    (found,) = check(data.frames, [("copy", "000000")])["left"]
+    assert found.name == "copies" and "frames 000000 and copy" in found.text
 
 
 def copies(table: Correspondences, number: int) -> Correspondences:

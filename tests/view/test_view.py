@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import calibgraph
 from calibgraph import (
     Calibration,
     CalibrationError,
@@ -22,8 +23,6 @@ from calibgraph import (
     solve,
 )
 from calibgraph.model.geometry import invert
-from calibgraph.view.mcap_file import write_mcap
-from calibgraph.view.rerun_file import write_rerun
 from calibgraph.view.scene import project_cloud
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
@@ -77,14 +76,14 @@ def read_mcap(path: Path) -> list[tuple[str, str, int, Any]]:
 
 @pytest.fixture(scope="module")
 def entities(result: Calibration, tmp_path_factory: pytest.TempPathFactory) -> Entities:
-    return read_rerun(write_rerun(result, tmp_path_factory.mktemp("rerun") / "view.rrd"))
+    return read_rerun(calibgraph.write_rerun(result, tmp_path_factory.mktemp("rerun") / "view.rrd"))
 
 
 @pytest.fixture(scope="module")
 def messages(
     result: Calibration, tmp_path_factory: pytest.TempPathFactory
 ) -> list[tuple[str, str, int, Any]]:
-    return read_mcap(write_mcap(result, tmp_path_factory.mktemp("mcap") / "view.mcap"))
+    return read_mcap(calibgraph.write_mcap(result, tmp_path_factory.mktemp("mcap") / "view.mcap"))
 
 
 def cloud_of(result: Calibration, number: int) -> np.ndarray:
@@ -110,10 +109,10 @@ def test_rerun_draws_points_where_the_lens_projects_them(
     when: str, entities: Entities, result: Calibration
 ) -> None:
     rig = result.initial_rig if when == "before" else result.rig
-    expected = project_cloud(rig.cameras[CAMERA], cloud_of(result, 1))
+    expected, _ = project_cloud(rig.cameras[CAMERA], cloud_of(result, 1))
     pixels = np.array(entities[f"/images/{CAMERA}/{when}", 1]["Points2D:positions"])
     # Rerun counts pixels from the corner of the first one; float32.
-    np.testing.assert_allclose(pixels, expected.pixels_px + 0.5, atol=1e-4)
+    np.testing.assert_allclose(pixels, expected + 0.5, atol=1e-4)
     assert len(pixels) > 1000
     (T,) = entities[f"/lidar/{when}/{CAMERA}", None]["Transform3D:translation"]
     np.testing.assert_allclose(T, invert(rig.T_camera_lidar[CAMERA])[:3, 3], atol=1e-6)
@@ -141,7 +140,7 @@ def test_mcap_has_cloud_image_lens_and_points(
     assert image.shape == (360, 640, 3)
     for when, rig in (("before", result.initial_rig), ("after", result.rig)):
         (points,) = second[f"/{CAMERA}/{when}"].points
-        expected = project_cloud(rig.cameras[CAMERA], cloud_of(result, 1)).pixels_px
+        expected, _ = project_cloud(rig.cameras[CAMERA], cloud_of(result, 1))
         np.testing.assert_allclose([(p.x, p.y) for p in points.points], expected, atol=1e-9)
         assert len(points.outline_colors) == len(expected) > 1000
         assert points.type == points.POINTS
@@ -167,7 +166,7 @@ def test_mcap_places_the_optical_frames_in_the_lidar_s(
 
 
 def test_a_result_without_frames_has_nothing_to_show(result: Calibration, tmp_path: Path) -> None:
-    for write in (write_rerun, write_mcap):
+    for write in (calibgraph.write_rerun, calibgraph.write_mcap):
         with pytest.raises(CalibrationError, match="names no images and clouds"):
             write(replace(result, frames=()), tmp_path / "file")
     assert not list(tmp_path.iterdir())

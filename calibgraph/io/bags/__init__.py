@@ -4,29 +4,33 @@ The rest of the package reads a message as it reads a file: by the path that is 
 """
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.io.bags.messages import MESSAGE_SUFFIX as MESSAGE_SUFFIX
 from calibgraph.io.bags.messages import read_message
-from calibgraph.io.bags.options import BagOptions as BagOptions
 from calibgraph.io.bags.pictures import image_from_message
 from calibgraph.io.bags.point_clouds import cloud_from_message, time_fields, timed_points_of
+from calibgraph.io.bags.storage import BagOptions as BagOptions
 from calibgraph.io.bags.storage import is_bag as is_bag
-from calibgraph.io.motion import ScanMotion
+
+Correction = Callable[[NDArray[np.float32], Array], Array]
+"""Of (n, 3) points for motion, by (n,) times after the stamp [s]."""
 
 
-def load_bag_cloud(path: Path, motion: ScanMotion | None = None) -> NDArray[np.float32]:
+def load_bag_cloud(path: Path, correct: Correction | None = None) -> NDArray[np.float32]:
     """(n, 4) the cloud in the message with this address, corrected for motion if it is given."""
     content = read_message(path)[1]
-    if motion is None:
+    if correct is None:
         cloud = cloud_from_message(content, str(path))
     else:
         cloud, times_s = timed_points_of(content, str(path))
-        cloud[:, :3] = motion.correct(cloud[:, :3], times_s)
+        cloud[:, :3] = correct(cloud[:, :3], times_s)
     if not len(cloud):
         raise FileError(path, "holds no point")
     return cloud

@@ -19,7 +19,7 @@ from calibgraph.io.lenses import (
     lens_model,
     listed_intrinsics,
 )
-from calibgraph.model.rig import Camera, Intrinsics
+from calibgraph.model.rig import Camera
 from factors import LensModel
 
 _AS_NONE = ("", "inverse_brown_conrady")
@@ -126,17 +126,24 @@ class LensStates:
 
 
 def lens_of(message: Any, where: str, *, rectified: bool) -> StatedLens:
-    """The lens of a camera's images as recorded, or as rectified by R to the matrix P.
-
-    Raises:
-        FileError: if the camera is not calibrated, or its lens model is unknown.
-    """
+    """The lens of a camera's images as recorded, or as rectified by R to the matrix P."""
     frame = message.header.frame_id.lstrip("/")
     matrix = "P" if rectified else "K"
     K = np.reshape(_field(message, matrix), (3, -1))[:, :3]
     intrinsics_of_matrix(K, f"{where}: {matrix}")
-    model, distortion = ("pinhole", ()) if rectified else _distortion(message, where)
-    lens = CameraLens(model, *_on_image(message, K, where), distortion)
+    model: LensModel = "pinhole"
+    distortion: tuple[float, ...] = ()
+    if not rectified:
+        given, stated = _field(message, "D"), message.distortion_model.strip()
+        model = lens_model("none" if stated in _AS_NONE and not given.any() else stated, where)
+        distortion = fitted_coefficients(given.tolist(), model, where)
+    # K is of the full sensor, before its window and binning
+    bins, window = np.maximum([message.binning_x, message.binning_y], 1), message.roi
+    size = np.array([window.width or message.width, window.height or message.height]) // bins
+    centre = (K[:2, 2] - np.array([window.x_offset, window.y_offset])) / bins
+    numbers = [*(np.diag(K)[:2] / bins).tolist(), *centre.tolist()]
+    intrinsics = listed_intrinsics(numbers, where)
+    lens = CameraLens(model, (int(size[0]), int(size[1])), intrinsics, distortion)
     R = np.reshape(_field(message, "R"), (3, 3))
     R = R if R.any() else np.eye(3)
     baseline_m = stated_baseline(message)
@@ -146,11 +153,7 @@ def lens_of(message: Any, where: str, *, rectified: bool) -> StatedLens:
 
 
 def camera_from_message(
-    message: Any,
-    T_camera_lidar: Array,
-    *,
-    rectified: bool = False,
-    frame_of_first: bool = False,
+    message: Any, T_camera_lidar: Array, *, rectified: bool = False, frame_of_first: bool = False
 ) -> Camera:
     """A camera with the lens of a CameraInfo.
 
@@ -186,22 +189,3 @@ def _field(message: Any, name: str) -> Array:
     """A matrix: upper case in ROS 1, lower in ROS 2."""
     value = getattr(message, name, None)
     return np.array(getattr(message, name.lower()) if value is None else value, np.float64)
-
-
-def _on_image(message: Any, K: Array, where: str) -> tuple[tuple[int, int], Intrinsics]:
-    """Size and intrinsics of the image: K is of the full sensor, before its window and binning."""
-    bins = np.maximum([message.binning_x, message.binning_y], 1)
-    window = message.roi
-    size = np.array([window.width or message.width, window.height or message.height]) // bins
-    corner = np.array([window.x_offset, window.y_offset])
-    focal, centre = np.diag(K)[:2] / bins, (K[:2, 2] - corner) / bins
-    intrinsics = listed_intrinsics([*focal.tolist(), *centre.tolist()], where)
-    return (int(size[0]), int(size[1])), intrinsics
-
-
-def _distortion(message: Any, where: str) -> tuple[LensModel, tuple[float, ...]]:
-    """Lens model and coefficients; both may be empty for none, and zeros appended."""
-    given = _field(message, "D")
-    stated = message.distortion_model.strip()
-    model = lens_model("none" if stated in _AS_NONE and not given.any() else stated, where)
-    return model, fitted_coefficients(given.tolist(), model, where)

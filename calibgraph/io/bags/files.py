@@ -67,15 +67,9 @@ _ALWAYS_WHOLE, _RATIO_WHOLE = 2**28, 1000
 
 
 def unpack(path: Path, kind: str, data: Buffer) -> Buffer:
-    """The content of a compressed chunk or message.
-
-    Args:
-        path: its bag.
-        kind: bz2, lz4 or zstd; empty or ``none`` if it is not compressed.
-        data: the chunk or message.
+    """The content of a chunk or message, which may be compressed by bz2, lz4 or zstd.
 
     Raises:
-        FileError: if the kind is unknown, or the content larger than a recording's can be.
         Exception: what the library raises for damaged data.
     """
     if kind in ("", "none"):
@@ -240,7 +234,6 @@ class McapFile:
             yield topic, time_ns, data
 
     def _content(self, index: ChunkIndex) -> bytes | memoryview:
-        """The records of a chunk."""
         self._file.seek(index.chunk_start_offset)
         if _HEAD.unpack(self._file.read(_HEAD.size)) != (
             Opcode.CHUNK, index.chunk_length - _HEAD.size
@@ -315,7 +308,14 @@ class BagFolder:
         self._folder = folder
         stated = read_yaml(folder / METADATA)["rosbag2_bagfile_information"]
         mode = (stated.get("compression_mode") or "none").lower()
-        files = _files_of(folder, stated["relative_file_paths"])
+        files = [folder / PurePath(name).name for name in stated["relative_file_paths"]]
+        for file in files:
+            if not file.is_file():
+                raise FileError(
+                    folder,
+                    f"its {METADATA} names {file.name}, which is not there; copy it there, or "
+                    f"write the metadata again with `{REPAIR_ROS2.format(quote(str(folder)))}`",
+                )
         if mode == "file":
             raise FileError(
                 folder,
@@ -336,19 +336,6 @@ class BagFolder:
         parts = (part.messages(topics, start_ns, stop_ns) for part in self._parts)
         for topic, record_ns, data in merge(*parts, key=itemgetter(1)):
             yield topic, record_ns, bytes(unpack(self._folder, self._compression, data))
-
-
-def _files_of(folder: Path, stated: Iterable[str]) -> list[Path]:
-    """The files of a folder."""
-    files = [folder / PurePath(name).name for name in stated]
-    for file in files:
-        if not file.is_file():
-            raise FileError(
-                folder,
-                f"its {METADATA} names {file.name}, which is not there; copy it there, or write "
-                f"the metadata again with `{REPAIR_ROS2.format(quote(str(folder)))}`",
-            )
-    return files
 
 
 Recording = Ros1File | McapFile | Db3File | BagFolder

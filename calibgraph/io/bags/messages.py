@@ -155,7 +155,6 @@ class Bag:
         return data[0], self._deserialize(topic, record_ns, data[0])
 
     def _deserialize(self, topic: str, record_ns: int, data: bytes) -> Any:
-        """The content of a message."""
         kind = self.topics[topic]
         ros1 = kind.encoding == "ros1"
         store = type_store(ros1=ros1)
@@ -170,27 +169,6 @@ class Bag:
                 f"the message of {topic} recorded at {record_ns} ns is no {kind.type} "
                 f"({error or type(error).__name__}); choose another topic or other frames",
             ) from error
-
-
-class Drive:
-    """A bag, and others of its drive, which are opened one by one as they are asked for."""
-
-    def __init__(self, bag: Bag, beside: Collection[Path] = ()) -> None:
-        self._opened = [bag]
-        self._waiting = [path for path in beside if path != bag.path]
-
-    @property
-    def bag(self) -> Bag:
-        """The first."""
-        return self._opened[0]
-
-    def __iter__(self) -> Iterator[Bag]:
-        number = 0
-        while number < len(self._opened) or self._waiting:
-            if number == len(self._opened):
-                self._opened.append(Bag(self._waiting.pop(0)))
-            yield self._opened[number]
-            number += 1
 
 
 def read_message(path: Path) -> tuple[bytes, Any]:
@@ -211,6 +189,11 @@ def read_message(path: Path) -> tuple[bytes, Any]:
 def _kept_open(path: Path, _changed_ns: int) -> Bag:
     """The bag, opened once: that takes seconds where it is large."""
     return Bag(path)
+
+
+def open_drive(bag: Bag, beside: Collection[Path] = ()) -> list[Bag]:
+    """A bag, and others of its drive."""
+    return [bag, *(Bag(path) for path in beside if path != bag.path)]
 
 
 os.register_at_fork(after_in_child=_kept_open.cache_clear)  # parent and child would share offsets

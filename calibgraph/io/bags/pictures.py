@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags.messages import describe_message
-from calibgraph.io.encoded_images import decode_image, describe_turn
+from calibgraph.io.images import decode_image, describe_turn
 
 Image = NDArray[np.uint8]
 

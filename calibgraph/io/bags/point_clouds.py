@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags.messages import describe_message
-from calibgraph.io.point_fields import find_intensity, make_cloud
+from calibgraph.io.clouds import find_intensity, make_cloud
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _TIMES = ("t", "time", "timestamp", "offset_time", "time_offset", "time_stamp")
@@ -46,9 +46,6 @@ def timed_points_of(message: Any, where: str) -> tuple[NDArray[np.float32], NDAr
     Returns:
         (n, 4) as of :func:`cloud_from_message`; (n,) seconds after the stamp, zeros if points have
         no times.
-
-    Raises:
-        DatasetError: as there, or if times are not within a second of the stamp.
     """
     cloud, returned = _all_points(message, where)
     points = np.asarray(cloud[returned], dtype=np.float32)
@@ -60,7 +57,6 @@ def timed_points_of(message: Any, where: str) -> tuple[NDArray[np.float32], NDAr
 
 
 def _seconds_after(stamp: Any, times: NDArray[Any], where: str) -> NDArray[np.float64]:
-    """(n,) seconds after a stamp."""
     if times.dtype.kind in "iu":
         seconds = times.astype(np.float64) / 1e9
     elif times.max(initial=0.0) > _NANOSECOND_STAMPS:

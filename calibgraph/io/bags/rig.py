@@ -1,6 +1,7 @@
 """The rig of a bag: lenses from camera_info, the guess from tf_static."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -11,13 +12,12 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bags.camera_info import StatedLens, lens_of, stated_baseline
-from calibgraph.io.bags.messages import CAMERA_INFO, Bag, Drive
-from calibgraph.io.bags.options import BagOptions
+from calibgraph.io.bags.messages import CAMERA_INFO, Bag, open_drive
+from calibgraph.io.bags.storage import BagOptions
 from calibgraph.io.bags.topics import CameraTopics, choose_topics
 from calibgraph.io.bags.transforms import Transforms
-from calibgraph.io.frame_tree import find_mounts
 from calibgraph.io.lenses import CameraLens
-from calibgraph.io.rig_parts import RelativeCamera, RigParts
+from calibgraph.io.rig_parts import RelativeCamera, RigParts, find_mounts
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.model.rig import Rig
 
@@ -33,7 +33,7 @@ def read_bag_rig(path: Path, options: BagOptions | None = None) -> RigParts:
     """What a bag holds about its rig; extrinsics may be missing."""
     options = options or BagOptions()
     bag = Bag(path)
-    drive = Drive(bag, options.beside)
+    drive = open_drive(bag, options.beside)
     chosen = choose_topics(bag, options.topics, drive=drive)
     lidar = bag.first(chosen.lidar).header.frame_id.lstrip("/")
     reader = _CameraReader(drive, lidar)
@@ -115,7 +115,7 @@ class _CameraReader:
         by_frame: the cameras that name a frame, where no baseline parts them.
     """
 
-    def __init__(self, drive: Drive, lidar: str) -> None:
+    def __init__(self, drive: Sequence[Bag], lidar: str) -> None:
         self._drive, self._lidar = drive, lidar
         self.transforms = Transforms(drive)
         self.notes: list[str] = []
@@ -127,21 +127,16 @@ class _CameraReader:
         self.why_missing: dict[str, str] = {}
 
     def read(self, name: str, topics: CameraTopics) -> None:
-        """Read a camera; its extrinsic may be missing.
-
-        Raises:
-            DatasetError: if it has no CameraInfo.
-            FileError: if it is not calibrated.
-        """
+        """Read a camera; its extrinsic may be missing."""
         if topics.info is None:
             raise DatasetError(
-                f"{self._drive.bag.path}: {_why_no_info(name, topics)}, or calibrate "
+                f"{self._drive[0].path}: {_why_no_info(name, topics)}, or calibrate "
                 f"with a rig that has the lens of camera {name!r} (--rig)",
                 camera=name,
             )
         bag = next(bag for bag in self._drive if bag.has(topics.info))
-        if bag is not self._drive.bag:
-            self.notes.append(f"{self._drive.bag.path}: {topics.info} is that of {bag.path}")
+        if bag is not self._drive[0]:
+            self.notes.append(f"{self._drive[0].path}: {topics.info} is that of {bag.path}")
         where = f"{bag.path}: {topics.info}"
         lens = _first_lens(bag, topics, where)
         with_baseline = self._counts_baseline(name, lens, bag, topics.info)
@@ -210,11 +205,7 @@ def _why_no_info(name: str, topics: CameraTopics) -> str:
 
 
 def _first_lens(bag: Bag, topics: CameraTopics, where: str) -> StatedLens:
-    """The lens of the first CameraInfo that has one: some drivers begin with zeros.
-
-    Raises:
-        FileError: why the first has none, if no other has.
-    """
+    """The lens of the first CameraInfo that has one: some drivers begin with zeros."""
     error: FileError | None = None
     for message in islice(bag.messages([topics.infos[0]]), _MOST_WITHOUT_LENS):
         try:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.io.bags.messages import CLOUDS, Bag, Message
-from calibgraph.io.bags.options import Stamps
 from calibgraph.io.bags.point_clouds import has_points
+from calibgraph.io.bags.storage import Stamps
 from calibgraph.io.bags.transforms import stamp_ns_of
 
 _S = 1_000_000_000
@@ -73,13 +73,7 @@ def read_messages(
     """The messages of some topics, and which ``every_s`` since the first they are of.
 
     With ``every_s`` only so many at its start as give each topic a message with neighbours. Times
-    in which nothing was recorded are passed over, be they years.
-
-    Args:
-        bag: the bag.
-        topics: their names.
-        every_s: seconds between frames; all messages are read if None.
-        beside: further topics, which are read with the others.
+    in which nothing was recorded are passed over, be they years. ``beside`` are further topics.
     """
     all_topics = {*topics, *beside}
     if every_s is None:

@@ -10,8 +10,8 @@ from shlex import quote
 
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags.messages import CAMERA_INFO, CLOUDS, COMPRESSED_IMAGE, IMAGE, Bag
-from calibgraph.io.bags.options import LIDAR, ODOMETRY
 from calibgraph.io.bags.pictures import is_depth
+from calibgraph.io.bags.storage import LIDAR, ODOMETRY
 
 _BEST_FIRST = ("image_raw", "image", "image_color", "image_mono", "image_rect_color", "image_rect")
 _FORM = re.compile(
@@ -81,9 +81,6 @@ def choose_topics(
             a camera with that of its CameraInfo behind a comma, where several could be.
         cameras: names that are wanted; those named, or if none is all that have a CameraInfo.
         drive: the bag, and others whose CameraInfo serve where it has none; the bag alone if None.
-
-    Raises:
-        DatasetError: if a topic is missing, or there are several to choose from.
     """
     bags = [*(drive or [bag])]
     parted = {name: topic.split(",") for name, topic in named.items()}
@@ -276,7 +273,6 @@ def _short_names(cameras: Iterable[Words]) -> dict[Words, str]:
 
 
 def _listed(bag: Bag) -> str:
-    """The topics of images and clouds, for errors."""
     found = bag.of_type(IMAGE, COMPRESSED_IMAGE, *CLOUDS)
     if not found:
         types = Counter(each.type for each in bag.topics.values())

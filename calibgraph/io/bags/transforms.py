@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from calibgraph.io.bags.messages import TREES, Bag, Drive
-from calibgraph.io.frame_tree import Link, T_between, ancestors, links_between
+from calibgraph.io.bags.messages import TREES, Bag
+from calibgraph.io.rig_parts import Link, T_between, ancestors, links_between
 from calibgraph.model.geometry import transform
 
 STATIC, MOVING = "tf_static", "tf"
@@ -32,42 +32,40 @@ class _Tree:
     invalid: dict[str, str] = field(default_factory=dict)
     moving: set[str] = field(default_factory=set)
 
-    def widened(self, others: Sequence[_Tree]) -> _Tree:
+    def widened(self, *others: _Tree) -> _Tree:
         """With what others have of frames that are missing here; of several, the first counts."""
-        trees = [self, *others]
-        links = {child: link for tree in reversed(trees) for child, link in tree.links.items()}
-        invalid = {child: why for tree in reversed(trees) for child, why in tree.invalid.items()}
-        return _Tree(links, invalid, set().union(*(tree.moving for tree in trees)))
+        found = _Tree()
+        for tree in (*reversed(others), self):
+            found.links |= tree.links
+            found.invalid |= tree.invalid
+            found.moving |= tree.moving
+        return found
 
 
 class Transforms:
-    """The static transforms of a bag.
+    """The static transforms of a bag, the first of its drive.
 
     Where they do not connect two frames, those of other bags of the drive serve, and then those on
     /tf that never change, as ROS 1 may have them.
     """
 
-    def __init__(self, drive: Drive) -> None:
+    def __init__(self, drive: Sequence[Bag]) -> None:
         self._drive = drive
-        self._static: list[_Tree] = []
+        self._read = cache(_read_tree)  # once, and only as far as trees are needed
         self._used: dict[str, set[str]] = {}
-        self.links: dict[str, Link] = {}  # as far as trees were needed
+        self.links: dict[str, Link] = {}  # of the trees that were needed
 
     def _trees(self) -> Iterator[_Tree]:
         """Wider and wider trees: of the bag, with another bag, ..., with /tf of all."""
-        for number, bag in enumerate(self._drive):
-            if number == 0 and not self._static:
-                self._static.append(_static_tree(bag))
-            elif number == len(self._static):
-                other = _static_tree(bag, f"/{STATIC} of {bag.path}")
-                self._static.append(self._static[-1].widened([other]))
-            yield self._static[number]
-        yield self._unchanging
-
-    @cached_property
-    def _unchanging(self) -> _Tree:
-        *_, static = self._static
-        return static.widened([_unchanging_tree(bag) for bag in self._drive])
+        tree = self._read(self._drive[0], STATIC, "")
+        yield tree
+        for bag in self._drive[1:]:
+            tree = tree.widened(self._read(bag, STATIC, f"/{STATIC} of {bag.path}"))
+            yield tree
+        never = "/{} of {}, on which they never change"
+        yield tree.widened(
+            *(self._read(bag, MOVING, never.format(MOVING, bag.path)) for bag in self._drive)
+        )
 
     def between(self, target: str, source: str) -> Array | None:
         """(4, 4) T_target_source through the frame that both hang from; None if there is none."""
@@ -91,7 +89,7 @@ class Transforms:
         """A line for each transform that was left out, and each source beside /tf_static."""
         left_out = [f"{why}; it is left out" for why in next(self._trees()).invalid.values()]
         used = [
-            f"{self._drive.bag.path}: the transforms of {_listed(frames)} are from {source}"
+            f"{self._drive[0].path}: the transforms of {_listed(frames)} are from {source}"
             for source, frames in self._used.items()
             if source
         ]
@@ -112,29 +110,19 @@ def _listed(frames: set[str]) -> str:
     return ", ".join(sorted(frames)) or "none"
 
 
-def _static_tree(bag: Bag, source: str = "") -> _Tree:
-    """Of several transforms for one child, the last that is one counts, as in tf."""
+def _read_tree(bag: Bag, name: str, source: str) -> _Tree:
+    """The last transform to each child, as in tf; on /tf, those that are the same throughout."""
     tree = _Tree()
-    for each in stamped_transforms(bag, STATIC):
-        if each.T_parent_child is None:
-            tree.invalid[each.child] = each.text
-        else:
-            tree.links[each.child] = Link(each.parent, each.child, each.T_parent_child, source)
-    return tree
-
-
-def _unchanging_tree(bag: Bag) -> _Tree:
-    """The transforms on /tf that are the same in all messages; the frames that are not."""
-    tree = _Tree()
-    source = f"/{MOVING} of {bag.path}, on which they never change"
-    for each in stamped_transforms(bag, MOVING):
+    for each in stamped_transforms(bag, name):
         if each.T_parent_child is None:
             tree.invalid[each.child] = each.text
             continue
         link = Link(each.parent, each.child, each.T_parent_child, source)
         first = tree.links.setdefault(each.child, link)
-        change = np.abs(each.T_parent_child - first.T_parent_child).max()
-        if each.parent != first.parent or change > _SAME:
+        change = np.abs(link.T_parent_child - first.T_parent_child).max()
+        if name == STATIC:
+            tree.links[each.child] = link
+        elif link.parent != first.parent or change > _SAME:
             tree.moving.add(each.child)
     for child in tree.moving:
         del tree.links[child]

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import StrictNumbers, checked_model, holds_truth_value
-from calibgraph.io.formats.writers import DERIVED
 from calibgraph.io.lenses import (
     CameraLens,
     fitted_coefficients,
@@ -28,14 +28,15 @@ from calibgraph.io.lenses import (
     stated_model,
     unified_coefficients,
 )
-from calibgraph.io.rig_parts import ONLY_CAMERA, RelativeCamera, RigParts
-from calibgraph.io.rotations import pose_of_quaternion
+from calibgraph.io.rig_parts import ONLY_CAMERA, RelativeCamera, RigParts, pose_of_quaternion
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Intrinsics, Size, plain_key, rigid_transform
 from calibgraph.yaml_text import describe_value, parse_yaml
 from factors import LensModel
 from factors.lens import COEFFICIENTS
 
+DERIVED = "computed from T_cam_lidar"
+"""States of a T_cn_cnm1 that it is no measurement."""
 _DEEPEST = 6
 _SAME = 1e-6  # of transforms that are given twice: they may be rounded
 _FISHEYE_COUNT = 4
@@ -220,7 +221,6 @@ class _Map:
             raise FileError(where, str(error)) from error
 
     def _key(self, quantity: str) -> str | None:
-        """The key of a quantity of the lens."""
         aliases = foreign_keys().lens[quantity]
         given = [self._keys[alias] for alias in aliases if alias in self._keys]
         for other in given[1:]:
@@ -315,7 +315,13 @@ class _Map:
         return values
 
 
-class _Image(StrictNumbers):
+class Foreign(StrictNumbers):
+    """Of another program's file: what is not needed may be there."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class _Image(Foreign):
     size: tuple[Size, Size]
 
 

@@ -1,33 +1,460 @@
-"""A rig from the files of other programs."""
+"""A rig from files of other programs, each in the format that its name or content shows."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from types import SimpleNamespace
+from typing import Annotated, Any, TypeVar
+from xml.etree import ElementTree
 
 import numpy as np
+from defusedxml import DefusedXmlException
+from defusedxml.ElementTree import fromstring
+from pydantic import ConfigDict, Field
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, FileError
-from calibgraph.io.formats.read_part import read_part
-from calibgraph.io.formats.rig_export import frame_id
-from calibgraph.io.frame_tree import (
-    Link,
-    Links,
-    T_between,
-    ancestors,
-    find_mounts,
-    links_between,
-)
+from calibgraph.files import checked_model, read_json, read_text, require_file
+from calibgraph.io.bags import is_bag
+from calibgraph.io.bags.camera_info import lens_of
+from calibgraph.io.bags.rig import read_bag_rig
+from calibgraph.io.clouds import read_npy
+from calibgraph.io.formats.foreign_keys import Foreign, read_foreign
+from calibgraph.io.kitti import CALIBRATION_NAME, NumberLines
+from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rig_parts import (
     ONLY_CAMERA,
     RELATIVE_SIGMA_CM,
     RELATIVE_SIGMA_DEG,
+    Link,
+    Links,
+    RelativeCamera,
     RigParts,
+    T_between,
+    ancestors,
+    find_mounts,
+    frame_id,
     frame_names,
+    links_between,
+    pose_of_angles,
+    pose_of_quaternion,
 )
-from calibgraph.model.geometry import T_OPTICAL_LINK
-from calibgraph.model.rig import Mount, Rig
+from calibgraph.io.rigs import is_exported_rig, read_rig
+from calibgraph.model.geometry import T_OPTICAL_LINK, invert
+from calibgraph.model.rig import KNOWLEDGE, Finite, Mount, Rig, Size, rigid_transform
+from calibgraph.yaml_text import parse_yaml_documents
+
+_PUBLISHER = "static_transform_publisher"
+_NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_ANGLES = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def read_publishers(lines: Iterable[str], path: Path) -> RigParts:
+    """The frames of lines ``... static_transform_publisher ARGUMENTS``, of ROS 1 or 2."""
+    links = [
+        _published(line.partition(_PUBLISHER)[2].partition(" &")[0], path)
+        for line in lines
+        if _PUBLISHER in line and not line.lstrip().startswith("#")
+    ]
+    if not links:
+        raise FileError(
+            path,
+            f"has no {_PUBLISHER}; write the transforms to a file: `ros2 topic echo --once "
+            "/tf_static > tf_static.yaml`",
+        )
+    return RigParts(path, links=tuple(links))
+
+
+def _published(text: str, path: Path) -> Link:
+    """The frame of a publisher: with names, or x y z, yaw pitch roll or a quaternion, frames."""
+    wrong = FileError(
+        path, f"{_PUBLISHER}{text[:80]}: expected numbers and two frames, without $()"
+    )
+    try:
+        words = shlex.split(text)
+        given = dict(zip(words[::2], words[1::2], strict=False))
+        if text.lstrip().startswith("--"):
+            frames = given["--frame-id"], given["--child-frame-id"]
+            x, y, z, roll, pitch, yaw, *turn = (
+                float(given.get(f"--{key}", "0")) for key in (*_ANGLES, *_NAMES[3:6])
+            )
+            by_quaternion = "--qw" in given
+            turn.append(float(given.get("--qw", "1")))
+        else:
+            places = [n for n, word in enumerate(words) if not _is_number(word)][:2]
+            frames = words[places[0]], words[places[1]]
+            x, y, z, *turn = map(float, words[: places[0]])
+            by_quaternion = len(turn) == len("xyzw")
+            yaw, pitch, roll = turn[:3]
+        T = (
+            pose_of_quaternion((x, y, z), turn) if by_quaternion
+            else pose_of_angles((x, y, z), (roll, pitch, yaw))
+        )  # fmt: skip
+    except (KeyError, IndexError, ValueError) as error:
+        raise wrong from error
+    if not np.isfinite(T).all():
+        raise wrong
+    return Link(frames[0].lstrip("/"), frames[1].lstrip("/"), T)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+class _Vector(Foreign):
+    x: float
+    y: float
+    z: float
+
+
+class _Quaternion(_Vector):
+    w: float
+
+
+class _Transform(Foreign):
+    translation: _Vector
+    rotation: _Quaternion
+
+
+class _TfHeader(Foreign):
+    frame_id: str
+
+
+class _Stamped(Foreign):
+    header: _TfHeader
+    child_frame_id: str
+    transform: _Transform
+
+
+class _TfMessage(Foreign):
+    transforms: list[_Stamped]
+
+
+def is_tf2(content: dict[str, Any]) -> bool:
+    """Whether the content of a YAML file is a TFMessage, or a single TransformStamped."""
+    return "transforms" in content or {"transform", "child_frame_id"} <= content.keys()
+
+
+def read_tf2(documents: list[dict[str, Any]], path: Path) -> RigParts:
+    """The frames of TFMessages and TransformStampeds; the last of several for a child.
+
+    A frame whose numbers are no transform is left out with a note: others may do without it.
+    """
+    links: dict[str, Link] = {}
+    notes: list[str] = []
+    for content in documents:
+        listed = content if "transforms" in content else {"transforms": [content]}
+        for stamped in checked_model(_TfMessage, listed, path).transforms:
+            t, q = stamped.transform.translation, stamped.transform.rotation
+            names = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
+            try:
+                if not np.isfinite([t.x, t.y, t.z]).all():
+                    raise ValueError(f"translation [{t.x}, {t.y}, {t.z}] is not finite")
+                T = pose_of_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
+                links[names[1]] = Link(*names, T)
+            except ValueError as error:
+                notes.append(f"{path}: frame {stamped.child_frame_id!r} is left out: {error}")
+    return RigParts(path, links=tuple(links.values()), notes=tuple(notes))
+
+
+class _Pose(Foreign):
+    model_config = ConfigDict(extra="forbid")
+
+    x: Finite
+    y: Finite
+    z: Finite
+    roll: Finite
+    pitch: Finite
+    yaw: Finite
+
+
+def is_autoware(content: dict[str, Any]) -> bool:
+    """Whether the content of a YAML file is parent: {child: {x, y, z, roll, pitch, yaw}}."""
+    return any(isinstance(pose, dict) and "roll" in pose for _, _, pose in _entries(content))
+
+
+def _entries(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
+    for parent, children in content.items():
+        for child, pose in children.items() if isinstance(children, dict) else ():
+            yield str(parent), str(child), pose
+
+
+def read_autoware(content: dict[str, Any], path: Path) -> RigParts:
+    """The frames of a sensor kit."""
+    links = []
+    for parent, child, pose in _entries(content):
+        p = checked_model(_Pose, pose, f"{path}: {parent}: {child}")
+        try:
+            T = pose_of_angles((p.x, p.y, p.z), (p.roll, p.pitch, p.yaw))
+        except ValueError as error:
+            raise FileError(path, f"{parent}: {child}: {error}") from error
+        links.append(Link(parent, child, T))
+    return RigParts(path, links=tuple(links))
+
+
+def _read_xml(path: Path) -> RigParts:
+    """The frames of a launch file's publishers, or of a URDF's joints at their zero position."""
+    try:
+        root: ElementTree.Element = fromstring(read_text(path), forbid_dtd=True)
+    except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
+        raise FileError(path, f"is not a URDF or other XML: {error}") from error
+    if root.tag == "launch":
+        nodes = (each for each in root.iter("node") if _PUBLISHER in each.attrib.values())
+        return read_publishers((f"{_PUBLISHER} {each.get('args', '')}" for each in nodes), path)
+    if root.tag == "opencv_storage":
+        raise FileError(path, "is OpenCV's XML, which is not read; write it to a name in .yml")
+    if root.tag != "robot":
+        raise FileError(path, f"is not a URDF: its root is <{root.tag}>, expected <robot>")
+    if "{http://www.ros.org/wiki/xacro}" in "".join(element.tag for element in root.iter()):
+        raise FileError(path, "holds xacro macros; expand it: xacro FILE > robot.urdf")
+    return RigParts(path, links=tuple(_link_of_joint(j, path) for j in root.findall("joint")))
+
+
+def _link_of_joint(joint: ElementTree.Element, path: Path) -> Link:
+    parent, child, origin = (joint.find(tag) for tag in ("parent", "child", "origin"))
+    if parent is None or child is None:
+        raise FileError(path, f"joint {joint.get('name')!r} has no <parent> or no <child>")
+    attributes = {} if origin is None else origin.attrib
+    xyz = _three_numbers(attributes.get("xyz", "0 0 0"), joint, path)
+    rpy = _three_numbers(attributes.get("rpy", "0 0 0"), joint, path)
+    try:
+        T = pose_of_angles(xyz, rpy)
+    except ValueError as error:
+        raise FileError(path, f"joint {joint.get('name')!r}: {error}") from error
+    note = f"{path}: {_movement(joint)}" if joint.get("type") in _MOVABLE else ""
+    return Link(parent.get("link", ""), child.get("link", ""), T, note)
+
+
+_MOVABLE = ("revolute", "continuous", "prismatic", "planar", "floating")
+
+
+def _movement(joint: ElementTree.Element) -> str:
+    """That a joint between LiDAR and camera can move, and between which limits."""
+    limit = joint.find("limit")
+    unit = "m" if joint.get("type") == "prismatic" else "rad"
+    found = {} if limit is None or joint.get("type") == "continuous" else limit.attrib
+    try:
+        low, high = (float(found.get(key, "0")) for key in ("lower", "upper"))
+    except ValueError:
+        low = high = 0.0
+    limits = f" from {low:g} to {high:g} {unit}" if low < high else ""
+    zero = "at zero" if low <= 0 <= high else "at zero, which is outside its limits"
+    return (
+        f"joint {joint.get('name')!r} lies between LiDAR and camera and can move{limits}; it is "
+        f"taken {zero}: if it stands elsewhere, write its position into <origin>"
+    )
+
+
+def _three_numbers(text: str, joint: ElementTree.Element, path: Path) -> list[float]:
+    try:
+        x, y, z = (float(part) for part in text.split())
+    except ValueError as error:
+        raise FileError(
+            path, f"joint {joint.get('name')!r}: expected three numbers, found {text!r}"
+        ) from error
+    if not np.isfinite([x, y, z]).all():
+        raise FileError(path, f"joint {joint.get('name')!r}: {text!r} is not finite")
+    return [x, y, z]
+
+
+_TO_LIDAR = re.compile(r"cam[a-z]*_?(to|2)_?(velo|lidar)", re.IGNORECASE)
+_TO_CAMERA = re.compile(r"(velo[a-z]*|lidar)_?(to|2)_?cam", re.IGNORECASE)
+_SIZES = (12, 16)
+
+
+def read_matrix(path: Path, name: str | None) -> RigParts:
+    """The extrinsic in a file of one matrix, 3 x 4 or 4 x 4, as KITTI and others write it.
+
+    Its name states the direction: cam_to_velo is p_velo = M p_cam, velo_to_cam is p_cam = M p_velo.
+    """
+    if path.suffix.lower() == ".npy":
+        M = read_npy(path)
+        if M.dtype.kind not in "fiu" or M.size not in _SIZES:
+            raise FileError(path, f"holds {M.shape} of {M.dtype}, expected 3 x 4 or 4 x 4")
+    elif len(M := _numbers_of_text(path)) not in _SIZES:
+        text = read_text(path)
+        first = next((line for line in text.splitlines() if line.strip()), "")
+        raise FileError(path, _unknown(f"its line {first[:40]!r} is", text))
+    rows = [*M.astype(np.float64).reshape(-1, 4), [0.0, 0.0, 0.0, 1.0]]
+    try:
+        T = rigid_transform(np.array(rows[:4]))
+    except ValueError as error:
+        raise FileError(path, f"the matrix: {error}") from error
+    to_lidar, to_camera = (bool(each.search(path.stem)) for each in (_TO_LIDAR, _TO_CAMERA))
+    if to_lidar == to_camera:
+        raise FileError(
+            path, "holds a matrix, and its name states no direction; name the file cam_to_velo.txt "
+            "if p_velo = M p_cam, velo_to_cam.txt if p_cam = M p_velo"
+        )  # fmt: skip
+    return RigParts(path, T_camera_lidar={name or ONLY_CAMERA: invert(T) if to_lidar else T})
+
+
+def _numbers_of_text(path: Path) -> Array:
+    """Of KITTI's lines R and T, or of a text of numbers alone; none of another."""
+    text = read_text(path)
+    if re.search(r"^R:", text, re.MULTILINE) and re.search(r"^T:", text, re.MULTILINE):
+        lines = NumberLines(path)
+        return np.hstack([lines.array("R", 3, 3), lines.array("T", 3, 1)]).ravel()
+    try:
+        return np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        return np.empty(0)
+
+
+_MAX_BYTES, _HEAD_BYTES = 32 * 2**20, 2**16
+
+
+def read_part(path: Path, name: str | None) -> RigParts:  # noqa: PLR0911 - a line for each kind
+    """Read a file; ``name`` replaces the file's own name of its camera if it has a single one."""
+    if is_bag(path):
+        return read_bag_rig(path)
+    if path.is_dir() or path.name == CALIBRATION_NAME:
+        return _part_of_rig(path)
+    suffix = require_file(path).suffix.lower()
+    if path.stat().st_size > _MAX_BYTES:
+        raise FileError(path, f"{path.stat().st_size} bytes are too many for a calibration")
+    if suffix in (".urdf", ".xml", ".xacro", ".launch"):
+        return _read_xml(path)
+    if suffix in (".sh", ".bash"):
+        return read_publishers(read_text(path).splitlines(), path)
+    if suffix in (".txt", ".csv", ".npy"):
+        return read_matrix(path, name)
+    if suffix in (".yaml", ".yml", ".json"):
+        return _read_content(_read_documents(path), path, name)
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES).decode("utf-8", "replace")
+    raise FileError(path, _unknown(f"a file {suffix or 'without a suffix'} is", head))
+
+
+def _unknown(what: str, text: str = "") -> str:
+    """The error of a format that is not known, with the way to a file that is."""
+    if "static_transform_publisher" in text or "Rotation: in Quaternion" in text:
+        return (
+            "states transforms of ROS in lines that are not read; start what publishes them, and "
+            "write them into a file that is: `ros2 topic echo --once /tf_static > tf.yaml`"
+        )
+    if "camera matrix" in text:
+        return "is the .ini of camera_calibration; give the .yaml that it writes beside it"
+    return (
+        f"{what} of no known format; known are those of Kalibr, ROS (camera_info, /tf_static, "
+        "URDF), OpenCV, Autoware, KITTI and others in docs/formats.md; or write "
+        "T_camera_lidar into rig.yaml"
+    )
+
+
+def _read_documents(path: Path) -> list[dict[str, Any]]:
+    """The mappings of a file: several of a YAML file, as ``ros2 topic echo`` prints them."""
+    if path.suffix.lower() == ".json":
+        return [read_json(path)]
+    return parse_yaml_documents(re.sub(r"\A%YAML.*\n", "", read_text(path)), path)
+
+
+def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None) -> RigParts:
+    content = documents[0]
+    if is_tf2(content):
+        return read_tf2(documents, path)
+    if _is_camera_info(content):
+        documents = [content, *(each for each in documents if _message(each) != _message(content))]
+    if len(documents) > 1:
+        raise FileError(path, f"holds {len(documents)} different YAML documents; keep one of them")
+    if _is_camera_info(content):
+        return _read_camera_info(content, path, name)
+    if "format" in content or is_exported_rig(content):
+        return _part_of_rig(path)
+    if is_autoware(content):
+        return read_autoware(content, path)
+    found = read_foreign(content, path, name)
+    if found is None:
+        keys = ", ".join(str(key) for key in list(content)[:5])
+        raise FileError(path, _unknown(f"its keys ({keys}) are"))
+    return found
+
+
+def _message(content: dict[str, Any]) -> dict[str, Any]:
+    """A message without its header, whose stamp changes."""
+    return {**content, "header": None}
+
+
+_Count = Annotated[int, Field(ge=0, le=1_000_000)]
+
+
+_Nine = Annotated[list[Finite], Field(min_length=9, max_length=9)]
+_Twelve = Annotated[list[Finite], Field(min_length=12, max_length=12)]
+
+
+class _Header(Foreign):
+    frame_id: str = ""
+
+
+class _Window(Foreign):
+    x_offset: _Count = 0
+    y_offset: _Count = 0
+    height: _Count = 0
+    width: _Count = 0
+
+
+class _Message(Foreign):
+    header: _Header = _Header()
+    height: Size
+    width: Size
+    distortion_model: str
+    d: list[Finite]
+    k: _Nine
+    r: _Nine
+    p: _Twelve
+    binning_x: _Count = 0
+    binning_y: _Count = 0
+    roi: _Window = _Window()
+
+
+def _is_camera_info(content: dict[str, Any]) -> bool:
+    """Whether the content of a file is a CameraInfo message, as ``ros2 topic echo`` prints it."""
+    keys = {str(key).lower() for key in content}  # in capitals: K of ROS 1
+    return {"height", "width", "distortion_model", "k", "d", "p"} <= keys
+
+
+def _read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> RigParts:
+    """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame."""
+    message = checked_model(_Message, {str(key).lower(): v for key, v in content.items()}, path)
+    stated = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
+    camera = name or path.stem
+    return RigParts(
+        path, {camera: stated.lens}, frame_ids={camera: stated.frame} if stated.frame else {}
+    )
+
+
+def _part_of_rig(path: Path) -> RigParts:
+    rig, notes = read_rig(path)
+    cameras = rig.cameras.items()
+    return RigParts(
+        path,
+        lenses={
+            name: CameraLens(
+                c.model,
+                (c.width_px, c.height_px),
+                c.intrinsics_px,
+                c.distortion,
+                stated={key: getattr(c, key) for key in KNOWLEDGE},
+            )
+            for name, c in cameras
+        },
+        T_camera_lidar=rig.T_camera_lidar,
+        relative_poses=tuple(
+            RelativeCamera(p.a, p.b, p.T_a_b, p.rotation_sigma_rad, p.translation_sigma_m)
+            for p in rig.relative_poses
+        ),
+        frame_ids={name: each.frame_id for name, each in cameras if each.frame_id},
+        mounts={name: each.mount for name, each in cameras if each.mount},
+        lidar=rig.lidar,
+        notes=notes,
+    )
+
 
 Value = TypeVar("Value")
 
@@ -57,7 +484,7 @@ def import_rig(
     """Build a rig from files of other programs, which together hold lenses and extrinsics.
 
     Args:
-        files: of the kinds in ``calibgraph.io.formats.names.IMPORT_FORMATS``.
+        files: of the kinds in ``calibgraph.io.formats.IMPORT_FORMATS``.
         names: camera names for files of a single camera, by file.
         rename: new names of cameras, by those in the files.
         lidar_frame: the LiDAR's frame among those of the files; the one with such a name if None.
@@ -73,9 +500,7 @@ def import_rig(
         files, names=names, rename=rename, lidar_frame=lidar_frame, camera_frames=camera_frames
     )
     return parts.to_rig(
-        size_px=size_px,
-        relative_sigma_deg=relative_sigma_deg,
-        relative_sigma_cm=relative_sigma_cm,
+        size_px=size_px, relative_sigma_deg=relative_sigma_deg, relative_sigma_cm=relative_sigma_cm
     )
 
 
@@ -87,14 +512,15 @@ def read_rig_parts(
     lidar_frame: str | None = None,
     camera_frames: Mapping[str, str] | None = None,
 ) -> RigParts:
-    """Read the files of a rig; arguments as of :func:`import_rig`.
-
-    Raises:
-        CalibrationError: if a file is malformed, or a lens is none of ours.
-    """
+    """Read the files of a rig; arguments as of :func:`import_rig`."""
     parts = _read_all(files, names or {}, rename or {})
     lenses = _merged(parts, lambda part: part.lenses, "lens", lambda one, other: one == other)
-    T_camera_lidar = _merged(parts, lambda part: part.T_camera_lidar, "T_camera_lidar", _is_same)
+    T_camera_lidar = _merged(
+        parts,
+        lambda part: part.T_camera_lidar,
+        "T_camera_lidar",
+        lambda one, other: bool(np.abs(one - other).max() <= _SAME),
+    )
     links, notes = _later_first(parts)
     tree = _tree(links)
     frame_ids = {name: frame for part in parts for name, frame in part.frame_ids.items()}
@@ -172,10 +598,6 @@ def _merged(
     return merged
 
 
-def _is_same(one: Array, other: Array) -> bool:
-    return bool(np.abs(one - other).max() <= _SAME)
-
-
 def _later_first(parts: Sequence[RigParts]) -> tuple[list[Link], list[str]]:
     """The links, of which a later file's replace those between the same frames; and notes."""
     links: list[Link] = []
@@ -212,7 +634,11 @@ def _by_frames(
 ) -> tuple[dict[str, Array], dict[str, Mount]]:
     """T_camera_lidar and mounts of the cameras that have a frame in the tree; notes on links."""
     names = frame_names(tree.values())
-    frames = {name: _find_camera_frame(names, name, chosen) for name in cameras}
+    frames = {
+        name: chosen.get(name)
+        or next((f for each in _CAMERA_FRAMES if (f := each.format(frame_id(name))) in names), None)
+        for name in cameras
+    }
     found = {
         name: (frame, np.eye(4) if "optical" in frame.lower() else T_OPTICAL_LINK)
         for name, frame in frames.items()
@@ -229,7 +655,6 @@ def _by_frames(
 
 
 def _T_between(tree: Links, target: str, source: str) -> Array:
-    """(4, 4) T_target_source of two frames."""
     names = frame_names(tree.values())
     for frame in (target, source):
         if frame not in names:
@@ -245,17 +670,8 @@ def _T_between(tree: Links, target: str, source: str) -> Array:
 
 
 def _find_lidar_frame(names: Sequence[str]) -> str:
-    """The one frame with the name of a LiDAR."""
     found = [name for name in names if any(word in name.lower() for word in _LIDAR_WORDS)]
     if len(found) != 1:
         what = f"could be {', '.join(found)}" if found else f"is none of {', '.join(names)}"
         raise CalibrationError(f"the frame of the LiDAR {what} by name; name it with --lidar-frame")
     return found[0]
-
-
-def _find_camera_frame(names: Sequence[str], camera: str, chosen: Mapping[str, str]) -> str | None:
-    """The chosen frame of a camera, else one with its name; None if there is none."""
-    if camera in chosen:
-        return chosen[camera]
-    likely = (pattern.format(frame_id(camera)) for pattern in _CAMERA_FRAMES)
-    return next((name for name in likely if name in names), None)

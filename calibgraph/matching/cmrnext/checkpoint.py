@@ -1,25 +1,25 @@
 """Checkpoints: a network's weights, checked against their config, with the file's hash."""
 
+from __future__ import annotations
+
 import json
 import math
+import re
+import warnings
+import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
 from pydantic import BaseModel, Field, StrictBool
 from torch import Tensor
 
-from calibgraph.errors import FileError
+from calibgraph.errors import FileError, in_words
 from calibgraph.files import checked_model, sha256, write_atomically
-from calibgraph.matching.cmrnext.architecture import (
-    Architecture,
-    recognize_architecture,
-    require_config_agrees,
-)
-from calibgraph.matching.cmrnext.network import CmrNext
-from calibgraph.matching.cmrnext.torch_file import MAX_BYTES, read_torch_file
+from calibgraph.matching.cmrnext.network import Architecture, CmrNext
 
 SAFETENSORS = ".safetensors"
 
@@ -41,6 +41,11 @@ class _Config(BaseModel):
     systematic_rotation_rad: Annotated[_Number, Field(le=10)] | None = None
     systematic_translation_m: Annotated[_Number, Field(le=1000)] | None = None
     use_reflectance: StrictBool
+    fourier_levels: Annotated[int, Field(strict=True)] = -1
+    context_encoder: Literal["lidar", "rgb"] = "rgb"
+    uncertainty: StrictBool = False
+    unc_freeze: StrictBool = False
+    al_contrario: Literal[False] = False
     normalize_images: StrictBool
     half_resolution: StrictBool | None = None
 
@@ -123,22 +128,32 @@ def _to_checkpoint(
     path: Path, given: Mapping[Any, Any], tensors: Mapping[str, Tensor]
 ) -> Checkpoint:
     try:
-        config = _plain(given)
-        checked_model(_Config, config, path)
-        shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-        architecture = recognize_architecture(shapes, reflectance=config["use_reflectance"])
-        require_config_agrees(architecture, config)
+        # The part that is plain, printable values of ordinary size.
+        config = {key: value for key, value in given.items() if _is_plain(key) and _is_plain(value)}
+        architecture = _architecture(checked_model(_Config, config, path), tensors)
         state = _copy_state(architecture, tensors)
     except ValueError as error:
         raise FileError(path, f"{error}") from None
     return Checkpoint(path, sha256(path), architecture, config, state)
 
 
+def _architecture(config: _Config, tensors: Mapping[str, Tensor]) -> Architecture:
+    """The network by its config, and its width by its first layer; all weights have to fit it."""
+    first = tensors.get("fnet_img.conv1.weight")
+    if first is None or first.ndim != 4:  # noqa: PLR2004 - a convolution
+        raise ValueError("these are not the weights of a CMRNext network")
+    head: Literal["nll", "nll_frozen"] = "nll_frozen" if config.unc_freeze else "nll"
+    return Architecture(
+        fourier_levels=config.fourier_levels,
+        reflectance=config.use_reflectance,
+        context=config.context_encoder,
+        uncertainty=head if config.uncertainty else "none",
+        width=len(first),
+    )
+
+
 def _read_torch(path: Path) -> tuple[dict[Any, Any], dict[str, Tensor]]:
-    return _weights_in(read_torch_file(path), path)
-
-
-def _weights_in(content: Mapping[Any, Any], path: Path) -> tuple[dict[Any, Any], dict[str, Tensor]]:
+    content = read_torch_file(path)
     for key in ("config", "state_dict"):
         if not isinstance(content.get(key), dict):
             raise FileError(path, f"lacks {key!r}: expected the checkpoint of a CMRNext training")
@@ -169,11 +184,6 @@ def _read_safetensors(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     return config, tensors
 
 
-def _plain(config: Mapping[Any, Any]) -> dict[str, Any]:
-    """The part of a config that is plain, printable values of ordinary size."""
-    return {key: value for key, value in config.items() if _is_plain(key) and _is_plain(value)}
-
-
 def _is_plain(value: Any) -> bool:
     if isinstance(value, str):
         return len(value) <= _MAX_TEXT and value.isprintable()
@@ -194,6 +204,11 @@ def _copy_state(architecture: Architecture, tensors: Mapping[str, Tensor]) -> di
     ):
         if names:
             raise ValueError(f"{kind} weights {min(names)!r} ({len(names)} such names)")
+    for name, like in expected.items():
+        if tensors[name].shape != like.shape:
+            network = ", ".join(f"{key} {value}" for key, value in asdict(architecture).items())
+            found, wanted = tuple(tensors[name].shape), tuple(like.shape)
+            raise ValueError(f"{name!r} has shape {found}, expected {wanted}, with {network}")
     state = {name: _copy(name, tensors[name], like) for name, like in expected.items()}
     for name, tensor in state.items():
         if ".norm3." in name and not torch.equal(
@@ -205,8 +220,6 @@ def _copy_state(architecture: Architecture, tensors: Mapping[str, Tensor]) -> di
 
 def _copy(name: str, tensor: Tensor, like: Tensor) -> Tensor:
     """A sound copy of a tensor, in the type that the network expects."""
-    if tensor.shape != like.shape:
-        raise ValueError(f"{name!r} has shape {tuple(tensor.shape)}, expected {tuple(like.shape)}")
     if tensor.is_floating_point() != like.is_floating_point():
         raise ValueError(f"{name!r} holds numbers of type {tensor.dtype}")
     copy = torch.empty(like.shape, dtype=like.dtype).copy_(tensor)
@@ -215,3 +228,90 @@ def _copy(name: str, tensor: Tensor, like: Tensor) -> Tensor:
     if name.endswith("running_var") and (copy < 0).any():
         raise ValueError(f"{name!r} holds variances below zero")
     return copy
+
+
+MAX_BYTES = 2 * 2**30
+
+_ADVICE = "download it again, or save its config and state_dict anew where it was made"
+
+
+class _Foreign:
+    """Stands for an object of any class but those of plain data; it has no content."""
+
+    def __new__(cls, *_: object) -> _Foreign:
+        return super().__new__(cls)
+
+    def __setstate__(self, _: object) -> None:
+        """Drop the state."""
+
+
+class _NumberType:
+    """Stands for numpy's number types."""
+
+    def __init__(self, name: object, *_: object) -> None:
+        if not isinstance(name, str) or not re.fullmatch(r"[fiub][1248]", name):
+            raise ValueError("a numpy number of an unknown type")
+        self.dtype = np.dtype(name).newbyteorder("<")
+
+    def __setstate__(self, _: object) -> None:
+        """Drop the state: the byte order is little."""
+
+
+def _to_number(kind: _NumberType, data: bytes) -> float:
+    """A numpy number as a plain one."""
+    value: float = np.frombuffer(data, kind.dtype, count=1)[0].item()
+    return value
+
+
+_STAND_INS: dict[str, Any] = {
+    "numpy.dtype": _NumberType,
+    "numpy.core.multiarray.scalar": _to_number,
+    "numpy._core.multiarray.scalar": _to_number,
+}
+
+
+def read_torch_file(path: Path) -> dict[Any, Any]:
+    """Read the mapping that ``torch.save`` wrote; its tensors are on the CPU.
+
+    Objects of classes beyond plain data become inert.
+
+    Raises:
+        FileError: if it is not such a file, is damaged, too large, or claims more than it holds.
+    """
+    try:
+        content = _load(path)
+    except zipfile.BadZipFile:
+        raise FileError(
+            path, f"is not a checkpoint of torch 1.6 or newer, or is damaged; {_ADVICE}"
+        ) from None
+    except Exception as error:  # torch raises anything on damaged files
+        raise FileError(
+            path, f"cannot be read as a checkpoint: {_reason(error)}; {_ADVICE}"
+        ) from None
+    if not isinstance(content, dict):
+        raise FileError(path, "holds no mapping, expected a checkpoint's")
+    return content
+
+
+def _reason(error: Exception) -> str:
+    """The cause alone: torch surrounds it with advice to load the file unsafely."""
+    text = in_words(error)
+    cause = re.search(r"(?:WeightsUnpickler error:|\n\n)\s*(?!\n)(\S[^\n]*)", text)
+    return (cause[1] if cause else text.splitlines()[0]).rstrip(". ")
+
+
+def _load(path: Path) -> object:
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise ValueError(f"{size} bytes, expected at most {MAX_BYTES}")
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+        raise ValueError("its entries are packed, which torch does not do")
+    if sum(entry.file_size for entry in entries) > size:
+        raise ValueError("its entries claim more bytes than the file has")
+    foreign = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+    stand_ins: list[Any] = [(_STAND_INS.get(name, _Foreign), name) for name in foreign]
+    with torch.serialization.safe_globals(stand_ins), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of pickle protocols: what cannot be read is an error
+        return torch.load(path, map_location="cpu", weights_only=True)

@@ -7,9 +7,8 @@ pose. It ranks matches, but is not calibrated: it is no probability.
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -96,7 +95,9 @@ class FlowMatcher:
 
     def match(self, jobs: Sequence[MatchingJob]) -> list[Correspondences]:
         """Match a batch of images of one size; the tables do not depend on a frame's pose."""
-        halved = self._halves(jobs[0].camera)
+        given = self.half_resolution, self.checkpoint.config.get("half_resolution")
+        is_wide = jobs[0].camera.width_px >= HALVED_FROM_PX
+        halved = next((each for each in given if each is not None), is_wide)
         lidar_images = [LidarImage.render(j.cloud, j.T_camera_lidar, j.view) for j in jobs]
         full, coarse = self._flow(jobs, lidar_images, halved)
         cell = CELL * (1 + halved)
@@ -104,13 +105,6 @@ class FlowMatcher:
             to_table(job, lidar, full[i], coarse[i], cell=cell)
             for i, (job, lidar) in enumerate(zip(jobs, lidar_images, strict=True))
         ]
-
-    def _halves(self, camera: Camera) -> bool:
-        """Whether the network reads a camera's images at half their size."""
-        if self.half_resolution is not None:
-            return self.half_resolution
-        trained = self.checkpoint.config.get("half_resolution")
-        return trained if isinstance(trained, bool) else camera.width_px >= HALVED_FROM_PX
 
     def _flow(
         self, jobs: Sequence[MatchingJob], lidar_images: Sequence[LidarImage], halved: bool
@@ -123,7 +117,10 @@ class FlowMatcher:
             channels = lidar_channels(lidar, checkpoint.architecture, checkpoint.max_depth_m)
             rgbs.append(rgb_tensor(image, normalize=checkpoint.config["normalize_images"]))
             lidars.append(lidar_tensor(halve_lidar(channels) if halved else channels))
-        with torch.inference_mode(), _exact():
+        exact: Any = torch.backends.cudnn.flags(  # full float32, the same numbers at every call
+            enabled=True, benchmark=False, deterministic=True, allow_tf32=False
+        )
+        with torch.inference_mode(), exact:
             rgb, raw = torch.stack(rgbs).to(device), torch.stack(lidars).to(device)
             inputs = encode_depth(raw, checkpoint.architecture)
             flow = self.model(rgb, inputs, iterations=self.iterations)
@@ -132,14 +129,6 @@ class FlowMatcher:
                 maps.append(upscale(flow.sigma_px, halved=halved, is_flow=False))
             coarse = torch.stack([flow.step_px * (1 + halved), flow.peak], dim=1)
             return torch.cat(maps, dim=1).cpu().numpy(), coarse.cpu().numpy()
-
-
-def _exact() -> AbstractContextManager[None]:
-    """Full float32 on a GPU, and the same numbers at every call."""
-    flags = torch.backends.cudnn.flags(
-        enabled=True, benchmark=False, deterministic=True, allow_tf32=False
-    )
-    return cast(AbstractContextManager[None], flags)
 
 
 def to_table(
@@ -160,51 +149,29 @@ def to_table(
     kept = on_image & np.isfinite(values).all(axis=1)
     index = lidar.point_index[kept]
     step, peak = coarse[:, rows[kept] // cell, columns[kept] // cell].astype(np.float64)
-    sigma = values[kept, 2:] if values.shape[1] > 2 else None  # noqa: PLR2004 - flow and sigmas
+    information = None
+    if values.shape[1] == 2:  # noqa: PLR2004 - no uncertainty head
+        converged = 1.0 / (1.0 + (step / STEP_PX) ** 2)
+        confidence = converged * peak / (peak + 1.0 / WINDOW**2)  # a peak of chance halves it
+    else:
+        sigma = values[kept, 2:]
+        confidence = 2.0 / sigma.sum(axis=1)  # 1 for the least, 1 px per axis
+        diagonal = sigma**-2.0
+        information = np.column_stack([diagonal[:, 0], np.zeros(len(sigma)), diagonal[:, 1]])
     return Correspondences.from_arrays(
         camera=job.name,
         frame=job.frame.index,
         pixels_px=pixels[kept].reshape(-1, 2),
         points_lidar_m=job.cloud[index, :3],
-        confidence=_confidence_of_flow(step, peak)
-        if sigma is None
-        else _confidence_of_sigmas(sigma),
-        information_px=None if sigma is None else _to_information(sigma),
+        confidence=_bound(confidence),
+        information_px=information,
         point_index=index,
     )
-
-
-def _confidence_of_flow(step_px: Array, peak: Array) -> NDArray[np.float32]:
-    """Confidence without an uncertainty head, before the frame's pose is estimated.
-
-    Args:
-        step_px: (n,) length of the last iteration's change.
-        peak: (n,) softmax share of the correlation at the target among its 9 x 9 neighbours; a
-            share no better than chance halves the confidence.
-
-    Returns:
-        (n,) in (0, 1]; uncalibrated.
-    """
-    converged = 1.0 / (1.0 + (step_px / STEP_PX) ** 2)
-    distinct = peak / (peak + 1.0 / WINDOW**2)
-    return _bound(converged * distinct)
 
 
 def lower_by_residuals(confidence: NDArray[np.float32], residual_px: Array) -> NDArray[np.float32]:
     """Confidence lowered by (n,) reprojection errors at the pose of the frame's own matches."""
     return _bound(confidence / (1.0 + (residual_px / RESIDUAL_PX) ** 2))
-
-
-def _confidence_of_sigmas(sigma_px: Array) -> NDArray[np.float32]:
-    """Confidence from (n, 2) predicted standard deviations; 1 for the least, 1 px per axis."""
-    return _bound(2.0 / sigma_px.sum(axis=1))
-
-
-def _to_information(sigma_px: Array) -> Array:
-    """(n, 3) i_uu, i_uv, i_vv from (n, 2) predicted standard deviations."""
-    return np.column_stack(
-        [sigma_px[:, 0] ** -2.0, np.zeros(len(sigma_px)), sigma_px[:, 1] ** -2.0]
-    )
 
 
 def _bound(values: Array | NDArray[np.float32]) -> NDArray[np.float32]:
@@ -220,7 +187,7 @@ class ImageResult:
         matches: of the last network.
         T_camera_lidar: (4, 4) estimated from them by PnP; None if that failed.
         failed: whether a network gave no pose, or one beyond its range of training.
-        start_dependence: see :mod:`calibgraph.matching.cmrnext.probe`; None if not measured.
+        start_dependence: see :mod:`calibgraph.matching.cmrnext.matcher`; None if not measured.
         memorization: see the same module; None if not measured.
     """
 
@@ -246,12 +213,11 @@ def to_findings(results: Mapping[str, Sequence[ImageResult]], last: Checkpoint) 
 
 def _medians(results: Mapping[str, Sequence[ImageResult]], attribute: str) -> dict[str, float]:
     """Median of a probe over the frames of each probed camera; NaN if none could be measured."""
-    values = {name: [getattr(result, attribute) for result in each]
-              for name, each in results.items()}  # fmt: skip
-    probed = {name: [v for v in each if v is not None] for name, each in values.items()}
-    return {name: _finite_median(each) for name, each in probed.items() if each}
-
-
-def _finite_median(values: Sequence[float]) -> float:
-    finite = [value for value in values if np.isfinite(value)]
-    return float(np.median(finite)) if finite else float("nan")
+    medians = {}
+    for name, of_camera in results.items():
+        measured = [getattr(result, attribute) for result in of_camera]
+        probed = np.array([value for value in measured if value is not None])
+        if len(probed):
+            finite = probed[np.isfinite(probed)]
+            medians[name] = float(np.median(finite)) if len(finite) else float("nan")
+    return medians

@@ -5,7 +5,7 @@ The conventions of the published networks (rounding, scaling, padding, encoding)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -16,10 +16,8 @@ from torch import Tensor
 
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
-from calibgraph.matching.cmrnext.architecture import Architecture
-from calibgraph.matching.cmrnext.network import SIZE_MIN, SIZE_MULTIPLE
+from calibgraph.matching.cmrnext.network import SIZE_MIN, SIZE_MULTIPLE, Architecture
 from calibgraph.model.rig import Camera
-from factors import Lens
 
 Image = NDArray[np.uint8]
 
@@ -51,12 +49,6 @@ class View:
         if self.camera.distortion or self.camera.model != "pinhole":
             rgb = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR)
         return np.ascontiguousarray(rgb[: self.height, : self.width], dtype=np.uint8)
-
-    @cached_property
-    def lens(self) -> Lens:
-        """The pinhole."""
-        (fx, fy), (cx, cy) = self.focal_px.tolist(), self.centre_px.tolist()
-        return Lens.pinhole(fx=fx, fy=fy, cx=cx, cy=cy)
 
     def project(self, points_camera_m: Array) -> Array:
         """(n, 2) pixels of (n, 3) points in front of the camera."""
@@ -126,17 +118,6 @@ class LidarImage:
             depth_m=depth[nearest],
             shape=(view.height, view.width),
             intensity=_scale_intensity(cloud)[index[nearest]],
-        )
-
-    def select(self, rows: NDArray[np.bool_]) -> LidarImage:
-        """Only some points."""
-        return replace(
-            self,
-            point_index=self.point_index[rows],
-            pixels_px=self.pixels_px[rows],
-            cells=self.cells[rows],
-            depth_m=self.depth_m[rows],
-            intensity=self.intensity[rows],
         )
 
     def rasterize(self, values: NDArray[np.float32]) -> NDArray[np.float32]:

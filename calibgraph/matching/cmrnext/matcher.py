@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.matching.cmrnext import probe
 from calibgraph.matching.cmrnext.checkpoint import Checkpoint, load_checkpoint
 from calibgraph.matching.cmrnext.flow_matching import (
     FlowMatcher,
@@ -24,8 +24,8 @@ from calibgraph.matching.cmrnext.inputs import View
 from calibgraph.matching.cmrnext.network import torch_device
 from calibgraph.model.config import Config, Stage1Source
 from calibgraph.model.correspondences import Correspondences, concatenate
-from calibgraph.model.geometry import angle_deg, relative_transform
-from calibgraph.model.rig import Rig
+from calibgraph.model.geometry import angle_deg, relative_transform, transform
+from calibgraph.model.rig import Camera, Rig
 from calibgraph.progress import Progress
 from calibgraph.solver.pnp import frame_pose
 
@@ -175,15 +175,14 @@ class CmrNextMatcher:
         job = result.job
         base = job.T_camera_lidar if result.T_camera_lidar is None else result.T_camera_lidar
         rng = np.random.default_rng([self.seed, job.frame.index])
-        start = probe.displace(base, network.checkpoint.range_deg_m, rng)
-        blank = np.full_like(job.image, probe.BLANK)
+        start = displace(base, network.checkpoint.range_deg_m, rng)
+        blank = np.full_like(job.image, BLANK)
         with_image, without_image = (
             network.match([replace(job, T_camera_lidar=start, image=image)])[0]
             for image in (job.image, blank)
         )
         dependence, kept = (
-            probe.remaining_share(job.camera, base, start, table)
-            for table in (with_image, without_image)
+            remaining_share(job.camera, base, start, table) for table in (with_image, without_image)
         )
         return replace(result, start_dependence=dependence, memorization=1.0 - kept)
 
@@ -225,3 +224,47 @@ def _weigh(job: MatchingJob, table: Correspondences, T_camera_lidar: Array) -> C
     residuals = np.linalg.norm(projected - table.pixels_px, axis=1)
     residuals = np.where(valid, residuals, np.inf)
     return replace(table, confidence=lower_by_residuals(table.confidence, residuals))
+
+
+BLANK = (124, 116, 104)
+"""The mean colour of the networks' training: zero, once normalised."""
+
+_SHARE_OF_RANGE = 0.7  # displacement per axis, as a share of the training's perturbation
+_DEFAULT_RANGE = (0.2, 0.05)  # degrees and metres: the finest published network's
+_MIN_POINTS = 50
+
+
+def displace(
+    T_camera_lidar: Array, range_deg_m: tuple[float, float] | None, rng: np.random.Generator
+) -> Array:
+    """(4, 4) a start within the network's range: per axis a rotation and a shift of random sign."""
+    rotation_deg, translation_m = range_deg_m or _DEFAULT_RANGE
+    signs = rng.choice([-1.0, 1.0], 6)
+    turn = Rotation.from_rotvec(_SHARE_OF_RANGE * rotation_deg * signs[:3], degrees=True)
+    D = transform(turn, _SHARE_OF_RANGE * translation_m * signs[3:])
+    return np.asarray(D @ T_camera_lidar)
+
+
+def remaining_share(
+    camera: Camera, T_base: Array, T_displaced: Array, matches: Correspondences
+) -> float:
+    """Share of a displacement that remains in the matches found from it.
+
+    Args:
+        camera: with its lens.
+        T_base: (4, 4) T_camera_lidar estimated by the network before.
+        T_displaced: (4, 4) T_camera_lidar from which the matches were found.
+        matches: of one frame.
+
+    Returns:
+        Slope of the matches' displacement over the start's, both in pixels from the base: 0 if
+        the matches are independent of the start, 1 if they follow it; NaN with too few matches.
+    """
+    points = matches.points_lidar_m
+    base, start = (
+        camera.lens.project(points @ T[:3, :3].T + T[:3, 3])[0] for T in (T_base, T_displaced)
+    )
+    displacement, remainder = start - base, matches.pixels_px - base
+    if len(points) < _MIN_POINTS:
+        return float("nan")
+    return float((remainder * displacement).sum() / (displacement**2).sum())

@@ -6,24 +6,24 @@ shaped as in the published checkpoints.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.correlation import (
     CHANNELS,
     WINDOW,
     Correlation,
-    OnTheFly,
-    Volume,
-    volume_bytes,
 )
 
+FULL_WIDTH = 64
+"""Channels of the published networks' first layer; every other width follows it in proportion."""
+
+_RGB = 3
+_MAX_WIDTH = 256
 SIZE_MULTIPLE, SIZE_MIN = 64, 128
-VOLUME_BYTES_MAX = 2**30
-"""Above this, correlations are computed on the fly."""
 CELL = 8
 """Pixels per cell of the feature maps."""
 
@@ -40,6 +40,48 @@ def torch_device(name: str) -> torch.device:
         raise ValueError("device 'cuda': torch finds no GPU; use device: cpu in --config")
     use_gpu = name == "cuda" or (name == "auto" and torch.cuda.is_available())
     return torch.device("cuda" if use_gpu else "cpu")
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """The dimensions that differ between CMRNext networks.
+
+    Attributes:
+        fourier_levels: of the depth encoding; -1: plain depth.
+        reflectance: whether the LiDAR image has a channel of intensities.
+        context: which image the context encoder reads.
+        uncertainty: ``nll``: the flow head also predicts standard deviations; ``nll_frozen``: a
+            second update block does.
+        width: channels of the first layer, a multiple of 8; published networks have 64.
+    """
+
+    fourier_levels: int = 12
+    reflectance: bool = False
+    context: Literal["lidar", "rgb"] = "lidar"
+    uncertainty: Literal["none", "nll", "nll_frozen"] = "none"
+    width: int = FULL_WIDTH
+
+    def __post_init__(self) -> None:
+        if not 8 <= self.width <= _MAX_WIDTH or self.width % 8:  # noqa: PLR2004 - all parts whole
+            raise ValueError(
+                f"network width {self.width}: expected a multiple of 8 up to {_MAX_WIDTH}"
+            )
+        if not (self.fourier_levels == -1 or 1 <= self.fourier_levels <= 20):  # noqa: PLR2004
+            raise ValueError(f"fourier_levels {self.fourier_levels}: expected 1 to 20, or -1")
+
+    @property
+    def lidar_channels(self) -> int:
+        """Channels of the LiDAR input: 2L + 1, or 1 without encoding; 1 more with reflectance."""
+        return 2 * max(self.fourier_levels, 0) + 1 + self.reflectance
+
+    @property
+    def context_channels(self) -> int:
+        """Channels of the context encoder's input."""
+        return self.lidar_channels if self.context == "lidar" else _RGB
+
+    def scale(self, channels: int) -> int:
+        """A layer's channels, scaled from the published width."""
+        return channels * self.width // FULL_WIDTH
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,10 +271,7 @@ class CmrNext(nn.Module):
             iterations: at least 1.
         """
         _require_size(rgb, lidar)
-        features = self.fnet_lidar(lidar), self.fnet_img(rgb)
-        batch, _, height, width = rgb.shape
-        is_small = volume_bytes(batch, height, width) <= VOLUME_BYTES_MAX
-        correlation = Volume(*features) if is_small else OnTheFly(*features)
+        correlation = Correlation(self.fnet_lidar(lidar), self.fnet_img(rgb))
         h, context = self.cnet(lidar if self.architecture.context == "lidar" else rgb).chunk(2, 1)
         h, context = torch.tanh(h), F.relu(context)
         blocks = [self.update_block]
@@ -251,20 +290,17 @@ class CmrNext(nn.Module):
             both = torch.cat(outputs, dim=1)  # the flow's step, and raw uncertainty if there is one
             step, raw_sigma = both[:, :2], both[:, 2:]
             flow = flow + step
-        weights = self._upsampling_weights(hiddens[0])
+        # (B, 1, 9, 8, 8, h, w) of the 3 x 3 neighbours of every pixel's cell.
+        mask = 0.25 * self.update_block.mask(hiddens[0])
+        weights = mask.view(len(mask), 1, 9, CELL, CELL, *mask.shape[2:]).softmax(dim=2)
+        # The softmax share of the target itself in its window of the finest level.
+        window = correlation.window(grid + flow)[:, : WINDOW**2]
         return Flow(
             flow_px=_upsample(CELL * flow, weights),
             sigma_px=_upsample(F.elu(raw_sigma) + 2, weights) if raw_sigma.shape[1] else None,
             step_px=CELL * step.norm(dim=1),
-            peak=_peak(correlation, flow),
+            peak=window.softmax(dim=1)[:, WINDOW**2 // 2],
         )
-
-    def _upsampling_weights(self, h: Tensor) -> Tensor:
-        """(B, 1, 9, 8, 8, h, w) weights of the 3 x 3 neighbours of every pixel's cell."""
-        mask = 0.25 * self.update_block.mask(h)
-        batch, _, height, width = mask.shape
-        weights: Tensor = mask.view(batch, 1, 9, CELL, CELL, height, width).softmax(dim=2)
-        return weights
 
 
 def _require_size(rgb: Tensor, lidar: Tensor) -> None:
@@ -294,12 +330,6 @@ def _upsample(cells: Tensor, weights: Tensor) -> Tensor:
     neighbours = F.unfold(cells, 3, padding=1).view(batch, channels, 9, 1, 1, height, width)
     pixels = (weights * neighbours).sum(dim=2)  # (B, 2, 8, 8, h, w)
     return pixels.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels, CELL * height, CELL * width)
-
-
-def _peak(correlation: Correlation, flow: Tensor) -> Tensor:
-    """(B, h, w) softmax share of the target itself in its window of the finest level."""
-    window = correlation.window(_identity_grid(flow) + flow)[:, : WINDOW**2]
-    return window.softmax(dim=1)[:, WINDOW**2 // 2]
 
 
 def upscale(maps: Tensor, *, halved: bool, is_flow: bool = True) -> Tensor:

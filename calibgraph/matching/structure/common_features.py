@@ -7,9 +7,12 @@ from itertools import combinations
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.matching.camera_pairs.features import Features, features_of, match_features
-from calibgraph.matching.camera_pairs.geometry import agree_on_epipolar_geometry, relative_pose
-from calibgraph.matching.camera_pairs.surfaces import planes_at
+from calibgraph.matching.camera_pairs.find import Features, features_of, match_features
+from calibgraph.matching.camera_pairs.geometry import (
+    agree_on_epipolar_geometry,
+    planes_at,
+    relative_pose,
+)
 from calibgraph.matching.structure.pose_refinement import CameraFrames
 from calibgraph.model.rig import Rig
 
@@ -68,10 +71,10 @@ def _match(
             for rows in [match_features(one, two)]
         ]
         sides = [np.concatenate(side) for side in zip(*rays, strict=True)]
-        fit = agree_on_epipolar_geometry(rig.cameras[a], rig.cameras[b], *sides, seed=seed)
-        if fit.inlier.any():
+        agrees = agree_on_epipolar_geometry(rig.cameras[a], rig.cameras[b], *sides, seed=seed)
+        if agrees.any():
             ends = np.cumsum([len(one) for one, _ in rays])[:-1]
-            inlier = np.split(fit.inlier, ends)
+            inlier = np.split(agrees, ends)
             yield (
                 (a, b),
                 [

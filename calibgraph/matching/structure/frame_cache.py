@@ -5,9 +5,7 @@ from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 
-from calibgraph.io.frame import Frame
-from calibgraph.io.kept_frames import KeptFrame
-from calibgraph.io.motion import ScanMotion
+from calibgraph.io.frame import Frame, ScanMotion
 from calibgraph.matching.structure.pose_refinement import CameraFrames
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.prepared_image import PreparedImage, SmallImages
@@ -60,7 +58,7 @@ class FrameCache:
 
         def load() -> PreparedImage:
             gray = frame.load_gray(name, camera)
-            kept = gray if isinstance(frame, KeptFrame) else mmap_copy(gray)
+            kept = gray if frame.kept else mmap_copy(gray)
             return PreparedImage.from_gray(kept, camera, self._smaller)
 
         return self._images.get(key, load)
@@ -68,7 +66,7 @@ class FrameCache:
 
 def cache_of(frames: Sequence[Frame], otherwise: FrameCache) -> FrameCache:
     """The cache that goes with kept frames, for all that score them; else, the given one."""
-    if frames and isinstance(frames[0], KeptFrame):
+    if frames and frames[0].kept:
         return frames[0].derive_for_all("frame cache", FrameCache)
     return otherwise
 

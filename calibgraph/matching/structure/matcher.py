@@ -35,8 +35,7 @@ from calibgraph.model.findings import STAGE1, MatcherFindings, error_components
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress
-from calibgraph.solver.camera_twist import free_fields_px
-from factors import displace
+from factors import displace, fields_px
 
 _TRACKING_ROUNDS = (2, 4)
 _ROUND_AFTER_SEARCH = 3
@@ -230,7 +229,8 @@ class StructureMatcher:
         if twist_per_s is not None:
             times_s = clock_of(camera).times_s(scores.pixels_px[:, 1])
             points_m = displace(points_m, twist_per_s, -times_s)
-        return scores.with_unknowns(free_fields_px(camera, free, points_m, twist_per_s))
+        fields = fields_px(points_m, camera.T_camera_lidar, free, twist_per_s)[1]
+        return scores.with_unknowns(fields[6:])
 
     def _match_camera(
         self, level: Level, name: str, waiting: deque[Future[ShiftScores]]

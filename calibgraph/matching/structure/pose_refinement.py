@@ -22,7 +22,7 @@ from calibgraph.matching.structure.shift_scores import (
     pad_grids,
     score_frame,
 )
-from calibgraph.solver.camera_twist import apply_twist
+from calibgraph.solver.columns import apply_twist
 
 APPROACH = (WIDE, 4_000)
 REFINEMENT = (

@@ -97,6 +97,39 @@ def score_windows(
     )  # fmt: skip
 
 
+@compiled()
+def centre_grids(shape, places, counts, group, origin, grids):  # type: ignore[no-untyped-def]
+    """Subtract the mean score of a window from each grid, as often as windows are in the image.
+
+    A window that leaves the image counts 0, as an unrelated one does in the mean: subtracted from
+    all shifts alike, the mean would hold windows near the border in the image, and with them the
+    ground below the camera, by pitch and height.
+
+    shape: height and width of the image; the others as of :func:`score_windows`.
+    """
+    (height, width), (rows, columns) = shape, grids.shape[1:]
+    inside = np.zeros((rows, columns), np.float32)
+    for w in range(len(places)):
+        left, top = places[w, 0, 0], places[w, 0, 1]
+        right, bottom = left, top
+        for p in range(counts[w]):
+            u, v = places[w, p, 0], places[w, p, 1]
+            left, right = u if u < left else left, u if u > right else right
+            top, bottom = v if v < top else top, v if v > bottom else bottom
+        for row in range(rows):
+            for column in range(columns):
+                right_by, down_by = origin[0] + column, origin[1] + row
+                inside[row, column] += (
+                    (left + right_by >= 0) & (right + right_by < width)
+                    & (top + down_by >= 0) & (bottom + down_by < height)
+                )  # fmt: skip
+        if w + 1 == len(places) or group[w + 1] != group[w]:
+            grid, seen = grids[group[w]], inside.sum()
+            if seen > 0:
+                grid -= inside * (grid.sum() / seen)
+            inside[:] = 0
+
+
 def _aligned(size: int) -> NDArray[np.float32]:
     """Zeros that begin where a vector does: others take half as long again to load and store."""
     room = np.zeros(size + LANES, np.float32)

@@ -15,14 +15,19 @@ from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import Level
-from calibgraph.matching.structure.score_kernel import score_windows
+from calibgraph.matching.structure.score_kernel import (
+    LANES,
+    LINES,
+    centre_grids,
+    score_windows,
+)
 from calibgraph.matching.structure.visibility import find_in_view, find_places, find_visible
 from calibgraph.matching.structure.window_weights import window_network
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.memory import mmap_zeros
 from calibgraph.model.clock import seen_at_rows, when_taken
 from calibgraph.model.rig import Camera
-from calibgraph.solver.camera_twist import project_with_jacobian
+from factors import Columns, fields_px
 
 Grids = NDArray[np.float32]
 
@@ -114,7 +119,9 @@ def score_frame(  # noqa: PLR0913 - what is scored, and how
     reach, groups = _reach_steps(camera, level, scale), len(seen.points_lidar_m)
     grids: Grids = mmap_zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
     _add_scores(grids, seen, likelihood=level.fine)
-    pixels_px, jacobian_px = project_with_jacobian(seen.camera, seen.seen_lidar_m)
+    lens, T = Columns(seen.camera.lens), seen.camera.T_camera_lidar
+    pixels_px, fields_of_pose = fields_px(seen.seen_lidar_m, T, lens)
+    jacobian_px = np.ascontiguousarray(fields_of_pose.transpose(2, 1, 0))
     return ShiftScores(
         grids=grids,
         jacobian=jacobian_px * scale[:, None],
@@ -267,10 +274,16 @@ def _mean_by_group(points: Array, group: NDArray[np.int32], counts: NDArray[np.i
 
 
 def _add_scores(grids: Grids, seen: ViewedWindows, *, likelihood: bool) -> None:
-    """Add the windows' scores to their groups' grids, and subtract each grid's mean."""
+    """Add the windows' scores to their groups' grids, above their mean.
+
+    At coarse levels that is of all shifts: poses that take few windows out of the image are better
+    ones to propose.
+    """
     windows, reach = seen.windows, (grids.shape[1] - 1) // 2
-    score_windows(
-        seen.image, seen.places, windows.counts, windows.basis, seen.group,
-        np.array([-reach, -reach]), likelihood, grids,
-    )  # fmt: skip
-    grids -= grids.mean(axis=(1, 2), keepdims=True)
+    at = seen.places, windows.counts
+    origin, shape = np.array([-reach, -reach]), np.subtract(seen.image.shape, (LINES, LANES))
+    score_windows(seen.image, *at, windows.basis, seen.group, origin, likelihood, grids)
+    if likelihood:
+        centre_grids(shape, *at, seen.group, origin, grids)
+    else:
+        grids -= grids.mean(axis=(1, 2), keepdims=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array, Mask
 from calibgraph.model.rig import Camera
 from factors import unproject
-from factors.block_arrays import contiguous
+from factors.arrays import contiguous
 from factors.compiled import compiled
 from factors.lens_kernels import (
     EQUIRECTANGULAR,

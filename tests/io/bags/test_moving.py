@@ -11,36 +11,18 @@ import pytest
 
 from calibgraph import BagOptions, DatasetError, calibrate, evaluate, load_dataset, load_rig
 from calibgraph.io.bags.point_clouds import timed_points_of
-from calibgraph.io.frame import frame_of_entry
-from calibgraph.io.motion import ScanMotion
+from calibgraph.io.frame import ScanMotion, frame_of_entry
 from calibgraph.matching import places
 from calibgraph.model.geometry import invert
 from calibgraph.trust.inputs import find_doubts
 from tests.conftest import SAMPLE
-from tests.io.bags.writing import (
-    PERIOD_NS,
-    START_NS,
-    Messages,
-    Stamped,
-    tree_of,
-    write_bag,
-)
+from tests.io.bags.writing import PERIOD_NS, START_NS, Messages, Stamped, tree_of, write_bag
 
 RIG = load_rig(SAMPLE)
-
-
 MAKE = Messages("mcap")
-
-
 TWIST = np.array([0.0, 0.0, 0.3, 10.0, 0.0, 0.0])  # of base: 36 km/h along a bend
-
-
 T_BASE_LIDAR = tree_of(RIG)[0][2]
-
-
 IMAGE_S = 0.04  # after the start of the scan
-
-
 FRAMES = 4
 
 
@@ -154,9 +136,7 @@ def errors_m(bag: tuple[Path, list[np.ndarray]], motion: Any) -> list[float]:
     return found
 
 
-def test_scans_of_a_moving_vehicle_are_off_as_they_are(
-    bag: tuple[Path, list[np.ndarray]],
-) -> None:
+def test_scans_of_a_moving_vehicle_are_off_as_they_are(bag: tuple[Path, list[np.ndarray]]) -> None:
     assert min(errors_m(bag, "none")) > 0.25
     (note,) = [n for n in load_dataset(bag[0]).notes if "points have a t" in n]
     assert note.endswith("give --motion odometry, tf or scans, or stand still")
@@ -173,10 +153,7 @@ def test_registration_of_neighbours_corrects_them(bag: tuple[Path, list[np.ndarr
 
 @pytest.mark.parametrize(("motion", "limit_m"), [("odometry", 2e-4), ("scans", 0.1)])
 def test_poses_or_twists_give_the_motion_between_frames(
-    bag: tuple[Path, list[np.ndarray]],
-    monkeypatch: pytest.MonkeyPatch,
-    motion: Any,
-    limit_m: float,
+    bag: tuple[Path, list[np.ndarray]], monkeypatch: pytest.MonkeyPatch, motion: Any, limit_m: float
 ) -> None:
     """No feature is looked for; scans give twists alone, which hold for a short time.
 

@@ -27,11 +27,11 @@ from calibgraph import (
     solve,
 )
 from calibgraph.io.bags.camera_info import lens_of
-from calibgraph.io.bags.messages import Bag, Drive
+from calibgraph.io.bags.messages import Bag
 from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.topics import choose_topics
 from calibgraph.io.bags.transforms import Transforms
-from calibgraph.io.frame_tree import Link, find_mounts
+from calibgraph.io.rig_parts import Link, find_mounts
 from calibgraph.model.geometry import invert
 from tests.conftest import SAMPLE, make_camera
 from tests.io.bags.writing import (
@@ -155,7 +155,7 @@ def test_one_point_goes_through_the_tree_by_hand(tmp_path: Path, kind: str) -> N
         Stamped("/tf_static", TREE, START_NS + n, make.transforms([edge]))
         for n, edge in enumerate([("base", "lidar", shifted(9.0, 9.0, 9.0)), *edges])  # last counts
     ]
-    transforms = Transforms(Drive(Bag(write_bag(tmp_path, kind, messages))))
+    transforms = Transforms([Bag(write_bag(tmp_path, kind, messages))])
     T_optical_lidar = transforms.between("optical", "lidar")
     assert T_optical_lidar is not None
     # 3 m along the LiDAR's x: (1, 3, 2) of the base, (0.5, 3, 0.5) of the body: 3 m to the left

@@ -248,6 +248,15 @@ def sample_messages(
     return written
 
 
+def require_same_frames(found: Dataset, expected: Dataset) -> None:
+    """Check that clouds and images are the same."""
+    for one, two in zip(found.frames, expected.frames, strict=True):
+        np.testing.assert_array_equal(one.load_cloud(), two.load_cloud())
+        for name, camera in expected.rig.cameras.items():
+            images = one.load_image(name, camera), two.load_image(name, camera)
+            np.testing.assert_array_equal(*images)
+
+
 def sample_bag(folder: Path, kind: str, **options: Any) -> Path:
     """The sample as a bag."""
     return write_bag(folder, kind, sample_messages(Messages(kind), **options))

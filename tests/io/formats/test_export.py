@@ -24,8 +24,8 @@ from calibgraph import (
     import_rig,
     load_rig,
 )
+from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.formats.export import WRITERS
-from calibgraph.io.formats.names import EXPORT_FORMATS
 from calibgraph.simulation.rigs import rig_of
 from tests.conftest import make_pair
 from tests.io.formats.conftest import rig_for, varied_rig
@@ -45,28 +45,19 @@ def test_each_format_has_a_meaning_a_writer_and_an_independent_reader() -> None:
 
 
 @pytest.mark.parametrize("format", READERS)
-def test_an_independent_reader_finds_the_same_extrinsics(format: str, tmp_path: Path) -> None:
-    rig = rig_for(format)
-    path = tmp_path / "file.txt"
+def test_an_independent_reader_finds_the_extrinsics_that_the_worked_point_proves(
+    format: str, tmp_path: Path
+) -> None:
+    rig, path = rig_for(format), tmp_path / "file.txt"
     export_calibration(rig, path, format)
-    found = READERS[format](path)
-    assert set(found) == set(rig.cameras)
+    found, points = READERS[format](path), worked_points(exported_text(path))
+    assert set(found) == set(points) == set(rig.cameras)
     for name, T in rig.T_camera_lidar.items():
         np.testing.assert_allclose(found[name], T, atol=1e-9, rtol=0)
-
-
-@pytest.mark.parametrize("format", READERS)
-def test_the_worked_point_proves_the_direction(format: str, tmp_path: Path) -> None:
-    rig = rig_for(format)
-    path = tmp_path / "file.txt"
-    export_calibration(rig, path, format)
-    points = worked_points(exported_text(path))
-    assert set(points) == set(rig.cameras)
-    for name, T in READERS[format](path).items():
         p_lidar, p_camera = points[name]
         # Six digits are printed: half a unit of the last is the largest error.
-        np.testing.assert_allclose((T @ [*p_lidar, 1])[:3], p_camera, atol=5.1e-7)
-        assert np.abs((np.linalg.inv(T) @ [*p_lidar, 1])[:3] - p_camera).max() > 0.1
+        np.testing.assert_allclose((found[name] @ [*p_lidar, 1])[:3], p_camera, atol=5.1e-7)
+        assert np.abs((np.linalg.inv(found[name]) @ [*p_lidar, 1])[:3] - p_camera).max() > 0.1
 
 
 def test_the_lidars_mounting_moves_sensors_together(tmp_path: Path) -> None:

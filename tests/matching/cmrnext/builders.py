@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from calibgraph import Camera
-from calibgraph.matching.cmrnext.architecture import Architecture
-from calibgraph.matching.cmrnext.network import CmrNext
+from calibgraph.matching.cmrnext.network import Architecture, CmrNext
 
 CONFIG = {
     "use_reflectance": False,

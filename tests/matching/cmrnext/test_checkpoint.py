@@ -20,8 +20,9 @@ import pytest
 import torch
 
 from calibgraph import FileError
-from calibgraph.matching.cmrnext import load_checkpoint, torch_file
-from calibgraph.matching.cmrnext.architecture import Architecture
+from calibgraph.matching.cmrnext import checkpoint as checkpoints
+from calibgraph.matching.cmrnext import load_checkpoint
+from calibgraph.matching.cmrnext.network import Architecture
 from tests.matching.cmrnext.builders import CONFIG, good_content, saved
 
 
@@ -87,16 +88,16 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "no depth scale": (with_weights(lambda c: c["config"].pop("max_depth")), "max_depth"),
     "a depth scale of zero": (changed_config(max_depth=0), "max_depth"),
-    "another encoding than in its config": (changed_config(fourier_levels=8), "fourier_levels = 8"),
+    "another encoding than in its config": (changed_config(fourier_levels=8), "fourier_levels 8"),
     "another context than in its config": (
-        changed_config(context_encoder="rgb"), "context_encoder",
+        changed_config(context_encoder="rgb"), "context rgb",
     ),
-    "uncertainty that is not there": (changed_config(uncertainty=True), "uncertainty"),
-    "reflectance that is not there": (changed_config(use_reflectance=True), "use_reflectance"),
+    "uncertainty that is not there": (changed_config(uncertainty=True), "uncertainty nll"),
+    "reflectance that is not there": (changed_config(use_reflectance=True), "reflectance True"),
     "flow of the other sign": (changed_config(al_contrario=True), "al_contrario"),
     "an evidential head": (
         changed_weights(update_block__flow_head__conv2__weight=torch.zeros(8, 32, 3, 3)),
-        "evidential",
+        "has shape (8, 32, 3, 3)",
     ),
     "weights of another network": (
         with_weights(lambda c: c.update(state_dict={"a": torch.zeros(1)})), "not the weights",
@@ -194,7 +195,7 @@ def test_wrapped_half_and_strided_weights_are_read(tmp_path: Path) -> None:
 
 def test_sizes_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = saved(tmp_path / "a.tar", good_content())
-    monkeypatch.setattr(torch_file, "MAX_BYTES", 50)
+    monkeypatch.setattr(checkpoints, "MAX_BYTES", 50)
     with pytest.raises(FileError, match="bytes, expected at most"):
         load_checkpoint(path)
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from calibgraph.matching.cmrnext.architecture import Architecture
 from calibgraph.matching.cmrnext.inputs import (
     LidarImage,
     View,
@@ -17,6 +16,7 @@ from calibgraph.matching.cmrnext.inputs import (
     halve_lidar,
     network_size,
 )
+from calibgraph.matching.cmrnext.network import Architecture
 from tests.conftest import KANNALA, RADTAN5, make_camera
 from tests.matching.cmrnext.builders import cloud_before
 

@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 import torch
 
-from calibgraph.matching.cmrnext.architecture import Architecture
-from calibgraph.matching.cmrnext.correlation import OnTheFly, Volume
-from calibgraph.matching.cmrnext.network import CmrNext
+from calibgraph.matching.cmrnext.correlation import MOST_BYTES, Correlation
+from calibgraph.matching.cmrnext.network import Architecture, CmrNext
 from tests.matching.cmrnext import reference_network
 
+WAYS = (MOST_BYTES, 0)
+"""All pairs at once, and only the requested ones."""
 
-def test_volume_and_on_the_fly_agree() -> None:
+
+def test_all_pairs_and_only_the_requested_ones_agree() -> None:
     generator = torch.Generator().manual_seed(1)
     lidar, image = (torch.randn(2, 32, 16, 24, generator=generator) for _ in range(2))
     spread = torch.rand(2, 2, 16, 24, generator=generator) * 60 - 20  # inside, across the edge, out
-    one, two = Volume(lidar, image).window(spread), OnTheFly(lidar, image).window(spread)
+    one, two = (Correlation(lidar, image, most).window(spread) for most in WAYS)
     torch.testing.assert_close(one, two, atol=1e-5, rtol=0)
     torch.testing.assert_close(
         one, reference_network.lookup(lidar, image, spread), atol=1e-4, rtol=0
@@ -30,8 +32,8 @@ def test_correlation_far_outside_is_zero() -> None:
     lidar = torch.ones(1, 8, 16, 16)
     for value in (1e30, -1e30, torch.nan, torch.inf):
         positions = torch.full((1, 2, 16, 16), value)
-        for way in (Volume, OnTheFly):
-            assert not way(lidar, lidar).window(positions).any()
+        for most in WAYS:
+            assert not Correlation(lidar, lidar, most).window(positions).any()
 
 
 ROUNDING = float(np.finfo(np.float32).eps)
@@ -118,11 +120,12 @@ def test_published_test_vectors_are_reproduced(reference_folder: Path) -> None:
         y, x = np.indices((16, 24), dtype=np.float32)
         positions = torch.tensor(np.stack([x + 0.3, y - 0.7])[None])
         expected = vectors["corr_at_offset_0.3_-0.7"]
-        for way in (Volume, OnTheFly):
+        for most in WAYS:
             maps = [torch.tensor(vectors[key]) for key in ("fmap_lidar", "fmap_img")]
             np.testing.assert_allclose(
-                way(*maps).window(positions), expected, atol=2e-6 * np.abs(expected).max(), rtol=0
-            )
+                Correlation(*maps, most_bytes=most).window(positions), expected,
+                atol=2e-6 * np.abs(expected).max(), rtol=0,
+            )  # fmt: skip
         for iterations in (1, 2, 6, 12):
             flow = model(rgb, lidar, iterations=iterations).flow_px
             np.testing.assert_allclose(flow, vectors[f"flow_iter{iterations}"], atol=1e-3, rtol=0)

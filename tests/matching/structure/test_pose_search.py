@@ -19,7 +19,7 @@ from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.frame_cache import FrameCache, load_camera_frames
 from calibgraph.model.geometry import pose_difference
 from calibgraph.parallel import core_pool
-from calibgraph.solver.camera_twist import apply_twist
+from calibgraph.solver.columns import apply_twist
 from tests.conftest import SAMPLE, make_camera
 
 

@@ -20,6 +20,7 @@ from calibgraph.matching.structure.score_kernel import (
     GRAY_NOISE,
     MIN_RESIDUAL_SHARE,
     OPPOSITE,
+    centre_grids,
     pad,
     score_windows,
 )
@@ -171,6 +172,25 @@ def test_unrelated_windows_score_no_higher_on_structure_than_on_a_flat_image() -
         )  # fmt: skip
     flat, structured = grids[0, 5:55, 5:25].mean() / 400, grids[0, 5:55, 35:55].mean() / 400
     assert abs(structured - flat) < 0.5 * CHANCE_DEPTH
+
+
+def test_windows_that_tell_nothing_do_not_hold_a_group_in_the_image() -> None:
+    """A score that each window has wherever it is in the image is none; what is above it stays."""
+    rng, size, origin = np.random.default_rng(0), (9, 13), np.array([-6, -4])
+    places = rng.integers([-5, -5], [35, 25], (60, 1, 2)) + rng.integers(-3, 4, (60, 12, 2))
+    counts, group = np.full(60, 12, np.int32), np.repeat([0, 1, 2], 20).astype(np.int32)
+    places[40:] = rng.integers(10, 14, (20, 12, 2))  # a group that never leaves
+    grids = np.zeros((3, *size), np.float32)
+    for row, column in np.ndindex(size):
+        at = places + origin + [column, row]
+        inside = ((at >= 0) & (at < [30, 20])).all(axis=(1, 2))
+        grids[:, row, column] = 0.3 * np.bincount(group, inside, minlength=3)
+    assert np.ptp(grids[:2]) > 1 and np.ptp(grids[2]) == 0
+    grids[2, 4, 6] += 1
+    centre_grids((20, 30), places.astype(np.int32), counts, group, origin, grids)
+    np.testing.assert_allclose(grids[:2], 0, atol=1e-5)
+    assert grids[2, 4, 6] - grids[2, 0, 0] == pytest.approx(1)
+    np.testing.assert_allclose(grids.mean(axis=(1, 2)), 0, atol=1e-5)
 
 
 def test_scores_of_a_frame_agree_at_the_true_pose(truth: Rig) -> None:

@@ -1,0 +1,118 @@
+"""Folders: the server's own, with one per job and tracker, and the roots that jobs may read from.
+
+A root, or what is in it, is a place: its fsspec protocol and its path without links, as one text.
+"""
+
+import fcntl
+import os
+import secrets
+import shutil
+from pathlib import Path
+from urllib.parse import unquote
+
+from calibgraph.errors import FileError
+from calibgraph.files import require_place_for_folder, sync_folder, write_text
+from calibgraph.fleet.files import is_local, locate
+
+INPUT, SCRATCH, WORK, RESULT, LOG = "input", "scratch", "work", "result", "log.txt"
+"""In a job's folder: its input, its working folder, its result as it is written, then; its log."""
+
+FILES, ARCHIVE, SUMMARY = "files", "files.zip", "summary.json"
+"""In the result: the files that the command writes, all of them, the summary that it prints."""
+
+
+class DataFolder:
+    """The data folder of a server, locked against a second one.
+
+    Raises:
+        FileError: if it cannot be used, or another server uses it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        require_place_for_folder(path)
+        path.mkdir(parents=True, exist_ok=True, mode=0o700)
+        self.path = path.resolve()
+        self._lock = _lock(self.path)
+        self.jobs, self.trackers = self.path / "jobs", self.path / "trackers"
+        self.arriving = self.path / "arriving"
+        shutil.rmtree(self.arriving, ignore_errors=True)
+        for folder in (self.jobs, self.trackers, self.arriving):
+            folder.mkdir(exist_ok=True, mode=0o700)
+        owner = self.path / "owner"
+        if not owner.exists():
+            write_text(owner, secrets.token_hex(16))
+        self.owner = owner.read_text().strip()
+
+    def of_job(self, id: str) -> Path:
+        """The folder of a job."""
+        return self.jobs / id
+
+    def keep(self, arrived: Path) -> None:
+        """Put an upload on disk, and give it its place among the jobs."""
+        for path in (*arrived.rglob("*"), arrived):
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        arrived.rename(self.of_job(arrived.name))
+        sync_folder(self.jobs)
+
+    def close(self) -> None:
+        """Release the folder."""
+        os.close(self._lock)
+
+
+def _lock(folder: Path) -> int:
+    try:
+        descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        why = "is in use by another server; stop that one, or give another --data"
+        raise FileError(folder, why) from None
+    except OSError as error:
+        raise FileError(folder, f"cannot be locked ({error.strerror})") from error
+    return descriptor
+
+
+def open_roots(uris: tuple[str, ...]) -> tuple[str, ...]:
+    """The places of these URIs.
+
+    Raises:
+        FileError: if one is no URI that can be read, or a local folder that is not there.
+    """
+    if "" in uris:
+        raise FileError("--root", "is empty; name a folder, or leave it out")
+    return tuple(map(_place, uris))
+
+
+def require_inside(uri: str, roots: tuple[str, ...]) -> None:
+    """Check that a URI is inside the roots; links of local folders are followed first.
+
+    Raises:
+        FileError: if not. The message is the same whether or not anything is there.
+    """
+    outside = FileError(uri[:200], "is not inside the folders that this server reads from")
+    if "::" in uri or not uri.isprintable() or ".." in unquote(uri).split("/"):
+        raise outside
+    protocols = tuple(root.partition("//")[0] for root in roots)
+    if "://" in uri and not uri.startswith(protocols):
+        raise outside  # before a store's client is loaded
+    try:
+        place = _place(uri)
+    except (FileError, ValueError):
+        raise outside from None
+    if not any(f"{place}/".startswith(f"{root.rstrip('/')}/") for root in roots):
+        raise outside
+
+
+def _place(uri: str) -> str:
+    """The place of a URI."""
+    filesystem, path = locate(uri)
+    if not is_local(filesystem):
+        return f"{uri.partition('://')[0]}://{path.rstrip('/')}"
+    try:
+        return f"file://{Path(path).resolve(strict=True)}"
+    except (OSError, RuntimeError) as error:
+        raise FileError(uri, "no such file or folder; check the path") from error

@@ -1,0 +1,591 @@
+"""The error model of the batch (``calibgraph.graph.latent_poses``) while frames come in.
+
+Until the end of an epoch all but its own frames stays the same: the sums of closed epochs, place by
+place, the weights that places have in their robust loss, and the graph of what all places share. An
+update eliminates the places of the open epoch and exchanges one factor of that graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from calibgraph.arrays import Array, Mask
+from calibgraph.graph.by_place import QuadraticByPlace
+from calibgraph.graph.components import VarianceComponents, least_cost_of_distortion
+from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.objective import join, objective_graph
+from calibgraph.graph.variables import camera_key
+from calibgraph.model.error_sources import ErrorSources
+from calibgraph.model.findings import error_components
+from calibgraph.model.geometry import pose_rows, retract_all, to_T_lidar_camera
+from calibgraph.model.rig import RelativePose
+from calibgraph.model.verdict import Verdict
+from calibgraph.solver.components import (
+    Component,
+    Evidence,
+    common_error,
+    pose_covariance,
+    ratios_by_evidence,
+)
+from calibgraph.solver.covariance import ENOUGH_FRAMES, pose_equations
+from calibgraph.solver.error_model import Conflict, relative_pose_conflict
+from calibgraph.solver.places import fit_latent_poses, start_values
+from calibgraph.solver.sources import (
+    predict_variances,
+    sources_by_camera,
+    variances_by_source,
+)
+from calibgraph.solver.within_place import (
+    WEAK,
+    allow_for_few_frames,
+    relative_covariance,
+    split_excess,
+)
+from calibgraph.tracking.eliminate import Eliminated, block_diagonal, eliminate
+from calibgraph.tracking.noise import sure_inflation
+from calibgraph.tracking.state import Spread, State, rows_of
+from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
+from calibgraph.tracking.window import Window
+
+_PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a moved camera has few
+_EXACT = 1e-4  # rad and m: what is stated of places to be smaller counts as nothing
+_ROUNDING = 1e-7  # rad and m: a pose that is shared more exactly makes the graph lose digits
+_SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
+_ROUNDS = 2  # of estimates of the variance ratios, a fit after each
+_OPEN_WEIGHINGS, _MOST_WEIGHINGS, _SAME_WEIGHT = 2, 20, 1e-2
+
+
+def spread_of(state: State, sums: PlaceSums) -> Spread:
+    """What the frames of each camera show of their errors, about the means of their places.
+
+    With an allowance for few frames, as in a batch. While a camera that has moved has few frames,
+    the scatter is shrunk towards that of all its frames so far. Where the matcher states nothing of
+    places it is wider if epochs scatter more than their frames suggest.
+    """
+    (scatter, left), every = sums.within_places, sums.rows.total()
+    hessian, reweighted, frames = every.hessian, every.reweighted, every.frames
+    blank = Spread.unknown(len(frames))
+    least, excess, efficiency = blank.least, blank.excess, blank.efficiency
+    for camera in map(int, np.flatnonzero(frames)):
+        own = _usual_while_few(state, camera, scatter[camera], frames[camera])
+        if not states_places(state) and state.scatter_of_frames(camera) is not None:
+            own = own * sure_inflation(state.groups[camera])
+        true = hessian[camera] + WEAK
+        own = allow_for_few_frames(
+            own, true, left[camera], frames=frames[camera], matches=every.matches[camera]
+        )
+        root = np.linalg.cholesky(reweighted[camera] + WEAK)
+        covariance, efficiency[camera] = relative_covariance(own, root, true)
+        least[camera], excess[camera] = split_excess(covariance)
+    return Spread(least, excess, efficiency)
+
+
+def _usual_while_few(state: State, camera: int, scatter: Array, frames: float) -> Array:
+    """(6, 6) scatter of a camera's frames, that of all before counted in after a move."""
+    if state.moved_at[camera] < 0 or state.walk[camera]:
+        return scatter
+    share, rows = _PRIOR_FRAMES / (frames + _PRIOR_FRAMES), pose_rows(camera)
+    usual = state.total[rows, rows] * (frames / max(state.total_frames[camera], 1.0))
+    return np.asarray((1.0 - share) * scatter + share * usual)
+
+
+def states_places(state: State) -> bool:
+    """Whether frames of one place share more than all frames do."""
+    stated = state.findings
+    sizes = stated.place_rotation_rad, stated.place_translation_m
+    return stated.place_variance > 0 or max(sizes) > _EXACT
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """Some places: their matches, and the covariances of their displacements.
+
+    Attributes:
+        names: of the places.
+        seen: (P, n) which cameras have matches there.
+        root: (P, n, 6, 6) Cholesky roots of the Hessians by weights.
+        least: (n,) k of ``calibgraph.solver.within_place``.
+        excess: (P, n, 6, 6) K - k, with what the matcher states of places.
+        minimum: (P, n, 6) of the matches, from the references.
+        cloud: (P, 6, 6) information of the cloud's displacement.
+        robust_scale: tuning constant of the loss; infinite: none.
+    """
+
+    names: tuple[str, ...]
+    seen: Mask
+    root: Array
+    least: Array
+    excess: Array
+    minimum: Array
+    cloud: Array
+    robust_scale: float
+
+    @staticmethod
+    def of(
+        state: State, sums: PlaceSums, rows: Numbers, spread: Spread, *, by_scatter: bool = False
+    ) -> Terms:
+        """Of some rows of the sums over all frames.
+
+        Args:
+            state: of the tracker.
+            sums: over all frames.
+            rows: of the places.
+            spread: of the frames.
+            by_scatter: whether cameras are displaced by what the scatter of frames shows alone.
+        """
+        own, frames, findings = sums.rows[rows], sums.frames[rows], state.findings
+        seen, places, prior = frames > 0, sums.places[rows], error_components()
+        names, weighted = tuple(sums.names[row] for row in rows), own.reweighted + WEAK
+        stated = (0.0 if by_scatter else findings.place_variance) * spread.efficiency
+        excess = spread.excess + (stated * frames / places)[..., None, None] * np.eye(6)
+        of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
+        alike = np.where(seen, places, np.inf).min(axis=1)
+        cloud = np.linalg.inv(state.ratios.cloud * pose_covariance(*of_place))
+        return Terms(
+            names,
+            seen,
+            np.asarray(np.linalg.cholesky(weighted)),
+            spread.least,
+            state.ratios.cameras * excess,
+            _minimum(state, own, names, weighted),
+            alike[:, None, None] * cloud,
+            prior.robust_sigmas if sums.count >= prior.robust_places else np.inf,
+        )
+
+    def eliminate(self, weights: Array, adjoint: Array) -> Eliminated:
+        """The places without their poses, for (P, 1 + n) weights in the loss."""
+        noise = self.excess / weights[:, 1:, None, None]
+        noise = noise + self.least[:, None, None] * np.eye(6)
+        weight = self.root @ np.linalg.inv(noise) @ self.root.swapaxes(2, 3)
+        weight = (weight + weight.swapaxes(2, 3)) * (0.5 * self.seen[..., None, None])
+        return eliminate(weight, self.minimum, self.cloud * weights[:, :1, None], adjoint)
+
+    @cached_property
+    def at_place(self) -> Array:
+        """(P, n, 6, 6) covariance of a camera's matches about its mean."""
+        inverse = np.linalg.inv(self.root)
+        exact = _ROUNDING**2 * np.eye(6)
+        return np.asarray(inverse.swapaxes(2, 3) @ self.excess @ inverse + exact)
+
+    def weighted_at_place(self, weights: Array) -> Array:
+        """The same, for (P, 1 + n) weights in the loss."""
+        return np.asarray(self.at_place / weights[:, 1:, None, None])
+
+    def squared(self, u: Array, v: Array) -> Array:
+        """(P, 1 + n) squared sigmas of the displacements of the clouds and of the cameras."""
+        of_u = (u * (self.cloud @ u[..., None])[..., 0]).sum(axis=-1)
+        of_v = (v * np.linalg.solve(self.at_place, v[..., None])[..., 0]).sum(axis=-1)
+        return np.column_stack([of_u, np.where(self.seen, of_v, 0.0)])
+
+    def weigh(self, squared: Array) -> Array:
+        """(P, 1 + n) weights in the loss of Geman and McClure."""
+        return np.asarray((1.0 + squared / self.robust_scale**2) ** -2)
+
+    def known_weights(self, state: State) -> tuple[Array, Mask]:
+        """(P, 1 + n) weights at the optimum of the last epoch, 1 of new places; which are new."""
+        weights = np.ones((len(self.names), 1 + self.seen.shape[1]))
+        row_of = {name: row for row, name in enumerate(state.settled)}
+        rows = [row_of.get(name, -1) for name in self.names]
+        new = np.array(rows, dtype=np.int64) < 0
+        if np.isfinite(self.robust_scale) and not new.all():
+            weights[~new] = state.weights[[row for row in rows if row >= 0]]
+        return weights, new
+
+    def open_weights(self, state: State, adjoint: Array) -> Array:
+        """(P, 1 + n) weights while an epoch is open: of new places, from a non-robust start."""
+        weights, new = self.known_weights(state)
+        for _ in range(_OPEN_WEIGHINGS if np.isfinite(self.robust_scale) and new.any() else 0):
+            found, at_place = self.eliminate(weights, adjoint), self.weighted_at_place(weights)
+            apart = found.displacements(state.shared, at_place)
+            weights[new] = self.weigh(self.squared(*apart))[new]
+        return weights
+
+
+def _minimum(state: State, own: Sums, names: tuple[str, ...], weighted: Array) -> Array:
+    """(P, n, 6) from the references to the minima of quadratics with the Hessian by weights.
+
+    The gradient is that of the robust cost, by its true Hessian, where matches of the place show
+    the cameras at the optimum of the last epoch; of a new place, at its own minimum.
+    """
+    row_of = {name: row for row, name in enumerate(state.settled)}
+    known = np.array([name in row_of for name in names], dtype=np.bool_)
+    at = np.zeros_like(own.gradient)
+    if known.any():
+        at[known] = state.steps[[row_of[name] for name in names if name in row_of]]
+    pull = own.gradient + (own.hessian @ at[..., None])[..., 0]
+    by = np.where(known[:, None, None, None], weighted, own.hessian + WEAK)
+    return np.asarray(at - np.linalg.solve(by, pull[..., None])[..., 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The optimum of the graph, and its marginal, until the next update.
+
+    Attributes:
+        T_camera_lidar: (n, 4, 4).
+        covariance: (6 n, 6 n) of the reported poses; NaN for cameras with too few frames.
+        sums: (n,) over all frames.
+        conflicts: of relative poses with the correspondences, by their places in the rig.
+        window: the graph of what all places share.
+        verdicts: per camera, once it is assessed.
+    """
+
+    T_camera_lidar: Array
+    covariance: Array
+    sums: Sums
+    conflicts: Mapping[int, Conflict]
+    window: Window
+    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
+
+
+class EpochGraph:
+    """What stays the same until the end of an epoch.
+
+    Args:
+        state: with the closed epochs.
+    """
+
+    def __init__(self, state: State) -> None:
+        self.references, self.findings = state.references, state.findings
+        self.settled, self.contradicting = state.settled, state.contradicting
+        self.rig = state.rig_at(state.references)
+        self.sums = state.sums_before_epochs()[-2]
+        self.places = closed_places(state)
+        frames = self.places.frames.sum(axis=0)
+        self._is_settled = bool((frames[state.started] >= _SETTLED).all())
+        self.spread = state.spread
+        self.pose_graph = pose_priors(state)
+        T = dict(zip(state.names, state.references, strict=True))
+        self.prior = pose_equations(self.pose_graph, state.names, T)
+        self.window = Window(self.model(state, self.places, self.spread), state.references)
+        self._held: dict[frozenset[str], tuple[Array, Array]] = {}
+
+    def is_of(self, state: State) -> bool:
+        """Whether the state is of the same epoch, with no change but more frames."""
+        same = state.references is self.references and state.settled is self.settled
+        return (
+            same and state.findings == self.findings and state.contradicting == self.contradicting
+        )
+
+    def equation_5(self, sums: Sums) -> Array:
+        """(n, 6) from the references to the minimum of Eq. 5 of the paper."""
+        hessian = block_diagonal(sums.hessian) + self.prior[0]
+        pull = sums.gradient.ravel() + self.prior[1]
+        return np.asarray(-np.linalg.solve(hessian, pull).reshape(-1, 6))
+
+    def solve(self, state: State) -> Estimate:
+        """The optimum and marginal with the frames of the open epoch.
+
+        Raises:
+            RuntimeError: by iSAM2, which is of no use then.
+        """
+        open_sums = state.sums[state.closed :]
+        sums = self.sums + open_sums.total()
+        every = every_place(state, self.places, sums)
+        own = self.open_places(state, every)
+        touched = frozenset(own.names)
+        if touched not in self._held:
+            self._held[touched] = self._others(state, touched)
+        information, vector = self._held[touched]
+        if own.names:
+            weights = own.open_weights(state, self.window.adjoint)
+            found = own.eliminate(weights, self.window.adjoint)
+            information, vector = information + found.information, vector + found.vector
+        self.window.exchange(information, vector)
+        keys = self.window.model.reported_keys
+        if state.config.preset == "auto":
+            T = self.window.T_camera_lidar(keys)
+        else:
+            T = retract_all(state.references, self.equation_5(sums))
+        covariance = self.window.covariance(keys)
+        few = np.repeat(sums.frames < ENOUGH_FRAMES, 6)
+        covariance[few], covariance[:, few] = np.nan, np.nan
+        return Estimate(T, covariance, sums, self._conflicts(state, sums), self.window)
+
+    def open_places(self, state: State, every: PlaceSums) -> Terms:
+        """Those of the frames of the open epoch, and the last one; of a drift, all that it has."""
+        names = {*state.at[state.closed :], *state.at[-1:]}
+        spread = self.spread if self._is_settled else spread_of(state, every)
+        if not self._is_settled:  # that of all places changes with each frame
+            self._held.clear()
+            names |= {*every.names}
+        found = np.flatnonzero(every.frames.any(axis=1)).tolist()
+        rows = [row for row in found if every.names[row] in names]
+        return Terms.of(state, every, np.array(rows, dtype=np.int64), spread)
+
+    def _others(self, state: State, touched: frozenset[str]) -> tuple[Array, Array]:
+        """Information and vector of the closed places but some."""
+        frames = self.places.frames.any(axis=1)
+        names = self.places.names
+        rows = [row for row in np.flatnonzero(frames) if names[row] not in touched]
+        size = 6 * len(state.names)
+        if not rows:
+            return np.zeros((size, size)), np.zeros(size)
+        terms = Terms.of(state, self.places, np.array(rows), self.spread)
+        weights, _ = terms.known_weights(state)
+        found = terms.eliminate(weights, self.window.adjoint)
+        return found.information, found.vector
+
+    def at_its_place(self, state: State) -> tuple[Array, Array]:
+        """(1 + n,) squared sigmas of the displacements at the last frame's place.
+
+        And (n, 4, 4) T_camera_lidar there.
+        """
+        estimate = self.solve(state)
+        own = self.open_places(state, every_place(state, self.places, estimate.sums))
+        row, shown = own.names.index(state.at[-1]), self.window.shown
+        weights = own.open_weights(state, self.window.adjoint)
+        found = own.eliminate(weights, self.window.adjoint)
+        u, v = found.displacements(shown, own.weighted_at_place(weights))
+        steps = shown + v[row] - (self.window.adjoint @ u[row])
+        return own.squared(u, v)[row], retract_all(state.references, steps)
+
+    def _conflicts(self, state: State, sums: Sums) -> dict[int, Conflict]:
+        """Conflicts of the rig's relative poses with the correspondences alone, by their places.
+
+        Of the graph, the priors of the mounts are left out.
+        """
+        if not state.rig.relative_poses:
+            return {}
+        enough = state.started & (sums.frames >= ENOUGH_FRAMES) & sums.are_determined
+        names = state.names
+        known = {names[camera]: camera for camera in np.flatnonzero(enough).tolist()}
+        measured = {
+            place: pair
+            for place, pair in enumerate(state.rig.relative_poses)
+            if place not in state.dropped_pairs and {pair.a, pair.b} <= known.keys()
+        }
+        if not measured:
+            return {}
+        keys = self.window.model.camera_keys
+        information = np.linalg.inv(self.window.covariance(keys))
+        vector = information @ self.window.steps(keys) + self.prior[1]
+        information = information - self.prior[0] + np.diag(np.repeat(~enough, 6) * 1.0)
+        covariance = np.asarray(np.linalg.inv(information))
+        T = retract_all(state.references, (covariance @ vector).reshape(-1, 6))
+        rows = rows_of(known.values())
+        own = {name: T[camera] for name, camera in known.items()}
+        return {
+            place: relative_pose_conflict(pair, tuple(own), own, covariance[np.ix_(rows, rows)])
+            for place, pair in measured.items()
+        }
+
+    def model(
+        self, state: State, sums: PlaceSums, spread: Spread, rows: Numbers | None = None
+    ) -> LatentPoseModel:
+        """The whole graph; without rows of places, that of what all of them share."""
+        terms = None if rows is None else Terms.of(state, sums, rows, spread)
+        findings, cameras, blocks = state.findings, state.names, {}
+        bends = state.bends.sum(axis=0)
+        sigmas, places = np.asarray(findings.bend_sigmas), 1 if terms is None else len(terms.names)
+        size = len(sigmas)
+        shape = (places, len(cameras), size)
+        jacobian = np.zeros((len(cameras), 6, size))
+        shown, vector = np.zeros((*shape, size)), np.zeros(shape)
+        if any(findings.bend_sigmas):
+            hessian, pulled = bends[:, :36].reshape(-1, 6, 6), bends[:, 36:54].reshape(-1, 6, size)
+            jacobian = np.linalg.solve(hessian + WEAK, pulled) * sigmas
+            weight = 1.0 / spread.mean_variance(findings.place_variance, sums.alike)
+            shown[0] = weight[:, None, None] * bends[:, 54:63].reshape(-1, size, size)
+            shown[0] *= np.outer(sigmas, sigmas)
+            vector[0] = weight[:, None] * bends[:, 63:] * sigmas
+        none = np.zeros((0, 6, 6))
+        for camera, name in enumerate(cameras):
+            at = np.zeros(0, np.int64) if terms is None else np.flatnonzero(terms.seen[:, camera])
+            reference = to_T_lidar_camera(state.references[camera])
+            minima = [] if terms is None else [*map(reference.retract, terms.minimum[at, camera])]
+            root = none if terms is None else terms.root[at, camera]
+            information = root @ root.swapaxes(1, 2) / spread.least[camera]
+            blocks[name] = QuadraticByPlace(at, minima, information)
+        each = np.tile(np.eye(6), (places, len(cameras), 1, 1))
+        components = VarianceComponents(
+            cloud=np.eye(6),
+            cloud_at_place=np.asarray(np.linalg.inv(np.eye(6) if terms is None else terms.cloud)),
+            camera=np.eye(6),
+            pairs=np.eye(6),
+            at_place=each if terms is None else terms.at_place,
+            scatter_at_place=each if rows is None else _scatter(state, sums, rows, spread),
+            distortion_jacobian=jacobian,
+            pair_distortion_jacobian=np.zeros_like(jacobian),
+            distortion_information=shown,
+            distortion_vector=vector,
+            distortion_weight=np.ones(shape[:2]),
+            robust_scale=np.inf if terms is None else terms.robust_scale,
+        )
+        components = common_error(components, findings.rigid_sigmas, findings.camera_share)
+        shared = state.ratios.shared
+        components = replace(
+            components,
+            cloud=shared * components.cloud,
+            camera=shared * components.camera,
+            distortion_size=shared,
+        )
+        return LatentPoseModel(cameras, blocks, (), self.pose_graph, components, state.config.of)
+
+    def whole_model(self, state: State) -> LatentPoseModel:
+        """The graph whose optimum and marginal are reported, with the poses of all places."""
+        sums = self.sums + state.sums[state.closed :].total()
+        every = every_place(state, self.places, sums)
+        rows = np.flatnonzero(every.frames.any(axis=1))
+        spread = self.spread if self._is_settled else spread_of(state, every)
+        return self.model(state, every, spread, rows)
+
+    def equation_5_graph(self, state: State) -> gtsam.NonlinearFactorGraph:
+        """Eq. 5 of the paper: priors, and a quadratic per camera."""
+        graph, at = join(self.pose_graph), gtsam.Values()
+        sums = self.sums + state.sums[state.closed :].total()
+        for camera, hessian in enumerate(sums.hessian):
+            if hessian.any():
+                key = camera_key(camera)
+                at.insert(key, to_T_lidar_camera(state.references[camera]))
+                factor = gtsam.HessianFactor(key, hessian, -sums.gradient[camera], 0.0)
+                graph.add(gtsam.LinearContainerFactor(factor, at))
+        return graph
+
+
+def _scatter(state: State, sums: PlaceSums, rows: Numbers, spread: Spread) -> Array:
+    """(P, n, 6, 6) covariance of a camera's matches at places by the scatter of frames alone."""
+    return Terms.of(state, sums, rows, spread, by_scatter=True).at_place
+
+
+def pose_priors(state: State) -> gtsam.NonlinearFactorGraph:
+    """Priors about the references, and the relative poses that take part."""
+    rig, T = state.rig, dict(zip(state.names, state.references, strict=True))
+    rig = rig.model_copy(update={"relative_poses": pairs_that_count(state)})
+    return objective_graph(rig, {}, T, state.config, terms="full")
+
+
+def pairs_that_count(state: State) -> tuple[RelativePose, ...]:
+    """The relative poses but those that a move has invalidated, or the data contradict."""
+    out = {*state.dropped_pairs, *state.contradicting}
+    return tuple(pair for place, pair in enumerate(state.rig.relative_poses) if place not in out)
+
+
+def contradicting(conflicts: Mapping[int, Conflict]) -> tuple[int, ...]:
+    """Those that take no part, by their places in the rig."""
+    limit = error_components().contradiction_sigmas
+    return tuple(place for place, one in conflicts.items() if one.largest > limit)
+
+
+def closed_places(state: State) -> PlaceSums:
+    """The sums of closed epochs at all places; of a drifting camera, none."""
+    closed = state.closed
+    places = state.places.add(state.at[:closed], state.sums[:closed])
+    for camera in state.drifting:
+        places = places.without(camera)
+    return places
+
+
+def every_place(state: State, closed: PlaceSums, sums: Sums) -> PlaceSums:
+    """The sums at all places, of drifting cameras as if of the present place.
+
+    Args:
+        state: with the frames of the open epoch.
+        closed: the sums of closed epochs.
+        sums: (n,) over all frames.
+    """
+    every = closed.add(state.at[state.closed :], state.sums[state.closed :])
+    for camera in state.drifting:
+        every = every.with_camera_at(state.at[-1], camera, sums[camera])
+    return every
+
+
+def settle(state: State) -> EpochGraph:
+    """Find optimum, weights and variance ratios of the closed epochs; the graph with these."""
+    state.spread = spread_of(state, closed_places(state))
+    graph = EpochGraph(state)
+    rows = np.flatnonzero(graph.places.frames.any(axis=1))
+    shows_ratios = len(rows) > 1 or bool(len(rows) and state.rig.relative_poses)
+    for left in range(_ROUNDS if shows_ratios else 0, -1, -1):
+        terms = Terms.of(state, graph.places, rows, graph.spread)
+        found = _fit(state, terms, graph.window)
+        if not left:
+            break
+        evidence = _evidence(state, terms, found, graph.window)
+        ratios = ratios_by_evidence(evidence, places=len(rows), present=state.ratios)
+        if ratios.is_near(state.ratios):
+            break
+        state.ratios = ratios
+        model = graph.model(state, graph.places, graph.spread)
+        graph.window = Window(model, state.references)
+    graph.settled = state.settled
+    return graph
+
+
+def locate_places(state: State, graph: EpochGraph) -> None:
+    """Find the optimum of all places, those of the open epoch too, for the present ratios."""
+    every = every_place(state, graph.places, state.all_sums())
+    rows = np.flatnonzero(every.frames.any(axis=1))
+    if len(rows) > 1:
+        _fit(state, Terms.of(state, every, rows, graph.spread), graph.window)
+
+
+def _fit(state: State, terms: Terms, window: Window) -> Eliminated:
+    """Find where matches show the cameras, at all places and at each, and the weights of these.
+
+    In a robust loss those of new places start from 1. The places are left eliminated.
+    """
+    weights, _ = terms.known_weights(state)
+    for _ in range(_MOST_WEIGHINGS):
+        found = terms.eliminate(weights, window.adjoint)
+        window.exchange(found.information, found.vector)
+        shown = window.shown
+        u, v = found.displacements(shown, terms.weighted_at_place(weights))
+        new = terms.weigh(terms.squared(u, v))  # 1 in a loss that is not robust
+        if not new.size or np.abs(new - weights).max() < _SAME_WEIGHT:
+            break
+        weights = new
+    state.settled, state.weights, state.shared = terms.names, weights, shown
+    state.steps = shown + v - (found.adjoint @ u[:, None, :, None])[..., 0]
+    return found
+
+
+def _evidence(
+    state: State, terms: Terms, found: Eliminated, window: Window
+) -> dict[Component, Evidence]:
+    """Per component its weighted sum of squares, and what of its freedom the data determine."""
+    weights, at_place = state.weights, terms.weighted_at_place(state.weights)
+    squared = weights * terms.squared(*found.displacements(state.shared, at_place))
+    of_u, of_v = found.covariances(window.covariance_of_shown, at_place)
+    open_u = np.trace(terms.cloud @ of_u, axis1=1, axis2=2) * weights[:, 0]
+    open_v = np.trace(np.linalg.solve(at_place, of_v), axis1=2, axis2=3)
+    present, parts = weights[:, 1:][terms.seen], window.model.components
+    model, known, distortions = window.model, 0.0, 0
+    if model.is_distorted:  # its residuals count as a part of its prior
+        distortions, known = parts.distortion_jacobian.shape[2], least_cost_of_distortion(parts)
+    variables = 6.0 * (1 + len(model.cameras)) + distortions
+    shared = window.squared_errors - known
+    return {
+        "shared": Evidence(shared, variables - window.undetermined()),
+        "cloud": Evidence(squared[:, 0].sum(), 6.0 * weights[:, 0].sum() - open_u.sum()),
+        "cameras": Evidence(squared[:, 1:].sum(), 6.0 * present.sum() - open_v[terms.seen].sum()),
+    }
+
+
+def error_sources(state: State, graph: EpochGraph, joint: Array | None) -> dict[str, ErrorSources]:
+    """Per camera, the shares of its error bar at the end of a drive.
+
+    None without error bars of all cameras, and where a camera drifts: then the graph of the places
+    is not the whole.
+
+    Args:
+        state: of the tracker.
+        graph: of its epoch.
+        joint: (6 N, 6 N) the reported covariance.
+    """
+    if joint is None or state.drifting:
+        return {}
+    model = graph.whole_model(state)
+    T = dict(zip(state.names, state.references, strict=True))
+    errors = fit_latent_poses(model, start_values(model, T))
+    if errors is None:
+        raise RuntimeError("a direction of a camera is not determined")
+    total = np.minimum(np.diag(errors.covariance), np.diag(joint))
+    parts, forecast = variances_by_source(errors), predict_variances(errors)
+    numbers = {name: number for number, name in enumerate(state.names)}
+    return sources_by_camera(joint, total, parts, forecast, numbers=numbers)

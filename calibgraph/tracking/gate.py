@@ -1,0 +1,180 @@
+"""The gate of a camera's matches, and the sums of those within."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibgraph.arrays import Array, Mask
+from calibgraph.graph.objective import projection_graph
+from calibgraph.model.config import Config
+from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.solver.matches import MIN_MATCHES, BlockResiduals, CameraBlock
+from calibgraph.solver.pnp import frame_pose
+from calibgraph.solver.robust import ResidualScale
+from calibgraph.solver.two_pass import optimize
+from calibgraph.solver.within_place import WEAK
+from calibgraph.tracking.state import OutlierFrame, State
+from calibgraph.tracking.sums import Sums
+from factors import BlockSums, ProjectionBlock
+
+_AGREEMENT = 0.7
+"""A frame agrees with an estimate that explains this share of the usual share of its matches."""
+_CURVATURES = 0.3, 1.0
+"""Of the true Hessian, in units of the one by weights; usually 0.6 to 0.9."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gated:
+    """Frames of a camera, gated at one T_camera_lidar.
+
+    Attributes:
+        residuals: of all their matches, there.
+        inliers: (m,) which of them are within the gate.
+        counts: (f,) how many are, in each frame.
+    """
+
+    residuals: BlockResiduals
+    inliers: Mask
+    counts: Array
+
+    @staticmethod
+    def at(T_camera_lidar: Array, raw: CameraBlock, scale: ResidualScale) -> Gated:
+        """Gate all matches of some frames."""
+        residuals = BlockResiduals.at(T_camera_lidar, raw)
+        inliers = residuals.inliers(scale)
+        counts = np.add.reduceat(inliers, raw.frame_edges[:-1], dtype=np.float64)
+        return Gated(residuals, inliers, counts)
+
+    @property
+    def raw(self) -> CameraBlock:
+        """All matches."""
+        return self.residuals.block
+
+    @property
+    def enough(self) -> Mask:
+        """(f,) whether a frame has enough matches within the gate to be absorbed."""
+        return np.asarray(self.counts >= MIN_MATCHES)
+
+    def agree(self, state: State, camera: int) -> Mask:
+        """(f,) whether the pose explains about the usual share of each frame's matches."""
+        least = _AGREEMENT * state.share[camera] * self.raw.frame_counts
+        return np.asarray(self.enough & (self.counts >= least))
+
+    def select(self, frames: Mask) -> Gated:
+        """Some of the frames."""
+        if frames.all():
+            return self
+        rows = np.flatnonzero(np.repeat(frames, self.raw.frame_counts))
+        residuals, raw = self.residuals, self.raw.select(rows)
+        chosen = BlockResiduals(
+            raw, residuals.T_lidar_camera, residuals.residuals_px[rows], residuals.projectable[rows]
+        )
+        return Gated(chosen, self.inliers[rows], self.counts[frames])
+
+    def sums(
+        self, state: State, camera: int, T_camera_lidar: Array, *, together: bool = False
+    ) -> Sums:
+        """(f,) sums of the inliers, linearized here.
+
+        Args:
+            state: with the scale of the residuals, and how curved their cost is.
+            camera: by its place in the rig.
+            T_camera_lidar: (4, 4) the reference.
+            together: whether all frames are one.
+        """
+        pose, counts = self.residuals.T_lidar_camera, self.counts
+        counts = np.array([counts.sum()]) if together else counts
+        inside = np.concatenate([[0], counts.cumsum().astype(np.int64)])
+        here = self._block(state.scales[camera]).frame_sums(pose, inside)
+        step = pose.localCoordinates(to_T_lidar_camera(T_camera_lidar))
+        return frame_sums(here, state.curvature[camera], np.tile(step, (len(counts), 1)), counts)
+
+    def curvature(self, scale: ResidualScale) -> Array:
+        """(6, 6) M: with the Hessian by weights L L^T, the true one is L M L^T, of all inliers.
+
+        With what the gate's moving with the extrinsic adds.
+        """
+        edges = np.array([0, int(self.counts.sum())])
+        pose = self.residuals.T_lidar_camera
+        here = self._block(scale).frame_sums(pose, edges, curvature=True)
+        assert here.curvature is not None
+        true = here.curvature[0] + self.residuals.gate_hessians(scale)[0]
+        inverse = np.linalg.inv(np.linalg.cholesky(here.hessian[0] + WEAK))
+        values, vectors = np.linalg.eigh(inverse @ true @ inverse.T)
+        return np.asarray((vectors * np.clip(values, *_CURVATURES)) @ vectors.T)
+
+    def _block(self, scale: ResidualScale) -> ProjectionBlock:
+        return self.raw.with_scale(scale).select(self.inliers)
+
+
+def frame_sums(here: BlockSums, curvature: Array, steps: Array, matches: Array) -> Sums:
+    """(f,) sums of frames about a reference.
+
+    The true Hessian of few matches is noise, and may not be definite: its ratio to the one by
+    weights is that of all frames.
+
+    Args:
+        here: where they are linearized.
+        curvature: (6, 6) M of :meth:`Gated.curvature`.
+        steps: (f, 6) from there to the reference.
+        matches: (f,) how many.
+    """
+    root = np.linalg.cholesky(here.hessian + WEAK)
+    hessian = root @ curvature @ root.swapaxes(1, 2)
+    gradient = here.gradient + (hessian @ steps[..., None])[..., 0]
+    return Sums.of(
+        hessian=hessian,
+        gradient=gradient,
+        reweighted=here.hessian,
+        score=gradient,
+        scatter=gradient[:, :, None] * gradient[:, None, :],
+        frames=np.ones(len(matches)),
+        matches=matches,
+    )
+
+
+def find_outlier_frame(state: State, camera: int, raw: CameraBlock) -> OutlierFrame | None:
+    """A frame with its own T_camera_lidar; None if none explains it, so the matching failed."""
+    for start in _starts(state, camera, raw):
+        T_own = refine(raw, start, state.scales[camera], state.config)
+        if agrees(state, camera, raw, T_own):
+            return OutlierFrame(int(raw.frame[0]), raw, T_own)
+    return None
+
+
+def agrees(state: State, camera: int, raw: CameraBlock, T_camera_lidar: Array) -> bool:
+    """Whether a T_camera_lidar explains about the usual share of a frame's matches."""
+    return bool(Gated.at(T_camera_lidar, raw, state.scales[camera]).agree(state, camera).all())
+
+
+def _starts(state: State, camera: int, raw: CameraBlock) -> Iterator[Array]:
+    """Start values for the frame's own T_camera_lidar: the estimate; then PnP, if possible.
+
+    PnP takes several times as long as a fit from the estimate, which is mostly near enough. Both
+    end at the same minimum where most of the usual share of matches agrees.
+    """
+    yield state.references[camera]
+    if raw.information is not None or state.config.stage1 == "rig":
+        return
+    by_pnp = frame_pose(state.rig.cameras[state.names[camera]], raw.block, state.config)
+    if by_pnp is not None:
+        yield by_pnp
+
+
+def refine(raw: CameraBlock, start: Array, scale: ResidualScale, config: Config) -> Array:
+    """The T_camera_lidar that fits a camera's matches, with a wide loss first."""
+    T = start
+    widening = max(config.pnp_threshold_px / scale.gate_px, 1.0)
+    for factor in (widening, 1.0):
+        wide = ResidualScale(
+            scale.sigma, scale.loss_scale * factor, scale.gate_px * factor, scale.sigma_px
+        )
+        inliers = raw.without_outliers(T, wide)
+        if len(inliers.frame) < MIN_MATCHES:
+            return start
+        graph = projection_graph(["camera"], {"camera": inliers.with_scale(wide)})
+        T = optimize(graph, ["camera"], {"camera": T}).T_camera_lidar["camera"]
+    return T

@@ -1,0 +1,191 @@
+"""Shared by blocks of correspondences: their sums, the scale of the loss, read-only arrays."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.conditioning import fill_root, unit_diagonal
+from factors.loss import loss_id
+
+Array = NDArray[np.float64]
+_Number = TypeVar("_Number", bound=np.generic)
+
+_CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
+_LEAST = 1e-14  # of the largest eigenvalue: below, a direction counts as free
+_PLACES = np.array([[min(i, j) * (11 - min(i, j)) // 2 + max(i, j) for j in range(6)]
+                    for i in range(6)])  # fmt: skip
+
+
+@dataclass(frozen=True)
+class BlockSums:
+    """H, b and c of a block of correspondences at one pose. Sums of blocks simply add.
+
+    Attributes:
+        hessian: (n, n) or (f, n, n), H of ``factors.block``, in GTSAM's tangent of
+            ``T_lidar_camera`` and by further columns.
+        gradient: (n,) or (f, n), b.
+        cost: () or (f,), c; GTSAM's error is half of it.
+        curvature: the second derivative of half the cost, like ``hessian``, where it was asked
+            for; but for the second derivative of the residuals, which is their noise over the focal
+            length as large.
+        weights: (f,) sum of psi, where columns were asked for.
+        squares: (f,) sum of psi s, there.
+    """
+
+    hessian: Array
+    gradient: Array
+    cost: Array
+    curvature: Array | None = None
+    weights: Array | None = None
+    squares: Array | None = None
+
+
+class RobustBlock:
+    """A frozen block of residuals with one robust loss.
+
+    Attributes:
+        loss: its name.
+        scale: norm of a whitened residual, divided by sigma, at which the loss bends.
+        sigma: divides all whitened residuals.
+    """
+
+    loss: str
+    scale: float
+    sigma: float
+
+    def rescale(self, *, scale: float, sigma: float = 1.0, loss: str | None = None) -> Self:
+        """The same correspondences, not copied, with another scale of the loss, sigma and loss."""
+        other = self._copy()  # not checked again: its correspondences are of a good block
+        other.__dict__.update(scale=scale, sigma=sigma, loss=loss or self.loss)
+        other._check_loss()
+        return other
+
+    def _copy(self) -> Self:
+        """A block with the same attributes, to be changed; faster than ``copy.copy``."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
+
+    def _check_loss(self) -> None:
+        loss_id(self.loss)
+        if not (self.scale > 0 and self.sigma > 0):
+            name = "sigma" if self.scale > 0 else "scale"
+            raise ValueError(f"{name} must be positive, found {getattr(self, name)}")
+
+    def _replace(self, **values: Any) -> None:
+        """Set attributes of a block that is being made; arrays as views that are read-only."""
+        for name, value in values.items():
+            array = isinstance(value, np.ndarray)
+            self.__dict__[name] = read_only(value) if array else value
+
+
+def read_only(array: NDArray[_Number]) -> NDArray[_Number]:
+    """A view that cannot be written."""
+    view = array.view()
+    view.setflags(write=False)
+    return view
+
+
+def contiguous(array: NDArray[_Number]) -> NDArray[_Number]:
+    """An array in C order, as a view that cannot be written.
+
+    Every array that a kernel only reads is given to it in this form: for arrays that can be
+    written, it would be compiled a second time.
+    """
+    flags = array.flags
+    if not flags.c_contiguous:
+        array = np.ascontiguousarray(array)
+    elif not flags.writeable:
+        return array
+    view = array.view()
+    view.setflags(write=False)
+    return view
+
+
+def check_shape(name: str, array: Array, shape: tuple[int, ...]) -> None:
+    """Check an array.
+
+    Raises:
+        ValueError: if it has another shape, or values that are not finite.
+    """
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise ValueError(f"{name}[{row}] is not finite: {array[row]}")
+
+
+def join_roots(roots: Sequence[Array | None], counts: Sequence[int]) -> Array | None:
+    """Whitening matrices of blocks under each other; the identity where a block has none."""
+    if all(root is None for root in roots):
+        return None
+    return np.concatenate([
+        np.tile([1.0, 0.0, 1.0], (count, 1)) if root is None else root
+        for root, count in zip(roots, counts, strict=True)
+    ])  # fmt: skip
+
+
+def rows_of_root(root: Array | None) -> tuple[Array | None, int]:
+    """(3, n) whitening matrices by columns, and how many of these rows the kernel takes.
+
+    One, if they are all numbers.
+    """
+    if root is None:
+        return None, 0
+    isotropic = not root[:, 1].any() and np.array_equal(root[:, 0], root[:, 2])
+    return np.ascontiguousarray(root.T), 1 if isotropic else 3
+
+
+def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(r, 2) the runs ``edges[i]:edges[i + 1]``, from (r + 1,) edges."""
+    runs = np.empty((len(edges) - 1, 2), dtype=np.int64)
+    runs[:, 0], runs[:, 1] = edges[:-1], edges[1:]
+    return read_only(runs)
+
+
+def rotate_each(R: Array, vectors: Array) -> Array:
+    """Rotate (n, 3) vectors, each by its own of (n, 3, 3), or all by one of (1, 3, 3)."""
+    if len(R) == 1:
+        return np.asarray(vectors @ R[0].T)
+    return np.asarray(np.einsum("nij,nj->ni", R, vectors))
+
+
+@lru_cache
+def chunks(count: int) -> NDArray[np.int64]:
+    """(c, 2) runs of _CHUNK of so many correspondences at most."""
+    edges = np.arange(0, count + _CHUNK, _CHUNK)
+    edges[-1] = count
+    return to_runs(edges)
+
+
+def square_root(sums: BlockSums) -> tuple[Array, Array]:
+    """(n + 1,) error and (n + 1, n) Jacobian with the given H, b and c; H may be rank deficient.
+
+    H is scaled to a unit diagonal before its root is taken, so that radians and metres lose no
+    digits to each other. The root is triangular; where H is nearly rank deficient, it is by the
+    eigenvectors, and directions without information get a zero row.
+    """
+    size = len(sums.gradient)
+    error, jacobian = np.empty(size + 1), np.zeros((size, size + 1))
+    hessian, gradient = contiguous(sums.hessian), contiguous(sums.gradient)
+    if fill_root(hessian, gradient, float(sums.cost), error, jacobian):
+        return error, jacobian.T
+    scaled, units = unit_diagonal(hessian)
+    values, vectors = np.linalg.eigh(scaled)
+    known = values > _LEAST * max(values[-1], 0.0)
+    roots = np.sqrt(np.where(known, values, 1.0))
+    error[:size] = np.where(known, vectors.T @ (gradient / units) / roots, 0.0)
+    error[size] = math.sqrt(max(float(sums.cost) - float(error[:size] @ error[:size]), 0.0))
+    jacobian[:, :size] = (vectors * np.where(known, roots, 0.0)) * units[:, None]
+    jacobian[:, size] = 0.0
+    return error, jacobian.T
+
+
+def unpack_sums(sums: Array) -> BlockSums:
+    """Split (..., 28) kernel sums: 21 of the upper triangle of H, 6 of b, 1 of c."""
+    return BlockSums(sums.take(_PLACES, axis=-1), sums[..., 21:27], sums[..., 27])

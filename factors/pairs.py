@@ -1,0 +1,385 @@
+"""Factors of co-visible features of two cameras, on ``T_lidar_a`` and ``T_lidar_b``.
+
+A feature with the unit ray f in A lies on a plane q . p = 1 [1/m] that the LiDAR measured. With
+X = T_lidar_camera = (R, c), its inverse range w from A, and w times its place in B's frame, are
+
+    w = q . R_a f / k,   k = 1 - q . c_a,        y = R_b^T (R_a f + w (c_a - c_b)),
+
+and the residual is pi_b(y) - u_b. The range follows from the pose of A, as that of the real feature
+does: where A moves, its ray meets the surface in another point. Written with the inverse range, a
+ray that no longer meets the plane passes smoothly through infinity.
+
+A feature without depth gives an epipolar residual, on rays, so that any lens will do. For unit rays
+f_a, f_b of one feature and the relative pose (R, t) = T_a_b, both rays and the baseline lie in one
+plane where C(f_a, f_b) = f_a . (t x R f_b) = 0. The residual is C over its own standard deviation
+for pixel errors of 1 px (Sampson's distance; here with the derivatives of the rays by the pixels,
+F_a and F_b, instead of a linear lens):
+
+    r = C / D,   D^2 = |C(F_a, f_b)|^2 + |C(f_a, F_b)|^2      [px].
+
+It does not depend on the length of t, which epipolar geometry does not determine. Only the relative
+pose enters: X exp(xi) gives T_a_b exp(delta), delta = xi_b - Ad(T_a_b^-1) xi_a.
+
+All features of a block are one lossless factor, as of ``factors.block``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Self
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.arrays import BlockSums, RobustBlock, contiguous, square_root
+from factors.block import ProjectionBlock
+from factors.compiled import compiled
+from factors.kernel import FAST, TILE, add_products
+from factors.lens import Lens, ray_spreads, unproject
+from factors.lens_kernels import is_projectable, project_one, subtract_columns
+from factors.loss import loss_and_weight, loss_id
+from factors.pose import custom_factor, keep_last
+
+Array = NDArray[np.float64]
+
+_EPIPOLAR = -1  # in place of a kind of lens
+_LEAST_K = 1e-9  # in place of less: A's centre is on the plane
+_LEAST_SQUARE = 1e-300  # of D: less has no baseline, or both rays are along it
+
+
+class PairBlock(RobustBlock):
+    """Features of camera A, seen in camera B. Immutable."""
+
+    _features: Array  # (n, 8) f, q and the pixel in B; (n, 18) f_a, F_a, f_b, F_b
+    _lens: tuple[int, Array]  # kind of B's, and its parameters
+
+    def __len__(self) -> int:
+        return len(self._features)
+
+    def select(self, rows: NDArray[Any]) -> Self:
+        """The block with only some features: a mask or an index array."""
+        other, of_features = self._copy(), len(self)
+        for name, value in self.__dict__.items():
+            if isinstance(value, np.ndarray) and len(value) == of_features:
+                other.__dict__[name] = contiguous(value[rows])
+        return other
+
+    def sums(self, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> BlockSums:
+        """H (12, 12), b (12,) and c, in GTSAM's tangents of both poses, first A's."""
+        poses = T_lidar_a.matrix()[None], T_lidar_b.matrix()[None]
+        sums = self.run_sums(*poses, np.array([0, len(self)]))
+        return BlockSums(sums.hessian[0], sums.gradient[0], sums.cost[0])
+
+    def run_sums(self, T_lidar_a: Array, T_lidar_b: Array, edges: NDArray[np.int64]) -> BlockSums:
+        """H, b and c of each run ``edges[i]:edges[i + 1]`` of the features, stacked.
+
+        At (r, 4, 4) poses of each run, or (1, 4, 4) of all.
+        """
+        sums, costs = np.zeros((len(edges) - 1, 13, 13)), np.zeros(len(edges) - 1)
+        none = np.empty((0, 2)), np.empty(0, np.bool_)
+        self._evaluate(T_lidar_a, T_lidar_b, edges, (sums, costs, *none))
+        return BlockSums(sums[:, :12, :12], sums[:, :12, 12], costs)
+
+    def residuals(
+        self, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """(n, 2) residuals [px], not divided by sigma; (n,) whether B's lens can see the point.
+
+        Of epipolar ones the second is zero.
+        """
+        residuals, visible = np.empty((len(self), 2)), np.empty(len(self), np.bool_)
+        poses, none = (T_lidar_a.matrix()[None], T_lidar_b.matrix()[None]), np.empty((0, 13, 13))
+        plain = self.rescale(scale=self.scale, loss="l2")
+        plain._evaluate(*poses, np.array([0, len(self)]), (none, none[:, 0, 0], residuals, visible))
+        return residuals, visible
+
+    def _evaluate(
+        self, T_lidar_a: Array, T_lidar_b: Array, edges: NDArray[np.int64], out: tuple[Any, ...]
+    ) -> None:
+        _sum_runs(
+            *self._lens, contiguous(T_lidar_a), contiguous(T_lidar_b), self._features,
+            loss_id(self.loss), self.scale, self.sigma, contiguous(edges), *out,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceBlock(PairBlock):
+    """Features of camera A with their surfaces, and their pixels in camera B.
+
+    Attributes:
+        lens_b: of camera B.
+        rays_a: (n, 3) unit rays f in A's frame.
+        planes_lidar_per_m: (n, 3) q in the LiDAR frame.
+        pixels_b_px: (n, 2) the same features in B.
+        loss: name of the robust loss.
+        scale: of the residual over sigma, at which the loss bends.
+        sigma: what all residuals are divided by [px].
+
+    Raises:
+        ValueError: on wrong shapes, values that are not finite, an unknown loss, a scale or sigma
+            <= 0.
+    """
+
+    lens_b: Lens
+    rays_a: Array
+    planes_lidar_per_m: Array
+    pixels_b_px: Array
+    loss: str = "cauchy"
+    scale: float = 4.0
+    sigma: float = 1.0
+    _features: Array = field(init=False, repr=False)
+    _lens: tuple[int, Array] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        n = len(self.rays_a)
+        self._check_loss()
+        for name, width in (("rays_a", 3), ("planes_lidar_per_m", 3), ("pixels_b_px", 2)):
+            array = getattr(self, name)
+            if array.shape != (n, width) or not np.isfinite(array).all():
+                raise ValueError(
+                    f"{name}: expected {(n, width)} finite values, found {array.shape}"
+                )
+        features = np.column_stack([self.rays_a, self.planes_lidar_per_m, self.pixels_b_px])
+        lens = self.lens_b.kind, self.lens_b.packed
+        self.__dict__.update(_features=contiguous(features), _lens=lens)
+
+
+@dataclass(frozen=True, eq=False)
+class EpipolarBlock(PairBlock):
+    """Co-visible features of two cameras, for epipolar residuals.
+
+    Attributes:
+        lens_a: of the one camera.
+        lens_b: of the other.
+        pixels_a_px: (n, 2) features in the one image; every pixel must have a ray.
+        pixels_b_px: (n, 2) the same features in the other.
+        loss: name of the robust loss.
+        scale: of the residual over sigma, at which the loss bends.
+        sigma: divides all residuals [px].
+
+    Raises:
+        ValueError: on wrong shapes, pixels without a ray, an unknown loss, a scale or sigma <= 0.
+    """
+
+    lens_a: Lens
+    lens_b: Lens
+    pixels_a_px: Array
+    pixels_b_px: Array
+    loss: str = "cauchy"
+    scale: float = 4.0
+    sigma: float = 1.0
+    _features: Array = field(init=False, repr=False)
+    _lens: tuple[int, Array] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        n = len(self.pixels_a_px)
+        self._check_loss()
+        parts = []
+        for name, lens in (("pixels_a_px", self.lens_a), ("pixels_b_px", self.lens_b)):
+            pixels = getattr(self, name)
+            if pixels.shape != (n, 2):
+                raise ValueError(f"{name} has shape {pixels.shape}, expected {(n, 2)}")
+            rays, valid = unproject(lens, pixels)
+            if not valid.all():
+                row = int(np.flatnonzero(~valid)[0])
+                raise ValueError(f"{name}[{row}] has no ray: {pixels[row]}")
+            parts += [rays, ray_spreads(lens, rays).transpose(0, 2, 1).reshape(n, 6)]
+        known = _EPIPOLAR, self.lens_b.packed
+        self.__dict__.update(_features=contiguous(np.hstack(parts)), _lens=known)
+
+
+def pair_block_factor(
+    key_a: int, key_b: int, block: ProjectionBlock | PairBlock
+) -> gtsam.CustomFactor:
+    """All features of a block as one factor on two poses, equal to its separate factors.
+
+    Args:
+        key_a: the variable ``T_lidar_a``.
+        key_b: the variable ``T_lidar_b``.
+        block: of features of camera A, seen in camera B; or correspondences of B, whose points are
+            in A's frame.
+    """
+    residual = keep_last(partial(_error_and_jacobian, block))
+    rows = 7 if isinstance(block, ProjectionBlock) else 13
+    return factor_on_two_poses(gtsam.noiseModel.Unit.Create(rows), key_a, key_b, residual)
+
+
+def placed_pair_factor(
+    key_cloud: int, key_a: int, key_b: int, block: PairBlock
+) -> gtsam.CustomFactor:
+    """As :func:`pair_block_factor`, with the cloud displaced: on ``T_lidar_cloud`` and both poses.
+
+    The block's poses are T_cloud_a = T_lidar_cloud^-1 T_lidar_a, and T_cloud_b likewise.
+
+    Args:
+        key_cloud: the variable ``T_lidar_cloud``.
+        key_a: the variable ``T_lidar_a``.
+        key_b: the variable ``T_lidar_b``.
+        block: of features of camera A, seen in camera B.
+    """
+
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
+        cloud, *cameras = (values.atPose3(key) for key in (key_cloud, key_a, key_b))
+        found, jacobian = _error_and_jacobian(block, *(cloud.between(pose) for pose in cameras))
+        chain = np.vstack([-pose.between(cloud).AdjointMap() for pose in cameras])
+        return found, [jacobian @ chain, jacobian[:, :6], jacobian[:, 6:]]
+
+    return custom_factor(gtsam.noiseModel.Unit.Create(13), [key_cloud, key_a, key_b], linearize)
+
+
+def _error_and_jacobian(
+    block: ProjectionBlock | PairBlock, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3
+) -> tuple[Array, Array]:
+    """(13,) error and (13, 12) Jacobian, or (7,) and (7, 12)."""
+    if not isinstance(block, ProjectionBlock):
+        return square_root(block.sums(T_lidar_a, T_lidar_b))
+    error, jacobian = block.error_and_jacobian(T_lidar_a.between(T_lidar_b))
+    return error, jacobian @ pair_chain(T_lidar_a, T_lidar_b)
+
+
+def pair_chain(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> Array:
+    """(6, 12) derivative of the tangent of ``T_a_b`` by the tangents of both poses."""
+    T_b_a = T_lidar_b.between(T_lidar_a)
+    return np.hstack([-T_b_a.AdjointMap(), np.eye(6)])
+
+
+def factor_on_two_poses(
+    noise: gtsam.noiseModel.Base,
+    key_a: int,
+    key_b: int,
+    residual: Callable[[gtsam.Pose3, gtsam.Pose3], tuple[Array, Array]],
+) -> gtsam.CustomFactor:
+    """A factor of (m,) residuals with (m, 12) Jacobians, in the tangents of both poses."""
+
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
+        found, jacobian = residual(values.atPose3(key_a), values.atPose3(key_b))
+        return found, [jacobian[:, :6], jacobian[:, 6:]]
+
+    return custom_factor(noise, [key_a, key_b], linearize)
+
+
+@compiled(fastmath=FAST)
+def _sum_runs(  # type: ignore[no-untyped-def]
+    kind, lens, T_a, T_b, features, loss, scale, sigma, edges, sums, costs, residuals, visible
+):
+    """Fill (r, 13, 13): H and, in the last column, b; (r,) c. Or residuals, where there is room."""
+    tile, axes = np.empty((13, 2 * TILE + 8)), 1 if kind == _EPIPOLAR else 2
+    for run in range(len(edges) - 1):
+        T = T_a[run if len(T_a) > 1 else 0]
+        M = _relative_pose(T, T_b[run if len(T_b) > 1 else 0])
+        for start in range(edges[run], edges[run + 1], TILE):
+            n, cost = min(TILE, edges[run + 1] - start), 0.0
+            for i in range(n):
+                feature = features[start + i]
+                if kind == _EPIPOLAR:
+                    seen = True
+                    _fill_epipolar(M, feature, sigma, tile, i)
+                else:
+                    seen = _fill_surface(kind, lens, T, M, feature, sigma, tile, 2 * i)
+                u, v = tile[12, axes * i], tile[12, axes * i + 1] if axes > 1 else 0.0
+                if len(residuals):
+                    residuals[start + i, 0], residuals[start + i, 1] = u, v
+                    visible[start + i] = seen
+                    continue
+                value, weight = loss_and_weight(loss, scale, u * u + v * v)
+                cost, root = cost + value, math.sqrt(weight)
+                for column in range(axes * i, axes * i + axes):
+                    for row in range(13):
+                        tile[row, column] *= root
+            if not len(residuals):
+                costs[run] += cost
+                add_products(axes * n, tile, sums[run])
+        for i in range(12 if len(sums) else 0):
+            for j in range(i):
+                sums[run, i, j] = sums[run, j, i]
+
+
+@compiled(part=True)
+def _fill_surface(kind, lens, T_a, M, feature, sigma, tile, at):  # type: ignore[no-untyped-def]
+    """Fill two columns with derivatives by A and B, and residuals; whether B sees the point."""
+    f0, f1, f2 = feature[0], feature[1], feature[2]
+    q0, q1, q2 = feature[3], feature[4], feature[5]
+    g0 = T_a[0, 0] * q0 + T_a[1, 0] * q1 + T_a[2, 0] * q2  # R_a^T q
+    g1 = T_a[0, 1] * q0 + T_a[1, 1] * q1 + T_a[2, 1] * q2
+    g2 = T_a[0, 2] * q0 + T_a[1, 2] * q1 + T_a[2, 2] * q2
+    k = 1.0 - (q0 * T_a[0, 3] + q1 * T_a[1, 3] + q2 * T_a[2, 3])
+    k = k if abs(k) >= _LEAST_K else _LEAST_K
+    w = (g0 * f0 + g1 * f1 + g2 * f2) / k
+    y0 = M[0, 0] * f0 + M[0, 1] * f1 + M[0, 2] * f2 + w * M[0, 3]
+    y1 = M[1, 0] * f0 + M[1, 1] * f1 + M[1, 2] * f2 + w * M[1, 3]
+    y2 = M[2, 0] * f0 + M[2, 1] * f1 + M[2, 2] * f2 + w * M[2, 3]
+    u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, y0, y1, y2)
+    tile[12, at] = subtract_columns(kind, lens, u, feature[6]) / sigma
+    tile[12, at + 1] = (v - feature[7]) / sigma
+    for row in range(2):
+        jx, jy, jz = (ux, uy, uz) if row == 0 else (vx, vy, vz)
+        jx, jy, jz, n = jx / sigma, jy / sigma, jz / sigma, at + row
+        along = (jx * M[0, 3] + jy * M[1, 3] + jz * M[2, 3]) / k
+        a0 = jx * M[0, 0] + jy * M[1, 0] + jz * M[2, 0] + along * g0  # in A's axes
+        a1 = jx * M[0, 1] + jy * M[1, 1] + jz * M[2, 1] + along * g1
+        a2 = jx * M[0, 2] + jy * M[1, 2] + jz * M[2, 2] + along * g2
+        tile[0, n], tile[1, n], tile[2, n] = _cross(f0, f1, f2, a0, a1, a2)
+        tile[3, n], tile[4, n], tile[5, n] = w * a0, w * a1, w * a2
+        tile[6, n], tile[7, n], tile[8, n] = _cross(jx, jy, jz, y0, y1, y2)
+        tile[9, n], tile[10, n], tile[11, n] = -w * jx, -w * jy, -w * jz
+    return w > 0.0 and is_projectable(kind, lens, y0 / w, y1 / w, y2 / w)
+
+
+@compiled(part=True)
+def _fill_epipolar(M, feature, sigma, tile, at):  # type: ignore[no-untyped-def]
+    """Fill a column with derivatives by A and B, and the residual."""
+    value, half, square = np.empty(7), np.zeros(6), 0.0
+    for x, y in ((3, 9), (6, 9), (0, 12), (0, 15)):
+        _fill_form(M, feature[x : x + 3], feature[y : y + 3], value)
+        square += value[6] * value[6]
+        for k in range(6):
+            half[k] += value[k] * value[6]
+    _fill_form(M, feature[0:3], feature[9:12], value)
+    over = 1.0 / (sigma * math.sqrt(square)) if square > _LEAST_SQUARE else 0.0
+    for k in range(6 if over > 0.0 else 0):
+        value[k] -= value[6] / square * half[k]
+    for k in range(7):
+        tile[6 + k, at] = over * value[k]
+    # By A: minus the derivative by B, a row, times Ad(T_b_a), T_b_a = M.
+    v0, v1, v2 = tile[9, at], tile[10, at], tile[11, at]
+    w0, w1, w2 = _cross(v0, v1, v2, M[0, 3], M[1, 3], M[2, 3])
+    w0, w1, w2 = w0 + tile[6, at], w1 + tile[7, at], w2 + tile[8, at]
+    for k in range(3):
+        tile[k, at] = -(w0 * M[0, k] + w1 * M[1, k] + w2 * M[2, k])
+        tile[3 + k, at] = -(v0 * M[0, k] + v1 * M[1, k] + v2 * M[2, k])
+
+
+@compiled(part=True)
+def _fill_form(M, x, y, out):  # type: ignore[no-untyped-def]
+    """Derivatives of C(x, y) in the tangent of T_a_b, and last C itself.
+
+    In B's axes, with T_b_a = M = (R^T, s): C = (s x R^T x) . y, since t = -R s.
+    """
+    a0 = M[0, 0] * x[0] + M[0, 1] * x[1] + M[0, 2] * x[2]
+    a1 = M[1, 0] * x[0] + M[1, 1] * x[1] + M[1, 2] * x[2]
+    a2 = M[2, 0] * x[0] + M[2, 1] * x[1] + M[2, 2] * x[2]
+    b0, b1, b2 = _cross(M[0, 3], M[1, 3], M[2, 3], a0, a1, a2)  # R^T (x x t)
+    out[0], out[1], out[2] = _cross(y[0], y[1], y[2], b0, b1, b2)
+    out[3], out[4], out[5] = _cross(y[0], y[1], y[2], a0, a1, a2)
+    out[6] = b0 * y[0] + b1 * y[1] + b2 * y[2]
+
+
+@compiled(part=True, forceinline=True)
+def _cross(a, b, c, x, y, z):  # type: ignore[no-untyped-def]
+    return b * z - c * y, c * x - a * z, a * y - b * x
+
+
+@compiled(part=True)
+def _relative_pose(T_a, T_b):  # type: ignore[no-untyped-def]
+    """(3, 4) T_b_a: R_b^T R_a and R_b^T (c_a - c_b)."""
+    M = np.zeros((3, 4))
+    for i in range(3):
+        for k in range(3):
+            for j in range(3):
+                M[i, j] += T_b[k, i] * T_a[k, j]
+            M[i, 3] += T_b[k, i] * (T_a[k, 3] - T_b[k, 3])
+    return M

@@ -1,0 +1,320 @@
+"""The block factor with columns of lens, clock, distortion: by differences, and stock factors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import (
+    Clock,
+    Columns,
+    Lens,
+    ProjectionBlock,
+    columns_factor,
+    displace,
+    fields_px,
+    to_runs,
+)
+from factors.columns import COEFFICIENT_NUMBERS, DISTORTION
+from factors.loss import loss_and_weight, loss_id
+from tests.draws.places import distortions_at
+from tests.factors.blocks import KEY, LENSES, TRUTH, K, at, poses, with_loss, world
+from tests.factors.test_block import EACH_LENS_AND_LOSS, together
+
+KEY_CLOUD, KEY_LENS, FIRST_POINT = 6, 8, 100
+SIGMAS = {"focal": 0.002, "aspect": 0.001, "centre_x": 2.0, "centre_y": 3.0}
+FREE = [name for name in LENSES if name != "equirectangular"]
+TWIST = np.array([0.05, -0.03, 0.4, 9.0, 0.3, -0.1])
+HEIGHT_PX = 480
+
+
+def free(name: str, *, clock: bool = False) -> Columns:
+    """All parameters of a lens, and of its clock."""
+    lens = LENSES[name]
+    sigmas = SIGMAS | dict.fromkeys(COEFFICIENT_NUMBERS[lens.kind], 0.01) if name in FREE else {}
+    if clock:
+        sigmas = {"offset": 0.02, **sigmas, "readout": 0.02}
+    return Columns(lens, tuple(sigmas), tuple(sigmas.values()), Clock(0.01, 0.005, HEIGHT_PX))
+
+
+def moving(name: str, count: int, *, alike: bool = False) -> ProjectionBlock:
+    """Correspondences of a LiDAR that moves, each with its own twist."""
+    block, rng = world(LENSES[name], count), np.random.default_rng(2)
+    twists = TWIST * (np.ones((count, 1)) if alike else rng.uniform(0.5, 1.5, (count, 6)))
+    return replace(block, motion=np.column_stack([twists, np.zeros(count)]))
+
+
+def with_lens(pose: gtsam.Pose3, values: np.ndarray) -> gtsam.Values:
+    found = at(pose)
+    found.insert(KEY_LENS, values)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "clock"), [*((name, False) for name in FREE), *((name, True) for name in LENSES)]
+)
+def test_derivatives_are_those_of_differences(name: str, clock: bool) -> None:
+    lens, rng = free(name, clock=clock), np.random.default_rng(1)
+    block = moving(name, 50) if clock else world(LENSES[name], 50)
+    values, step = rng.standard_normal(len(lens)), 1e-5
+    pose = TRUTH.retract(rng.normal(size=6) / 50)
+    T = pose.inverse().matrix()
+    columns = block.columns(T, lens, values)
+    for number, direction in enumerate(np.eye(6 + len(lens))):
+        up, down = (
+            block.columns(
+                pose.retract(sign * step * direction[:6]).inverse().matrix(),
+                lens,
+                values + sign * step * direction[6:],
+            )[-1]
+            for sign in (1, -1)
+        )
+        # Differences of numbers of size 1e3 px are exact to 1e3 * 1e-16 / 1e-5; their second
+        # order is 1e-10 of the largest column.
+        limit = 1e-6 * max(1.0, np.abs(columns[number]).max())
+        np.testing.assert_allclose(columns[number], (up - down) / (2 * step), atol=limit)
+
+
+@pytest.mark.parametrize("name", FREE)
+def test_with_the_lens_held_it_is_the_block_factor(name: str) -> None:
+    block, lens = world(LENSES[name], 60), free(name)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(columns_factor([KEY, KEY_LENS], block, lens))
+    for pose in poses()[:3]:
+        values = with_lens(pose, np.zeros(len(lens)))
+        np.testing.assert_allclose(graph.error(values), together(block).error(at(pose)), rtol=1e-9)
+        hessian, gradient = together(block).linearize(at(pose)).hessian()
+        found = graph.linearize(values).hessian()
+        np.testing.assert_allclose(found[0][:6, :6], hessian, atol=1e-9 * np.abs(hessian).max())
+        np.testing.assert_allclose(found[1][:6], gradient, atol=1e-9 * np.abs(gradient).max())
+
+
+@pytest.mark.parametrize(
+    ("stock", "calibration", "distortion", "parameters"),
+    [
+        (gtsam.GeneralSFMFactor2Cal3_S2, gtsam.Cal3_S2, (), ()),
+        (
+            gtsam.GeneralSFMFactor2Cal3DS2,
+            gtsam.Cal3DS2,
+            (-0.2, 0.05, 0.001, -0.002),
+            ("k1", "k2", "p1", "p2"),
+        ),
+    ],
+)
+def test_equals_factors_of_gtsam(stock, calibration, distortion, parameters) -> None:  # type: ignore[no-untyped-def]
+    """Their calibration is fx, fy, skew, cx, cy and the coefficients; ours scales fx and fy."""
+    lens = Lens.pinhole(**K, distortion=distortion)
+    names = ("focal", "aspect", "centre_x", "centre_y", *parameters)
+    free_lens = Columns(lens, names, (1.0,) * len(names))
+    block = replace(world(lens, 20), sqrt_information=None, loss="l2")
+    pose = TRUTH.retract(np.full(6, 0.01))
+    theirs = at(pose)
+    theirs.insert(KEY_LENS, calibration(K["fx"], K["fy"], 0.0, K["cx"], K["cy"], *distortion))
+    factors = [
+        stock(pixel, gtsam.noiseModel.Unit.Create(2), KEY, number, KEY_LENS)
+        for number, pixel in enumerate(block.pixels_px, start=FIRST_POINT)
+    ]
+    chain = np.zeros((6 + 5 + len(parameters), 6 + len(names)))
+    chain[:6, :6] = np.eye(6)
+    chain[6, 6:8], chain[7, 6:8] = [K["fx"], K["fx"] / 2], [K["fy"], -K["fy"] / 2]
+    chain[9:, 8:] = np.eye(2 + len(parameters))
+    ours = with_lens(pose, np.zeros(len(names)))
+    require_equal((block, free_lens), ours, factors, theirs, [KEY, KEY_LENS], chain)
+
+
+def require_equal(
+    of: tuple[ProjectionBlock, Columns],
+    ours: gtsam.Values,
+    factors: list[gtsam.NonlinearFactor],
+    theirs: gtsam.Values,
+    keys: list[int],
+    chain: np.ndarray,
+) -> None:
+    """Error and linearization at ``ours`` are those of GTSAM's factors, one for each fixed point.
+
+    ``chain`` has the derivatives of their variables ``keys`` by pose and lens.
+    """
+    one, many = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    one.add(columns_factor([KEY, KEY_LENS], *of))
+    for number, (factor, point) in enumerate(
+        zip(factors, of[0].points_lidar_m, strict=True), start=FIRST_POINT
+    ):
+        many.add(factor)
+        theirs.insert(number, point)
+    points = [*range(FIRST_POINT, FIRST_POINT + len(factors))]
+    size = len(chain)
+    order, whole = to_ordering([KEY, KEY_LENS]), to_ordering([*keys, *points])
+    hessian, gradient = (part[:size, ...] for part in many.linearize(theirs).hessian(whole))
+    found = one.linearize(ours).hessian(order)
+    np.testing.assert_allclose(2 * one.error(ours), 2 * many.error(theirs), rtol=1e-9)
+    expected, pulled = chain.T @ hessian[:, :size] @ chain, chain.T @ gradient
+    np.testing.assert_allclose(found[0], expected, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(found[1], pulled, atol=1e-9 * np.abs(pulled).max())
+
+
+def to_ordering(keys: list[int]) -> gtsam.Ordering:
+    order = gtsam.Ordering()
+    for key in keys:
+        order.push_back(key)
+    return order
+
+
+def test_a_displaced_cloud_is_a_displaced_camera() -> None:
+    lens = free("radtan")
+    factor = columns_factor([KEY_CLOUD, KEY, KEY_LENS], world(LENSES["radtan"], 40), lens)
+    values = with_lens(TRUTH, np.full(len(lens), 0.3))
+    values.insert(KEY_CLOUD, gtsam.Pose3().retract(np.linspace(-0.02, 0.03, 6)))
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(factor)
+    linear = graph.linearize(values)
+    step = 1e-6
+    for key, size in ((KEY_CLOUD, 6), (KEY, 6), (KEY_LENS, len(lens))):
+        slope = linear.gradientAtZero().at(key)
+        for number in range(size):
+            moved = step * np.eye(size)[number]
+            up, down = (graph.error(moved_by(values, key, s * moved)) for s in (1, -1))
+            np.testing.assert_allclose(
+                slope[number], (up - down) / (2 * step), rtol=1e-4, atol=1e-2
+            )
+
+
+def moved_by(values: gtsam.Values, key: int, step: np.ndarray) -> gtsam.Values:
+    moved = gtsam.Values(values)
+    if key == KEY_LENS:
+        moved.update(key, values.atVector(key) + step)
+    else:
+        moved.update(key, values.atPose3(key).retract(step))
+    return moved
+
+
+def test_refuses_parameters_that_a_lens_does_not_have() -> None:
+    with pytest.raises(ValueError, match="no free k4"):
+        Columns(LENSES["radtan"], ("k4",), (1.0,))
+    with pytest.raises(ValueError, match="no free focal"):
+        Columns(LENSES["equirectangular"], ("focal",), (1.0,))
+
+
+def test_equals_factors_of_gtsam_on_a_camera_that_moves_on() -> None:
+    """Stock factors on the pose exp(xi t) X of the camera at the time of its image."""
+    block = replace(moving("pinhole", 20, alike=True), sqrt_information=None, loss="l2")
+    free = Columns(LENSES["pinhole"], ("offset",), (1.0,))
+    calibration = gtsam.Cal3_S2(K["fx"], K["fy"], 0.0, K["cx"], K["cy"])
+    pose, late = TRUTH.retract(np.full(6, 0.01)), 0.05
+    moved = gtsam.Pose3.Expmap(late * TWIST) * pose
+    factors = [
+        gtsam.GenericProjectionFactorCal3_S2(
+            pixel, gtsam.noiseModel.Unit.Create(2), KEY, number, calibration
+        )
+        for number, pixel in enumerate(block.pixels_px, start=FIRST_POINT)
+    ]
+    chain = np.column_stack([np.eye(6), moved.inverse().AdjointMap() @ TWIST])
+    ours = with_lens(pose, np.array([late]))
+    require_equal((block, free), ours, factors, at(moved), [KEY], chain)
+
+
+def test_points_that_have_been_moved_are_moved_on() -> None:
+    """A block at one clock has the residuals of the recorded points at that clock."""
+    free = Columns(LENSES["radtan"], ("offset", "readout"), (0.1, 0.1), Clock(0, 0, HEIGHT_PX))
+    block, values, T = moving("radtan", 40), np.array([0.4, -0.3]), TRUTH.inverse().matrix()
+    times_s = free.clock_at(values).times_s(block.pixels_px[:, 1])
+    points = displace(block.points_lidar_m, block.motion[:, :6], -times_s)
+    motion = np.column_stack([block.motion[:, :6], times_s])
+    moved = replace(block, points_lidar_m=points, motion=motion)
+    recorded, there = (one.columns(T, free, values) for one in (block, moved))
+    np.testing.assert_allclose(there, recorded, atol=1e-9 * np.abs(recorded).max())
+
+
+def test_displacement_is_that_of_the_exponential() -> None:
+    points = np.random.default_rng(3).normal(0, 20, (30, 3))
+    for rate in (1.0, 1e-4, 0.0):
+        twist = TWIST * [rate, rate, rate, 1, 1, 1]
+        T = gtsam.Pose3.Expmap(0.3 * twist).matrix()
+        expected = points @ T[:3, :3].T + T[:3, 3]
+        np.testing.assert_allclose(displace(points, twist, 0.3), expected, atol=1e-9)
+
+
+def test_without_motion_or_at_rest_the_clock_is_not_observable() -> None:
+    free = Columns(LENSES["pinhole"], ("offset", "readout"), (0.02, 0.02))
+    still = world(LENSES["pinhole"], 20)
+    parked = replace(still, motion=np.zeros((20, 7)))
+    for block in (still, parked):
+        columns = block.columns(TRUTH.inverse().matrix(), free, np.ones(2))
+        assert not columns[6:8].any()
+
+
+def test_the_motion_stays_with_its_correspondences() -> None:
+    block, rows = moving("pinhole", 12), np.array([7, 2, 5])
+    parts = [block.select(rows), block.select(np.arange(3)).rewhiten(None)]
+    expected = block.motion[[*rows, 0, 1, 2]]
+    joined = ProjectionBlock.join(parts)
+    np.testing.assert_array_equal(joined.motion, expected)
+    assert ProjectionBlock.join([world(LENSES["pinhole"], 4)] * 2).motion is None
+
+
+def test_the_columns_of_a_scan_distortion_displace_the_points() -> None:
+    """By central differences of 1e-6; their third order is far below."""
+    for name in LENSES:
+        block = world(LENSES[name], 30)
+        free, T = Columns(LENSES[name], DISTORTION, (1.0, 0.5, 2.0)), TRUTH.inverse().matrix()
+        found = block.columns(T, free)[6:9]
+        for column, shift, sigma in zip(
+            found, distortions_at(block.points_lidar_m), free.sigmas, strict=True
+        ):
+            up, down = (
+                replace(block, points_lidar_m=block.points_lidar_m + s * 1e-6 * sigma * shift)
+                .columns(T)[-1] for s in (1, -1)
+            )  # fmt: skip
+            limit = 1e-6 * max(1.0, np.abs(column).max())
+            np.testing.assert_allclose(column, (up - down) / 2e-6, atol=limit)
+
+
+@pytest.mark.parametrize(("name", "loss"), EACH_LENS_AND_LOSS)
+def test_sums_of_runs_are_those_of_the_columns(name: str, loss: str) -> None:
+    """H, b, c, the sums of weights, and the second derivative of c / 2; some points lie behind."""
+    block, lens = with_loss(moving(name, 600), loss), free(name, clock=True)
+    block = block.rescale(scale=3.0, sigma=0.7)
+    edges, number, step = np.array([0, 300, 300, 600]), loss_id(loss), 1e-3 * np.ones(6 + len(lens))
+    T = np.array([pose.inverse().matrix() for pose in (TRUTH, TRUTH, poses()[3])])
+    values = np.full(len(lens), 0.3)
+    found = block.summarize(T, to_runs(edges), lens, values, step=step, curvature=True)
+    for run, (first, end) in enumerate(to_runs(edges)):
+        columns = block.select(np.arange(first, end)).columns(T[run], lens, values)
+        columns[-1] += np.tensordot(step, columns[:-1], axes=1)
+        rows, residuals = columns[:-1], columns[-1]
+        pulls, s = (rows * residuals).sum(axis=1), np.square(residuals).sum(axis=0)
+        (losses, weights), *slopes = (
+            np.array([loss_and_weight(number, 3.0, each * (1 + h)) for each in s]).reshape(-1, 2).T
+            for h in (0.0, 1e-6, -1e-6)
+        )
+        bend = (slopes[0][1] - slopes[1][1]) / np.maximum(1e-6 * s, 1e-300)  # 2 psi'
+        hessian = np.einsum("ain,bin,n->ab", rows, rows, weights)
+        unit = np.sqrt(np.diag(hessian)) + 1e-300
+        across = np.einsum("an,bn,n->ab", pulls, pulls, bend)
+        for mine, expected, limit in (
+            (found.hessian[run], hessian, 1e-12), (found.curvature[run], hessian + across, 1e-6)
+        ):  # fmt: skip
+            np.testing.assert_allclose(
+                mine / unit / unit[:, None], expected / unit / unit[:, None], atol=limit
+            )
+        np.testing.assert_allclose(
+            found.gradient[run] / unit, pulls @ weights / unit, rtol=1e-9, atol=1e-9
+        )
+        sums = losses.sum(), weights.sum(), weights @ s
+        mine = found.cost[run], found.weights[run], found.squares[run]
+        np.testing.assert_allclose(mine, sums, rtol=1e-12)
+
+
+def test_plain_fields_are_derivatives_of_pixels_by_twist_and_lens() -> None:
+    block, lens = moving("radtan", 20), free("radtan", clock=True)
+    pixels, fields = fields_px(block.points_lidar_m, TRUTH.inverse().matrix(), lens, TWIST)
+    seen = replace(block, pixels_px=pixels, sqrt_information=None)
+    seen = replace(seen, motion=np.column_stack([np.tile(TWIST, (20, 1)), np.zeros(20)]))
+    shift = lens.clock.times_s(pixels[:, 1])
+    seen = replace(seen, motion=np.column_stack([np.tile(TWIST, (20, 1)), shift]))
+    columns = seen.columns(TRUTH.inverse().matrix(), lens)
+    np.testing.assert_allclose(columns[-1], 0.0, atol=1e-9)
+    np.testing.assert_array_equal(fields[6:], columns[6:-1])
+    np.testing.assert_array_equal(fields[:6], -columns[:6])
