@@ -28,7 +28,7 @@ from calibgraph.model.geometry import invert, twist_between
 from calibgraph.model.places import Places
 from tests.conftest import SAMPLE, Call, stereo_relative_pose
 from tests.matching.structure.data import with_noise_images
-from tests.solver.test_elimination import minimize
+from tests.solver.test_places import minimize
 
 pytestmark = pytest.mark.usefixtures("blank_diagrams", "no_image_checks")
 

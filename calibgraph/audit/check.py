@@ -262,7 +262,7 @@ def match_from_deployed(
     watch: Stopwatch,
     progress: Progress,
 ) -> MatchingRun:
-    """Match in as few rounds as settle: the last tracking round, all of these, or all rounds.
+    """Match in the last tracking round; if cameras still move, in all of these, then in all rounds.
 
     Raises:
         CorrespondenceError: if no camera has enough correspondences.

@@ -28,7 +28,7 @@ from calibgraph.solver.lens import lens_estimates
 from calibgraph.solver.solution import Solution
 from tests.draws.lenses import put_lens_error
 from tests.solver.latent import all_values
-from tests.solver.test_elimination import STATED, minimize
+from tests.solver.test_places import STATED, minimize
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
 ORDERS_OF = {"fisheye": ("k1", "k2", "k3", "k4"), "omni": ("xi", "k1", "k2", "p1", "p2")}
