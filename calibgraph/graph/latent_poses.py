@@ -240,11 +240,6 @@ class LatentPoseModel:
         keys = [[paired_key(a), paired_key(b)] for a, b in names]
         return [np.append(np.arange(6), 6 + self.columns_of(own)) for own in keys]
 
-    @cached_property
-    def ordering(self) -> gtsam.Ordering:
-        """The poses of places first: their elimination is a Schur complement, place by place."""
-        return to_ordering([*self.place_keys, *self.shared_keys])
-
 
 def latent_pose_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
     """The whole graph; its optimum and its marginal are what is reported.
