@@ -179,12 +179,6 @@ class LatentPoseModel:
         return _place_graph(self)
 
     @property
-    def place_keys(self) -> list[int]:
-        """Keys of ``a_cp`` and ``o_p``."""
-        matched = [matched_at_key(place, camera) for place, camera in self.matched_places]
-        return [*matched, *map(cloud_at_key, range(self.places))]
-
-    @property
     def tied_keys(self) -> list[int]:
         """Keys of ``o`` and every ``m_c``."""
         return [CLOUD, *map(matched_key, self.matched)]

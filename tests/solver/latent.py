@@ -29,7 +29,13 @@ def linearized(model: LatentPoseModel, values: gtsam.Values) -> Linearization:
     keys += [[matched_at_key(place, number) for place in places] for number in model.matched]
     poses = [[values.atPose3(k) if values.exists(k) else none for k in row] for row in keys]
     shared = gtsam.Values(values)
-    for key in model.place_keys:
+    for key in place_keys(model):
         shared.erase(key)
     inverses = np.array([[to_T_camera_lidar(pose) for pose in row] for row in poses])
     return Linearization(model, shared, inverses)
+
+
+def place_keys(model: LatentPoseModel) -> list[int]:
+    """Keys of all ``a_cp`` and ``o_p``."""
+    matched = [matched_at_key(place, camera) for place, camera in model.matched_places]
+    return [*matched, *map(cloud_at_key, range(model.places))]

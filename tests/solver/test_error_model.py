@@ -38,7 +38,7 @@ from calibgraph.solver.within_place import block_by_place
 from calibgraph.trust.evidence import Evidence, gather
 from factors import pose_sigmas
 from tests.draws.places import displaced
-from tests.solver.latent import all_values
+from tests.solver.latent import all_values, place_keys
 from tests.solver.test_camera_pairs import simulated_pairs
 
 ZERO = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
@@ -174,7 +174,7 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
     )
     model = replace(errors.model, components=parts)
     others = [key for key in model.shared_keys if key not in model.reported_keys]
-    order = to_ordering([*model.reported_keys, *others, *model.place_keys])
+    order = to_ordering([*model.reported_keys, *others, *place_keys(model)])
     starts, end = {}, 0
     for number in range(order.size()):
         starts[order.at(number)] = end
