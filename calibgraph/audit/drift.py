@@ -73,8 +73,8 @@ class Drift:
         results: their names.
         cameras: per camera, one entry per result.
         trends: per camera with an error bar in three results or more.
-        lidar: per result, the motion of the LiDAR where one explains the deviations of all
-            cameras; None otherwise.
+        lidar: per result, how the LiDAR moved, where that alone explains the deviation of every
+            camera; None otherwise.
         tolerance_deg, tolerance_cm: largest turn and shift that are OK.
         false_alarm_rate: probability of one CHANGED or more in this call if nothing has changed.
         same_recording: pairs of results that were made from the same files.
@@ -102,7 +102,7 @@ class Drift:
 
     @property
     def status(self) -> str:
-        """The worst of all cameras, results and trends."""
+        """CHANGED if any trend is; otherwise the worst status of a camera in a result."""
         if any(trend.changed for trend in self.trends.values()):
             return "CHANGED"
         every = (each.status for entries in self.cameras.values() for each in entries)

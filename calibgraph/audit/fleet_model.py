@@ -346,8 +346,8 @@ def observe(rows: pa.Table) -> Observations:
     if len(of) > 1:
         alignment, mount = vehicle[done][first].tolist()
         raise CalibrationError(
-            f"the rows of vehicle {mount!r} are of mounts, those of {alignment!r} of alignments, "
-            "which are different quantities; calibrate all with one `of` in their settings"
+            f"vehicle {mount!r} has mounts and vehicle {alignment!r} has alignments, which are "
+            "different quantities; calibrate all with the same `of` in their settings"
         )
     T, placed = _fixed_size(rows, "T_camera_lidar", 16)
     covariance, bounded = _fixed_size(rows, "covariance", 36)

@@ -307,5 +307,5 @@ def test_wrong_tables_are_one_line(rows: pa.Table, message: str) -> None:
 def test_mounts_are_not_mixed_with_alignments() -> None:
     """Rows without the column are alignments; a failed row is neither."""
     assert observe(rows_of(of=["mount", "mount", None])).measured.any()
-    with pytest.raises(CalibrationError, match="vehicle 'a' are of mounts, those of 'a' of align"):
+    with pytest.raises(CalibrationError, match="vehicle 'a' has mounts and vehicle 'a' has align"):
         observe(rows_of(of=["mount", None, None]))
