@@ -18,7 +18,7 @@ from calibgraph.model.clock import when_taken
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
 from calibgraph.progress import Progress, no_progress
-from calibgraph.report.page_overlays import depth_colours, visible_points
+from calibgraph.report.page_overlays import Image, depth_colours, visible_points
 
 with needs_extra("view", "--mcap needs foxglove-sdk"):
     import foxglove
@@ -99,7 +99,7 @@ def _messages(frame: Frame, at: m.Timestamp, result: Calibration) -> Iterator[tu
             yield f"/{name}/{when}", _annotations(*seen, at)
 
 
-def project_cloud(camera: Camera, points_lidar_m: NDArray[np.float32]) -> tuple[Array, Array]:
+def project_cloud(camera: Camera, points_lidar_m: NDArray[np.float32]) -> tuple[Array, Image]:
     """The points of a cloud (n, 3) on a camera's image, an even choice of very many.
 
     Returns:
@@ -110,8 +110,8 @@ def project_cloud(camera: Camera, points_lidar_m: NDArray[np.float32]) -> tuple[
     return pixels[::step], _by_distance(points[::step])
 
 
-def _by_distance(points: Array) -> Array:
-    return depth_colours(np.linalg.norm(points, axis=1))[:, ::-1]
+def _by_distance(points: NDArray[np.floating]) -> Image:
+    return depth_colours(np.asarray(np.linalg.norm(points, axis=1), np.float64))[:, ::-1]
 
 
 def _cloud(points: NDArray[np.float32], at: m.Timestamp) -> Any:
@@ -167,7 +167,7 @@ def _lens(camera: Camera, frame_id: str, at: m.Timestamp) -> Any:
     )
 
 
-def _annotations(pixels_px: Array, colours: Array, at: m.Timestamp) -> Any:
+def _annotations(pixels_px: Array, colours: Image, at: m.Timestamp) -> Any:
     one = m.PointsAnnotation(
         timestamp=at,
         type=m.PointsAnnotationType.Points,
