@@ -196,9 +196,7 @@ def _frames_of_files(
         if not found.pairing or rig.cameras.keys() <= each.images.keys()
     )
     frames = frames if interval_s is None else _driven(frames, interval_s)
-    published = published_folder(path)
-    notes = (found.pairing, published.note() if published else "")
-    return FoundFrames(frames, frames, tuple(note for note in notes if note))
+    return FoundFrames(frames, frames, (found.pairing,) if found.pairing else ())
 
 
 def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:

@@ -210,7 +210,7 @@ def _require_pairs(folder: Path, camera: str, clouds: set[str], images: set[str]
     )
 
 
-_PUBLISHED = (nuscenes, kitti.kitti_drive, kitti.kitti_object, argoverse)
+_PUBLISHED = (nuscenes, kitti.kitti_drive, argoverse)
 
 
 def published_folder(path: Path | str) -> PublishedFolder | None:

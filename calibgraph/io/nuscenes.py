@@ -1,8 +1,8 @@
 """nuScenes folders: tables of records tied by tokens, read as far as they are needed.
 
-A sample_data (an image or a scan) is of one sample (an instant), has a calibrated_sensor (the pose
-of its sensor in the vehicle, ego) and an ego_pose (the vehicle's pose when it was taken). Frames
-are the key frames of one vehicle; images are undistorted.
+A sample_data (an image or a scan) is of one sample (an instant), and has a calibrated_sensor (the
+pose of its sensor in the vehicle, ego). Frames are the key frames of one vehicle; images are
+undistorted.
 """
 
 import json
@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model, read_text
-from calibgraph.io.frame_files import FrameFiles, IncompleteCamera, PublishedFolder, describe_motion
+from calibgraph.io.frame_files import FrameFiles, IncompleteCamera, PublishedFolder
 from calibgraph.io.lenses import intrinsics_of_matrix
 from calibgraph.io.rig_parts import pose_of_quaternion
 from calibgraph.model.geometry import invert
@@ -36,26 +36,21 @@ class _Record(BaseModel):
     token: str
 
 
-class _Pose(_Record):
-    """Of a sensor in ego, or of ego in the world."""
+class _CalibratedSensor(_Record):
+    """The pose of a sensor in ego, and a camera's matrix."""
 
+    sensor_token: str
     translation: _Triple
     rotation: tuple[Finite, Finite, Finite, Finite]  # w x y z
+    camera_intrinsic: tuple[_Triple, ...] = ()
 
     def matrix(self, where: Path) -> Array:
-        """(4, 4), from the sensor's or ego's coordinates."""
+        """(4, 4), from the sensor's coordinates."""
         w, x, y, z = self.rotation
         try:
             return pose_of_quaternion(self.translation, (x, y, z, w))
         except ValueError as error:
             raise FileError(where, f"record {self.token}: {error}") from error
-
-
-class _CalibratedSensor(_Pose):
-    """The pose of a sensor in ego, and a camera's matrix."""
-
-    sensor_token: str
-    camera_intrinsic: tuple[_Triple, ...] = ()
 
 
 class _Sensor(_Record):
@@ -74,7 +69,6 @@ class _Scene(_Record):
 
 class _SampleData(_Record):
     sample_token: str
-    ego_pose_token: str
     calibrated_sensor_token: str
     filename: str
     width: int | None = None
@@ -133,9 +127,7 @@ def nuscenes(path: Path) -> PublishedFolder | None:
             for each in tables.with_scan(path)
         ]
 
-    return PublishedFolder(
-        LIDAR, cameras, lambda name: _camera(path, name), frames, lambda: _motion(path)
-    )
+    return PublishedFolder(LIDAR, cameras, lambda name: _camera(path, name), frames)
 
 
 def _camera(path: Path, name: str) -> Camera:
@@ -174,26 +166,6 @@ def _require_one_rig(path: Path, tables: _Tables) -> None:
                 f"{path}: its scenes have {len(scenes)} calibrations of {name} ({groups}); name "
                 f"scenes of one, as {path / instants[0].scene}"
             )
-
-
-def _motion(path: Path) -> str:
-    """How far the vehicle moves between scans and images; empty without ego_pose."""
-    tables = _read_tables(path)
-    file = tables.folder / "ego_pose.json"
-    if not file.is_file():
-        return ""
-    wanted = {each.ego_pose_token for i in tables.instants for each in i.taken.values()}
-    records = (each for each in _read_list(file) if each.get("token") in wanted)
-    poses = [checked_model(_Pose, record, file) for record in records]
-    places = {pose.token: pose.matrix(file)[:3, 3] for pose in poses}
-    moved_m = []
-    for taken in (each.taken for each in tables.instants if LIDAR in each.taken):
-        scan = places.get(taken[LIDAR].ego_pose_token)
-        images = (places.get(taken[n].ego_pose_token) for n in tables.cameras if n in taken)
-        apart_m = [np.linalg.norm(scan - image) for image in images
-                   if scan is not None and image is not None]  # fmt: skip
-        moved_m += [float(max(apart_m))] if apart_m else []
-    return describe_motion(path, moved_m)
 
 
 def _find_tables(path: Path) -> tuple[Path, str | None] | None:
