@@ -189,14 +189,16 @@ def _frames_of_files(
     complete: bool, tolerance_s: float, interval_s: float | None,
 ) -> FoundFrames:  # fmt: skip
     """The frames of a folder; the complete ones where names are stamps."""
-    found = frames_of_folder(path, [*rig.cameras], complete=complete, sync_tolerance_s=tolerance_s)
+    files, pairing = frames_of_folder(
+        path, [*rig.cameras], complete=complete, sync_tolerance_s=tolerance_s
+    )
     frames = tuple(
         Frame(start + n, prefix + each.stem, each.cloud, each.images, columns=rig.cloud_columns)
-        for n, each in enumerate(found.files)
-        if not found.pairing or rig.cameras.keys() <= each.images.keys()
+        for n, each in enumerate(files)
+        if not pairing or rig.cameras.keys() <= each.images.keys()
     )
     frames = frames if interval_s is None else _driven(frames, interval_s)
-    return FoundFrames(frames, frames, (found.pairing,) if found.pairing else ())
+    return FoundFrames(frames, frames, (pairing,) if pairing else ())
 
 
 def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
@@ -245,7 +247,7 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
     for number, path in enumerate(paths):
         if path.resolve() in {other.resolve() for other in paths[:number]}:
             raise DatasetError(f"{path}: is given twice, and its frames would count twice")
-        if is_bag(path) or published_folder(path) or folder_layout(path).clouds.is_dir():
+        if is_bag(path) or published_folder(path) or folder_layout(path)[0].is_dir():
             continue
         if not path.is_dir():
             unread = way_out(path) if path.is_file() else None

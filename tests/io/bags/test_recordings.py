@@ -64,15 +64,6 @@ def test_frames_of_a_bag_equal_those_of_the_folder(tmp_path: Path, kind: str, ra
     assert len({hash_source(path) for path in paths}) == len(paths)
 
 
-@pytest.mark.realdata
-@pytest.mark.parametrize("kind", KINDS)
-def test_recorded_frames_are_the_same_from_a_bag(tmp_path: Path, realdata: Path, kind: str) -> None:
-    folder = load_dataset(realdata / "kitti_odometry" / "sequences" / "05", frames="0:3")
-    for raw in (False, True):
-        bag = sample_bag(tmp_path / str(raw), kind, data=folder, raw=raw)
-        require_same_frames(load_dataset(bag), folder)
-
-
 @pytest.mark.slow
 def test_a_calibration_from_a_bag_equals_that_from_the_folder(tmp_path: Path) -> None:
     rig = load_rig(SAMPLE)
