@@ -29,7 +29,7 @@ from calibgraph.io.clouds import (
 )
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, published_folder
 from calibgraph.io.frame import Frame, Kept, twist_by_scans
-from calibgraph.io.frame_files import RigRead, way_out
+from calibgraph.io.frame_files import way_out
 from calibgraph.io.rigs import describe_rig, read_rig
 from calibgraph.memory import available_bytes
 from calibgraph.model.rig import Camera, Rig
@@ -162,11 +162,11 @@ def load_dataset(
 
 def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -> Dataset:
     """The rig of all sources, which may differ in their extrinsics, and notes on it."""
-    read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
-    first = read[0].rig
-    for path, other in zip(paths, read, strict=True):
-        _require_same_lenses(paths[0], first, path, other.rig)
-    notes = [note for each in read for note in each.notes]
+    read = [read_rig(path, bag) if rig is None else (rig, ()) for path in paths]
+    first = read[0][0]
+    for path, (other, _) in zip(paths, read, strict=True):
+        _require_same_lenses(paths[0], first, path, other)
+    notes = [note for _, of_source in read for note in of_source]
     _require_memory(paths[0], first)
     if rig is None and is_bag(paths[0]):
         notes = [*describe_rig(first), *doubtful_axes(first), *notes]

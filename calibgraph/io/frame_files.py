@@ -120,13 +120,6 @@ class IncompleteCamera(FileError):
     """A camera without its lens, its pose or its images; what is there but wrong is no such."""
 
 
-class RigRead(NamedTuple):
-    """The complete cameras of a data set, and what was left out or assumed, a line each."""
-
-    rig: Rig
-    notes: tuple[str, ...] = ()
-
-
 class PublishedFolder(NamedTuple):
     """A folder of a published data set, read as far as it is asked.
 
@@ -142,8 +135,8 @@ class PublishedFolder(NamedTuple):
     read: Callable[[str], Camera]
     frames: Callable[[Sequence[str]], list[FrameFiles]]
 
-    def read_rig(self, path: Path) -> RigRead:
-        """The rig of the cameras that have all parts; the path is for errors."""
+    def read_rig(self, path: Path) -> tuple[Rig, tuple[str, ...]]:
+        """The rig of the cameras that have all parts, with notes; the path is for errors."""
         cameras: dict[str, Camera] = {}
         missing: dict[str, IncompleteCamera] = {}
         for name in self.cameras():
@@ -154,4 +147,4 @@ class PublishedFolder(NamedTuple):
         if missing and not cameras:
             raise next(iter(missing.values()))
         notes = tuple(f"{error}: camera {name!r} is left out" for name, error in missing.items())
-        return RigRead(checked_model(Rig, {"lidar": self.lidar, "cameras": cameras}, path), notes)
+        return checked_model(Rig, {"lidar": self.lidar, "cameras": cameras}, path), notes
