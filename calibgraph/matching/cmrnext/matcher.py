@@ -101,7 +101,7 @@ class CmrNextMatcher:
         tables = [result.matches for each in good for result in each]
         findings = to_findings(results, last.checkpoint)
         metadata = {
-            **self._metadata(last.checkpoint),
+            **self._metadata(),
             "failed_frames": {
                 n: [r.job.frame.name for r in e if r.failed] for n, e in results.items()
             },
@@ -175,7 +175,7 @@ class CmrNextMatcher:
         )
         return replace(result, start_dependence=dependence, memorization=1.0 - kept)
 
-    def _metadata(self, last: Checkpoint) -> dict[str, Any]:
+    def _metadata(self) -> dict[str, Any]:
         return {
             "matcher": "cmrnext",
             "schedule": [
@@ -187,8 +187,7 @@ class CmrNextMatcher:
             "half_resolution": self.half_resolution,
             "device": self.device.type,
             "seed": self.seed,
-            "confidence": "uncalibrated" if last.architecture.uncertainty == "none"
-                          else "predicted",
+            "confidence": "uncalibrated",
         }  # fmt: skip
 
 
@@ -203,9 +202,7 @@ def _is_within_range(checkpoint: Checkpoint, job: MatchingJob, T_camera_lidar: A
 
 
 def _weigh(job: MatchingJob, table: Correspondences, T_camera_lidar: Array) -> Correspondences:
-    """The matches with their confidence lowered by their residuals, unless it is predicted."""
-    if table.information_px is not None:
-        return table
+    """The matches with their confidence lowered by their residuals."""
     points = table.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
     projected, valid = job.camera.lens.project(points)
     residuals = np.linalg.norm(projected - table.pixels_px, axis=1)

@@ -24,7 +24,6 @@ from calibgraph.matching.cmrnext import CmrNextMatcher
 from calibgraph.matching.cmrnext.flow_matching import FlowMatcher, MatchingJob, to_table
 from calibgraph.matching.cmrnext.inputs import LidarImage, network_size
 from tests.conftest import SAMPLE
-from tests.matching.cmrnext.builders import nll_content, saved
 
 Array = NDArray[np.float64]
 
@@ -149,13 +148,3 @@ def test_a_batch_gives_what_single_images_give(sample: Dataset, weights: Path) -
     )
     assert len(one) == len(four)
     np.testing.assert_allclose(one.pixels_px, four.pixels_px, atol=1e-3)
-
-
-def test_predicted_sigmas_become_information(sample: Dataset, tmp_path: Path) -> None:
-    weights = saved(tmp_path / "nll.tar", nll_content())
-    matcher = CmrNextMatcher([weights], iterations=1, half_resolution=True)
-    table = matcher.match(sample.select("0"), sample.rig, round_index=0, progress=lambda *_: None)
-    assert table.information_px is not None
-    assert table.metadata["confidence"] == "predicted"
-    sigma = table.information_px[:, [0, 2]] ** -0.5
-    np.testing.assert_allclose(table.confidence, (2 / sigma.sum(axis=1)).clip(1e-3, 1), rtol=1e-5)
