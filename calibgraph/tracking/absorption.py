@@ -19,7 +19,7 @@ from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.cause import chance_limit
 from calibgraph.tracking.estimate import EpochGraph, states_places
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import PLACE, Incoming
+from calibgraph.tracking.frame_order import PLACE, StreamFrame
 from calibgraph.tracking.gate import Gated, agrees, find_outlier_frame
 from calibgraph.tracking.noise import add_residuals, median, scale_of
 from calibgraph.tracking.state import BEND, HISTORY, OutlierFrame, State
@@ -31,15 +31,15 @@ _TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
 _TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt to start
 
 
-def begin_frames(state: State, frames: Sequence[Incoming]) -> None:
+def begin_frames(state: State, frames: Sequence[StreamFrame]) -> None:
     """Begin frames, none of whose matches is absorbed."""
     last, n = frames[-1], len(state.names)
     found = [one.table.findings for one in frames if len(one.table)]
-    state.frame, state.stamp_ns = last.number, last.stamp_ns
+    state.frame, state.stamp_ns = last.frame, last.stamp_ns
     state.updates += len(frames)
     if found and found[-1] != state.findings:
         state.findings = found[-1]
-    numbers = np.array([one.number for one in frames], dtype=np.int64)
+    numbers = np.array([one.frame for one in frames], dtype=np.int64)
     state.numbers = np.concatenate([state.numbers, numbers])
     state.at = (*state.at, *(one.table.metadata.get(PLACE, "") for one in frames))
     state.sizes = (*state.sizes[:-1], state.sizes[-1] + len(frames))
@@ -181,7 +181,7 @@ def count_repeats(state: State, given: Correspondences, new: Correspondences) ->
         state.count(camera, repeated=1 if number in again else -before)
 
 
-def count_absent(state: State, used: Collection[int], frame: Incoming) -> list[Event]:
+def count_absent(state: State, used: Collection[int], frame: StreamFrame) -> list[Event]:
     """Count the frames without usable matches; the events ``blind`` and ``back``.
 
     Args:
@@ -189,7 +189,7 @@ def count_absent(state: State, used: Collection[int], frame: Incoming) -> list[E
         used: the cameras whose matches of the frame were absorbed, by their places in the rig.
         frame: this one.
     """
-    events, limit, number = [], state.config.tracking.blind_frames, frame.number
+    events, limit, number = [], state.config.tracking.blind_frames, frame.frame
     absent = np.where(state.started, state.absent + 1, state.absent)
     absent[[*used]] = 0
     for camera in np.flatnonzero(state.started & (absent != state.absent)).tolist():

@@ -19,7 +19,7 @@ from calibgraph.report.as_json import finite
 from calibgraph.solver.error_model import Conflict
 from calibgraph.tracking.estimate import EpochGraph, Estimate, error_sources, pairs_that_count
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import Incoming
+from calibgraph.tracking.frame_order import StreamFrame
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.state import State
 from calibgraph.trust.evidence import Estimate as Checked
@@ -238,7 +238,7 @@ class Update:
 
     Attributes:
         frame: its number.
-        stamp_ns: its time, or that of the last frame that had one, or None.
+        stamp_ns: its time, or None.
         T_camera_lidar: per camera, (4, 4): p_camera = T_camera_lidar * p_lidar. The guess, as long
             as the camera has no estimate.
         covariance: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
@@ -262,7 +262,7 @@ class Update:
 def make_updates(
     state: State,
     estimate: Estimate,
-    taken: Sequence[tuple[Incoming, Sequence[Event], Mapping[int, int]]],
+    taken: Sequence[tuple[StreamFrame, Sequence[Event], Mapping[int, int]]],
 ) -> list[Update]:
     """The updates after the last frames of a state.
 
@@ -281,14 +281,14 @@ def make_updates(
     last = {n: own[-1:] for n, own in zip(names, state.agreements, strict=True)}
     return [
         Update(
-            frame=one.number,
+            frame=one.frame,
             stamp_ns=one.stamp_ns,
             T_camera_lidar=dict(poses),
             covariance=dict(covariance),
             verdicts=dict(estimate.verdicts),
             events=tuple(events),
             used={names[camera]: count for camera, count in used.items()},
-            left_out=tuple(n for n in names if last[n] == ((one.number, False),)),
+            left_out=tuple(n for n in names if last[n] == ((one.frame, False),)),
         )
         for one, events, used in taken
     ]

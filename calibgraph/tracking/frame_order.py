@@ -23,11 +23,6 @@ from calibgraph.solver.preprocess import (
 )
 from calibgraph.tracking.state import State
 
-_LAST = 2**63 - 1  # other programs write it for "none"
-_MOST_SKIPPED = {"number": 10**12, "stamp_ns": 2**62}
-"""Between two frames. Numbers that are nanoseconds pause for 17 min; a clock may be set once."""
-_SKIPPED_SHARE = 1000
-"""A larger number may skip this part of it: three weeks, if it is a time since 1970."""
 LONGEST_PLACE = 200
 _FINDINGS_PER_FRAME = (
     "systematic_rotation_rad", "systematic_translation_m", "camera_share",
@@ -39,45 +34,75 @@ PLACE = "place"
 """Key of a frame's metadata: the name of the place that it is of."""
 
 
-@dataclass(frozen=True, eq=False)
-class Incoming:
-    """A frame that comes after the last one.
+@dataclass(frozen=True)
+class StreamFrame:
+    """The correspondences of one frame, all its cameras.
 
     Attributes:
-        number: of the frame.
-        stamp_ns: its time, or that of the last frame that had one, or None.
-        table: its correspondences, with the metadata of a single frame.
+        frame: its number.
+        table: rows of this frame alone; there may be none.
+        stamp_ns: its time; None: as the table has it.
     """
 
-    number: int
-    stamp_ns: int | None
+    frame: int
     table: Correspondences
+    stamp_ns: int | None = None
 
 
-def incoming(
-    state: State,
-    table: Correspondences,
-    frame: int | None,
-    last: tuple[int | None, int | None] | None = None,
-) -> Incoming:
-    """A frame that an update can take.
+def with_number(table: Correspondences, frame: int | None) -> StreamFrame:
+    """The one frame that a table holds.
+
+    Args:
+        table: its correspondences.
+        frame: its number, which an empty table does not have.
+
+    Raises:
+        CorrespondenceError: if the table holds several frames or another one, or a number has more
+            than 63 bits.
+    """
+    numbers = {*np.unique(table.frame).tolist()}
+    if len(numbers) > 1:
+        raise CorrespondenceError(
+            f"an update takes one frame, found {len(numbers)} (from {min(numbers)} to "
+            f"{max(numbers)}); give them one by one"
+        )
+    if frame is None and not numbers:
+        raise CorrespondenceError("the table is empty; name which frame it is: frame=...")
+    number = index(min(numbers) if frame is None else frame)
+    if not -(2**63) <= number < 2**63:
+        raise CorrespondenceError(
+            f"a frame's number must have at most 63 bits, found {number.bit_length()}; "
+            "correct it: it is left out"
+        )
+    if numbers and number not in numbers:
+        raise CorrespondenceError(f"the table is of frame {min(numbers)}, not {number}")
+    return StreamFrame(number, table)
+
+
+def prepared(state: State, frame: StreamFrame, last: int | None) -> StreamFrame:
+    """A frame as an update takes it, with the metadata of a single frame.
 
     Args:
         state: of the frames before.
-        table: the correspondences of one frame.
-        frame: its number, which an empty table does not have.
-        last: number and time of the frame before; None: that of the state.
+        frame: with all rows of one frame.
+        last: number of the frame before.
 
     Raises:
-        CorrespondenceError: if it is none.
+        CorrespondenceError: if it does not come after the last one, or its metadata are wrong.
     """
-    table = with_common_error(table, state.config)
+    number = with_number(frame.table, frame.frame).frame
+    if last is not None and number <= last:
+        what = "comes again" if number == last else f"comes after frame {last}"
+        raise CorrespondenceError(
+            f"frame {number} {what}; frames must be in the order of their numbers: it is left out"
+        )
+    table = with_common_error(frame.table, state.config)
     if len(table):
         table = _with_motion_in_use(state.rig, table, state.knows_motion)
-    table = with_metadata_per_frame(with_place(table, None))
-    last = (state.frame, state.stamp_ns) if last is None else last
-    number, stamp = number_and_stamp(table, frame, last)
-    return Incoming(number, last[1] if stamp is None else stamp, table)
+    stamp = frame.stamp_ns
+    if stamp is None and len(table) and table.stamp_ns is not None:
+        stamp = int(table.stamp_ns.max())
+    return StreamFrame(number, with_metadata_per_frame(with_place(table, None)), stamp)
 
 
 def unsolvable(number: int, error: BaseException) -> CorrespondenceError:
@@ -115,99 +140,23 @@ def _with_motion_in_use(rig: Rig, table: Correspondences, before: bool | None) -
     return table
 
 
-def number_and_stamp(
-    table: Correspondences, frame: int | None, last: tuple[int | None, int | None]
-) -> tuple[int, int | None]:
-    """The number and the time stamp [ns] of the frame that a table holds.
-
-    Args:
-        table: the correspondences of one frame.
-        frame: its number, which an empty table does not have.
-        last: those of the frame before.
-
-    Raises:
-        CorrespondenceError: if the table holds several frames, or one that is not after the last,
-            or the number is beyond 63 bits.
-    """
-    require_number(frame)
-    same = len(table) > 0 and (table.frame == table.frame[0]).all()
-    numbers = table.frame[:1] if same else np.unique(table.frame)
-    if len(numbers) > 1:
-        raise CorrespondenceError(
-            f"an update takes one frame, found {len(numbers)} (from {numbers[0]} to "
-            f"{numbers[-1]}); give them one by one"
-        )
-    if frame is None and not len(numbers):
-        raise CorrespondenceError("the table is empty; name which frame it is: frame=...")
-    number = int(numbers[0]) if len(numbers) else int(frame or 0)
-    if frame is not None and number != frame:
-        raise CorrespondenceError(f"the table is of frame {number}, not {frame}", frame=number)
-    stamp = int(table.stamp_ns.max()) if table.stamp_ns is not None and len(table) else None
-    _require_after(last, number, stamp)
-    return number, stamp
-
-
-def require_number(frame: int | None) -> None:
-    """Refuse a number that no table can hold.
-
-    Raises:
-        CorrespondenceError: if it is beyond 63 bits.
-    """
-    if frame is not None and not -_LAST - 1 <= frame <= _LAST:
-        raise CorrespondenceError(
-            f"a frame's number must have at most 63 bits, found {index(frame).bit_length()}; "
-            "correct it: it is left out"
-        )
-
-
-def _require_after(last: tuple[int | None, int | None], number: int, stamp: int | None) -> None:
-    for what, value in (("number", number), ("stamp_ns", stamp)):
-        if value == _LAST:
-            raise CorrespondenceError(
-                f"frame {number}: its {what} {value} is the largest there is, and no frame could "
-                "follow; correct it: it is left out",
-                frame=number,
-            )
-    last_number, last_stamp = last
-    if last_number is not None and number <= last_number:
-        what = "comes again" if number == last_number else f"comes after frame {last_number}"
-        raise CorrespondenceError(
-            f"frame {number} {what}; frames must be in the order of their numbers: it is left out",
-            frame=number,
-        )
-    for what, value, before in (("number", number, last_number), ("stamp_ns", stamp, last_stamp)):
-        if value is None or before is None:
-            continue
-        if value - before > max(_MOST_SKIPPED[what], abs(before) // _SKIPPED_SHARE):
-            raise CorrespondenceError(
-                f"frame {number}: its {what} {value} is far beyond {before} of the frame before, "
-                "and the frames between would be too late; correct it: it is left out",
-                frame=number,
-            )
-    if stamp is not None and last_stamp is not None and stamp <= last_stamp:
-        raise CorrespondenceError(
-            f"frame {number}: its stamp_ns {stamp} is not after {last_stamp} of the frame "
-            "before; correct the clock: it is left out",
-            frame=number,
-        )
-
-
 def with_place(table: Correspondences, place: str | int | None) -> Correspondences:
     """The table with the name of its place in the metadata, and without the lists of places.
 
     Args:
         table: the correspondences of one frame.
-        place: None: as by the metadata.
+        place: None: its own by the metadata, or the first number of its list.
 
     Raises:
         CorrespondenceError: if it is no name, or the lists are wrong.
     """
     if place is None and not table.metadata:
         return table
-    name = place_of(table) if place is None else _place_name(place)
+    if place is None and PLACE not in table.metadata:
+        place = table.places.name_of(int(table.frame[0])) if len(table) else ""
+    name = _place_name(table.metadata[PLACE] if place is None else place)
     kept = {key: value for key, value in table.metadata.items() if key not in (PLACE, PLACES)}
-    kept |= {PLACE: name} if name else {}
-    return table if kept == table.metadata else replace(table, metadata=kept)
+    return _with_metadata(table, kept | ({PLACE: name} if name else {}))
 
 
 def with_metadata_per_frame(table: Correspondences) -> Correspondences:
@@ -226,17 +175,11 @@ def with_metadata_per_frame(table: Correspondences) -> Correspondences:
     findings = table.findings.to_metadata()
     kept = {key: findings[key] for key in _FINDINGS_PER_FRAME if key in findings}
     kept |= {key: table.metadata[key] for key in (PLACE,) if key in table.metadata}
-    return table if kept == table.metadata else replace(table, metadata=kept)
+    return _with_metadata(table, kept)
 
 
-def place_of(table: Correspondences) -> str:
-    """The name of a frame's place: its own, or the first number of its list; empty if unknown."""
-    if PLACE in table.metadata:
-        return _place_name(table.metadata[PLACE])
-    if not len(table):
-        return ""
-    number = int(table.frame[0])
-    return table.places.name_of(number)
+def _with_metadata(table: Correspondences, kept: dict[str, object]) -> Correspondences:
+    return table if kept == table.metadata else table.with_metadata(kept)
 
 
 def _place_name(place: object) -> str:

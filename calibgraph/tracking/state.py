@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import accumulate, chain
 from typing import Any, TypeVar
 
@@ -410,30 +410,6 @@ class State:
     def all_sums(self, before: int | None = None) -> Sums:
         """(n,) over all frames, or those before a frame's number."""
         return self.sums_before_epochs(before)[-1]
-
-    def require_consistent(self) -> None:
-        """Check that the parts of a state that was read fit together.
-
-        Raises:
-            ValueError: with the first that does not.
-        """
-        n, rows, places = len(self.names), len(self.numbers), len(self.settled)
-        epochs, blank = len(self.sizes), State.initial(self.rig, self.config)
-        first = {"numbers": rows, "sums": rows, "poses": epochs, "bends": 1 + epochs,
-                 "steps": places, "weights": places}  # fmt: skip
-        for one in fields(State):
-            found, known = getattr(self, one.name), getattr(blank, one.name)
-            if isinstance(known, Sums):
-                found, known = found.packed, known.packed
-            if not isinstance(known, np.ndarray):
-                continue
-            shape = first.get(one.name, len(known)), *known.shape[1:]
-            if (found.shape, found.dtype) != (shape, known.dtype):
-                raise ValueError(f"{one.name} has the shape {found.shape}, expected {shape}")
-        by_camera = self.blocks, self.inliers, self.scales, self.waiting, self.refused
-        cameras = {*map(len, (*by_camera, self.outliers, self.agreements))}
-        if cameras != {n} or {len(self.at), sum(self.sizes)} != {rows}:
-            raise ValueError("its cameras or frames differ in number")
 
 
 def require_poses_alone(config: Config) -> None:

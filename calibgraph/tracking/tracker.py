@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
-from calibgraph.errors import CorrespondenceError, FileError, in_words
+from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file, write_bytes
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
@@ -47,10 +47,11 @@ from calibgraph.tracking.estimate import (
 )
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import (
-    Incoming,
-    incoming,
+    StreamFrame,
+    prepared,
     share_last_points,
     unsolvable,
+    with_number,
     with_place,
     without_repeats,
 )
@@ -63,10 +64,11 @@ from calibgraph.tracking.moves import (
 )
 from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import StateError, decode, encode
-from calibgraph.tracking.streams import StreamFrame
 
 UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
-Taken = list[tuple[Incoming, list[Event], Mapping[int, int]]]
+Taken = list[tuple[StreamFrame, list[Event], Mapping[int, int]]]
+Outcome = list[Update] | CorrespondenceError
+"""Updates of frames that were taken in at once, or why one frame is left out."""
 
 
 class IncrementalCalibrator:
@@ -149,46 +151,30 @@ class IncrementalCalibrator:
                 have, a frame that does not come after the last one, or wrong metadata. Nothing has
                 changed then.
         """
-        return self._take([incoming(self._state, with_place(table, place), frame)])[0]
+        return self.update_together([with_number(with_place(table, place), frame)])[0]
+
+    def update_all(self, frames: Sequence[StreamFrame]) -> Iterator[Outcome]:
+        """Take in frames, together where nothing is unusual; what became of them, in order."""
+        while frames:
+            try:
+                updates = self.update_together(frames)
+            except CorrespondenceError as error:
+                yield error
+                frames = frames[1:]
+            else:
+                yield updates
+                frames = frames[len(updates) :]
 
     def update_together(self, frames: Sequence[StreamFrame]) -> list[Update]:
-        """Take in the first of some frames at once; none if the first is refused.
+        """Take in the first of some frames at once: as many as show nothing unusual.
 
-        As many as show nothing unusual, up to the end of an epoch. All their updates have the
-        estimate after the last of them, which is as of one by one.
+        At most up to the end of an epoch. All their updates have the estimate after the last of
+        them, which is as of one by one.
+
+        Raises:
+            CorrespondenceError: if the first cannot be taken in, as of :meth:`update`.
         """
         group = self._alike(frames)
-        try:
-            return self._take(group) if group else []
-        except CorrespondenceError:
-            return []
-
-    def _alike(self, frames: Sequence[StreamFrame]) -> list[Incoming]:
-        """The first frames, up to the end of the epoch, that state the same of their errors.
-
-        None but the first repeats a frame of before: a camera may have its first matches in any of
-        them.
-        """
-        group, state = list[Incoming](), self._state
-        room = state.config.tracking.epoch_frames - state.sizes[-1]
-        last = state.frame, state.stamp_ns
-        for frame, _ in zip(frames, range(room), strict=False):
-            try:
-                one = incoming(state, frame.table, frame.frame, last)
-            except CorrespondenceError:
-                break
-            known = {*one.table.cameras} <= {*state.names}
-            if not known or (group and _columns(group[0].table) != _columns(one.table)):
-                break
-            group.append(one)
-            last = one.number, one.stamp_ns
-        if not group or not share_last_points(state, [one.table for one in group]):
-            return group
-        alone = [*takewhile(lambda one: without_repeats(state, one.table) is one.table, group)]
-        return alone or group[:1]
-
-    def _take(self, group: Sequence[Incoming]) -> list[Update]:
-        """Take in the first frames of a group, at least one; after any error, none."""
         state = self._state.draft()
         try:
             graph, taken = self._take_in(state, group)
@@ -197,20 +183,44 @@ class IncrementalCalibrator:
         except BaseException as error:
             self._graph = self._estimate = None
             if isinstance(error, UNSOLVABLE):
-                raise unsolvable(group[0].number, error) from error
+                raise unsolvable(group[0].frame, error) from error
             raise
         self._state, self._graph, self._estimate = state, graph, estimate
         return updates
 
-    def _take_in(self, state: State, group: Sequence[Incoming]) -> tuple[EpochGraph, Taken]:
+    def _alike(self, frames: Sequence[StreamFrame]) -> list[StreamFrame]:
+        """The first frames, up to the end of the epoch, that state the same of their errors.
+
+        None but the first repeats a frame of before: a camera may have its first matches in any of
+        them.
+        """
+        state = self._state
+        group = [prepared(state, frames[0], state.frame)]
+        room = state.config.tracking.epoch_frames - state.sizes[-1]
+        for frame in frames[1:room]:
+            try:
+                one = prepared(state, frame, group[-1].frame)
+            except CorrespondenceError:
+                break
+            if not {*one.table.cameras, *group[0].table.cameras} <= {*state.names}:
+                break
+            if _columns(group[0].table) != _columns(one.table):
+                break
+            group.append(one)
+        if not group[1:] or not share_last_points(state, [one.table for one in group]):
+            return group
+        alone = [*takewhile(lambda one: without_repeats(state, one.table) is one.table, group)]
+        return alone or group[:1]
+
+    def _take_in(self, state: State, group: Sequence[StreamFrame]) -> tuple[EpochGraph, Taken]:
         """Absorb the matches that agree, set aside the others, detect events."""
         group, table, blocks = _preprocessed(state, group, self._graph_of(state).rig)
         gated = _gate(state, blocks)
         usual = _count_usual(state, group, blocks, gated)
         if usual < len(group):
             group = group[: max(usual, 1)]
-            table = table.select(table.frame <= group[-1].number)
-            blocks = {c: raw.select(raw.frame <= group[-1].number) for c, raw in blocks.items()}
+            table = table.select(table.frame <= group[-1].frame)
+            blocks = {c: raw.select(raw.frame <= group[-1].frame) for c, raw in blocks.items()}
             blocks = {camera: raw for camera, raw in blocks.items() if len(raw)}
             gated = _gate(state, blocks)
         begin_frames(state, group)
@@ -258,7 +268,7 @@ class IncrementalCalibrator:
 
     def to_bytes(self) -> bytes:
         """The tracker as bytes, from which :meth:`from_bytes` continues with the same numbers."""
-        return encode(self._state, "state")
+        return encode(self._state)
 
     @staticmethod
     def from_bytes(data: bytes) -> IncrementalCalibrator:
@@ -267,14 +277,9 @@ class IncrementalCalibrator:
         Raises:
             CalibrationError: if the bytes are damaged or of another format.
         """
-        state = decode(data, "state")
-        try:
-            state.require_consistent()
-            tracker = IncrementalCalibrator(state.rig, state.config)
-            tracker._state = state
-            tracker._assess()
-        except Exception as error:  # of any kind: parts of the state may contradict each other
-            raise StateError(f"is no tracker's state ({in_words(error)})") from error
+        state = decode(data, State)
+        tracker = IncrementalCalibrator(state.rig, state.config)
+        tracker._state = state
         return tracker
 
     def save(self, path: Path | str) -> None:
@@ -312,8 +317,8 @@ def _columns(table: Correspondences) -> tuple[object, ...]:
 
 
 def _preprocessed(
-    state: State, group: Sequence[Incoming], rig: Rig
-) -> tuple[Sequence[Incoming], Correspondences, dict[int, CameraBlock]]:
+    state: State, group: Sequence[StreamFrame], rig: Rig
+) -> tuple[Sequence[StreamFrame], Correspondences, dict[int, CameraBlock]]:
     """Frames that can be taken in at once; their matches as given, and preprocessed by camera.
 
     The first alone, without what it repeats, where one of them repeats another one.
@@ -353,7 +358,7 @@ def _gate(state: State, blocks: Mapping[int, CameraBlock]) -> dict[int, Gated]:
 
 def _count_usual(
     state: State,
-    group: Sequence[Incoming],
+    group: Sequence[StreamFrame],
     blocks: Mapping[int, CameraBlock],
     gated: Mapping[int, Gated],
 ) -> int:
@@ -366,7 +371,7 @@ def _count_usual(
         first += numbers[:1].tolist()
     if not first:
         return len(group)
-    return sum(one.number < min(first) for one in group)
+    return sum(one.frame < min(first) for one in group)
 
 
 _FRAMES, _MATCHES = 24, 250  # enough to start a camera, close two epochs and fill a large block
