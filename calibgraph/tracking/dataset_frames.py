@@ -24,7 +24,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.pipeline import calibrate
 from calibgraph.progress import no_progress
 from calibgraph.solver.joint import solve_joint
-from calibgraph.tracking.frame_order import StreamFrame, with_place
+from calibgraph.tracking.frame_order import StreamFrame
 from calibgraph.tracking.streams import Item, frames_of_table
 from calibgraph.tracking.sums import MOST_PLACES
 from calibgraph.tracking.tracker import IncrementalCalibrator
@@ -188,7 +188,7 @@ def with_places(
                 finder.first_of_place(frames[number])
             first = []
         place = finder.first_of_place(frames[item.frame])
-        yield replace(item, table=with_place(item.table, place))
+        yield replace(item, place=str(place))
 
 
 def _refined(rig: Rig, table: Correspondences, config: Config) -> Rig:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from types import TracebackType
@@ -14,12 +13,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.tracking.assessment import Update
-from calibgraph.tracking.frame_order import (
-    StreamFrame,
-    with_metadata_per_frame,
-    with_number,
-    with_place,
-)
+from calibgraph.tracking.frame_order import StreamFrame, as_kept, frame_of
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.state_database import StateDatabase
 from calibgraph.tracking.tracker import IncrementalCalibrator, Outcome
@@ -100,7 +94,7 @@ class DurableCalibrator:
             CorrespondenceError: as there. Nothing has changed then.
             OSError: if it cannot be written; then close this, and make a new one.
         """
-        (found,) = self.update_all([with_number(with_place(table, place), frame)])
+        (found,) = self.update_all([frame_of(table, frame, place)])
         if isinstance(found, CorrespondenceError):
             raise found
         return found[0]
@@ -117,7 +111,7 @@ class DurableCalibrator:
         for one in found:
             taken = 1 if isinstance(one, CorrespondenceError) else len(one)
             if not isinstance(one, CorrespondenceError):
-                groups.append(tuple(map(_as_kept, left[:taken])))
+                groups.append(tuple(map(as_kept, left[:taken])))
             left = left[taken:]
         if groups:
             self._database.write([encode(tuple(groups))], state)
@@ -154,10 +148,6 @@ class DurableCalibrator:
             self.close()
         else:
             self.abandon()
-
-
-def _as_kept(one: StreamFrame) -> StreamFrame:
-    return replace(one, table=with_metadata_per_frame(with_place(one.table, None)))
 
 
 def _require_same(folder: Path, tracker: IncrementalCalibrator, rig: Rig, config: Config) -> None:

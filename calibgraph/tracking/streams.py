@@ -32,7 +32,7 @@ from calibgraph.model.correspondences import (
     Correspondences,
     as_confidence,
 )
-from calibgraph.tracking.frame_order import LONGEST_PLACE, StreamFrame, with_place
+from calibgraph.tracking.frame_order import LONGEST_PLACE, StreamFrame
 
 Item = StreamFrame | CalibrationError
 """A frame, or why there is none."""
@@ -137,7 +137,7 @@ class FrameLine(BaseModel):
             twist_per_s=np.tile(self.twist_per_s, (n, 1)) if self.twist_per_s and n else None,
             metadata=self.metadata,
         )
-        return StreamFrame(self.frame, with_place(table, self.place), self.stamp_ns)
+        return StreamFrame(self.frame, table, self.stamp_ns, self.place)
 
     def _columns(self, keys: Sequence[str], missing: Sequence[float], kind: type = float) -> Any:
         """(n, k) columns; with a value for cameras that do not give them, None if none does."""

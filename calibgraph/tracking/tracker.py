@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 import gtsam
@@ -18,8 +18,14 @@ from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.rig import Rig
 from calibgraph.simulation.correspondences import simulate_correspondences
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.solver.matches import MIN_MATCHES, CameraBlock, camera_blocks
-from calibgraph.solver.preprocess import preprocess
+from calibgraph.solver.matches import MIN_MATCHES, CameraBlock, camera_block
+from calibgraph.solver.preprocess import (
+    are_projectable,
+    best_in_cell,
+    camera_numbers,
+    number_repeats,
+    within_cap,
+)
 from calibgraph.tracking.absorption import (
     absorb,
     begin_frames,
@@ -31,7 +37,6 @@ from calibgraph.tracking.absorption import (
 from calibgraph.tracking.assessment import (
     MeasureOnFrames,
     Update,
-    assess,
     make_updates,
     to_calibration,
 )
@@ -48,11 +53,10 @@ from calibgraph.tracking.estimate import (
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import (
     StreamFrame,
+    frame_of,
     prepared,
     share_last_points,
     unsolvable,
-    with_number,
-    with_place,
     without_repeats,
 )
 from calibgraph.tracking.gate import Gated
@@ -119,7 +123,8 @@ class IncrementalCalibrator:
     ) -> Calibration:
         """The present estimate as a batch's result; posteriors by images widen its error bars."""
         graph = self._graph_of(self._state)
-        return to_calibration(self._state, graph, self._assess(), measure, sources=sources)
+        self._estimate = self._estimate or graph.solve(self._state)
+        return to_calibration(self._state, graph, self._estimate, measure, sources=sources)
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -151,7 +156,7 @@ class IncrementalCalibrator:
                 have, a frame that does not come after the last one, or wrong metadata. Nothing has
                 changed then.
         """
-        return self.update_together([with_number(with_place(table, place), frame)])[0]
+        return self.update_together([frame_of(table, frame, place)])[0]
 
     def update_all(self, frames: Sequence[StreamFrame]) -> Iterator[Outcome]:
         """Take in frames, together where nothing is unusual; what became of them, in order."""
@@ -179,7 +184,7 @@ class IncrementalCalibrator:
         try:
             graph, taken = self._take_in(state, group)
             graph, estimate = _estimated(state, graph)
-            updates = make_updates(state, assess(state, estimate), taken)
+            updates = make_updates(state, estimate, taken)
         except BaseException as error:
             self._graph = self._estimate = None
             if isinstance(error, UNSOLVABLE):
@@ -207,7 +212,7 @@ class IncrementalCalibrator:
             if _columns(group[0].table) != _columns(one.table):
                 break
             group.append(one)
-        if not group[1:] or not share_last_points(state, [one.table for one in group]):
+        if not any(share_last_points(state, one.table) for one in group[1:]):
             return group
         alone = [*takewhile(lambda one: without_repeats(state, one.table) is one.table, group)]
         return alone or group[:1]
@@ -259,12 +264,6 @@ class IncrementalCalibrator:
         if self._graph is None or not self._graph.is_of(state):
             self._graph = EpochGraph(state)
         return self._graph
-
-    def _assess(self) -> Estimate:
-        """Assess the present estimates."""
-        if self._estimate is None:
-            self._estimate = self._graph_of(self._state).solve(self._state)
-        return assess(self._state, self._estimate)
 
     def to_bytes(self) -> bytes:
         """The tracker as bytes, from which :meth:`from_bytes` continues with the same numbers."""
@@ -328,18 +327,31 @@ def _preprocessed(
         group: the frames.
         rig: at the estimates.
     """
-    for frames in (group, group[:1]):
-        alone = len(frames) == 1
-        table = frames[0].table
-        table = without_repeats(state, table) if alone else concatenate([f.table for f in frames])
-        if not len(table):
-            return frames, table, {}
-        kept = preprocess(rig, table, state.config)
-        if alone or not any(kept.repeated_frames.values()):
-            break
-    blocks = camera_blocks(state.rig, kept.table, state.config)
-    found = {state.names.index(name): _with_enough(block) for name, block in blocks.items()}
-    return frames, table, {camera: block for camera, block in found.items() if len(block)}
+    if len(group) == 1:
+        table = without_repeats(state, group[0].table)
+    else:
+        table = concatenate([one.table for one in group])
+    found = dict[int, CameraBlock]()
+    if not len(table):
+        return group, table, found
+    config, cameras = state.config, [*state.rig.cameras.values()]
+    usable = table.without_cameras(config.excluded_cameras)
+    numbers = camera_numbers(rig, usable)
+    confident = are_projectable(rig, usable, numbers) & (usable.confidence >= config.confidence_min)
+    rows = best_in_cell(rig, usable, numbers, config, among=confident)
+    kept, numbers = usable.select(rows), numbers[rows]
+    if len(group) > 1 and not np.array_equal(number_repeats(kept, numbers), kept.frame):
+        return _preprocessed(state, group[:1], rig)
+    capped = within_cap(kept, numbers, config) if len(kept) > config.matches_max else None
+    if capped is not None:
+        kept, numbers = kept.select(capped), numbers[capped]
+    edges = np.searchsorted(numbers, np.arange(len(cameras) + 1)).tolist()
+    for camera, (first, end) in enumerate(pairwise(edges)):
+        if end - first >= MIN_MATCHES:
+            block = camera_block(cameras[camera], kept.select(slice(first, end)), config)
+            block = block if len(group) == 1 else _with_enough(block)
+            found |= {camera: block} if len(block) else {}
+    return group, table, found
 
 
 def _with_enough(block: CameraBlock) -> CameraBlock:
