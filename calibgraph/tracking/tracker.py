@@ -212,7 +212,7 @@ class IncrementalCalibrator:
             if _columns(group[0].table) != _columns(one.table):
                 break
             group.append(one)
-        if not any(share_last_points(state, one.table) for one in group[1:]):
+        if not group[1:] or not any(share_last_points(state, one.table) for one in group):
             return group
         alone = [*takewhile(lambda one: without_repeats(state, one.table) is one.table, group)]
         return alone or group[:1]
