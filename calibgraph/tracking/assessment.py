@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,7 +36,6 @@ from calibgraph.trust.pose_posterior import (
 )
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
-from factors.conditioning import sigmas_of_hessian
 
 MeasureOnFrames = Callable[
     [Sequence[int], Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
@@ -135,13 +135,27 @@ def _verdict(state: _Judged, camera: int) -> Verdict:
         has_matches=True,
         used=state.counted(camera, "used"),
         frames=int(sums.frames[camera]),
-        covariance=None if np.isnan(own).any() else own,
-        data_sigmas=sigmas_of_hessian(sums.hessian[camera]),
+        has_error_bar=not np.isnan(own).any(),
+        is_free=bool(np.isnan(own).any()),
         conflicts=conflicts,
         scatter_only=not state.findings.states_common_error,
         tolerance=state.config.tolerance,
     )
-    return Verdict((*check_estimate(found), *_recent_checks(state, camera)))
+    checks = check_estimate(found), _sigma_checks(found, own), _recent_checks(state, camera)
+    return Verdict(tuple(chain.from_iterable(checks)))
+
+
+def _sigma_checks(found: Checked, covariance: Array) -> list[Check]:
+    """The error bar about its worst axes: the probability of an error is not known while driving.
+
+    Of a (6, 6) covariance: rotation [rad], translation [m].
+    """
+    if not found.has_error_bar:
+        return []
+    sigmas = np.sqrt(np.diag(covariance))
+    degrees, centimetres = np.degrees(sigmas[:3].max()), 100 * sigmas[3:].max()
+    values = ("sigma_rotation", degrees), ("sigma_translation", centimetres)
+    return [threshold(key, found.tolerance).check(float(value)) for key, value in values]
 
 
 def _stuck_check(repeated: int, status: Status) -> Check:
