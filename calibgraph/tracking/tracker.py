@@ -176,6 +176,9 @@ class IncrementalCalibrator:
         At most up to the end of an epoch. All their updates have the estimate after the last of
         them, which is as of one by one.
 
+        Args:
+            frames: in the order of their numbers, at least one.
+
         Raises:
             CorrespondenceError: if the first cannot be taken in, as of :meth:`update`.
         """
