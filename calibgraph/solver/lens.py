@@ -8,7 +8,7 @@ matches, S that by the scatter of frames, and k the variance that matches are le
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -18,11 +18,11 @@ from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.graph.components import EXACT
 from calibgraph.graph.lens import LensTerm, LensVariable
 from calibgraph.graph.variables import lens_key
-from calibgraph.model.config import LensPart
+from calibgraph.model.config import LensPart, Reported
 from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens import LensEstimate, LensSigmas
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.covariance import FittedObjective, positive_part
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
@@ -86,12 +86,9 @@ def lens_term(
     shared = within.efficiency * max(findings.place_variance * within.alike, of_matches)
     whole = within.efficiency**2 * (covariance @ scatter @ covariance) + shared * covariance
     excess = positive_part((whole - in_graph)[6:, 6:])
-    return LensTerm(lens, excess, np.zeros((len(excess), 0)), -_given_in(hessian, slice(6, None)))
-
-
-def _given_in(hessian: Array, columns: slice | list[int]) -> Array:
-    """(6, m) H_xx^-1 H_xe of some columns."""
-    return np.asarray(np.linalg.solve(hessian[:6, :6], hessian[:6, columns]))
+    return LensTerm(
+        lens, excess, np.zeros((len(excess), 0)), -np.linalg.solve(hessian[:6, :6], hessian[:6, 6:])
+    )
 
 
 def _by_place_at_minimum(
@@ -116,33 +113,65 @@ def _by_place_at_minimum(
 
 
 def lens_errors(at: FittedObjective) -> dict[int, Array]:
-    """Per number of a camera, (6, 6) covariance of its pose by what is not estimated of its lens.
-
-    Of the pose that fits the matches of a lens which errs as the rig states, or as that of a
-    calibrated camera, and, where the motion of the LiDAR is known, of a clock that errs so; in the
-    tangent of T_lidar_camera. An alignment makes up for a lens, in every recording nearly alike: it
-    errs by what other scenes would give. For a clock it makes up by the speed.
-    """
-    found, is_mount = {}, at.objective.config.of == "mount"
+    """Per number of a camera, (6, 6) covariance of its pose by what may err of its lens."""
+    found = {}
     for name, block in at.projections.items():
-        camera = at.objective.rig.cameras[name]
-        parts: list[LensPart] = [] if camera.model == "equirectangular" else [*_LENS]
-        if block.motion is not None:
-            parts += ["offset", "readout"] if camera.readout_sigma_s else ["offset"]
-        lens = LensVariable.of(camera, parts, LensSigmas.calibrated(camera))
+        lens, T = considered_lens(at.objective.rig.cameras[name], block), at.T_camera_lidar[name]
         estimated = at.objective.lenses[name].free.parameters if name in at.objective.lenses else ()
-        names = enumerate(lens.free.parameters, start=6)
-        rows = [row for row, name in names if name in _MAY_ERR and name not in estimated]
-        if rows:
-            T = at.T_camera_lidar[name][None]
-            hessian = block.summarize(T, None, lens.free, lens.values).hessian[0]
-            hessian[:6, :6] += WEAK
-            errors = _given_in(hessian, rows)[None]
-            if not is_mount:
-                errors = errors - _in_other_scenes(lens, block, at.T_camera_lidar[name], rows)
-            covariance = (errors @ errors.transpose(0, 2, 1)).mean(axis=0)
-            found[at.cameras.index(name)] = covariance + EXACT**2 * np.eye(6)
+        columns = lens_columns(lens, block, T)
+        own = error_by_lens(lens, columns, block, T, of=at.objective.config.of, estimated=estimated)
+        if own is not None:
+            found[at.cameras.index(name)] = own
     return found
+
+
+def considered_lens(camera: Camera, block: ProjectionBlock) -> LensVariable:
+    """What may err of a lens, as the rig states or as of a calibrated camera.
+
+    And of the clock, where the motion of the LiDAR is known.
+    """
+    parts: list[LensPart] = [] if camera.model == "equirectangular" else [*_LENS]
+    if block.motion is not None:
+        parts += ["offset", "readout"] if camera.readout_sigma_s else ["offset"]
+    return LensVariable.of(camera, parts, LensSigmas.calibrated(camera))
+
+
+def lens_columns(lens: LensVariable, block: ProjectionBlock, T_camera_lidar: Array) -> Array:
+    """(6, 6 + k) rows of the Hessian of some matches, of a pose and its lens: they add up."""
+    return block.summarize(T_camera_lidar[None], None, lens.free, lens.values).hessian[0, :6]
+
+
+def error_by_lens(  # noqa: PLR0913 - of what, where
+    lens: LensVariable,
+    columns: Array,
+    block: ProjectionBlock,
+    T_camera_lidar: Array,
+    *,
+    of: Reported,
+    estimated: Collection[str] = (),
+) -> Array | None:
+    """(6, 6) covariance of a pose by what is not estimated of its lens; None if nothing may err.
+
+    In the tangent of T_lidar_camera. An alignment makes up for a lens, in every recording nearly
+    alike: it errs by what other scenes would give. For a clock it makes up by the speed.
+
+    Args:
+        lens: by :func:`considered_lens`.
+        columns: by :func:`lens_columns`, of all matches.
+        block: some of them, at the distances of all.
+        T_camera_lidar: (4, 4).
+        of: which pose is reported.
+        estimated: parameters of the lens that are.
+    """
+    named = enumerate(lens.free.parameters, start=6)
+    rows = [row for row, name in named if name in _MAY_ERR and name not in estimated]
+    if not rows:
+        return None
+    errors = np.linalg.solve(columns[:, :6] + WEAK, columns[:, rows])[None]
+    if of == "alignment":
+        errors = errors - _in_other_scenes(lens, block, T_camera_lidar, rows)
+    covariance = (errors @ errors.transpose(0, 2, 1)).mean(axis=0)
+    return np.asarray(covariance + EXACT**2 * np.eye(6))
 
 
 def _in_other_scenes(
@@ -164,9 +193,8 @@ def _in_other_scenes(
     for number, scale in enumerate(_SCENES):
         spread = np.concatenate([usual_m * scale * depth * rays for depth in _DEPTHS])
         scene = ProjectionBlock(camera.lens, spread, np.tile(pixels, (len(_DEPTHS), 1)), loss="l2")
-        hessian = scene.summarize(np.eye(4)[None], None, lens.free, lens.values).hessian[0]
-        hessian[:6, :6] += WEAK
-        found[number] = _given_in(hessian, rows)
+        columns = lens_columns(lens, scene, np.eye(4))
+        found[number] = np.linalg.solve(columns[:, :6] + WEAK, columns[:, rows])
     return found
 
 

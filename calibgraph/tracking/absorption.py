@@ -13,6 +13,7 @@ from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
 from calibgraph.solver.columns import distortion_evidence
+from calibgraph.solver.lens import considered_lens, error_by_lens, lens_columns
 from calibgraph.solver.matches import BlockResiduals, CameraBlock, camera_blocks, merge
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.solver.robust import quantiles
@@ -280,7 +281,23 @@ def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
     state.put(camera, scales=scale, curvature=curvature, started=True, waiting=(), refused=())
     for block in usable:
         count_residuals(state, camera, Gated.at(T_camera_lidar, block, scale))
+    state.put(camera, references=T_camera_lidar)
+    consider_lens(state, camera, merge(usable))
     absorb_again(state, camera, usable, T_camera_lidar)
+
+
+def consider_lens(state: State, camera: int, matches: CameraBlock) -> Array:
+    """What may err of a camera's lens, by some matches and closed epochs; (6, 6 + k) of both."""
+    of, T = state.rig.cameras[state.names[camera]], state.references[camera]
+    inliers = matches.within_gate(T, state.scales[camera].gate_px)
+    block = matches.select(inliers if inliers.any() else ~inliers).with_scale(state.scales[camera])
+    lens, before = considered_lens(of, block), state.lens[camera]
+    columns = lens_columns(lens, block, T)
+    if before.shape == columns.shape:  # else motion became known, or none yet
+        columns = columns + before
+    found = error_by_lens(lens, columns, block, T, of=state.config.of)
+    state.put(camera, lens_errors=np.zeros((6, 6)) if found is None else found)
+    return columns
 
 
 def absorb_again(

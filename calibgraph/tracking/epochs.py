@@ -13,7 +13,12 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.within_place import WEAK
-from calibgraph.tracking.absorption import add_to_totals, bend_epoch, count_residuals
+from calibgraph.tracking.absorption import (
+    add_to_totals,
+    bend_epoch,
+    consider_lens,
+    count_residuals,
+)
 from calibgraph.tracking.estimate import EpochGraph, locate_places
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.gate import Gated, frame_sums
@@ -85,12 +90,13 @@ def _newest(state: State, graph: EpochGraph) -> Array:
 
 
 def _count_epoch(state: State, camera: int) -> None:
-    """Count the residuals of a camera's frames in the last epoch."""
+    """Count the residuals of a camera's frames in the last epoch, and what its lens may do."""
     own, first = state.matches_of(camera), int(state.numbers[state.closed])
     if own is not None and own[0].frame[-1] >= first:
         recent = own[0].select(own[0].frame >= first)
         pose, scale = state.references[camera], state.scales[camera]
         count_residuals(state, camera, Gated.at(pose, recent, scale))
+        state.put(camera, lens=consider_lens(state, camera, recent))
 
 
 def _set_references(state: State, references: Array) -> None:

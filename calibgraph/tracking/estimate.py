@@ -13,6 +13,7 @@ from functools import cached_property, lru_cache
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array, Mask
 from calibgraph.graph.by_place import QuadraticByPlace
@@ -307,7 +308,7 @@ class EpochGraph:
             T = self.window.T_camera_lidar(keys)
         else:
             T = retract_all(state.references, self.equation_5(sums))
-        covariance = self.window.covariance(keys)
+        covariance = self.window.covariance(keys) + block_diag(*state.lens_errors)
         few = np.repeat(sums.frames < ENOUGH_FRAMES, 6)
         covariance[few], covariance[:, few] = np.nan, np.nan
         return Estimate(T, covariance, sums, self._conflicts(state, sums), self.window)
@@ -438,7 +439,9 @@ class EpochGraph:
         every = every_place(state, self.places, sums)
         rows = np.flatnonzero(every.frames.any(axis=1))
         spread = self.spread if self._is_settled else spread_of(state, every)
-        return self.model(state, every, spread, rows)
+        found = enumerate(state.lens_errors)
+        lens_errors = {camera: covariance for camera, covariance in found if covariance.any()}
+        return replace(self.model(state, every, spread, rows), lens_errors=lens_errors)
 
     def equation_5_graph(self, state: State) -> gtsam.NonlinearFactorGraph:
         """Eq. 5 of the paper: priors, and a quadratic per camera."""

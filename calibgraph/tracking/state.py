@@ -139,6 +139,8 @@ class State:
         ungated: (n,) of all matches of older epochs, outliers too: Hessian by weights, gradient.
         groups: (n, 2) number of epochs, and how much these scatter.
         spread: of the frames of closed epochs.
+        lens: (6, 6 + k) per camera, of closed epochs, by ``calibgraph.solver.lens.lens_columns``.
+        lens_errors: (n, 6, 6) covariance of its pose by what may err of its lens.
         curvature: (n, 6, 6) M of :meth:`calibgraph.tracking.gate.Gated.curvature`.
         total: sum over all absorbed frames, slowly forgotten: (6 n, 6 n) scatter.
         total_hessian: (n, 6, 6) and of Hessians.
@@ -190,6 +192,8 @@ class State:
     ungated: Sums
     groups: Array
     spread: Spread
+    lens: tuple[Array, ...]
+    lens_errors: Array
     curvature: Array
     total: Array
     total_hessian: Array
@@ -252,6 +256,8 @@ class State:
             ungated=Sums.zeros(n),
             groups=np.zeros((n, 2)),
             spread=Spread.unknown(n),
+            lens=(np.zeros((6, 6)),) * n,
+            lens_errors=np.zeros((n, 6, 6)),
             curvature=np.tile(np.eye(6), (n, 1, 1)),
             total=np.zeros((6 * n, 6 * n)),
             total_hessian=np.zeros((n, 6, 6)),

@@ -32,7 +32,7 @@ from factors import Lens, ProjectionBlock
 
 Kind = TypeVar("Kind")
 
-_MARK = b"calibgraph-tracker/14\n"
+_MARK = b"calibgraph-tracker/15\n"
 _BODY = len(_MARK) + hashlib.sha256().digest_size
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
 

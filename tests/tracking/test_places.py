@@ -30,7 +30,6 @@ from calibgraph.solver.places import start_values
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
 from calibgraph.trust.evidence import gather
 from tests.conftest import stereo_relative_pose
-from tests.draws.lenses import with_known_lenses
 from tests.draws.places import Drawn, draw_places, tied
 from tests.solver.latent import all_values
 from tests.tracking.drives import drive, pair_of, track_draw
@@ -62,7 +61,6 @@ def sigmas_of_pair(T: dict[str, Array], joint: Array) -> Array:
 def drawn_of(places: int, frames: int, rounds: int, *, tie: bool) -> Drawn:
     rng = np.random.default_rng(places)
     drawn = draw_places(places, 100, rng, frames=frames, rounds=rounds)
-    drawn = replace(drawn, rig=with_known_lenses(drawn.rig))
     return tied(drawn, rng, deg=0.02, cm=0.3) if tie else drawn
 
 
@@ -319,11 +317,8 @@ def test_a_frame_of_another_place_disagrees_by_what_places_differ_by() -> None:
 
 
 def test_bends_widen_the_error_bar_as_in_a_batch_and_survive_a_restart(tmp_path: Path) -> None:
-    """Of cameras that look 90 degrees apart; motion displaces their views by other amounts.
-
-    Their lenses are known exactly: the tracker's error bar of a mount leaves the lens out.
-    """
-    rig = with_known_lenses(pair_of())
+    """Of cameras that look 90 degrees apart; motion displaces their views by other amounts."""
+    rig = pair_of()
     turn = np.eye(4)
     turn[:3, :3] = gtsam.Rot3.Ry(np.pi / 2).matrix()
     rig = rig.moved_to(
