@@ -31,7 +31,7 @@ from calibgraph.solver.error_model import fit_errors
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pairs import pair_terms
 from calibgraph.solver.places import ErrorFit, fit_latent_poses, start_values
-from factors import ProjectionBlock, placed_pair_factor
+from factors import ProjectionBlock, placed_factor
 from tests.conftest import stereo_relative_pose
 from tests.solver.latent import all_values, linearized
 from tests.solver.test_camera_pairs import simulated_pairs
@@ -200,7 +200,7 @@ def test_the_factor_of_a_pair_and_its_cloud_is_that_of_the_moved_cameras(pair: R
     values = gtsam.Values()
     for key, pose in enumerate([cloud, *poses]):
         values.insert(key, pose)
-    factor = placed_pair_factor(0, 1, 2, term.block)
+    factor = placed_factor([0, 1, 2], term.block)
     expected = term.block.sums(*(cloud.between(pose) for pose in poses))
     assert 2 * factor.error(values) == pytest.approx(expected.cost, rel=1e-9)
     jacobian, right = factor.linearize(values).jacobian()
@@ -238,7 +238,8 @@ def test_a_continued_fit_is_that_of_its_start(pair: Rig) -> None:
         found, expected = (fit_latent_poses(model, start) for start in starts)
         for name, T in found.T_camera_lidar.items():
             np.testing.assert_allclose(T, expected.T_camera_lidar[name], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-9, atol=1e-13)
+        # Exact ties have 1e10 of information, beside 1e5 of the matches: 1e-16 of it counts.
+        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-8, atol=1e-13)
 
 
 def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Rig) -> None:
