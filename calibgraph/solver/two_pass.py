@@ -30,7 +30,7 @@ from calibgraph.solver.pairs import PairTerm, pair_graph, rows_of_pair
 from calibgraph.solver.preprocess import FILTERS
 from calibgraph.solver.robust import ResidualScale
 from calibgraph.solver.stage1 import CameraStage1, Stage1
-from factors import BlockSums, lossless_factor
+from factors import BlockSums, ProjectionBlock, lossless_factor
 
 MAX_ITERATIONS = 200
 """Of Levenberg-Marquardt."""
@@ -149,11 +149,16 @@ class Objective:
             scales: of the residuals; only cameras that have one get a reprojection term. Without
                 any, there are no terms of pairs.
         """
-        blocks = {name: self.blocks[name].with_scale(scale) for name, scale in scales.items()}
+        blocks, pairs = self._at(scales)
         keys = {name: pose_key(self.cameras, name) for name in self.cameras}
-        pairs = self.pairs if scales else ()
-        reprojection = projection_graph(self.cameras, blocks if self.uses_correspondences else {})
+        reprojection = projection_graph(self.cameras, blocks)
         return join(reprojection, self.pose_graph, pair_graph(pairs, keys))
+
+    def _at(self, scales: Scales) -> tuple[dict[str, ProjectionBlock], tuple[PairTerm, ...]]:
+        """The correspondences of each camera, and the pairs, that the terms use."""
+        if not (scales and self.uses_correspondences):
+            return {}, ()
+        return {n: self.blocks[n].with_scale(scale) for n, scale in scales.items()}, self.pairs
 
     @cached_property
     def pose_graph(self) -> gtsam.NonlinearFactorGraph:
@@ -207,10 +212,8 @@ class Objective:
 
         Their sums add, and an optimizer then asks once, not of each camera and pair.
         """
-        blocks = {} if not self.uses_correspondences else self.blocks
-        scaled = {name: blocks[name].with_scale(scale) for name, scale in scales.items() if blocks}
-        pairs = self.pairs if scales else ()
-        seen = {*scaled, *(name for pair in pairs for name in (pair.a, pair.b))}
+        blocks, pairs = self._at(scales)
+        seen = {*blocks, *(name for pair in pairs for name in (pair.a, pair.b))}
         names = [name for name in self.cameras if name in seen]
         rows = {name: np.r_[pose_rows(number)] for number, name in enumerate(names)}
         tied = [(rows_of_pair(names, pair), pair) for pair in pairs]
@@ -219,7 +222,7 @@ class Objective:
         def sums_at(*poses: gtsam.Pose3) -> tuple[BlockSums, None]:
             at, cost = dict(zip(names, poses, strict=True)), 0.0
             hessian, gradient = np.zeros((size, size)), np.zeros(size)
-            parts = [(rows[name], block.sums(at[name])) for name, block in scaled.items()]
+            parts = [(rows[name], block.sums(at[name])) for name, block in blocks.items()]
             parts += [(own, pair.block.sums(at[pair.a], at[pair.b])) for own, pair in tied]
             for own, sums in parts:
                 hessian[own[:, None], own] += sums.hessian
