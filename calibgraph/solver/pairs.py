@@ -86,10 +86,6 @@ class PairTerm:
         """The features within the gate."""
         return self.select(self.errors_px(T_camera_lidar) <= GATE_SIGMAS * sigma_px)
 
-    def factor(self, key_a: int, key_b: int) -> gtsam.NonlinearFactor:
-        """The features as one lossless factor on ``T_lidar_a`` and ``T_lidar_b``."""
-        return pair_block_factor(key_a, key_b, self.block)
-
     def sums(self, T_camera_lidar: Mapping[str, Array]) -> BlockSums:
         """H (12, 12), b (12,) and c, in the tangents of ``T_lidar_a`` and ``T_lidar_b``."""
         return self.block.sums(*self._poses(T_camera_lidar))
@@ -167,7 +163,7 @@ def pair_graph(terms: Iterable[PairTerm], keys: Mapping[str, int]) -> gtsam.Nonl
     """
     graph = gtsam.NonlinearFactorGraph()
     for term in terms:
-        graph.add(term.factor(keys[term.a], keys[term.b]))
+        graph.add(pair_block_factor(keys[term.a], keys[term.b], term.block))
     return graph
 
 
