@@ -4,35 +4,31 @@ Every factor acts on ``T_lidar_camera``, the pose of a camera in the LiDAR frame
 This package is a leaf: it imports numpy, numba and gtsam, and nothing of calibgraph.
 """
 
-from factors.arrays import BlockSums, square_root, to_runs
+from factors.arrays import BlockSums, to_runs
 from factors.block import (
     ProjectionBlock,
     block_factor,
-    columns_factor,
     fields_px,
     projection_factor,
     projection_residual,
 )
 from factors.columns import Clock, Columns, displace
 from factors.conditioning import (
-    smallest_scaled_eigenvalue,
     smallest_scaled_eigenvalues,
     unit_diagonal,
 )
 from factors.lens import Lens, LensModel, ray_spreads, unproject
 from factors.loss import LOSSES, LossName, robust_noise
 from factors.pairs import (
-    EpipolarBlock,
     PairBlock,
-    SurfaceBlock,
     pair_block_factor,
-    pair_chain,
-    placed_pair_factor,
+    placed_factor,
 )
 from factors.pose import (
     camera_prior_factor,
     displaced_between_factor,
     linear_factor,
+    lossless_factor,
     pose_sigmas,
     relative_pose_factor,
     relative_prior_factor,
@@ -41,7 +37,6 @@ from factors.pose import (
 __all__ = [
     "LOSSES",
     "BlockSums",
-    "EpipolarBlock",
     "Clock",
     "Columns",
     "Lens",
@@ -49,17 +44,15 @@ __all__ = [
     "LossName",
     "PairBlock",
     "ProjectionBlock",
-    "SurfaceBlock",
     "block_factor",
     "camera_prior_factor",
-    "columns_factor",
     "displaced_between_factor",
     "displace",
     "fields_px",
     "linear_factor",
+    "lossless_factor",
     "pair_block_factor",
-    "pair_chain",
-    "placed_pair_factor",
+    "placed_factor",
     "pose_sigmas",
     "projection_factor",
     "projection_residual",
@@ -67,9 +60,7 @@ __all__ = [
     "relative_pose_factor",
     "relative_prior_factor",
     "robust_noise",
-    "smallest_scaled_eigenvalue",
     "smallest_scaled_eigenvalues",
-    "square_root",
     "to_runs",
     "unit_diagonal",
     "unproject",

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self, TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,11 @@ class RobustBlock:
         other._check_loss()
         return other
 
+    def with_variance(self, factor: float) -> Self:
+        """Residuals with so many times the variance; the loss bends at the same ones [px]."""
+        root = factor**0.5
+        return self.rescale(scale=self.scale / root, sigma=self.sigma * root, loss=self.loss)
+
     def _copy(self) -> Self:
         """A block with the same attributes, to be changed; faster than ``copy.copy``."""
         other = object.__new__(type(self))
@@ -75,12 +80,6 @@ class RobustBlock:
         if not (self.scale > 0 and self.sigma > 0):
             name = "sigma" if self.scale > 0 else "scale"
             raise ValueError(f"{name} must be positive, found {getattr(self, name)}")
-
-    def _replace(self, **values: Any) -> None:
-        """Set attributes of a block that is being made; arrays as views that are read-only."""
-        for name, value in values.items():
-            array = isinstance(value, np.ndarray)
-            self.__dict__[name] = read_only(value) if array else value
 
 
 def read_only(array: NDArray[_Number]) -> NDArray[_Number]:

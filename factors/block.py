@@ -29,7 +29,6 @@ from factors.arrays import (
     pack_sums,
     read_only,
     rows_of_root,
-    square_root,
     to_runs,
     unpack_sums,
 )
@@ -48,11 +47,12 @@ from factors.kernel import (
 )
 from factors.lens import Lens
 from factors.loss import loss_id, robust_noise
-from factors.pose import custom_factor, keep_last
+from factors.pose import custom_factor, lossless_factor
 
 Array = NDArray[np.float64]
 
-_NO_STEP = np.empty(0)
+_NO_STEP = contiguous(np.empty(0))
+_NO_COLUMNS = contiguous(np.empty((0, 3, 0))), np.empty(0, np.int64), np.empty(0)
 _WIDTHS = {"points_lidar_m": 3, "pixels_px": 2, "sqrt_information": 3, "motion": 7}
 
 
@@ -89,6 +89,7 @@ class ProjectionBlock(RobustBlock):
     _columns: Array = field(init=False, repr=False)  # (5, n) x y z u v, or (12, n) with the motion
     _whitening: Array = field(init=False, repr=False)  # (3, n), (1, n) or (0, n), see the kernel
     _whole: NDArray[np.int64] = field(init=False, repr=False)  # (1, 2) the run of all
+    _has_rays: bool = field(init=False, repr=False)  # whether RAYS serves, if no point is too near
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)
@@ -109,6 +110,7 @@ class ProjectionBlock(RobustBlock):
             _columns=columns,
             _whitening=columns[:0] if root is None else root[:rows],
             _whole=to_runs(np.array([0, columns.shape[1]])),
+            _has_rays=rows < MATRICES and self.lens.is_undistorted_pinhole,
             points_lidar_m=columns[:3].T,
             pixels_px=columns[3:5].T,
             motion=columns[5:].T if len(columns) > 5 else None,  # noqa: PLR2004
@@ -235,13 +237,14 @@ class ProjectionBlock(RobustBlock):
         values: Array | None = None,
         step: Array = _NO_STEP,
     ) -> None:
-        free = Columns(self.lens) if free is None else free
-        lens = free.lens if values is None else free.at(values)
-        columns = self._columns_at(free, np.zeros(len(free)) if values is None else values)
-        moves = free.displacements(columns[:3], columns[4], columns[5:11])
-        numbers, units = free.packed
+        lens, columns, (moves, numbers, units) = self.lens, self._columns, _NO_COLUMNS
+        if free is not None:
+            lens = free.lens if values is None else free.at(values)
+            columns = self._columns_at(free, np.zeros(len(free)) if values is None else values)
+            moves = contiguous(free.displacements(columns[:3], columns[4], columns[5:11]))
+            numbers, units = free.packed
         summarize(lens.kind)(
-            lens.packed, contiguous(T_camera_lidar), columns, contiguous(moves), self._whitening,
+            lens.packed, contiguous(T_camera_lidar), columns, moves, self._whitening,
             loss_id(self.loss), self._scales(scales), contiguous(runs), numbers, units,
             contiguous(step), wanted, out,
         )  # fmt: skip
@@ -278,12 +281,12 @@ class ProjectionBlock(RobustBlock):
     ) -> Array:
         """(r, 28) as :meth:`run_sums`: 21 of the upper triangle of H, 6 of b, 1 of c."""
         sums = np.empty((len(runs), SUMS))
-        if self._has_rays():
+        if self._has_rays:
             accumulate(
                 self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
                 loss_id(self.loss), self._scales(scales), contiguous(runs), wanted, sums,
             )  # fmt: skip
-        if not self._has_rays() or np.isnan(sums[:, 27]).any():
+        if not self._has_rays or np.isnan(sums[:, 27]).any():
             products = np.zeros((len(runs), 1, 8, 7))
             self._summarize(T_camera_lidar, runs, wanted, products, scales=scales)
             sums = pack_sums(products[:, 0])
@@ -292,10 +295,6 @@ class ProjectionBlock(RobustBlock):
     def _scales(self, scales: Array | None) -> Array:
         """Of the loss: every one has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2."""
         return np.array([self.scale * self.sigma]) if scales is None else scales * self.sigma
-
-    def _has_rays(self) -> bool:
-        """Whether the kernel RAYS serves, unless a point is too near."""
-        return len(self._whitening) < MATRICES and self.lens.is_undistorted_pinhole
 
     def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable."""
@@ -342,20 +341,10 @@ class ProjectionBlock(RobustBlock):
         )  # fmt: skip
         return valid
 
-    def error_and_jacobian(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, Array]:
-        """The (7,) error and (7, 6) Jacobian of the block factor."""
-        return square_root(self.sums(T_lidar_camera))
-
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
     """The block as one factor on the variable ``T_lidar_camera``, equal to its separate factors."""
-    residual = keep_last(block.error_and_jacobian)
-
-    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
-        error, jacobian = residual(values.atPose3(key))
-        return error, [jacobian]
-
-    return custom_factor(gtsam.noiseModel.Unit.Create(7), [key], linearize)
+    return lossless_factor([key], lambda pose: (block.sums(pose), None))
 
 
 def fields_px(
@@ -385,30 +374,6 @@ def fields_px(
     columns = block.columns(T_camera_lidar, free)[:-1]
     columns[:6] *= -1.0  # T_lidar_camera exp(-xi) is exp(xi) T_camera_lidar, inverted
     return pixels, columns
-
-
-def columns_factor(
-    keys: Sequence[int], block: ProjectionBlock, free: Columns
-) -> gtsam.CustomFactor:
-    """The block as one factor on the pose and further columns, equal to its separate factors.
-
-    Args:
-        keys: of ``T_lidar_camera`` and of the columns, a vector of k numbers; a pose
-            ``T_lidar_cloud`` before these displaces the points.
-        block: of the camera.
-        free: the columns.
-    """
-
-    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
-        *clouds, pose = (values.atPose3(key) for key in keys[:-1])
-        seen = clouds[0].between(pose) if clouds else pose
-        sums = block.summarize(_T_camera_lidar(seen)[None], None, free, values.atVector(keys[-1]))
-        found, jacobian = square_root(BlockSums(sums.hessian[0], sums.gradient[0], sums.cost[0]))
-        by_pose = jacobian[:, :6]
-        by_cloud = [-by_pose @ seen.inverse().AdjointMap()] if clouds else []
-        return found, [*by_cloud, by_pose, jacobian[:, 6:]]
-
-    return custom_factor(gtsam.noiseModel.Unit.Create(7 + len(free)), keys, linearize)
 
 
 def projection_residual(

@@ -29,19 +29,12 @@ def unit_diagonal(hessian: Array) -> tuple[Array, Array]:
     return hessian / np.outer(units, units), units
 
 
-def smallest_scaled_eigenvalue(hessian: Array) -> float:
-    """Of the matrix scaled to a unit diagonal: 1 if no unknowns are correlated, 0 if one is free.
-
-    Rounding noise of a singular matrix is near 1e-15.
-
-    Args:
-        hessian: (n, n), positive semidefinite.
-    """
-    return float(smallest_scaled_eigenvalues(hessian[None])[0])
-
-
 def smallest_scaled_eigenvalues(hessians: Array) -> Array:
-    """(f,) :func:`smallest_scaled_eigenvalue` of each of (f, n, n) matrices."""
+    """(f,) of (f, n, n) positive semidefinite matrices, scaled to a unit diagonal.
+
+    1 if no unknowns are correlated, 0 if one is free. Rounding noise of a singular one is near
+    1e-15.
+    """
     diagonals = np.einsum("fii->fi", hessians)
     known = (diagonals > 0).all(axis=1)
     units = np.sqrt(np.where(known[:, None], diagonals, 1.0))

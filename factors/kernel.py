@@ -67,6 +67,9 @@ FOCAL, ASPECT, CENTRE_X, CENTRE_Y, DISPLACED, P1, P2 = range(7)
 """Columns beside the pose: of a lens, or of what displaces the points; the radial coefficient k of
 a power is P2 plus the power."""
 
+WIDTH = 2 * TILE + 8
+"""Of rows with u and then v; those of 4096 bytes would share cache lines."""
+
 _SMALL = 1e-100  # far from the smallest float by more than four factors
 
 
@@ -127,8 +130,7 @@ def summarize(kind: int) -> Any:
         below it c and the sum of psi; then, if there is room, - sum 2 psi' t t^T.
         """
         size = 7 + len(free)
-        rows, bends = np.empty((size, 2, TILE)), np.empty((size, 1, TILE))
-        tile = np.empty((ROWS, TILE))
+        rows, bends, tile = np.empty((size, WIDTH)), np.empty((size, TILE)), np.empty((ROWS, TILE))
         for run in range(len(runs)):
             T, scale = poses[run if len(poses) > 1 else 0], scales[run if len(scales) > 1 else 0]
             for start in range(runs[run, 0], runs[run, 1], TILE):
@@ -145,21 +147,20 @@ def summarize(kind: int) -> Any:
                         )
                 residuals = rows[size - 1]
                 for i in range(n):
-                    residuals[0, i], residuals[1, i] = tile[RU, i], tile[RV, i]
+                    residuals[i], residuals[np.uint64(n + i)] = tile[RU, i], tile[RV, i]
                 if len(whitening):
                     whiten(whitening, start, n, rows, size - 1 if wanted == COST else 0)
                 if wanted == COLUMNS:
                     for k in range(size):
                         for i in range(n):
-                            out[0, k, 0, start + i] = rows[k, 0, i]
-                            out[0, k, 1, start + i] = rows[k, 1, i]
+                            out[0, k, 0, start + i] = rows[k, i]
+                            out[0, k, 1, start + i] = rows[k, n + i]
                     continue
                 for k in range(len(step)):
-                    for i in range(n):
-                        residuals[0, i] += step[k] * rows[k, 0, i]
-                        residuals[1, i] += step[k] * rows[k, 1, i]
+                    for i in range(2 * n):
+                        residuals[i] += step[k] * rows[k, i]
                 psi, sums = tile[PSI], out[run, 0]
-                sums[size, 0] += weigh(loss, scale, n, residuals[0], residuals[1], psi)
+                sums[size, 0] += weigh(loss, scale, n, residuals, residuals[n:], psi)
                 if wanted == COST:
                     continue
                 if wanted == CURVATURE:
@@ -172,9 +173,9 @@ def summarize(kind: int) -> Any:
                 sums[size, 1] += total
                 for k in range(size):
                     for i in range(n):
-                        rows[k, 0, i] *= psi[i]
-                        rows[k, 1, i] *= psi[i]
-                add_products(n, rows, sums)
+                        rows[k, i] *= psi[i]
+                        rows[k, np.uint64(n + i)] *= psi[i]
+                add_products(2 * n, rows, sums)
 
     return summarize_runs
 
@@ -188,11 +189,10 @@ def fill_rows(n, tile, rows):  # type: ignore[no-untyped-def]
     for axis in range(2):
         gx, gy, gz = tile[UX + 3 * axis], tile[UY + 3 * axis], tile[UZ + 3 * axis]
         for i in range(n):
-            x, y, z = tile[X, i], tile[Y, i], tile[Z, i]
-            rows[0, axis, i] = gy[i] * z - gz[i] * y
-            rows[1, axis, i] = gz[i] * x - gx[i] * z
-            rows[2, axis, i] = gx[i] * y - gy[i] * x
-            rows[3, axis, i], rows[4, axis, i], rows[5, axis, i] = -gx[i], -gy[i], -gz[i]
+            x, y, z, at = tile[X, i], tile[Y, i], tile[Z, i], np.uint64(axis * n + i)
+            rows[0, at], rows[1, at] = gy[i] * z - gz[i] * y, gz[i] * x - gx[i] * z
+            rows[2, at] = gx[i] * y - gy[i] * x
+            rows[3, at], rows[4, at], rows[5, at] = -gx[i], -gy[i], -gz[i]
 
 
 @compiled(part=True, fastmath=FAST)
@@ -220,7 +220,7 @@ def fill_columns(kind, lens, T, columns, moves, start, n, free, units, tile, row
                     tile[RV, i] + columns[4, at] - lens[3],
                 )
                 u, v = by_lens(free[k], lens, a, b, s, over, u, v)
-            rows[6 + k, 0, i], rows[6 + k, 1, i] = units[k] * u, units[k] * v
+            rows[6 + k, i], rows[6 + k, n + i] = units[k] * u, units[k] * v
 
 
 @compiled(part=True)
@@ -261,26 +261,25 @@ def by_lens(number, lens, a, b, s, over, u, v):  # type: ignore[no-untyped-def]
 def fill_bends(loss, scale, n, psi, rows, bends):  # type: ignore[no-untyped-def]
     """Each column's part of J^T r, times the root of -2 psi'."""
     last = len(rows) - 1
-    ru, rv, roots = rows[last, 0], rows[last, 1], bends[last, 0]
+    ru, rv, roots = rows[last], rows[last][n:], bends[last]
     for i in range(n):
         s = ru[i] * ru[i] + rv[i] * rv[i]
         least = s if s > 0.0 else 1.0
         roots[i] = math.sqrt(max(psi[i] - weight_along(loss, scale, s, psi[i]), 0.0) / least)
     for k in range(len(rows)):
         for i in range(n):
-            bends[k, 0, i] = roots[i] * (rows[k, 0, i] * ru[i] + rows[k, 1, i] * rv[i])
+            bends[k, i] = roots[i] * (rows[k, i] * ru[i] + rows[k, np.uint64(n + i)] * rv[i])
 
 
 @compiled(part=True, fastmath=FAST)
 def add_products(length, rows, out):  # type: ignore[no-untyped-def]
     """Add the products of all pairs of rows to an upper triangle."""
     for i in range(len(rows)):
+        first = rows[i]
         for j in range(i, len(rows)):
-            total = 0.0
-            for axis in range(rows.shape[1]):
-                first, second = rows[i, axis], rows[j, axis]
-                for k in range(length):
-                    total += first[k] * second[k]
+            second, total = rows[j], 0.0
+            for k in range(length):
+                total += first[k] * second[k]
             out[i, j] += total
 
 
@@ -290,13 +289,13 @@ def whiten(whitening, start, n, rows, first):  # type: ignore[no-untyped-def]
     for k in range(first, len(rows)):
         row = rows[k]
         for i in range(n):
-            at = np.uint64(start + i)
+            at, behind = np.uint64(start + i), np.uint64(n + i)
             if len(whitening) == MATRICES:
-                row[0, i] = whitening[0, at] * row[0, i] + whitening[1, at] * row[1, i]
-                row[1, i] *= whitening[2, at]
+                row[i] = whitening[0, at] * row[i] + whitening[1, at] * row[behind]
+                row[behind] *= whitening[2, at]
             else:
-                row[0, i] *= whitening[0, at]
-                row[1, i] *= whitening[0, at]
+                row[i] *= whitening[0, at]
+                row[behind] *= whitening[0, at]
 
 
 @compiled(part=True, fastmath=FAST)

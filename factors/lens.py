@@ -48,7 +48,7 @@ ORDERS: dict[LensModel, str] = {
     "equirectangular": "[]",
 }
 """The distortion coefficients of each model in their order, which is OpenCV's."""
-_NO_PIXELS, _NO_JACOBIANS, _NO_VALIDITY = np.empty((0, 2)), np.empty((0, 6)), np.empty(0, np.bool_)
+_NO_JACOBIANS, _NO_VALIDITY = np.empty((0, 6)), np.empty(0, np.bool_)
 _MAX_PLANE_RADIUS = math.tan(math.radians(85.0))  # polynomials are not fitted beyond
 _TABLE = 500
 _MAX_XI = 100.0  # beyond, the model is a parallel projection, whose focal length is not determined
@@ -158,13 +158,6 @@ class Lens:
         _project_many(self.kind)(self.packed, points, pixels, valid, _NO_JACOBIANS)
         return pixels, valid
 
-    def are_projectable(self, points_lidar_m: Array, T_camera_lidar: Array) -> NDArray[np.bool_]:
-        """(n,) whether (n, 3) points in the LiDAR frame have a real projection, as `project`."""
-        points = contiguous(points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3])
-        valid = np.empty(len(points), np.bool_)
-        _project_many(self.kind)(self.packed, points, _NO_PIXELS, valid, _NO_JACOBIANS)
-        return valid
-
     def project_with_jacobian(self, points_camera_m: ArrayLike) -> tuple[Array, Array]:
         """Project points: (n, 2) pixels, and their (n, 2, 3) derivatives by the points."""
         points = contiguous(np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3))
@@ -225,11 +218,10 @@ def _project_many(kind: int) -> Any:
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
             if len(valid):
                 valid[k] = is_projectable(kind, lens, x, y, z)
-            if len(pixels):
-                projection = project_one(kind, lens, x, y, z)
-                pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
-                for place in range(6 if len(jacobians) else 0):
-                    jacobians[k, place] = projection[2 + place]
+            projection = project_one(kind, lens, x, y, z)
+            pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
+            for place in range(6 if len(jacobians) else 0):
+                jacobians[k, place] = projection[2 + place]
 
     return run
 

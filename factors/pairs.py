@@ -26,46 +26,115 @@ All features of a block are one lossless factor, as of ``factors.block``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Self
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.arrays import BlockSums, RobustBlock, contiguous, square_root
+from factors.arrays import BlockSums, RobustBlock, check_shape, contiguous
 from factors.block import ProjectionBlock
+from factors.columns import Columns
 from factors.compiled import compiled
-from factors.kernel import FAST, TILE, add_products, weigh
+from factors.kernel import FAST, TILE, WIDTH, add_products, weigh
 from factors.lens import Lens, ray_spreads, unproject
 from factors.lens_kernels import is_projectable, project_one, subtract_columns
 from factors.loss import loss_id
-from factors.pose import custom_factor, keep_last
+from factors.pose import lossless_factor
 
 Array = NDArray[np.float64]
 
-_EPIPOLAR = -1  # in place of a kind of lens
+EPIPOLAR = -1  # in place of a kind of lens
 _LEAST_K = 1e-9  # in place of less: A's centre is on the plane
 _LEAST_SQUARE = 1e-300  # of D: less has no baseline, or both rays are along it
 
 
+@dataclass(frozen=True, eq=False)
 class PairBlock(RobustBlock):
-    """Features of camera A, seen in camera B. Immutable."""
+    """Features of camera A, seen in camera B. Immutable. Built by one of its static methods.
 
-    _features: Array  # (n, 8) f, q and the pixel in B; (n, 18) f_a, F_a, f_b, F_b
-    _lens: tuple[int, Array]  # kind of B's, and its parameters
+    Attributes:
+        kind: of B's lens; EPIPOLAR, where features have no surface.
+        lens: parameters of B's.
+        features: (n, 8) f, q and the pixel in B; of epipolar ones, (n, 18) f_a, F_a, f_b, F_b.
+        loss: name of the robust loss.
+        scale: of the residual over sigma, at which the loss bends.
+        sigma: what all residuals are divided by [px].
+
+    Raises:
+        ValueError: on an unknown loss, a scale or sigma <= 0.
+    """
+
+    kind: int
+    lens: Array
+    features: Array
+    loss: str = "cauchy"
+    scale: float = 4.0
+    sigma: float = 1.0
+
+    def __post_init__(self) -> None:
+        self._check_loss()
+        self.__dict__["features"] = contiguous(self.features)
+
+    @staticmethod
+    def of_surfaces(lens_b: Lens, rays_a: Array, planes: Array, pixels_b: Array) -> PairBlock:
+        """Features with their surfaces.
+
+        Args:
+            lens_b: of camera B.
+            rays_a: (n, 3) unit rays f in A's frame.
+            planes: (n, 3) q in the LiDAR frame [1/m].
+            pixels_b: (n, 2) the same features in B [px].
+
+        Raises:
+            ValueError: on wrong shapes, or values that are not finite.
+        """
+        n = len(rays_a)
+        for name, array, width in (
+            ("rays_a", rays_a, 3),
+            ("planes", planes, 3),
+            ("pixels_b", pixels_b, 2),
+        ):
+            check_shape(name, array, (n, width))
+        return PairBlock(lens_b.kind, lens_b.packed, np.column_stack([rays_a, planes, pixels_b]))
+
+    @staticmethod
+    def epipolar(lens_a: Lens, lens_b: Lens, pixels_a: Array, pixels_b: Array) -> PairBlock:
+        """Features without a surface.
+
+        Args:
+            lens_a: of the one camera.
+            lens_b: of the other.
+            pixels_a: (n, 2) features in the one image [px]; every pixel must have a ray.
+            pixels_b: (n, 2) the same features in the other.
+
+        Raises:
+            ValueError: on wrong shapes, and pixels without a ray.
+        """
+        n, parts = len(pixels_a), []
+        for name, lens, pixels in (("pixels_a", lens_a, pixels_a), ("pixels_b", lens_b, pixels_b)):
+            check_shape(name, pixels, (n, 2))
+            rays, valid = unproject(lens, pixels)
+            if not valid.all():
+                row = int(np.flatnonzero(~valid)[0])
+                raise ValueError(f"{name}[{row}] has no ray: {pixels[row]}")
+            parts += [rays, ray_spreads(lens, rays).transpose(0, 2, 1).reshape(n, 6)]
+        return PairBlock(EPIPOLAR, lens_b.packed, np.hstack(parts))
+
+    @property
+    def axes(self) -> int:
+        """Of a residual."""
+        return 1 if self.kind == EPIPOLAR else 2
 
     def __len__(self) -> int:
-        return len(self._features)
+        return len(self.features)
 
     def select(self, rows: NDArray[Any]) -> Self:
         """The block with only some features: a mask or an index array."""
-        other, of_features = self._copy(), len(self)
-        for name, value in self.__dict__.items():
-            if isinstance(value, np.ndarray) and len(value) == of_features:
-                other.__dict__[name] = contiguous(value[rows])
+        other = self._copy()
+        other.__dict__["features"] = contiguous(self.features[rows])
         return other
 
     def sums(self, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> BlockSums:
@@ -101,165 +170,41 @@ class PairBlock(RobustBlock):
         self, T_lidar_a: Array, T_lidar_b: Array, edges: NDArray[np.int64], out: tuple[Any, ...]
     ) -> None:
         _sum_runs(
-            *self._lens, contiguous(T_lidar_a), contiguous(T_lidar_b), self._features,
+            self.kind, self.lens, contiguous(T_lidar_a), contiguous(T_lidar_b), self.features,
             loss_id(self.loss), self.scale, self.sigma, contiguous(edges), *out,
         )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceBlock(PairBlock):
-    """Features of camera A with their surfaces, and their pixels in camera B.
-
-    Attributes:
-        lens_b: of camera B.
-        rays_a: (n, 3) unit rays f in A's frame.
-        planes_lidar_per_m: (n, 3) q in the LiDAR frame.
-        pixels_b_px: (n, 2) the same features in B.
-        loss: name of the robust loss.
-        scale: of the residual over sigma, at which the loss bends.
-        sigma: what all residuals are divided by [px].
-
-    Raises:
-        ValueError: on wrong shapes, values that are not finite, an unknown loss, a scale or sigma
-            <= 0.
-    """
-
-    lens_b: Lens
-    rays_a: Array
-    planes_lidar_per_m: Array
-    pixels_b_px: Array
-    loss: str = "cauchy"
-    scale: float = 4.0
-    sigma: float = 1.0
-    _features: Array = field(init=False, repr=False)
-    _lens: tuple[int, Array] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        n = len(self.rays_a)
-        self._check_loss()
-        for name, width in (("rays_a", 3), ("planes_lidar_per_m", 3), ("pixels_b_px", 2)):
-            array = getattr(self, name)
-            if array.shape != (n, width) or not np.isfinite(array).all():
-                raise ValueError(
-                    f"{name}: expected {(n, width)} finite values, found {array.shape}"
-                )
-        features = np.column_stack([self.rays_a, self.planes_lidar_per_m, self.pixels_b_px])
-        lens = self.lens_b.kind, self.lens_b.packed
-        self.__dict__.update(_features=contiguous(features), _lens=lens)
+def pair_block_factor(key_a: int, key_b: int, block: PairBlock) -> gtsam.CustomFactor:
+    """All features as one factor on ``T_lidar_a`` and ``T_lidar_b``, equal to separate factors."""
+    return lossless_factor([key_a, key_b], lambda *poses: (block.sums(*poses), None))
 
 
-@dataclass(frozen=True, eq=False)
-class EpipolarBlock(PairBlock):
-    """Co-visible features of two cameras, for epipolar residuals.
-
-    Attributes:
-        lens_a: of the one camera.
-        lens_b: of the other.
-        pixels_a_px: (n, 2) features in the one image; every pixel must have a ray.
-        pixels_b_px: (n, 2) the same features in the other.
-        loss: name of the robust loss.
-        scale: of the residual over sigma, at which the loss bends.
-        sigma: divides all residuals [px].
-
-    Raises:
-        ValueError: on wrong shapes, pixels without a ray, an unknown loss, a scale or sigma <= 0.
-    """
-
-    lens_a: Lens
-    lens_b: Lens
-    pixels_a_px: Array
-    pixels_b_px: Array
-    loss: str = "cauchy"
-    scale: float = 4.0
-    sigma: float = 1.0
-    _features: Array = field(init=False, repr=False)
-    _lens: tuple[int, Array] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        n = len(self.pixels_a_px)
-        self._check_loss()
-        parts = []
-        for name, lens in (("pixels_a_px", self.lens_a), ("pixels_b_px", self.lens_b)):
-            pixels = getattr(self, name)
-            if pixels.shape != (n, 2):
-                raise ValueError(f"{name} has shape {pixels.shape}, expected {(n, 2)}")
-            rays, valid = unproject(lens, pixels)
-            if not valid.all():
-                row = int(np.flatnonzero(~valid)[0])
-                raise ValueError(f"{name}[{row}] has no ray: {pixels[row]}")
-            parts += [rays, ray_spreads(lens, rays).transpose(0, 2, 1).reshape(n, 6)]
-        known = _EPIPOLAR, self.lens_b.packed
-        self.__dict__.update(_features=contiguous(np.hstack(parts)), _lens=known)
-
-
-def pair_block_factor(
-    key_a: int, key_b: int, block: ProjectionBlock | PairBlock
+def placed_factor(
+    keys: Sequence[int], block: ProjectionBlock | PairBlock, free: Columns | None = None
 ) -> gtsam.CustomFactor:
-    """All features of a block as one factor on two poses, equal to its separate factors.
+    """A block as one factor, with the cloud displaced, equal to its separate factors.
 
     Args:
-        key_a: the variable ``T_lidar_a``.
-        key_b: the variable ``T_lidar_b``.
-        block: of features of camera A, seen in camera B; or correspondences of B, whose points are
-            in A's frame.
+        keys: of ``T_lidar_cloud``, ``T_lidar_camera`` of the camera or of both of a pair, and of
+            the columns, a vector of k numbers. The block is at T_cloud_camera.
+        block: correspondences of a camera, or features of a pair.
+        free: k columns of the correspondences.
     """
-    residual = keep_last(partial(_error_and_jacobian, block))
-    rows = 7 if isinstance(block, ProjectionBlock) else 13
-    return factor_on_two_poses(gtsam.noiseModel.Unit.Create(rows), key_a, key_b, residual)
+    k = 0 if free is None else len(free)
+    size = 6 * (len(keys) - (2 if k else 1)) + k
 
+    def sums_at(cloud: gtsam.Pose3, *others: Any) -> tuple[BlockSums, Array]:
+        cameras = [cloud.between(pose) for pose in (others[:-1] if k else others)]
+        chain = np.eye(size, size + 6, 6)
+        for number, pose in enumerate(cameras):
+            chain[6 * number : 6 * number + 6, :6] = -pose.inverse().AdjointMap()
+        if free is None or not isinstance(block, ProjectionBlock):
+            return block.sums(*cameras), chain
+        sums = block.summarize(cameras[0].inverse().matrix()[None], None, free, others[-1])
+        return BlockSums(sums.hessian[0], sums.gradient[0], sums.cost[0]), chain
 
-def placed_pair_factor(
-    key_cloud: int, key_a: int, key_b: int, block: PairBlock
-) -> gtsam.CustomFactor:
-    """As :func:`pair_block_factor`, with the cloud displaced: on ``T_lidar_cloud`` and both poses.
-
-    The block's poses are T_cloud_a = T_lidar_cloud^-1 T_lidar_a, and T_cloud_b likewise.
-
-    Args:
-        key_cloud: the variable ``T_lidar_cloud``.
-        key_a: the variable ``T_lidar_a``.
-        key_b: the variable ``T_lidar_b``.
-        block: of features of camera A, seen in camera B.
-    """
-
-    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
-        cloud, *cameras = (values.atPose3(key) for key in (key_cloud, key_a, key_b))
-        found, jacobian = _error_and_jacobian(block, *(cloud.between(pose) for pose in cameras))
-        chain = np.vstack([-pose.between(cloud).AdjointMap() for pose in cameras])
-        return found, [jacobian @ chain, jacobian[:, :6], jacobian[:, 6:]]
-
-    return custom_factor(gtsam.noiseModel.Unit.Create(13), [key_cloud, key_a, key_b], linearize)
-
-
-def _error_and_jacobian(
-    block: ProjectionBlock | PairBlock, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3
-) -> tuple[Array, Array]:
-    """(13,) error and (13, 12) Jacobian, or (7,) and (7, 12)."""
-    if not isinstance(block, ProjectionBlock):
-        return square_root(block.sums(T_lidar_a, T_lidar_b))
-    error, jacobian = block.error_and_jacobian(T_lidar_a.between(T_lidar_b))
-    return error, jacobian @ pair_chain(T_lidar_a, T_lidar_b)
-
-
-def pair_chain(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> Array:
-    """(6, 12) derivative of the tangent of ``T_a_b`` by the tangents of both poses."""
-    T_b_a = T_lidar_b.between(T_lidar_a)
-    return np.hstack([-T_b_a.AdjointMap(), np.eye(6)])
-
-
-def factor_on_two_poses(
-    noise: gtsam.noiseModel.Base,
-    key_a: int,
-    key_b: int,
-    residual: Callable[[gtsam.Pose3, gtsam.Pose3], tuple[Array, Array]],
-) -> gtsam.CustomFactor:
-    """A factor of (m,) residuals with (m, 12) Jacobians, in the tangents of both poses."""
-
-    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
-        found, jacobian = residual(values.atPose3(key_a), values.atPose3(key_b))
-        return found, [jacobian[:, :6], jacobian[:, 6:]]
-
-    return custom_factor(noise, [key_a, key_b], linearize)
+    return lossless_factor(keys, sums_at, rows=size, columns=k)
 
 
 @compiled(fastmath=FAST)
@@ -267,8 +212,8 @@ def _sum_runs(  # type: ignore[no-untyped-def]
     kind, lens, T_a, T_b, features, loss, scale, sigma, edges, sums, costs, residuals, visible
 ):
     """Fill (r, 13, 13): H and, in the last column, b; (r,) c. Or residuals, where there is room."""
-    axes, psi, rv = 1 if kind == _EPIPOLAR else 2, np.empty(TILE), np.zeros(TILE)
-    tile = np.empty((13, axes, TILE))
+    axes, psi, rv = 1 if kind == EPIPOLAR else 2, np.empty(TILE), np.zeros(TILE)
+    tile = np.empty((13, WIDTH))
     for run in range(len(edges) - 1):
         T = T_a[run if len(T_a) > 1 else 0]
         M = _relative_pose(T, T_b[run if len(T_b) > 1 else 0])
@@ -276,30 +221,30 @@ def _sum_runs(  # type: ignore[no-untyped-def]
             n = min(TILE, edges[run + 1] - start)
             for i in range(n):
                 feature, seen = features[start + i], True
-                if kind == _EPIPOLAR:
+                if kind == EPIPOLAR:
                     _fill_epipolar(M, feature, sigma, tile, i)
                 else:
-                    seen = _fill_surface(kind, lens, T, M, feature, sigma, tile, i)
-                    rv[i] = tile[12, 1, i]
+                    seen = _fill_surface(kind, lens, T, M, feature, sigma, tile, i, n)
+                    rv[i] = tile[12, n + i]
                 if len(residuals):
-                    residuals[start + i, 0], residuals[start + i, 1] = tile[12, 0, i], rv[i]
+                    residuals[start + i, 0], residuals[start + i, 1] = tile[12, i], rv[i]
                     visible[start + i] = seen
             if len(residuals):
                 continue
-            costs[run] += weigh(loss, scale, n, tile[12, 0], rv, psi)
+            costs[run] += weigh(loss, scale, n, tile[12], rv, psi)
             for i in range(n):
                 root = math.sqrt(psi[i])
                 for row in range(13):
                     for axis in range(axes):
-                        tile[row, axis, i] *= root
-            add_products(n, tile, sums[run])
+                        tile[row, axis * n + i] *= root
+            add_products(axes * n, tile, sums[run])
         for i in range(12 if len(sums) else 0):
             for j in range(i):
                 sums[run, i, j] = sums[run, j, i]
 
 
 @compiled(part=True)
-def _fill_surface(kind, lens, T_a, M, feature, sigma, tile, at):  # type: ignore[no-untyped-def]
+def _fill_surface(kind, lens, T_a, M, feature, sigma, tile, i, n):  # type: ignore[no-untyped-def]
     """Fill in derivatives by A and B, and residuals; return whether B sees the point."""
     f0, f1, f2 = feature[0], feature[1], feature[2]
     q0, q1, q2 = feature[3], feature[4], feature[5]
@@ -313,19 +258,19 @@ def _fill_surface(kind, lens, T_a, M, feature, sigma, tile, at):  # type: ignore
     y1 = M[1, 0] * f0 + M[1, 1] * f1 + M[1, 2] * f2 + w * M[1, 3]
     y2 = M[2, 0] * f0 + M[2, 1] * f1 + M[2, 2] * f2 + w * M[2, 3]
     u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, y0, y1, y2)
-    tile[12, 0, at] = subtract_columns(kind, lens, u, feature[6]) / sigma
-    tile[12, 1, at] = (v - feature[7]) / sigma
+    tile[12, i] = subtract_columns(kind, lens, u, feature[6]) / sigma
+    tile[12, n + i] = (v - feature[7]) / sigma
     for row in range(2):
         jx, jy, jz = (ux, uy, uz) if row == 0 else (vx, vy, vz)
-        jx, jy, jz = jx / sigma, jy / sigma, jz / sigma
+        jx, jy, jz, at = jx / sigma, jy / sigma, jz / sigma, row * n + i
         along = (jx * M[0, 3] + jy * M[1, 3] + jz * M[2, 3]) / k
         a0 = jx * M[0, 0] + jy * M[1, 0] + jz * M[2, 0] + along * g0  # in A's axes
         a1 = jx * M[0, 1] + jy * M[1, 1] + jz * M[2, 1] + along * g1
         a2 = jx * M[0, 2] + jy * M[1, 2] + jz * M[2, 2] + along * g2
-        tile[0, row, at], tile[1, row, at], tile[2, row, at] = _cross(f0, f1, f2, a0, a1, a2)
-        tile[3, row, at], tile[4, row, at], tile[5, row, at] = w * a0, w * a1, w * a2
-        tile[6, row, at], tile[7, row, at], tile[8, row, at] = _cross(jx, jy, jz, y0, y1, y2)
-        tile[9, row, at], tile[10, row, at], tile[11, row, at] = -w * jx, -w * jy, -w * jz
+        tile[0, at], tile[1, at], tile[2, at] = _cross(f0, f1, f2, a0, a1, a2)
+        tile[3, at], tile[4, at], tile[5, at] = w * a0, w * a1, w * a2
+        tile[6, at], tile[7, at], tile[8, at] = _cross(jx, jy, jz, y0, y1, y2)
+        tile[9, at], tile[10, at], tile[11, at] = -w * jx, -w * jy, -w * jz
     return w > 0.0 and is_projectable(kind, lens, y0 / w, y1 / w, y2 / w)
 
 
@@ -343,14 +288,14 @@ def _fill_epipolar(M, feature, sigma, tile, at):  # type: ignore[no-untyped-def]
     for k in range(6 if over > 0.0 else 0):
         value[k] -= value[6] / square * half[k]
     for k in range(7):
-        tile[6 + k, 0, at] = over * value[k]
+        tile[6 + k, at] = over * value[k]
     # By A: minus the derivative by B, a row, times Ad(T_b_a), T_b_a = M.
-    v0, v1, v2 = tile[9, 0, at], tile[10, 0, at], tile[11, 0, at]
+    v0, v1, v2 = tile[9, at], tile[10, at], tile[11, at]
     w0, w1, w2 = _cross(v0, v1, v2, M[0, 3], M[1, 3], M[2, 3])
-    w0, w1, w2 = w0 + tile[6, 0, at], w1 + tile[7, 0, at], w2 + tile[8, 0, at]
+    w0, w1, w2 = w0 + tile[6, at], w1 + tile[7, at], w2 + tile[8, at]
     for k in range(3):
-        tile[k, 0, at] = -(w0 * M[0, k] + w1 * M[1, k] + w2 * M[2, k])
-        tile[3 + k, 0, at] = -(v0 * M[0, k] + v1 * M[1, k] + v2 * M[2, k])
+        tile[k, at] = -(w0 * M[0, k] + w1 * M[1, k] + w2 * M[2, k])
+        tile[3 + k, at] = -(v0 * M[0, k] + v1 * M[1, k] + v2 * M[2, k])
 
 
 @compiled(part=True)

@@ -7,12 +7,17 @@ paper weight lambda is a sigma of 1 / sqrt(lambda).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factors.arrays import BlockSums, square_root
+
 Array = NDArray[np.float64]
+SumsAt = Callable[..., tuple[BlockSums, Array | None]]
 
 
 def custom_factor(
@@ -34,25 +39,43 @@ def custom_factor(
     return gtsam.CustomFactor(noise, list(keys), error)
 
 
-def keep_last(
-    linearize: Callable[..., tuple[Array, Array]],
-) -> Callable[..., tuple[Array, Array]]:
-    """A function of poses that remembers its last result.
+def lossless_factor(
+    keys: Sequence[int], sums_at: SumsAt, *, rows: int | None = None, columns: int = 0
+) -> gtsam.CustomFactor:
+    """Robust residuals as one factor, equal to the separate ones, by their sums.
 
-    An optimizer evaluates the error of a step and then linearizes at the same pose, which takes one
-    pass over the correspondences. Poses and result are replaced as one tuple, so that threads never
-    see those with the result of others.
+    It remembers its last result: an optimizer evaluates the error of a step and then linearizes at
+    the same place, which takes one pass over the correspondences. Place and result are replaced as
+    one tuple, so that threads never see those with the result of others.
+
+    Args:
+        keys: of poses; the last of a vector, if there are columns.
+        sums_at: the sums at these variables, and (r, n) derivatives of what these are by.
+        rows: r; None: the sums are by the variables themselves.
+        columns: size of the vector.
     """
-    last: tuple[bytes, tuple[Array, Array]] | None = None
+    poses = len(keys) - (columns > 0)
+    edges = [*range(0, 6 * len(keys), 6), 6 * poses + columns]
+    parts = [slice(*both) for both in pairwise(edges)]
+    noise = gtsam.noiseModel.Unit.Create(1 + (6 * poses + columns if rows is None else rows))
+    last: tuple[bytes, tuple[Array, list[Array]]] | None = None
 
-    def run(*poses: gtsam.Pose3) -> tuple[Array, Array]:
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
         nonlocal last
-        place, found = b"".join(pose.matrix().tobytes() for pose in poses), last
+        at: list[Any] = [values.atPose3(key) for key in keys[:poses]]
+        numbers = [pose.matrix() for pose in at]
+        if columns:
+            at.append(values.atVector(keys[-1]))
+            numbers.append(at[-1])
+        place, found = b"".join(part.tobytes() for part in numbers), last
         if found is None or found[0] != place:
-            last = found = (place, linearize(*poses))
+            sums, chain = sums_at(*at)
+            error, jacobian = square_root(sums)
+            jacobian = jacobian if chain is None else jacobian @ chain
+            last = found = place, (error, [jacobian[:, part] for part in parts])
         return found[1]
 
-    return run
+    return custom_factor(noise, keys, linearize)
 
 
 def linear_factor(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -14,9 +14,11 @@ from calibgraph.arrays import Array
 from calibgraph.model.geometry import to_T_lidar_camera
 from factors import (
     BlockSums,
+    Columns,
     PairBlock,
     ProjectionBlock,
-    pair_block_factor,
+    placed_factor,
+    to_runs,
 )
 
 Numbers = NDArray[np.int64]
@@ -46,12 +48,14 @@ class BlockByPlace:
         edges: (P + 1,) first row of each place, and the end.
         place_of_frame: (f,) of the camera's frames, in their own order.
         count_of_frame: (f,) of correspondences.
+        free: columns of lens and clock that are estimated; None: none.
     """
 
     block: ProjectionBlock
     edges: Numbers
     place_of_frame: Numbers
     count_of_frame: Numbers
+    free: Columns | None = None
 
     @property
     def frames(self) -> Numbers:
@@ -63,26 +67,23 @@ class BlockByPlace:
         """(p,) the places that have correspondences, in rising order."""
         return np.flatnonzero(np.diff(self.edges))
 
-    def with_variance(self, factor: float) -> BlockByPlace:
-        """Multiply the variance of the matches; the loss keeps its tuning constant in pixels."""
-        root = factor**0.5
-        block = self.block.rescale(scale=self.block.scale / root, sigma=self.block.sigma * root)
-        return replace(self, block=block)
+    def sums(self, T_camera_cloud: Array, values: Array | None = None) -> BlockSums:
+        """H, b and c of every place by pose and columns, stacked.
 
-    def sums(self, T_camera_cloud: Array) -> BlockSums:
-        """H, b and c of every place at a pose of its own, (P, 4, 4), stacked."""
-        if len(T_camera_cloud) == 1:
-            one = self.block.sums(to_T_lidar_camera(T_camera_cloud[0]))
-            return BlockSums(one.hessian[None], one.gradient[None], np.array([one.cost]))
-        runs = np.column_stack([self.edges[:-1], self.edges[1:]])
-        return self.block.run_sums(np.ascontiguousarray(T_camera_cloud), runs)
+        Args:
+            T_camera_cloud: (P, 4, 4) of all places.
+            values: (k,) of the columns.
+        """
+        T, runs = np.ascontiguousarray(T_camera_cloud), to_runs(self.edges)
+        if self.free is None:
+            return self.block.run_sums(T, runs)
+        return self.block.summarize(T, runs, self.free, values)
 
-    def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
-        """The correspondences of one place, lossless, on the variables of these keys."""
+    def factors(self, place: int, keys: Sequence[int]) -> list[gtsam.NonlinearFactor]:
+        """The correspondences of one place, lossless, on cloud, camera and columns there."""
         first, end = self.edges[place : place + 2].tolist()
-        whole = end - first == len(self.block)
-        block = self.block if whole else self.block.select(np.arange(first, end))
-        return [pair_block_factor(cloud, matched, block)] if first < end else []
+        block = self.block.select(np.arange(first, end))
+        return [placed_factor(keys, block, self.free)] if first < end else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +100,9 @@ class QuadraticByPlace:
     T_lidar_camera: Sequence[gtsam.Pose3]
     information: Array
 
-    def sums(self, T_camera_cloud: Array) -> BlockSums:
+    def sums(self, T_camera_cloud: Array, values: Array | None = None) -> BlockSums:
         """H, b and c of every place at a pose of its own, (P, 4, 4), stacked."""
+        assert values is None  # a quadratic is in the pose alone
         count = len(T_camera_cloud)
         found = BlockSums(np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros(count))
         for row, place in enumerate(self.places.tolist()):
@@ -111,9 +113,9 @@ class QuadraticByPlace:
             found.cost[place] = step @ found.gradient[place]
         return found
 
-    def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
-        """The quadratic of one place, a stock factor on the variables of these keys."""
-        noise = gtsam.noiseModel.Gaussian.Information
+    def factors(self, place: int, keys: Sequence[int]) -> list[gtsam.NonlinearFactor]:
+        """The quadratic of one place, a stock factor on cloud and camera there."""
+        noise, (cloud, matched) = gtsam.noiseModel.Gaussian.Information, keys
         return [
             gtsam.BetweenFactorPose3(
                 cloud, matched, self.T_lidar_camera[row], noise(self.information[row])
@@ -139,8 +141,3 @@ class PairByPlace:
     block: PairBlock
     places: Numbers
     edges: Numbers
-
-    def at_each_place(self) -> Iterator[tuple[int, PairBlock]]:
-        """Every place with its features."""
-        for place, first, end in zip(self.places, self.edges[:-1], self.edges[1:], strict=True):
-            yield int(place), self.block.select(np.arange(first, end))

@@ -35,7 +35,7 @@ from calibgraph.graph.by_place import (
     QuadraticByPlace,
 )
 from calibgraph.graph.components import EXACT, VarianceComponents, shown_distortion
-from calibgraph.graph.lens import FreeLensByPlace, LensTerm, lens_graph
+from calibgraph.graph.lens import LensTerm, lens_graph
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import (
     CLOUD,
@@ -53,11 +53,12 @@ from calibgraph.graph.variables import (
 from calibgraph.model.config import Reported
 from factors import (
     displaced_between_factor,
-    placed_pair_factor,
+    placed_factor,
     robust_noise,
+    to_runs,
 )
 
-Data = BlockByPlace | QuadraticByPlace | FreeLensByPlace
+Data = BlockByPlace | QuadraticByPlace
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +120,10 @@ class LatentPoseModel:
         is_aligned = self.of == "alignment" and number in self.aligned
         return aligned_key(number) if is_aligned else camera_key(number)
 
+    def lens_keys(self, number: int) -> list[int]:
+        """Key of ``s_c``, if the lens of the camera is estimated."""
+        return [seen_lens_key(number)] if number in self.lenses else []
+
     @cached_property
     def matched(self) -> list[int]:
         """Numbers of the cameras that have correspondences."""
@@ -166,17 +171,48 @@ class LatentPoseModel:
     @cached_property
     def error_graph(self) -> gtsam.NonlinearFactorGraph:
         """Those of the errors that have variance components: cloud, distortion, camera, pairs."""
-        return _error_graph(self)
+        parts, graph = self.components, gtsam.NonlinearFactorGraph()
+        graph.add(gtsam.PriorFactorPose3(CLOUD, gtsam.Pose3(), _noise(parts.cloud)))
+        if self.is_distorted:
+            graph.push_back(_distortion_graph(parts))
+        seen = aligned_key if self.is_distorted else camera_key
+        for number in self.matched:
+            edge, noise = (seen(number), matched_key(number)), _noise(parts.camera)
+            if (term := self.lenses.get(number)) is None:
+                graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), noise))
+            else:
+                shifts = term.shifts(number, is_distorted=self.is_distorted)
+                graph.add(displaced_between_factor(*edge, shifts, noise))
+        for number in self.paired:
+            edge = camera_key(number), paired_key(number)
+            graph.add(_displaced(self, edge, parts.pair_distortion_jacobian[number], parts.pairs))
+        return graph
 
     @cached_property
     def tie_graph(self) -> gtsam.NonlinearFactorGraph:
-        """Those of the poses that are reported to the mounts."""
-        return _tie_graph(self)
+        """Those of the poses that are reported: x_c to y_c, and these to b_c."""
+        graph = gtsam.NonlinearFactorGraph()
+        for number, jacobian in self.aligned.items():
+            edge = camera_key(number), aligned_key(number)
+            graph.add(_displaced(self, edge, jacobian, EXACT**2 * np.eye(6)))
+        for number, covariance in self.lens_errors.items():
+            edge = self.fitted_key(number), body_key(number)
+            graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), _noise(covariance)))
+        return graph
 
     @cached_property
     def place_graph(self) -> gtsam.NonlinearFactorGraph:
-        """The factors between what all places share and each place."""
-        return _place_graph(self)
+        """Those between what all places share and each place: o to o_p, and m_c to a_cp."""
+        parts, graph, no_motion = self.components, gtsam.NonlinearFactorGraph(), gtsam.Pose3()
+        clouds = np.broadcast_to(parts.cloud_at_place, (self.places, 6, 6))
+        for place, covariance in enumerate(clouds):
+            noise = _robust(covariance, parts.robust_scale)
+            graph.add(gtsam.BetweenFactorPose3(CLOUD, cloud_at_key(place), no_motion, noise))
+        for place, camera in self.matched_places:
+            noise = _robust(parts.at_place[place, camera], parts.robust_scale)
+            keys = matched_key(camera), matched_at_key(place, camera)
+            graph.add(gtsam.BetweenFactorPose3(*keys, no_motion, noise))
+        return graph
 
     @property
     def tied_keys(self) -> list[int]:
@@ -223,8 +259,7 @@ class LatentPoseModel:
     @cached_property
     def columns_of_matches(self) -> list[NDArray[np.intp]]:
         """Per matched camera, of o_p in front of all, m_c and s_c."""
-        lenses = [[seen_lens_key(n)] if n in self.lenses else [] for n in self.matched]
-        keys = [[matched_key(n), *own] for n, own in zip(self.matched, lenses, strict=True)]
+        keys = [[matched_key(n), *self.lens_keys(n)] for n in self.matched]
         return [np.append(np.arange(6), 6 + self.columns_of(own)) for own in keys]
 
     @cached_property
@@ -250,51 +285,20 @@ def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
     """
     graph = gtsam.NonlinearFactorGraph()
     for place, camera in model.matched_places:
-        keys = cloud_at_key(place), matched_at_key(place, camera)
-        for factor in model.blocks[model.cameras[camera]].factors(place, *keys):
+        keys = [cloud_at_key(place), matched_at_key(place, camera), *model.lens_keys(camera)]
+        for factor in model.blocks[model.cameras[camera]].factors(place, keys):
             graph.add(factor)
     for pair in model.pairs:
         key_a, key_b = (paired_key(model.cameras.index(name)) for name in (pair.a, pair.b))
-        for place, features in pair.at_each_place():
-            graph.add(placed_pair_factor(cloud_at_key(place), key_a, key_b, features))
+        for place, (first, end) in zip(pair.places.tolist(), to_runs(pair.edges), strict=True):
+            features = pair.block.select(np.arange(first, end))
+            graph.add(placed_factor([cloud_at_key(place), key_a, key_b], features))
     return graph
 
 
 def to_ordering(keys: Iterable[int]) -> gtsam.Ordering:
     """GTSAM's list of keys."""
     return gtsam.Ordering([*keys])
-
-
-def _error_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
-    """Priors of cloud and distortion; y_c to m_c, and x_c to n_c."""
-    parts, graph = model.components, gtsam.NonlinearFactorGraph()
-    graph.add(gtsam.PriorFactorPose3(CLOUD, gtsam.Pose3(), _noise(parts.cloud)))
-    if model.is_distorted:
-        graph.push_back(_distortion_graph(parts))
-    seen = aligned_key if model.is_distorted else camera_key
-    for number in model.matched:
-        edge, noise = (seen(number), matched_key(number)), _noise(parts.camera)
-        if (term := model.lenses.get(number)) is None:
-            graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), noise))
-        else:
-            shifts = term.shifts(number, is_distorted=model.is_distorted)
-            graph.add(displaced_between_factor(*edge, shifts, noise))
-    for number in model.paired:
-        edge = camera_key(number), paired_key(number)
-        graph.add(_displaced(model, edge, parts.pair_distortion_jacobian[number], parts.pairs))
-    return graph
-
-
-def _tie_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
-    """x_c to y_c, and what is reported to b_c."""
-    graph = gtsam.NonlinearFactorGraph()
-    for number, jacobian in model.aligned.items():
-        edge = camera_key(number), aligned_key(number)
-        graph.add(_displaced(model, edge, jacobian, EXACT**2 * np.eye(6)))
-    for number, covariance in model.lens_errors.items():
-        edge = model.fitted_key(number), body_key(number)
-        graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), _noise(covariance)))
-    return graph
 
 
 def _displaced(
@@ -317,20 +321,6 @@ def _distortion_graph(parts: VarianceComponents) -> gtsam.NonlinearFactorGraph:
     zero.insert(DISTORTION, np.zeros(size))
     shown = gtsam.HessianFactor(DISTORTION, information, vector, constant)
     graph.add(gtsam.LinearContainerFactor(shown, zero))
-    return graph
-
-
-def _place_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
-    """O to o_p and m_c to a_cp."""
-    parts, graph, no_motion = model.components, gtsam.NonlinearFactorGraph(), gtsam.Pose3()
-    clouds = np.broadcast_to(parts.cloud_at_place, (model.places, 6, 6))
-    for place, covariance in enumerate(clouds):
-        noise = _robust(covariance, parts.robust_scale)
-        graph.add(gtsam.BetweenFactorPose3(CLOUD, cloud_at_key(place), no_motion, noise))
-    for place, camera in model.matched_places:
-        noise = _robust(parts.at_place[place, camera], parts.robust_scale)
-        keys = matched_key(camera), matched_at_key(place, camera)
-        graph.add(gtsam.BetweenFactorPose3(*keys, no_motion, noise))
     return graph
 
 

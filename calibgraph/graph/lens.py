@@ -21,22 +21,14 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.graph.variables import DISTORTION, lens_key, seen_lens_key
 from calibgraph.model.clock import clock_of
 from calibgraph.model.config import LensPart
 from calibgraph.model.lens import IN_DOUBT, LensSigmas
 from calibgraph.model.rig import Camera, Rig
-from factors import (
-    BlockSums,
-    Columns,
-    columns_factor,
-    linear_factor,
-    robust_noise,
-)
+from factors import Columns, linear_factor, robust_noise
 from factors.columns import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL, OFFSET, READOUT
 from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
 
@@ -194,39 +186,3 @@ def start_lenses(lenses: Mapping[int, LensTerm]) -> gtsam.Values:
         for key in (lens_key(number), seen_lens_key(number)):
             values.insert(key, term.variable.values)
     return values
-
-
-@dataclass(frozen=True, eq=False)
-class FreeLensByPlace:
-    """One camera's correspondences, sorted by place, with a free lens.
-
-    Attributes:
-        placed: the correspondences.
-        lens: of the camera.
-        key: of its variable.
-    """
-
-    placed: BlockByPlace
-    lens: Columns
-    key: int
-
-    @property
-    def places(self) -> NDArray[np.int64]:
-        """(p,) the places that have correspondences, in rising order."""
-        return self.placed.places
-
-    def sums(self, T_camera_cloud: Array, values: Array) -> BlockSums:
-        """H, b and c of every place by pose and lens, stacked.
-
-        Args:
-            T_camera_cloud: (P, 4, 4) of all places.
-            values: (k,) of the lens.
-        """
-        runs = np.column_stack([self.placed.edges[:-1], self.placed.edges[1:]])
-        return self.placed.block.summarize(T_camera_cloud, runs, self.lens, values)
-
-    def factors(self, place: int, cloud: int, matched: int) -> list[gtsam.NonlinearFactor]:
-        """The correspondences of one place, lossless, on the variables of these keys."""
-        first, end = self.placed.edges[place : place + 2].tolist()
-        block = self.placed.block.select(np.arange(first, end))
-        return [columns_factor([cloud, matched, self.key], block, self.lens)] if len(block) else []

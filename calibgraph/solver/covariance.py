@@ -67,12 +67,6 @@ def robust_hessians(sums: BlockSums) -> Array:
     return np.array([*map(convex_hessian, sums.curvature, sums.hessian)])
 
 
-def robust_hessian(sums: BlockSums) -> Array:
-    """(6, 6) the same of all frames together."""
-    assert sums.curvature is not None
-    return convex_hessian(sums.curvature.sum(axis=0), sums.hessian.sum(axis=0))
-
-
 @dataclass(frozen=True, eq=False)
 class FittedObjective:
     """An objective, its scales, and the extrinsics where it is examined.
@@ -116,8 +110,12 @@ class FittedObjective:
 
     @cached_property
     def robust_hessians(self) -> Mapping[str, Array]:
-        """Per camera with correspondences, their (6, 6) :func:`robust_hessian`."""
-        return {name: robust_hessian(sums) for name, sums in self.frame_sums.items()}
+        """Per camera, (6, 6) as of :func:`robust_hessians`, of all its frames together."""
+        return {
+            name: convex_hessian(sums.curvature.sum(axis=0), sums.hessian.sum(axis=0))
+            for name, sums in self.frame_sums.items()
+            if sums.curvature is not None
+        }
 
     def data_only(self) -> FittedObjective:
         """The correspondences alone, at their minimum near here."""

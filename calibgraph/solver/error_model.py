@@ -13,9 +13,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.graph.components import VarianceRatios
 from calibgraph.graph.latent_poses import LatentPoseModel
-from calibgraph.graph.lens import FreeLensByPlace
 from calibgraph.graph.objective import join, pose_key
-from calibgraph.graph.variables import seen_lens_key
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import (
     invert,
@@ -180,9 +178,11 @@ def fit_errors(at: FittedObjective, findings: MatcherFindings, places: Places) -
         if fit is None or found.is_near(ratios):
             break
         model, ratios = replace(model, components=found.scale(prior)), found
-        fit = fit_latent_poses(model, fit.linear, relative_tolerance=_COARSE_TOLERANCE)
-    if fit is not None:
-        fit = fit_latent_poses(model, fit.linear, is_determined=fit.model is model)
+        fit = fit_latent_poses(
+            model, fit.linear, relative_tolerance=_COARSE_TOLERANCE, is_determined=True
+        )
+    if fit is not None and not (fit.model is model and fit.converged):
+        fit = fit_latent_poses(model, fit.linear, is_determined=True)
     return None if fit is None else replace(fit, ratios=ratios)
 
 
@@ -204,12 +204,13 @@ def error_model(
         places: the frame numbers of each place.
     """
     inliers, cameras = at.objective, at.cameras
-    blocks: dict[str, BlockByPlace | FreeLensByPlace] = {}
+    blocks: dict[str, BlockByPlace] = {}
     shown, lenses = {}, {}
     for name, block in inliers.blocks.items():
         by_place = block_by_place(block, at.scales[name], places)
         within = within_place(at, name, by_place)
-        placed, evidence = by_place.with_variance(within.least), None
+        block_of_graph = by_place.block.with_variance(within.least)
+        placed, evidence = replace(by_place, block=block_of_graph), None
         lens, number = inliers.lenses.get(name), cameras.index(name)
         if any(findings.bend_sigmas):
             weak, pose = weak_information(lens), at.pose(name)
@@ -223,7 +224,7 @@ def error_model(
                 bent = evidence.lens_jacobian * np.asarray(findings.bend_sigmas)
                 term = replace(term, by_distortion=bent)
             lenses[number] = term
-            blocks[name] = FreeLensByPlace(placed, lens.free, seen_lens_key(number))
+            blocks[name] = replace(placed, free=lens.free)
         shown[name] = within, evidence
     pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
     components = variance_components(findings, cameras, shown, places=len(places))

@@ -30,10 +30,12 @@ from calibgraph.solver.pairs import (
 )
 from calibgraph.solver.pnp import DAMPING
 from calibgraph.solver.two_pass import Objective, Optimum
-from factors import EpipolarBlock, pose_sigmas
+from factors import pose_sigmas
 
 _NARROWINGS = 4  # steps from the spread at the estimate to the least one
-_MAX_STEPS, _MAX_STEP, _CONVERGED = 30, 0.1, 1e-6  # of a pair alone: rad, m
+_COARSE = 1e-6  # relative change of the error at which each of them stops
+_MAX_STEPS, _MAX_STEP, _CONVERGED = 30, 0.1, 1e-5  # of a pair alone: rad, m
+_NEAR = 1e-4  # the last step where only the spread of residuals is asked for
 _HELD_RAD, _HELD_M = np.radians(1.0), 0.2  # of the first camera, while its pair is fitted alone
 
 
@@ -60,7 +62,8 @@ def refine_with_pairs(
         now = np.array([term.sigma_px(T) for term in terms])
         sigmas = least * np.maximum(now / least, 1.0) ** (1.0 - (step + 1) / _NARROWINGS)
         scaled = tuple(t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True))
-        T = replace(inliers, pairs=scaled).minimize(T, at.scales).T_camera_lidar
+        near = replace(inliers, pairs=scaled)
+        T = near.minimize(T, at.scales, tolerance=_COARSE).T_camera_lidar
     kept = tuple(t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True))
     joined = replace(inliers, pairs=kept)
     return joined, joined.minimize(T, at.scales)
@@ -78,7 +81,8 @@ def _least_sigmas(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]
         pair = frozenset((term.a, term.b))
         if pair not in found:
             own = [other for other in terms if {other.a, other.b} == pair]
-            found[pair], _ = fit_pair((term.a, term.b), own, T_camera_lidar, covariance)
+            names = term.a, term.b
+            found[pair], _ = fit_pair(names, own, T_camera_lidar, covariance, last_step=_NEAR)
     return np.array([term.sigma_px(found[frozenset((term.a, term.b))]) for term in terms])
 
 
@@ -93,6 +97,8 @@ def fit_pair(
     terms: Sequence[PairTerm],
     start: Mapping[str, Array],
     covariance_a: Array,
+    *,
+    last_step: float = _CONVERGED,
 ) -> tuple[dict[str, Array], Array]:
     """Both cameras of a pair by what they see in common, the first held near its start.
 
@@ -103,6 +109,7 @@ def fit_pair(
         terms: of this pair.
         start: (4, 4) T_camera_lidar of both.
         covariance_a: (6, 6) of the start of A, of xi in T_camera_lidar = exp(xi) start.
+        last_step: [rad, m] at which it stops.
 
     Returns:
         (4, 4) T_camera_lidar of both; their (12, 12) covariance, if features of a frame err as
@@ -124,7 +131,7 @@ def fit_pair(
         step = -np.linalg.solve(hessian + DAMPING * np.diag(np.diag(hessian)), gradient)
         step *= min(1.0, _MAX_STEP / np.abs(step).max())
         T = retract_all(T, np.asarray(step.reshape(2, 6)))
-        if np.abs(step).max() < _CONVERGED:
+        if np.abs(step).max() < last_step:
             break
     covariance = np.linalg.pinv(prior + data / excess, hermitian=True)
     return dict(zip(names, T, strict=True)), np.asarray(covariance)
@@ -170,9 +177,7 @@ def fit_pairs(rig: Rig, matches: CameraMatches, config: Config, held: Array) -> 
     fits, cameras = [], list(rig.cameras)
     for a, b in matches.pairs():
         terms = tuple(
-            term
-            for term in pair_terms(rig, matches.of_pair(a, b), config)
-            if not isinstance(term.block, EpipolarBlock)
+            term for term in pair_terms(rig, matches.of_pair(a, b), config) if term.block.axes > 1
         )
         if terms:
             of_a = held[cameras.index(a)]

@@ -26,8 +26,7 @@ from calibgraph.solver.robust import (
 )
 from factors import (
     BlockSums,
-    EpipolarBlock,
-    SurfaceBlock,
+    PairBlock,
     pair_block_factor,
     unproject,
 )
@@ -55,7 +54,7 @@ class PairTerm:
 
     a: str
     b: str
-    block: SurfaceBlock | EpipolarBlock
+    block: PairBlock
     frame: NDArray[np.int64]
 
     @cached_property
@@ -73,12 +72,6 @@ class PairTerm:
         block = self.block.rescale(scale=CAUCHY_SCALE_SIGMAS, sigma=sigma_px)
         return replace(self, block=block)
 
-    def deflate(self, excess: float) -> PairTerm:
-        """With its information divided by so much, and the loss bending where it did."""
-        root = excess**0.5
-        scale, sigma = self.block.scale / root, self.block.sigma * root
-        return replace(self, block=self.block.rescale(scale=scale, sigma=sigma))
-
     def errors_px(self, T_camera_lidar: Mapping[str, Array]) -> Array:
         """(n,) lengths of the residuals; infinite where B cannot see the point."""
         residuals, projectable = self.block.residuals(*self._poses(T_camera_lidar))
@@ -86,16 +79,12 @@ class PairTerm:
 
     def sigma_px(self, T_camera_lidar: Mapping[str, Array]) -> float:
         """Robust spread of the residuals, per axis."""
-        spread = robust_spread(self.errors_px(T_camera_lidar) / MEDIAN_NORM[self._axes - 1])
+        spread = robust_spread(self.errors_px(T_camera_lidar) / MEDIAN_NORM[self.block.axes - 1])
         return max(spread, MIN_SIGMA_PX)
 
     def without_outliers(self, T_camera_lidar: Mapping[str, Array], sigma_px: float) -> PairTerm:
         """The features within the gate."""
         return self.select(self.errors_px(T_camera_lidar) <= GATE_SIGMAS * sigma_px)
-
-    def factor(self, key_a: int, key_b: int) -> gtsam.NonlinearFactor:
-        """The features as one lossless factor on ``T_lidar_a`` and ``T_lidar_b``."""
-        return pair_block_factor(key_a, key_b, self.block)
 
     def sums(self, T_camera_lidar: Mapping[str, Array]) -> BlockSums:
         """H (12, 12), b (12,) and c, in the tangents of ``T_lidar_a`` and ``T_lidar_b``."""
@@ -106,10 +95,6 @@ class PairTerm:
         a, b = (pose.matrix()[None] for pose in self._poses(T_camera_lidar))
         sums = self.block.run_sums(a, b, self.frame_edges)
         return sums.hessian, sums.gradient
-
-    @property
-    def _axes(self) -> int:
-        return 1 if isinstance(self.block, EpipolarBlock) else 2
 
     def _poses(self, T_camera_lidar: Mapping[str, Array]) -> tuple[gtsam.Pose3, gtsam.Pose3]:
         return (
@@ -178,7 +163,7 @@ def pair_graph(terms: Iterable[PairTerm], keys: Mapping[str, int]) -> gtsam.Nonl
     """
     graph = gtsam.NonlinearFactorGraph()
     for term in terms:
-        graph.add(term.factor(keys[term.a], keys[term.b]))
+        graph.add(pair_block_factor(keys[term.a], keys[term.b], term.block))
     return graph
 
 
@@ -195,7 +180,7 @@ def match_errors_px(rig: Rig, table: CameraMatches) -> Array:
             there = of_pair & np.isfinite(table.planes_lidar_per_m[:, side, 0])
             rays = unproject(rig.cameras[names[0]].lens, table.pixels_px[there, side])[0]
             planes, pixels = table.planes_lidar_per_m[there, side], table.pixels_px[there, 1 - side]
-            block = SurfaceBlock(rig.cameras[names[1]].lens, rays, planes, pixels)
+            block = PairBlock.of_surfaces(rig.cameras[names[1]].lens, rays, planes, pixels)
             values = PairTerm(*names, block, table.frame[there]).errors_px(rig.T_camera_lidar)
             errors[there] = np.fmax(errors[there], values)
     return errors
@@ -212,7 +197,8 @@ def _term_of_side(
     ahead = inverse_ranges(rays, planes, a.T_camera_lidar) > 0
     rows = rows.select(ahead)
     pixels = rows.pixels_px[:, 1 - side]
-    block = SurfaceBlock(b.lens, rays[ahead], planes[ahead], pixels, config.loss)
+    block = PairBlock.of_surfaces(b.lens, rays[ahead], planes[ahead], pixels)
+    block = replace(block, loss=config.loss)
     return PairTerm(*names, block, rows.frame)
 
 
@@ -221,5 +207,6 @@ def _epipolar_term(
 ) -> PairTerm:
     rows = rows.select(np.flatnonzero(np.isnan(rows.planes_lidar_per_m[:, :, 0]).all(axis=1)))
     a, b = (rig.cameras[name] for name in names)
-    block = EpipolarBlock(a.lens, b.lens, rows.pixels_px[:, 0], rows.pixels_px[:, 1], config.loss)
+    block = PairBlock.epipolar(a.lens, b.lens, rows.pixels_px[:, 0], rows.pixels_px[:, 1])
+    block = replace(block, loss=config.loss)
     return PairTerm(*names, block, rows.frame)

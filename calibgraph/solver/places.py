@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.graph.components import VarianceRatios
 from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
-from calibgraph.graph.lens import FreeLensByPlace, start_lenses
+from calibgraph.graph.lens import start_lenses
 from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
@@ -184,10 +184,7 @@ class Linearization:
         found = BlockSums(np.zeros((*shape, 6 + k)), np.zeros(shape), np.zeros(shape[:2]))
         for row, number in enumerate(model.matched):
             block, T = model.blocks[model.cameras[number]], self._T_camera_cloud[row]
-            if isinstance(block, FreeLensByPlace):
-                sums = block.sums(T, self.shared.atVector(block.key))
-            else:
-                sums = block.sums(T)
+            sums = block.sums(T, *map(self.shared.atVector, model.lens_keys(number)))
             n = sums.gradient.shape[1]
             found.hessian[row, :, :n, :n], found.gradient[row, :, :n] = sums.hessian, sums.gradient
             found.cost[row] = sums.cost
@@ -247,34 +244,38 @@ class Linearization:
             *by.shape[:2], 6, 6
         )
         by[..., :6, 6:12] = by_shared[1:]
-        seen = _soften(self.data.hessian, self.data.gradient, covariance[1:], error[1:])
-        of_cameras, pulls = _turned(by) @ seen.hessian @ by, _times(_turned(by), seen.gradient)
+        softened, pulled, seen = _soften(
+            self.data.hessian, self.data.gradient, covariance[1:], error[1:]
+        )
+        of_cameras, pulls = _turned(by) @ softened @ by, _times(_turned(by), pulled)
         for row, at in enumerate(model.columns_of_matches):
             hessian[:, at[:, None], at] += of_cameras[row, :, : len(at), : len(at)]
             gradient[:, at] += pulls[row, :, : len(at)]
         for pair, sums, at in zip(model.pairs, self.pairs, model.columns_of_pairs, strict=True):
             hessian[np.ix_(pair.places, at, at)] += sums.hessian
             gradient[np.ix_(pair.places, at)] += sums.gradient
-        own = _soften(hessian, gradient, covariance[0], error[0])
+        softened, pulled, own = _soften(hessian, gradient, covariance[0], error[0])
         by_cloud = np.tile(np.eye(6 + k, k, -6), (count, 1, 1))
         by_cloud[:, :6, :6] = by_shared[0]
-        rows = own.rows @ by_cloud
-        cloud = Displacement(rows, own.pull, np.zeros((count, 6, 6)), own.left, own.free)
+        cloud = own._replace(rows=own.rows @ by_cloud)
         still = -_times(own.free, own.pull) - error[0]  # of o_p where y is zero
-        moved = by_cloud[:, :6] - own.free @ rows
+        moved = by_cloud[:, :6] - own.free @ cloud.rows
         across = seen.rows @ by
-        rows = across[..., :6] @ moved
+        by_own = across[..., :6]
+        rows = by_own @ moved
         for row, at in enumerate(model.columns_of_matches):
             rows[row][:, :, at[6:] - 6] += across[row, :, :, 6 : len(at)]
-        cameras = Displacement(
-            rows,
-            seen.pull + _times(across[..., :6], still),
-            across[..., :6] @ own.free @ _turned(across[..., :6]),
-            seen.left,
-            seen.free,
+        cameras = seen._replace(
+            rows=rows,
+            pull=seen.pull + _times(by_own, still),
+            spread=by_own @ own.free @ _turned(by_own),
         )
-        hessian, gradient = _turned(by_cloud) @ own.hessian @ by_cloud, own.gradient
-        return Places(hessian, _times(_turned(by_cloud), gradient), cloud, cameras)
+        return Places(
+            _turned(by_cloud) @ softened @ by_cloud,
+            _times(_turned(by_cloud), pulled),
+            cloud,
+            cameras,
+        )
 
     @cached_property
     def shared_factors(self) -> gtsam.GaussianFactorGraph:
@@ -375,19 +376,13 @@ def _left_information(hessian: Array, rows: NDArray[np.intp]) -> Array:
     return np.asarray(left * np.outer(units[rows], units[rows]))
 
 
-class _Softened(NamedTuple):
-    """A quadratic whose pose has been set free about a tie; the module's text names all."""
+def _soften(
+    hessian: Array, gradient: Array, covariance: Array, error: Array
+) -> tuple[Array, Array, Displacement]:
+    """A quadratic whose pose has been set free about a tie, in the step of c + e.
 
-    hessian: Array
-    gradient: Array
-    rows: Array
-    pull: Array
-    left: Array
-    free: Array
-
-
-def _soften(hessian: Array, gradient: Array, covariance: Array, error: Array) -> _Softened:
-    """Of (..., k, k) and (..., k), the pose in front, S and e; in the step of c + e."""
+    Of (..., k, k) and (..., k), the pose in front, S and e.
+    """
     rows = hessian[..., :6, :]
     left = _inverses(np.eye(6) + rows[..., :6] @ covariance)
     free = covariance @ left
@@ -399,7 +394,7 @@ def _soften(hessian: Array, gradient: Array, covariance: Array, error: Array) ->
     softened[..., :6] = _turned(softened[..., :6, :])
     pulled = gradient - _times(across, error + _times(free, pull))
     pulled[..., :6] = _times(left, pull)
-    return _Softened(softened, pulled, rows, pull, left, free)
+    return softened, pulled, Displacement(rows, pull, np.zeros_like(free), left, free)
 
 
 @dataclass(frozen=True, eq=False)
@@ -409,7 +404,7 @@ class ErrorFit:
     Attributes:
         linear: the graph linearized there.
         iterations: number of Gauss-Newton steps.
-        converged: whether it stopped by its tolerance.
+        change: of the cost by the last step, relative to it.
         keys: of the poses that are reported.
         ratios: of its variance components.
         without_priors: the optimum without measured relative poses and priors, where some are
@@ -418,10 +413,15 @@ class ErrorFit:
 
     linear: Linearization
     iterations: int
-    converged: bool
+    change: float
     keys: Sequence[int]
     ratios: VarianceRatios = VarianceRatios()
     without_priors: ErrorFit | None = None
+
+    @property
+    def converged(self) -> bool:
+        """Whether it is the minimum."""
+        return self.change <= TOLERANCE
 
     @property
     def model(self) -> LatentPoseModel:
@@ -496,17 +496,17 @@ def fit_latent_poses(
     present = start if start.model is model else start.with_model(model)
     if not (is_determined or present.is_determined()):
         return None
-    iterations, converged = 0, False
-    while iterations < MAX_ITERATIONS and not converged:
+    iterations, change = 0, np.inf
+    while iterations < MAX_ITERATIONS and change > relative_tolerance:
         try:
             found = present.descend()
         except np.linalg.LinAlgError:
             return None
         if found is None:  # this is the minimum, to rounding
-            return ErrorFit(present, iterations, True, model.reported_keys)
-        converged = present.cost - found.cost <= relative_tolerance * present.cost
+            return ErrorFit(present, iterations, 0.0, model.reported_keys)
+        change = (present.cost - found.cost) / max(present.cost, np.finfo(float).tiny)
         present, iterations = found, iterations + 1
-    return ErrorFit(present, iterations, converged, model.reported_keys)
+    return ErrorFit(present, iterations, change, model.reported_keys)
 
 
 def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> Linearization:

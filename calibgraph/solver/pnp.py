@@ -30,7 +30,6 @@ FINE, COARSE = 1e-10, 1e-3
 DAMPING = 1e-6
 """Of the diagonal, for frames that leave a direction free."""
 
-_REFINEMENTS = 2  # the first with the inliers of PnP, the second with those of the first
 _MIN_INLIER_SHARE = 0.1  # chosen, not measured
 _MIN_SCALED_EIGENVALUE = 1e-9  # below it a direction is free: points on one line, or in one place
 
@@ -111,7 +110,7 @@ def refine_frames(
     """
     least = np.maximum(MIN_MATCHES, _MIN_INLIER_SHARE * (runs[:, 1] - runs[:, 0]))
     found = np.ones(len(runs), dtype=np.bool_)
-    for _ in range(_REFINEMENTS):
+    for tolerance in (COARSE, FINE):  # with the inliers of PnP, then with those of the first
         residuals, projectable = block.run_residuals(T_camera_lidar, runs)
         squared = residuals[:, 0] ** 2 + residuals[:, 1] ** 2
         inlier = projectable & (squared < config.pnp_threshold_px**2)
@@ -120,7 +119,7 @@ def refine_frames(
         found &= inliers >= least
         some = block.select(inlier).rescale(scale=config.pnp_threshold_px / 2)
         places[~found] = 0
-        fit = fit_frames(some, places, T_camera_lidar)
+        fit = fit_frames(some, places, T_camera_lidar, tolerance=tolerance)
         T_camera_lidar = fit.T_camera_lidar
         found &= are_regular(fit.hessians, _MIN_SCALED_EIGENVALUE)
     return FramePoses(T_camera_lidar, fit.hessians, found, inliers)

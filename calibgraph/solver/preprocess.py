@@ -185,7 +185,8 @@ def are_projectable(
         rows = rows_where(camera == number)
         points = table.points_lidar_m
         own = points[rows] if isinstance(rows, slice) else points.take(rows, axis=0)
-        keep[rows] = model.lens.are_projectable(own, model.T_camera_lidar)
+        T = model.T_camera_lidar
+        keep[rows] = model.lens.project(own @ T[:3, :3].T + T[:3, 3])[1]
     return keep
 
 

@@ -19,16 +19,18 @@ from calibgraph.graph.objective import join, objective_graph, pose_key, projecti
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.geometry import (
     invert,
+    pose_rows,
     relative_transform,
     to_T_camera_lidar,
     to_T_lidar_camera,
 )
 from calibgraph.model.rig import Rig
 from calibgraph.solver.matches import MIN_MATCHES, BlockResiduals, CameraBlock
-from calibgraph.solver.pairs import PairTerm, pair_graph
+from calibgraph.solver.pairs import PairTerm, pair_graph, rows_of_pair
 from calibgraph.solver.preprocess import FILTERS
 from calibgraph.solver.robust import ResidualScale
 from calibgraph.solver.stage1 import CameraStage1, Stage1
+from factors import BlockSums, ProjectionBlock, lossless_factor
 
 MAX_ITERATIONS = 200
 """Of Levenberg-Marquardt."""
@@ -66,6 +68,8 @@ def optimize(
     graph: gtsam.NonlinearFactorGraph,
     cameras: Sequence[str],
     T_camera_lidar: Mapping[str, Array],
+    *,
+    tolerance: float = RELATIVE_TOLERANCE,
 ) -> Optimum:
     """Minimize a graph by Levenberg-Marquardt.
 
@@ -73,9 +77,10 @@ def optimize(
         graph: over the variables of the cameras.
         cameras: their names, in the order of the variables.
         T_camera_lidar: (4, 4) per camera, the start.
+        tolerance: relative change of the error at which it stops.
     """
     start = to_values(cameras, T_camera_lidar)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, _parameters())
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, _parameters(tolerance))
     values = optimizer.optimize()
     found = {name: to_T_camera_lidar(values.atPose3(pose_key(cameras, name))) for name in cameras}
     iterations = int(optimizer.iterations())
@@ -83,11 +88,11 @@ def optimize(
 
 
 @cache
-def _parameters() -> gtsam.LevenbergMarquardtParams:
+def _parameters(tolerance: float) -> gtsam.LevenbergMarquardtParams:
     """Of Levenberg-Marquardt, which copies them."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(MAX_ITERATIONS)
-    parameters.setRelativeErrorTol(RELATIVE_TOLERANCE)
+    parameters.setRelativeErrorTol(tolerance)
     parameters.setAbsoluteErrorTol(0.0)
     return parameters
 
@@ -144,11 +149,16 @@ class Objective:
             scales: of the residuals; only cameras that have one get a reprojection term. Without
                 any, there are no terms of pairs.
         """
-        blocks = {name: self.blocks[name].with_scale(scale) for name, scale in scales.items()}
+        blocks, pairs = self._at(scales)
         keys = {name: pose_key(self.cameras, name) for name in self.cameras}
-        pairs = self.pairs if scales else ()
-        reprojection = projection_graph(self.cameras, blocks if self.uses_correspondences else {})
+        reprojection = projection_graph(self.cameras, blocks)
         return join(reprojection, self.pose_graph, pair_graph(pairs, keys))
+
+    def _at(self, scales: Scales) -> tuple[dict[str, ProjectionBlock], tuple[PairTerm, ...]]:
+        """The correspondences of each camera, and the pairs, that the terms use."""
+        if not (scales and self.uses_correspondences):
+            return {}, ()
+        return {n: self.blocks[n].with_scale(scale) for n, scale in scales.items()}, self.pairs
 
     @cached_property
     def pose_graph(self) -> gtsam.NonlinearFactorGraph:
@@ -189,11 +199,41 @@ class Objective:
         free.__dict__["gate_hessian"] = self.gate_hessian  # the same gate
         return free
 
-    def minimize(self, start: Transforms, scales: Scales) -> Optimum:
+    def minimize(
+        self, start: Transforms, scales: Scales, *, tolerance: float = RELATIVE_TOLERANCE
+    ) -> Optimum:
         """The minimum by Levenberg-Marquardt, with the residuals' scales held constant."""
         if self.terms == "stage1":
             return Optimum(start, math.nan, 0, True)
-        return optimize(self.graph(scales), self.cameras, start)
+        return optimize(self._joined(scales), self.cameras, start, tolerance=tolerance)
+
+    def _joined(self, scales: Scales) -> gtsam.NonlinearFactorGraph:
+        """:meth:`graph` with all correspondences and pairs as one factor.
+
+        Their sums add, and an optimizer then asks once, not of each camera and pair.
+        """
+        blocks, pairs = self._at(scales)
+        seen = {*blocks, *(name for pair in pairs for name in (pair.a, pair.b))}
+        names = [name for name in self.cameras if name in seen]
+        rows = {name: np.r_[pose_rows(number)] for number, name in enumerate(names)}
+        tied = [(rows_of_pair(names, pair), pair) for pair in pairs]
+        size, graph = 6 * len(names), join(self.pose_graph)
+
+        def sums_at(*poses: gtsam.Pose3) -> tuple[BlockSums, None]:
+            at, cost = dict(zip(names, poses, strict=True)), 0.0
+            hessian, gradient = np.zeros((size, size)), np.zeros(size)
+            parts = [(rows[name], block.sums(at[name])) for name, block in blocks.items()]
+            parts += [(own, pair.block.sums(at[pair.a], at[pair.b])) for own, pair in tied]
+            for own, sums in parts:
+                hessian[own[:, None], own] += sums.hessian
+                gradient[own] += sums.gradient
+                cost += float(sums.cost)
+            return BlockSums(hessian, gradient, np.array(cost)), None
+
+        if names:
+            keys = [pose_key(self.cameras, name) for name in names]
+            graph.add(lossless_factor(keys, sums_at))
+        return graph
 
     def minimize_with_scale(self, start: Transforms) -> tuple[Transforms, Scales]:
         """Pass 1. With `auto` scales: minimize and re-measure the spread until it is constant.

@@ -82,7 +82,8 @@ def within_place(at: FittedObjective, name: str, placed: BlockByPlace) -> Within
         placed: its matches.
     """
     block = at.objective.blocks[name]
-    hessians = placed.sums(np.tile(at.T_camera_lidar[name], (len(placed.frames), 1, 1))).hessian
+    hessians = np.zeros((len(placed.frames), 6, 6))
+    np.add.at(hessians, placed.place_of_frame, at.frame_sums[name].hessian)
     root = np.linalg.cholesky(hessians.sum(axis=0) + WEAK)
     robust = at.robust_hessians[name]
     true = convex_hessian(robust + at.objective.gate_hessian.get(name, 0.0), robust) + WEAK
@@ -177,10 +178,10 @@ def pairs_by_place(pairs: Sequence[PairTerm], places: Sequence[Numbers]) -> list
     found = []
     for pair in pairs:
         own = [one for one in pairs if {one.a, one.b} == {pair.a, pair.b}]
-        term = pair.deflate(usual_excess(own))
-        of_row = place_of(term.frame, places)
+        of_row = place_of(pair.frame, places)
         rows = np.argsort(of_row, kind="stable")
         present, first = np.unique(of_row[rows], return_index=True)
         edges = np.append(first, len(rows))
-        found.append(PairByPlace(term.a, term.b, term.block.select(rows), present, edges))
+        block = pair.block.with_variance(usual_excess(own)).select(rows)
+        found.append(PairByPlace(pair.a, pair.b, block, present, edges))
     return found

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from factors import LOSSES, Lens, ProjectionBlock, block_factor, projection_factor, to_runs
+from factors.arrays import square_root
 from tests.factors.blocks import KEY, LENSES, TRUTH, at, poses, with_loss, world
 
 EACH_LENS_AND_LOSS = [
@@ -184,38 +185,15 @@ def test_solution_equals_that_of_the_separate_factors(name: str, loss: str) -> N
     np.testing.assert_allclose(one.matrix(), many.matrix(), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", LENSES)
-def test_gradient_agrees_with_finite_differences_of_the_error(name: str) -> None:
-    block = with_loss(world(LENSES[name], 200), "cauchy")
-    for pose in poses()[:4]:
-        gradient = block.sums(pose).gradient
-        step = 1e-6
-        numeric = [
-            (block.sums(pose.retract(d)).cost - block.sums(pose.retract(-d)).cost) / (4 * step)
-            for d in step * np.eye(6)
-        ]
-        np.testing.assert_allclose(gradient, numeric, rtol=1e-5, atol=1e-6 * np.abs(gradient).max())
-
-
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_points_give_a_singular_but_harmless_factor(count: int) -> None:
     block = with_loss(world(LENSES["pinhole"], count), "cauchy")
-    error, jacobian = block.error_and_jacobian(poses()[2])
+    error, jacobian = square_root(block.sums(poses()[2]))
     sums = block.sums(poses()[2])
     assert np.isfinite(error).all()
     np.testing.assert_allclose(jacobian.T @ jacobian, sums.hessian, atol=1e-9 * sums.hessian.max())
     np.testing.assert_allclose(jacobian.T @ error, sums.gradient, atol=1e-9 * 1e4)
     np.testing.assert_allclose(error @ error, sums.cost, rtol=1e-9)
-
-
-def test_sums_of_parts_add() -> None:
-    block = with_loss(world(LENSES["radtan"], 5000), "cauchy")
-    whole, edges = block.sums(TRUTH), [0, 700, 700, 3000, 5000]
-    parts = block.run_sums(TRUTH.inverse().matrix()[None], to_runs(np.array(edges)))
-    assert parts.cost[1] == 0.0
-    np.testing.assert_allclose(parts.hessian.sum(axis=0), whole.hessian, rtol=1e-12)
-    np.testing.assert_allclose(parts.gradient.sum(axis=0), whole.gradient, rtol=1e-9)
-    np.testing.assert_allclose(parts.cost.sum(), whole.cost, rtol=1e-12)
 
 
 def test_every_point_behind_the_camera_is_finite_and_bounded() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
@@ -11,19 +12,17 @@ import pytest
 
 from factors import (
     LOSSES,
-    EpipolarBlock,
     Lens,
     PairBlock,
     ProjectionBlock,
-    SurfaceBlock,
     pair_block_factor,
-    pair_chain,
+    placed_factor,
     projection_residual,
     ray_spreads,
     robust_noise,
     unproject,
 )
-from factors.pairs import factor_on_two_poses
+from factors.pose import custom_factor
 from tests.conftest import FORWARD, KANNALA, RADTAN5
 
 Array = np.ndarray
@@ -42,6 +41,19 @@ T_LIDAR_A = gtsam.Pose3(gtsam.Rot3(FORWARD.T), np.array([0.3, 0.1, -0.1]))
 T_LIDAR_B = T_LIDAR_A.compose(
     gtsam.Pose3(gtsam.Rot3.RzRyRx(0.02, -0.15, 0.01), np.array([0.5, 0.02, -0.05]))
 )
+
+
+def pair_chain(T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> Array:
+    """(6, 12) derivative of the tangent of ``T_a_b`` by the tangents of both poses."""
+    return np.hstack([-T_lidar_b.between(T_lidar_a).AdjointMap(), np.eye(6)])
+
+
+def plain_factor(noise: gtsam.noiseModel.Base, residual: Residual) -> gtsam.CustomFactor:
+    def linearize(values: gtsam.Values) -> tuple[Array, list[Array]]:
+        error, jacobian = residual(values.atPose3(A), values.atPose3(B))
+        return error, [jacobian[:, :6], jacobian[:, 6:]]
+
+    return custom_factor(noise, [A, B], linearize)
 
 
 class Features:
@@ -72,7 +84,7 @@ class Features:
         unit = gtsam.noiseModel.Unit.Create(1 if kind == "epipolar" else 2)
         noise = robust_noise(unit, loss=loss, scale=scale)
         for n in range(len(self.pixels_b)):
-            graph.add(factor_on_two_poses(noise, A, B, self.residual(kind, n)))
+            graph.add(plain_factor(noise, self.residual(kind, n)))
         return graph
 
     def residual(self, kind: str, n: int) -> Residual:
@@ -94,10 +106,12 @@ class Features:
         self, kind: str, loss: str = "cauchy", scale: float = 2.0
     ) -> PairBlock | ProjectionBlock:
         if kind == "epipolar":
-            return EpipolarBlock(*self.lenses, self.pixels_a, self.pixels_b, loss, scale)
+            made = PairBlock.epipolar(*self.lenses, self.pixels_a, self.pixels_b)
+            return replace(made, loss=loss, scale=scale)
         lens = self.lenses[1]
         if kind == "surface":
-            return SurfaceBlock(lens, self.rays_a, self.planes, self.pixels_b, loss, scale)
+            made = PairBlock.of_surfaces(lens, self.rays_a, self.planes, self.pixels_b)
+            return replace(made, loss=loss, scale=scale)
         return ProjectionBlock(lens, self.points_a, self.pixels_b, loss=loss, scale=scale)
 
 
@@ -182,7 +196,9 @@ def linearized(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple
 def test_a_block_equals_its_separate_factors(kind: str, loss: str, lenses: str) -> None:
     features, values = Features(LENSES[lenses], 60), near_truth()
     one = gtsam.NonlinearFactorGraph()
-    one.add(pair_block_factor(A, B, features.block(kind, loss)))
+    block = features.block(kind, loss)
+    of_points = isinstance(block, ProjectionBlock)  # which are in the frame of A
+    one.add(placed_factor([A, B], block) if of_points else pair_block_factor(A, B, block))
     error, hessian = linearized(one, values)
     expected_error, expected = linearized(features.separate(kind, loss, 2.0), values)
     assert error == pytest.approx(expected_error, rel=1e-9)
@@ -258,7 +274,7 @@ def test_runs_have_the_sums_of_their_features_at_poses_of_their_own(kind: str) -
 def test_an_epipolar_residual_is_the_distance_from_the_epipolar_line() -> None:
     """Side by side, u is free and a difference of 2 px in v is one of sqrt(2) px from each line."""
     lens = Lens.pinhole(fx=700.0, fy=700.0, cx=600.0, cy=200.0)
-    block = EpipolarBlock(lens, lens, np.array([[650.0, 240.0]]), np.array([[610.0, 242.0]]))
+    block = PairBlock.epipolar(lens, lens, np.array([[650.0, 240.0]]), np.array([[610.0, 242.0]]))
     for length in (0.1, 0.5):
         T_lidar_b = gtsam.Pose3(gtsam.Rot3(), np.array([length, 0.0, 0.0]))
         # Sampson's distance is of first order in the ratio of 2 px to the focal length.
@@ -282,16 +298,16 @@ def test_a_ray_that_leaves_its_plane_gives_finite_numbers() -> None:
 
 
 BAD: dict[str, Callable[[Features], object]] = {
-    "shape": lambda f: SurfaceBlock(f.lenses[1], f.rays_a, f.planes[:3], f.pixels_b),
-    "nan": lambda f: SurfaceBlock(f.lenses[1], f.rays_a, f.planes * np.nan, f.pixels_b),
-    "loss": lambda f: EpipolarBlock(*f.lenses, f.pixels_a, f.pixels_b, "welsch"),
-    "sigma": lambda f: EpipolarBlock(*f.lenses, f.pixels_a, f.pixels_b, sigma=0.0),
-    "ray": lambda f: EpipolarBlock(*f.lenses, f.pixels_a * np.nan, f.pixels_b),
-    "pixels": lambda f: EpipolarBlock(*f.lenses, f.pixels_a, f.pixels_b[:2]),
+    "shape": lambda f: PairBlock.of_surfaces(f.lenses[1], f.rays_a, f.planes[:3], f.pixels_b),
+    "nan": lambda f: PairBlock.of_surfaces(f.lenses[1], f.rays_a, f.planes * np.nan, f.pixels_b),
+    "loss": lambda f: replace(f.block("epipolar"), loss="welsch"),
+    "sigma": lambda f: f.block("surface").rescale(scale=1.0, sigma=0.0),
+    "ray": lambda f: PairBlock.epipolar(*f.lenses, f.pixels_a * np.nan, f.pixels_b),
+    "pixels": lambda f: PairBlock.epipolar(*f.lenses, f.pixels_a, f.pixels_b[:2]),
 }
 
 
 @pytest.mark.parametrize("make", BAD.values(), ids=BAD)
 def test_wrong_blocks_are_refused(make: Callable[[Features], object]) -> None:
-    with pytest.raises(ValueError, match=r"expected|unknown|positive|no ray"):
+    with pytest.raises(ValueError, match=r"expected|finite|unknown|positive|no ray"):
         make(Features(LENSES["pinhole"], 10))

@@ -26,12 +26,11 @@ from calibgraph.graph.variables import (
     matched_key,
     paired_key,
 )
-from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.error_model import fit_errors
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pairs import pair_terms
 from calibgraph.solver.places import ErrorFit, fit_latent_poses, start_values
-from factors import ProjectionBlock, placed_pair_factor
+from factors import ProjectionBlock
 from tests.conftest import stereo_relative_pose
 from tests.draws.lenses import with_known_lenses
 from tests.solver.latent import all_values, linearized
@@ -193,30 +192,6 @@ def test_a_pair_of_which_the_gate_has_left_nothing_takes_no_part(pair: Rig) -> N
     np.testing.assert_array_equal(found.covariance, expected.covariance)
 
 
-def test_the_factor_of_a_pair_and_its_cloud_is_that_of_the_moved_cameras(pair: Rig) -> None:
-    """Its error is that of the pair seen from the cloud, its Jacobian that by differences."""
-    term = pair_terms(pair, simulated_pairs(pair), Config())[0]
-    cloud = gtsam.Pose3.Expmap(np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.1]))
-    poses = [to_T_lidar_camera(pair.T_camera_lidar[name]) for name in (term.a, term.b)]
-    values = gtsam.Values()
-    for key, pose in enumerate([cloud, *poses]):
-        values.insert(key, pose)
-    factor = placed_pair_factor(0, 1, 2, term.block)
-    expected = term.block.sums(*(cloud.between(pose) for pose in poses))
-    assert 2 * factor.error(values) == pytest.approx(expected.cost, rel=1e-9)
-    jacobian, right = factor.linearize(values).jacobian()
-    gradient = -jacobian.T @ right
-    for column in range(18):
-        key, axis = divmod(column, 6)
-        step = 1e-6 * np.eye(6)[axis]
-        costs = []
-        for sign in (1.0, -1.0):
-            moved = gtsam.Values(values)
-            moved.update(key, values.atPose3(key).retract(sign * step))
-            costs.append(factor.error(moved))
-        assert gradient[column] == pytest.approx((costs[0] - costs[1]) / 2e-6, rel=1e-4, abs=1e-2)
-
-
 def test_matches_of_one_place_decide_by_themselves(pair: Rig) -> None:
     """Nothing contradicts them: the solve has no model, and the model the same minimum."""
     table = table_of(pair, 8, False, [])
@@ -239,7 +214,8 @@ def test_a_continued_fit_is_that_of_its_start(pair: Rig) -> None:
         found, expected = (fit_latent_poses(model, start) for start in starts)
         for name, T in found.T_camera_lidar.items():
             np.testing.assert_allclose(T, expected.T_camera_lidar[name], rtol=0, atol=1e-12)
-        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-9, atol=1e-13)
+        # Exact ties have 1e10 of information, beside 1e5 of the matches: 1e-16 of it counts.
+        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-8, atol=1e-13)
 
 
 def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Rig) -> None:
