@@ -189,13 +189,13 @@ def _in_other_scenes(
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) * size - 0.5
     rays, known = unproject(camera.lens, pixels)
     rays, pixels = rays[known] / np.linalg.norm(rays[known], axis=1)[:, None], pixels[known]
-    found = np.zeros((len(_SCENES), 6, len(rows)))
-    for number, scale in enumerate(_SCENES):
-        spread = np.concatenate([usual_m * scale * depth * rays for depth in _DEPTHS])
-        scene = ProjectionBlock(camera.lens, spread, np.tile(pixels, (len(_DEPTHS), 1)), loss="l2")
-        columns = lens_columns(lens, scene, np.eye(4))
-        found[number] = np.linalg.solve(columns[:, :6] + WEAK, columns[:, rows])
-    return found
+    at_m = usual_m * np.outer(_SCENES, _DEPTHS).ravel()
+    points, pixels = (at_m[:, None, None] * rays).reshape(-1, 3), np.tile(pixels, (len(at_m), 1))
+    scenes, count = ProjectionBlock(camera.lens, points, pixels, loss="l2"), len(_SCENES)
+    runs = to_runs(np.arange(count + 1) * (len(points) // count))
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    hessian = scenes.summarize(poses, runs, lens.free, lens.values).hessian
+    return np.asarray(np.linalg.solve(hessian[:, :6, :6] + WEAK, hessian[:, :6, rows]))
 
 
 def weak_information(lens: LensVariable | None) -> Array:
