@@ -156,7 +156,7 @@ def load_dataset(
     others = () if recorded == chosen else tuple(recorded)
     data = replace(data, frames=tuple(chosen), recorded=others, notes=tuple(notes))
     data = data if frames is None else _complete(data.select(frames))
-    of_cloud = data.frames[0].describe_cloud() if data.frames else ()
+    of_cloud = data.frames[0].describe_cloud() if data.frames and data.rig.cameras else ()
     return replace(data, notes=(*of_cloud, *data.notes))
 
 
@@ -189,9 +189,19 @@ def _frames_of_files(
     complete: bool, tolerance_s: float, interval_s: float | None,
 ) -> FoundFrames:  # fmt: skip
     """The frames of a folder; the complete ones where names are stamps."""
-    found = frames_of_folder(path, [*rig.cameras], complete=complete, sync_tolerance_s=tolerance_s)
+    lidars = [rig.lidar, *rig.other_lidars] if rig.lidars else []
+    found = frames_of_folder(
+        path, [*rig.cameras], lidars=lidars, complete=complete, sync_tolerance_s=tolerance_s
+    )
     frames = tuple(
-        Frame(start + n, prefix + each.stem, each.cloud, each.images, columns=rig.cloud_columns)
+        Frame(
+            start + n,
+            prefix + each.stem,
+            each.cloud,
+            each.images,
+            columns=rig.cloud_columns,
+            lidar_paths=each.lidars,
+        )
         for n, each in enumerate(found.files)
         if not found.pairing or rig.cameras.keys() <= each.images.keys()
     )

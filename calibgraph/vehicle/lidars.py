@@ -1,93 +1,80 @@
 """LiDARs relative to a base LiDAR: planes of each matched with planes of all others, at once.
 
-With T_i = T_base_lidar of LiDAR i, a plane (c, n) of i and one (d, m) of j, the residual is
-m . (T_i c - T_j d) in the base frame. The steps xi of T = exp(xi) estimate have the Jacobian
-[(T_i c) x m, m] for i, and its negative for j. All LiDARs and places are one system of normal
-equations, so loops close by construction.
-
-Residuals of one surface err alike: the gradients of cells of ``CELL_M`` are the independent units,
-and the covariance is H^-1 (sum g g^T) H^-1 over cells. Where there are several places, each is
-fitted alone about the joint estimate; if they differ by more than their covariances say, all bars
-widen by what they differ.
+All LiDARs and places are one system of sums (``sums.py``), so loops close by construction. At each
+place p the LiDARs stand at theta + u_p, u_p ~ N(0, D): what a place does to all its planes alike,
+such as points of other times. With H_p, g_p of a place and S_p, the scatter of its cells'
+gradients, it has the information I_p = H_p S_p^-1 H_p about theta + u_p, and u_p is eliminated as
+a camera's places are: the sum of I_p - I_p (I_p + D^-1)^-1 I_p is the information about theta. The
+sizes in D are REML estimates (Schall), about a prior.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 
-import gtsam
 import numpy as np
-from numpy.typing import NDArray
+import scipy.linalg
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.vehicle.planes import Planes, find_planes
+from calibgraph.vehicle.sums import Matches, Sums, sum_up
 
-CELL_M = 2.0
-"""Edge of the cells whose residuals count as one."""
-
-_GATES_M = (1.0, 0.5, 0.3, 0.2)  # of the residuals, while the poses converge
-_LAST_GATE_M, _MOST_ROUNDS = 0.1, 20
+_GATES_M = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.13)  # of the residuals, while the poses converge
+_LAST_GATE_M, _MOST_ROUNDS = 0.1, 25
+_AT_PLACE = 2  # number of the gate from which a place is fitted alone
+_WIDTH = 0.5  # of the Cauchy loss over the gate, at least, while the poses converge
 _COARSE_COSINE, _FINE_COSINE = np.cos(np.radians([35.0, 20.0]))  # of two normals of one plane
 _LEAST_SCALE_M = 0.003  # of the Cauchy loss: simulated scans have none
 _CONVERGED = 1e-6  # rad and m
 _REACH_M = 3.0  # between the centres of two pieces of one plane
 _LEAST_MATCHES = 100
-_DETERMINED = 1e-9  # smallest eigenvalue of the unit-diagonal information
-_PRIOR_PLACES = 1.0  # places that scatter as the cells say, in the mean
+_UPRIGHT = np.cos(np.radians(45.0))  # of a normal against up: below, the plane is upright
+
+PLACE_SIGMAS = np.repeat([np.radians(0.1), 0.015], 3)
+"""(6,) [rad, m]: prior of what a LiDAR's pose differs between places, beyond what cells show: a car
+whose clouds are 10 ms apart at 1.5 m/s. Results of tilted domes differ by 1 to 2 cm, 0.2 deg."""
+_PLACE_DOF = 3.0  # of that prior: one place
+_GUESS_SIGMAS = np.repeat([np.radians(10.0), 1.0], 3)  # of a direction that no plane determines
+_EXACT = 1e-18  # [m^2, rad^2] least variance, for rounding
+_SETTLED, _MOST_STEPS = 0.01, 50  # of REML
 
 Clouds = Mapping[str, Sequence[Array]]
 """Per LiDAR its clouds (n, 3+) in its own frame [m], one of each instant; the same instants."""
 
 
 @dataclass(frozen=True, eq=False)
-class LidarCalibration:
+class LidarPoses:
     """LiDARs relative to the base.
 
     Attributes:
         base: its name.
         T_base_lidar: per LiDAR, (4, 4): p_base = T_base_lidar * p_lidar.
-        covariance: per LiDAR but the base, (6, 6) of xi in T_base_lidar = exp(xi) estimate,
-            xi = (rotation [rad], translation [m]) in the base's axes.
+        covariance: per LiDAR but the base, (6, 6) of xi = (rotation [rad], translation [m]) in the
+            base's axes: R = exp(rotation) R_estimate, t = t_estimate + translation, t being the
+            position of the LiDAR.
         joint_covariance: (6 k, 6 k) of them all, in their order.
-        matches: per LiDAR, matched planes.
-        place_ratio: variance of what places differ over what their covariances say; 1 of one place.
+        loose: per LiDAR but the base, the share of each axis of xi that no plane determines (0-1).
+        matched: per LiDAR, the share of its planes near others' that lie on them (0-1).
+        places: their number.
+        place_ratios: variance of rotation and translation between places over its prior.
     """
 
     base: str
     T_base_lidar: Mapping[str, Array]
     covariance: Mapping[str, Array]
     joint_covariance: Array
-    matches: Mapping[str, int]
-    place_ratio: float
+    loose: Mapping[str, Array]
+    matched: Mapping[str, float]
+    places: int
+    place_ratios: tuple[float, float]
 
 
-@dataclass(frozen=True, eq=False)
-class _Matches:
-    """Matched planes of two LiDARs at one place.
-
-    Attributes:
-        place: its number.
-        one, other: numbers of the LiDARs.
-        jacobian: (m, 6) of the residuals, by the step of the one; the other's is its negative.
-        residuals_m: (m,).
-        cells: (m, 3) numbers of cells.
-    """
-
-    place: int
-    one: int
-    other: int
-    jacobian: Array
-    residuals_m: Array
-    cells: NDArray[np.int64]
-
-
-def calibrate_lidars(
-    clouds: Clouds, T_base_lidar: Mapping[str, Array], *, base: str
-) -> LidarCalibration:
+def calibrate_lidars(clouds: Clouds, T_base_lidar: Mapping[str, Array], *, base: str) -> LidarPoses:
     """The poses of LiDARs from what they see in common, at all instants at once.
 
     The vehicle stands at each instant, or the clouds have been brought to one time.
@@ -98,29 +85,56 @@ def calibrate_lidars(
         base: name of the LiDAR in whose frame the others are.
 
     Raises:
-        CalibrationError: if LiDARs see too little in common, or leave a direction free.
+        CalibrationError: if LiDARs see too little in common.
         ValueError: if names or counts of clouds do not fit.
     """
     names = [base, *(name for name in clouds if name != base)]
     _require_alike(clouds, T_base_lidar, names)
     planes = [[find_planes(cloud) for cloud in clouds[name]] for name in names]
     T = np.array([np.eye(4), *(np.asarray(T_base_lidar[name], np.float64) for name in names[1:])])
-    for number in range(_MOST_ROUNDS):
+    T, sums = refine_poses(planes, T, names)
+    places = [_at_place([of[i : i + 1] for of in planes], T, names) for i in range(len(planes[0]))]
+    step, joint, ratios = _over_places(places)
+    T, loose = _moved(T, step), _loose(sums)
+    near, on = count_matched(planes, T)
+    rows = [slice(6 * row, 6 * row + 6) for row in range(len(names) - 1)]
+    return LidarPoses(
+        base,
+        dict(zip(names, T, strict=True)),
+        {name: joint[of, of] for name, of in zip(names[1:], rows, strict=True)},
+        joint,
+        {name: np.diag(loose)[of] for name, of in zip(names[1:], rows, strict=True)},
+        dict(zip(names, (on / near).tolist(), strict=True)),
+        len(places),
+        ratios,
+    )
+
+
+def refine_poses(
+    planes: Sequence[Sequence[Planes]],
+    T_base_lidar: Array,
+    names: Sequence[str],
+    *,
+    first: int = 0,
+    rounds: int = _MOST_ROUNDS,
+) -> tuple[Array, Sums]:
+    """The (k, 4, 4) poses at which planes fit best, and the sums there; the base is the first.
+
+    Raises:
+        CalibrationError: if a LiDAR has too few matches.
+    """
+    T = T_base_lidar
+    for number in range(first, rounds):
         is_last = number >= len(_GATES_M)
         gate_m = _LAST_GATE_M if is_last else _GATES_M[number]
         matches = _match(planes, T, gate_m, _FINE_COSINE if number > 1 else _COARSE_COSINE)
-        counts = _require_overlap(matches, names)
-        weights, scale_m = _weigh(matches)
-        hessian, gradient = _equations(matches, weights, len(names))
-        step = -np.linalg.solve(_require_determined(hessian, names), gradient)
-        moved = step.reshape(-1, 6)
-        T[1:] = [gtsam.Pose3.Expmap(xi).matrix() @ of for xi, of in zip(moved, T[1:], strict=True)]
+        _require_overlap(matches, names)
+        sums = sum_up(matches, T, _scale_m(matches, 0.0 if is_last else _WIDTH * gate_m))
+        step = _step(sums)
+        T = _moved(T, step)
         if is_last and np.abs(step).max() < _CONVERGED:
             break
-    joint, ratio = _covariance(matches, weights, scale_m, len(names))
-    rows = [slice(6 * row, 6 * row + 6) for row in range(len(names) - 1)]
-    own = {name: joint[of, of] for name, of in zip(names[1:], rows, strict=True)}
-    return LidarCalibration(base, dict(zip(names, T, strict=True)), own, joint, counts, ratio)
+    return T, sums
 
 
 def _require_alike(clouds: Clouds, guess: Mapping[str, Array], names: Sequence[str]) -> None:
@@ -133,11 +147,35 @@ def _require_alike(clouds: Clouds, guess: Mapping[str, Array], names: Sequence[s
         raise ValueError(f"clouds of the same instants are needed; found {counts}")
 
 
+def _moved(T_base_lidar: Array, steps: Array) -> Array:
+    """(k, 4, 4) poses after (6 (k - 1),) steps of all but the base."""
+    T = T_base_lidar.copy()
+    for pose, step in zip(T[1:], steps.reshape(-1, 6), strict=True):
+        pose[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3]
+        pose[:3, 3] += step[3:]
+    return T
+
+
 def _match(
     planes: Sequence[Sequence[Planes]], T_base_lidar: Array, gate_m: float, cosine: float
-) -> list[_Matches]:
+) -> list[Matches]:
     """Each plane with the nearest one of every other LiDAR, if that can be the same."""
     found = []
+    for place, one, other, of, to in _nearest(planes, T_base_lidar):
+        apart = of.centers_m - to.centers_m
+        across = (to.normals * apart).sum(axis=1)
+        along = np.sqrt(np.maximum((apart**2).sum(axis=1) - across**2, 0.0))
+        same = (along < np.maximum(of.radii_m, to.radii_m)) & (np.abs(across) < gate_m)
+        same &= (of.normals * to.normals).sum(axis=1) > cosine
+        if same.any():
+            found.append(Matches(place, one, other, of.select(same), to.select(same)))
+    return found
+
+
+def _nearest(
+    planes: Sequence[Sequence[Planes]], T_base_lidar: Array
+) -> Iterator[tuple[int, int, int, Planes, Planes]]:
+    """Per place and ordered pair of LiDARs, planes of one and the nearest of the other in reach."""
     for place, seen in enumerate(zip(*planes, strict=True)):
         here = [own.moved(T) for own, T in zip(seen, T_base_lidar, strict=True)]
         trees = [cKDTree(own.centers_m) if len(own) else None for own in here]
@@ -147,107 +185,120 @@ def _match(
                 continue
             away, nearest = tree.query(of.centers_m, distance_upper_bound=_REACH_M)
             rows = np.flatnonzero(np.isfinite(away))
-            of, to = of.select(rows), to.select(nearest[rows])
-            apart = of.centers_m - to.centers_m
-            across = (to.normals * apart).sum(axis=1)
-            along = np.sqrt(np.maximum((apart**2).sum(axis=1) - across**2, 0.0))
-            same = (along < np.maximum(of.radii_m, to.radii_m)) & (np.abs(across) < gate_m)
-            same &= (of.normals * to.normals).sum(axis=1) > cosine
-            of, to = of.select(same), to.select(same)
-            jacobian = np.hstack([np.cross(of.centers_m, to.normals), to.normals])
-            cells = np.floor(of.centers_m / CELL_M).astype(np.int64)
-            found.append(_Matches(place, one, other, jacobian, across[same], cells))
-    return found
+            yield place, one, other, of.select(rows), to.select(nearest[rows])
 
 
-def _require_overlap(matches: Sequence[_Matches], names: Sequence[str]) -> dict[str, int]:
-    """Per LiDAR its matches; one line if one has too few."""
-    counts = dict.fromkeys(names, 0)
-    for own in matches:
-        for number in (own.one, own.other):
-            counts[names[number]] += len(own.residuals_m)
-    for name, count in counts.items():
+def count_matched(
+    planes: Sequence[Sequence[Planes]], T_base_lidar: Array, *, up: Array | None = None
+) -> tuple[Array, Array]:
+    """Per LiDAR (k,): planes whose centre another's plane is near, and how many lie on it.
+
+    With (3,) ``up`` in the base frame only those that are upright.
+    """
+    near, on = np.zeros(len(T_base_lidar)), np.zeros(len(T_base_lidar))
+    for _, one, other, of, to in _nearest(planes, T_base_lidar):
+        apart = of.centers_m - to.centers_m
+        beside = (apart**2).sum(axis=1) < np.maximum(of.radii_m, to.radii_m) ** 2
+        if up is not None:
+            beside &= np.abs(of.normals @ up) < _UPRIGHT
+        across = np.abs((to.normals * apart).sum(axis=1)) < _LAST_GATE_M
+        on_it = beside & across & ((of.normals * to.normals).sum(axis=1) > _FINE_COSINE)
+        for number in (one, other):
+            near[number] += beside.sum()
+            on[number] += on_it.sum()
+    return near, on
+
+
+def _require_overlap(matches: Sequence[Matches], names: Sequence[str]) -> None:
+    """One line if a LiDAR has too few matches."""
+    for number, name in enumerate(names):
+        count = sum(len(own.planes) for own in matches if number in (own.one, own.other))
         if count < _LEAST_MATCHES:
             raise CalibrationError(
                 f"LiDAR {name!r} sees {count} planes that others see, at least {_LEAST_MATCHES} "
                 "are needed; check its guess T_base_lidar (p_base = T_base_lidar * p_lidar), or "
                 "record where walls and ground are in view of both"
             )
-    return counts
 
 
-def _weigh(matches: Sequence[_Matches]) -> tuple[list[Array], float]:
-    """Weights of the residuals in a Cauchy loss as wide as they spread, and that width."""
-    every = np.concatenate([own.residuals_m for own in matches])
-    scale_m = max(2.0 * 1.4826 * float(np.median(np.abs(every))), _LEAST_SCALE_M)
-    return [1.0 / (1.0 + (own.residuals_m / scale_m) ** 2) for own in matches], scale_m
+def _scale_m(matches: Sequence[Matches], least_m: float) -> float:
+    """Width of the Cauchy loss: as residuals spread."""
+    every = np.concatenate([own.residuals_m[0] for own in matches])
+    return max(2.0 * 1.4826 * float(np.median(np.abs(every))), _LEAST_SCALE_M, least_m)
 
 
-def _full(own: _Matches, lidars: int) -> Array:
-    """(m, 6 k) Jacobian by all LiDARs but the base."""
-    full = np.zeros((len(own.residuals_m), lidars, 6))
-    full[:, own.one] += own.jacobian
-    full[:, own.other] -= own.jacobian
-    return full[:, 1:].reshape(len(full), -1)
+def _step(sums: Sums) -> Array:
+    """(d,) Gauss-Newton, along what is determined."""
+    basis = sums.basis()
+    hessian = basis.T @ sums.hessian.sum(axis=0) @ basis
+    return np.asarray(-basis @ np.linalg.solve(hessian, basis.T @ sums.gradient.sum(axis=0)))
 
 
-def _equations(
-    matches: Sequence[_Matches], weights: Sequence[Array], lidars: int
+def _loose(sums: Sums) -> Array:
+    """(d, d) projection onto the steps that no pair determines, across the others."""
+    hessian = sums.hessian.sum(axis=0)
+    return np.asarray(
+        np.eye(len(hessian)) - np.linalg.pinv(hessian, 1e-9, hermitian=True) @ hessian
+    )
+
+
+def _at_place(
+    planes: Sequence[Sequence[Planes]], T_base_lidar: Array, names: Sequence[str]
 ) -> tuple[Array, Array]:
-    """(6 k, 6 k) H and (6 k,) g of the normal equations."""
-    size = 6 * (lidars - 1)
-    hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    for own, weight in zip(matches, weights, strict=True):
-        weighted = _full(own, lidars) * weight[:, None]
-        hessian += weighted.T @ _full(own, lidars)
-        gradient += own.residuals_m @ weighted
-    return hessian, gradient
+    """(d, d) I_p and (d,) I_p (theta + u_p) of one place, in steps from poses near its optimum.
 
-
-def _require_determined(hessian: Array, names: Sequence[str]) -> Array:
-    units = np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(hessian / np.outer(units, units))
-    if values[0] < _DETERMINED:
-        loose = names[1 + int(np.argmax(np.abs(vectors[:, 0]))) // 6]
-        raise CalibrationError(
-            f"LiDAR {loose!r}: the planes that it shares with others leave a direction free; record "
-            "where surfaces of three directions are in view, such as ground and two walls"
-        )
-    return hessian
-
-
-def _covariance(
-    matches: Sequence[_Matches], weights: Sequence[Array], scale_m: float, lidars: int
-) -> tuple[Array, float]:
-    """(6 k, 6 k) covariance by cells and places, and the variance ratio of places."""
-    places = sorted({own.place for own in matches})
-    hessians, scatters, gradients = [], [], []
-    for place in places:
-        own = [(of, by) for of, by in zip(matches, weights, strict=True) if of.place == place]
-        hessian, gradient = _equations(*zip(*own, strict=True), lidars)  # type: ignore[arg-type]
-        pulls = np.concatenate([_full(of, lidars) * (by * of.residuals_m)[:, None] for of, by in own])
-        cells = np.unique(np.concatenate([of.cells for of, _ in own]), axis=0, return_inverse=True)
-        sums = np.zeros((len(cells[0]), pulls.shape[1]))
-        np.add.at(sums, cells[1].ravel(), pulls)
-        hessians.append(hessian)
-        gradients.append(gradient)
-        scatters.append(sums.T @ sums)
-    inverse = np.linalg.inv(sum(hessians))
-    joint = inverse @ sum(scatters) @ inverse
-    ratio = _place_ratio(np.array(hessians), np.array(gradients), np.array(scatters))
-    return joint * ratio, ratio
-
-
-def _place_ratio(hessians: Array, gradients: Array, scatters: Array) -> float:
-    """At least 1: the squared gradients of places over the scatter of their cells.
-
-    At the joint estimate the gradients of places add up to zero: of P places they have P - 1 times
-    as many degrees of freedom as there are unknowns that a place determines.
+    The place is fitted alone. The scatter S_p is of its cells there, each with the weight of
+    leaving it out (the jackknife): a direction that hangs by one cell is determined by none. A
+    place with too few matches has no information.
     """
-    count, size = gradients.shape
-    if count == 1:
-        return 1.0
-    inverse = [np.linalg.pinv(scatter, rcond=1e-10, hermitian=True) for scatter in scatters]
-    squared = sum(float(g @ of @ g) for g, of in zip(gradients, inverse, strict=True))
-    prior = _PRIOR_PLACES * size
-    return max(1.0, (prior + squared) / (prior + (count - 1) * size))
+    size = 6 * (len(names) - 1)
+    try:
+        T, sums = refine_poses(planes, T_base_lidar, names, first=_AT_PLACE)
+    except CalibrationError:
+        return np.zeros((size, size)), np.zeros(size)
+    basis = sums.basis()
+    whole = sums.hessian.sum(axis=0) @ basis  # (d, q)
+    hessian, cells = basis.T @ whole, basis.T @ sums.hessian @ basis
+    gradients = (sums.gradient @ basis)[:, :, None]
+    apart = np.linalg.solve(hessian - cells, gradients)[:, :, 0]  # of a fit without the cell
+    root = np.linalg.cholesky(apart.T @ apart + _EXACT * np.eye(len(hessian)))
+    seen = np.linalg.solve(hessian, whole.T)
+    by = scipy.linalg.solve_triangular(root, seen, lower=True)  # (q, d)
+    return by.T @ by, by.T @ by @ _steps_between(T_base_lidar, T)
+
+
+def _steps_between(T_base_lidar: Array, others: Array) -> Array:
+    """(d,) the steps of all but the base from (k, 4, 4) poses to others."""
+    turns = others[1:, :3, :3] @ T_base_lidar[1:, :3, :3].transpose(0, 2, 1)
+    shifts = others[1:, :3, 3] - T_base_lidar[1:, :3, 3]
+    return np.column_stack([Rotation.from_matrix(turns).as_rotvec(), shifts]).ravel()
+
+
+def _over_places(
+    places: Sequence[tuple[Array, Array]],
+) -> tuple[Array, Array, tuple[float, float]]:
+    """(d,) step to the optimum over places, its (d, d) covariance, and the ratios of D."""
+    informations, vectors = map(np.array, zip(*places, strict=True))
+    size = len(vectors[0])
+    is_turn = np.tile([True] * 3 + [False] * 3, size // 6)
+    prior = np.tile(PLACE_SIGMAS**2, size // 6)
+    guess = np.tile(_GUESS_SIGMAS**-2.0, size // 6)
+    ratios = np.ones(2)
+    for _ in range(_MOST_STEPS):
+        variance = prior * np.where(is_turn, *ratios)
+        at_place = np.linalg.inv(informations + np.diag(1.0 / variance))
+        gain = at_place @ informations
+        known = (informations - informations @ gain).sum(axis=0) + np.diag(guess)
+        vector = (vectors - (informations @ (at_place @ vectors[:, :, None]))[:, :, 0]).sum(axis=0)
+        joint = np.linalg.inv(known)
+        step = joint @ vector
+        apart = (at_place @ (vectors - informations @ step)[:, :, None])[:, :, 0]
+        open_ = np.einsum("pii->pi", at_place + gain @ joint @ gain.transpose(0, 2, 1))
+        before, ratios = ratios, np.array([
+            (_PLACE_DOF + float((apart[:, own] ** 2 / prior[own]).sum()))
+            / (_PLACE_DOF + float((1.0 - open_[:, own] / variance[own]).sum()))
+            for own in (is_turn, ~is_turn)
+        ])  # fmt: skip
+        if np.abs(np.log(ratios / before)).max() < _SETTLED:
+            break
+    return step, (joint + joint.T) / 2, (float(ratios[0]), float(ratios[1]))

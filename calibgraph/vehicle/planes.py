@@ -7,6 +7,7 @@ were measured, if they spread in two directions.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -34,24 +35,31 @@ class Planes:
         centers_m: (n, 3) means of their points.
         normals: (n, 3) unit vectors, towards the LiDAR.
         radii_m: (n,) of the neighbourhoods.
+        tilts: (n,) by how much a normal may err [rad]: roughness over the least extent.
     """
 
     centers_m: Array
     normals: Array
     radii_m: Array
+    tilts: Array
 
     def __len__(self) -> int:
         return len(self.radii_m)
 
     def select(self, rows: NDArray[Any]) -> Planes:
         """Some of them: a mask, or an index array."""
-        return Planes(self.centers_m[rows], self.normals[rows], self.radii_m[rows])
+        return Planes(
+            self.centers_m[rows], self.normals[rows], self.radii_m[rows], self.tilts[rows]
+        )
 
     def moved(self, T_base_lidar: Array) -> Planes:
         """The same in another frame, by (4, 4)."""
         R = T_base_lidar[:3, :3]
         centers = self.centers_m @ R.T + T_base_lidar[:3, 3]
         return replace(self, centers_m=centers, normals=self.normals @ R.T)
+
+
+_NONE = Planes(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))
 
 
 def find_planes(points_lidar_m: Array) -> Planes:
@@ -63,7 +71,7 @@ def find_planes(points_lidar_m: Array) -> Planes:
     points = np.asarray(points_lidar_m[:, :3], dtype=np.float64)
     ranges = np.linalg.norm(points, axis=1)
     points = points[(ranges > _NEAREST_M) & (ranges < _FARTHEST_M)]
-    left, found, tree = _seeds(points), [Planes(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))], None
+    left, found, tree = _seeds(points), [_NONE], None
     for share in _SHARES:
         if not len(left):
             break
@@ -72,12 +80,15 @@ def find_planes(points_lidar_m: Array) -> Planes:
         own, is_plane, spreads = _fit(points, tree.query_ball_point(left, radii), radii)
         found.append(own.select(is_plane))
         left = left[~spreads]
-    joined = [np.concatenate(parts) for parts in zip(*map(_fields, found), strict=True)]
-    return Planes(*joined)
+    return join_planes(found)
 
 
-def _fields(planes: Planes) -> tuple[Array, Array, Array]:
-    return planes.centers_m, planes.normals, planes.radii_m
+def join_planes(parts: Sequence[Planes]) -> Planes:
+    """All planes of several clouds, in one frame."""
+    fields = zip(
+        *([getattr(each, key) for key in Planes.__annotations__] for each in parts), strict=True
+    )
+    return Planes(*map(np.concatenate, fields))
 
 
 def _seeds(points: Array) -> Array:
@@ -111,4 +122,5 @@ def _fit(
     is_plane = spreads & (across < _FLAT * least) & (across < _ROUGH_M**2)
     normals = vectors[:, :, 0]
     normals = normals * np.where((normals * centers).sum(axis=1) > 0, -1.0, 1.0)[:, None]
-    return Planes(centers, normals, radii), is_plane, spreads
+    tilts = np.sqrt(np.maximum(across, 0.0) / np.maximum(least, np.finfo(float).tiny))
+    return Planes(centers, normals, radii, tilts), is_plane, spreads
