@@ -70,6 +70,7 @@ from .model.verdict import Check as Check
 from .model.verdict import Verdict as Verdict
 from .pipeline import calibrate as calibrate
 from .pipeline import solve as solve
+from .report.mcap_file import write_mcap as write_mcap
 from .simulation.correspondences import MatcherErrors as MatcherErrors
 from .simulation.correspondences import simulate_correspondences as simulate_correspondences
 from .simulation.recording import simulate_street as simulate_street
@@ -79,5 +80,3 @@ from .tracking import IncrementalCalibrator as IncrementalCalibrator
 from .tracking import Update as Update
 from .tracking import warm_up_tracker as warm_up_tracker
 from .trust.inputs import Finding as Finding
-from .view.mcap_file import write_mcap as write_mcap
-from .view.rerun_file import write_rerun as write_rerun

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Self, TypeVar
 
 import numpy as np
@@ -15,10 +14,10 @@ from factors.loss import loss_id
 Array = NDArray[np.float64]
 _Number = TypeVar("_Number", bound=np.generic)
 
-_CHUNK = 2048  # correspondences a task: fixed, so that sums do not depend on the thread count
 _LEAST = 1e-14  # of the largest eigenvalue: below, a direction counts as free
-_PLACES = np.array([[min(i, j) * (11 - min(i, j)) // 2 + max(i, j) for j in range(6)]
-                    for i in range(6)])  # fmt: skip
+_UPPER = np.triu_indices(6)
+_PLACES = np.empty((6, 6), np.int64)
+_PLACES[_UPPER] = _PLACES.T[_UPPER] = np.arange(21)
 
 
 @dataclass(frozen=True)
@@ -148,21 +147,6 @@ def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     return read_only(runs)
 
 
-def rotate_each(R: Array, vectors: Array) -> Array:
-    """Rotate (n, 3) vectors, each by its own of (n, 3, 3), or all by one of (1, 3, 3)."""
-    if len(R) == 1:
-        return np.asarray(vectors @ R[0].T)
-    return np.asarray(np.einsum("nij,nj->ni", R, vectors))
-
-
-@lru_cache
-def chunks(count: int) -> NDArray[np.int64]:
-    """(c, 2) runs of _CHUNK of so many correspondences at most."""
-    edges = np.arange(0, count + _CHUNK, _CHUNK)
-    edges[-1] = count
-    return to_runs(edges)
-
-
 def square_root(sums: BlockSums) -> tuple[Array, Array]:
     """(n + 1,) error and (n + 1, n) Jacobian with the given H, b and c; H may be rank deficient.
 
@@ -189,3 +173,9 @@ def square_root(sums: BlockSums) -> tuple[Array, Array]:
 def unpack_sums(sums: Array) -> BlockSums:
     """Split (..., 28) kernel sums: 21 of the upper triangle of H, 6 of b, 1 of c."""
     return BlockSums(sums.take(_PLACES, axis=-1), sums[..., 21:27], sums[..., 27])
+
+
+def pack_sums(products: Array) -> Array:
+    """(r, 28) as above, of (r, 8, 7) products of the columns of a pose and the residual."""
+    upper = products[:, *_UPPER]
+    return np.concatenate([upper, products[:, :6, 6], products[:, 7, :1]], axis=1)

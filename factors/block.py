@@ -24,9 +24,9 @@ from factors.arrays import (
     BlockSums,
     RobustBlock,
     check_shape,
-    chunks,
     contiguous,
     join_roots,
+    pack_sums,
     read_only,
     rows_of_root,
     square_root,
@@ -38,7 +38,6 @@ from factors.kernel import (
     COLUMNS,
     COST,
     CURVATURE,
-    HESSIAN,
     MATRICES,
     PRODUCTS,
     RAYS,
@@ -53,7 +52,7 @@ from factors.pose import custom_factor, keep_last
 
 Array = NDArray[np.float64]
 
-_WORTH_SHARING = 2_000_000  # correspondences (7 ms): below, waiting for busy cores costs more
+_NO_STEP = np.empty(0)
 _WIDTHS = {"points_lidar_m": 3, "pixels_px": 2, "sqrt_information": 3, "motion": 7}
 
 
@@ -89,7 +88,7 @@ class ProjectionBlock(RobustBlock):
     motion: Array | None = None
     _columns: Array = field(init=False, repr=False)  # (5, n) x y z u v, or (12, n) with the motion
     _whitening: Array = field(init=False, repr=False)  # (3, n), (1, n) or (0, n), see the kernel
-    _chunks: NDArray[np.int64] = field(init=False, repr=False)  # (c, 2) runs of all
+    _whole: NDArray[np.int64] = field(init=False, repr=False)  # (1, 2) the run of all
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)
@@ -109,7 +108,7 @@ class ProjectionBlock(RobustBlock):
         self.__dict__.update(
             _columns=columns,
             _whitening=columns[:0] if root is None else root[:rows],
-            _chunks=chunks(columns.shape[1]),
+            _whole=to_runs(np.array([0, columns.shape[1]])),
             points_lidar_m=columns[:3].T,
             pixels_px=columns[3:5].T,
             motion=columns[5:].T if len(columns) > 5 else None,  # noqa: PLR2004
@@ -151,15 +150,13 @@ class ProjectionBlock(RobustBlock):
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
-        sums = self._run_sums(_T_camera_lidar(T_lidar_camera)[None], self._chunks, None)
-        return unpack_sums(sums.sum(axis=0))
+        sums = self.packed_run_sums(_T_camera_lidar(T_lidar_camera)[None], self._whole)
+        return unpack_sums(sums[0])
 
     def costs_at_each(self, T_camera_lidar: Array) -> Array:
-        """(p,) c of the whole block at each of (p, 4, 4) poses; every chunk at all in turn."""
-        count, chunks = len(T_camera_lidar), self._chunks
-        poses, each = np.tile(T_camera_lidar, (len(chunks), 1, 1)), np.repeat(chunks, count, axis=0)
-        costs = self._run_sums(poses, each, None, COST)[:, 27]
-        return np.asarray(costs.reshape(len(chunks), count).sum(axis=0))
+        """(p,) c of the whole block at each of (p, 4, 4) poses."""
+        runs = np.tile(self._whole, (len(T_camera_lidar), 1))
+        return self.packed_run_sums(T_camera_lidar, runs, wanted=COST)[:, 27]
 
     def frame_sums(
         self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike, *, curvature: bool = False
@@ -178,7 +175,7 @@ class ProjectionBlock(RobustBlock):
         free: Columns | None = None,
         values: Array | None = None,
         *,
-        step: Array | None = None,
+        step: Array = _NO_STEP,
         curvature: bool = False,
     ) -> BlockSums:
         """H, b and c of each run by pose and further columns, stacked, and sums of the weights.
@@ -193,11 +190,11 @@ class ProjectionBlock(RobustBlock):
                 first order.
             curvature: whether the second derivative of half the cost is wanted, too.
         """
-        runs = np.array([[0, len(self)]]) if runs is None else runs
+        runs = self._whole if runs is None else runs
         size, variance = 6 + (0 if free is None else len(free)), self.sigma**2
         sums = np.zeros((len(runs), 2 if curvature else 1, size + 2, size + 1))
         wanted = CURVATURE if curvature else PRODUCTS
-        self._summarize(T_camera_lidar, runs, free, values, step, wanted, sums)
+        self._summarize(T_camera_lidar, runs, wanted, sums, free=free, values=values, step=step)
         whole = sums[:, :, : size + 1] / variance
         whole += np.triu(whole, 1).swapaxes(-1, -2)
         hessian = whole[:, 0, :size, :size]
@@ -222,20 +219,21 @@ class ProjectionBlock(RobustBlock):
             free: k columns beside the pose.
             values: (k,) of these; None: zeros.
         """
-        size, runs = 7 + (0 if free is None else len(free)), np.array([[0, len(self)]])
-        found = np.empty((1, size, 2, len(self)))
-        self._summarize(T_camera_lidar[None], runs, free, values, None, COLUMNS, found)
+        found = np.empty((1, 7 + (0 if free is None else len(free)), 2, len(self)))
+        self._summarize(T_camera_lidar[None], self._whole, COLUMNS, found, free=free, values=values)
         return np.asarray(found[0] / self.sigma)
 
     def _summarize(
         self,
         T_camera_lidar: Array,
         runs: NDArray[np.int64],
-        free: Columns | None,
-        values: Array | None,
-        step: Array | None,
         wanted: int,
         out: Array,
+        *,
+        scales: Array | None = None,
+        free: Columns | None = None,
+        values: Array | None = None,
+        step: Array = _NO_STEP,
     ) -> None:
         free = Columns(self.lens) if free is None else free
         lens = free.lens if values is None else free.at(values)
@@ -244,8 +242,8 @@ class ProjectionBlock(RobustBlock):
         numbers, units = free.packed
         summarize(lens.kind)(
             lens.packed, contiguous(T_camera_lidar), columns, contiguous(moves), self._whitening,
-            loss_id(self.loss), np.array([self.scale * self.sigma]), contiguous(runs), numbers,
-            units, contiguous(np.empty(0) if step is None else step), wanted, out,
+            loss_id(self.loss), self._scales(scales), contiguous(runs), numbers, units,
+            contiguous(step), wanted, out,
         )  # fmt: skip
 
     def _columns_at(self, free: Columns, values: Array) -> Array:
@@ -271,31 +269,29 @@ class ProjectionBlock(RobustBlock):
         return unpack_sums(self.packed_run_sums(T_camera_lidar, runs, scales))
 
     def packed_run_sums(
-        self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None = None
-    ) -> Array:
-        """(r, 28) as :meth:`run_sums`: 21 of the upper triangle of H, 6 of b, 1 of c."""
-        return self._run_sums(T_camera_lidar, runs, scales)
-
-    def _run_sums(
         self,
         T_camera_lidar: Array,
         runs: NDArray[np.int64],
-        scales: Array | None,
-        wanted: int = HESSIAN,
+        scales: Array | None = None,
+        *,
+        wanted: int = PRODUCTS,
     ) -> Array:
-        shared = wanted == HESSIAN and len(runs) * len(self) >= _WORTH_SHARING
-        shared = shared and int((runs[:, 1] - runs[:, 0]).sum()) >= _WORTH_SHARING
-        scales = np.array([self.scale]) if scales is None else scales
+        """(r, 28) as :meth:`run_sums`: 21 of the upper triangle of H, 6 of b, 1 of c."""
         sums = np.empty((len(runs), SUMS))
-        for kind in (RAYS, self.lens.kind) if self._has_rays() else (self.lens.kind,):
-            # Every loss has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2.
-            accumulate(kind, shared=shared)(
+        if self._has_rays():
+            accumulate(
                 self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
-                loss_id(self.loss), scales * self.sigma, contiguous(runs), wanted, sums,
+                loss_id(self.loss), self._scales(scales), contiguous(runs), wanted, sums,
             )  # fmt: skip
-            if kind != RAYS or not np.isnan(sums[:, 27]).any():
-                break
+        if not self._has_rays() or np.isnan(sums[:, 27]).any():
+            products = np.zeros((len(runs), 1, 8, 7))
+            self._summarize(T_camera_lidar, runs, wanted, products, scales=scales)
+            sums = pack_sums(products[:, 0])
         return sums if self.sigma == 1.0 else sums / self.sigma**2
+
+    def _scales(self, scales: Array | None) -> Array:
+        """Of the loss: every one has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2."""
+        return np.array([self.scale * self.sigma]) if scales is None else scales * self.sigma
 
     def _has_rays(self) -> bool:
         """Whether the kernel RAYS serves, unless a point is too near."""
@@ -303,7 +299,7 @@ class ProjectionBlock(RobustBlock):
 
     def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
         """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable."""
-        return self.run_residuals(_T_camera_lidar(T_lidar_camera)[None], self._chunks)
+        return self.run_residuals(_T_camera_lidar(T_lidar_camera)[None], self._whole)
 
     def run_residuals(
         self, T_camera_lidar: Array, runs: NDArray[np.int64]
@@ -330,7 +326,7 @@ class ProjectionBlock(RobustBlock):
             factor: by which both are multiplied.
         """
         norms = np.empty((1 if len(self._whitening) == 0 else 2, len(self)))
-        runs = self._chunks if runs is None else runs
+        runs = self._whole if runs is None else runs
         self._evaluate(T_camera_lidar, runs, norms, factor)
         return norms
 
@@ -340,7 +336,7 @@ class ProjectionBlock(RobustBlock):
         """Fill in residuals, or norms times a factor; (n,) whether each point is projectable."""
         valid = np.empty(len(self), np.bool_)
         kind = RAYS if self.lens.is_undistorted_pinhole else self.lens.kind
-        evaluate(kind, shared=len(self) >= _WORTH_SHARING)(
+        evaluate(kind)(
             self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
             factor, contiguous(runs), out, valid,
         )  # fmt: skip

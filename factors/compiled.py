@@ -41,11 +41,11 @@ _log = logging.getLogger(__name__)
 _config: Any = numba.config  # its attributes are made when numba is imported
 
 _decorating = Lock()  # threads make kernels too: one at a time sets numba's folder
-_all_cores = Lock()
-for lock in (_decorating, _all_cores):
-    os.register_at_fork(  # no child is made while another thread holds it
-        before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release
-    )
+os.register_at_fork(  # no child is made while another thread holds it
+    before=_decorating.acquire,
+    after_in_parent=_decorating.release,
+    after_in_child=_decorating.release,
+)
 
 
 def compiled(*, part: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -73,19 +73,6 @@ def compiled(*, part: bool = False, **options: Any) -> Callable[[Callable[..., A
                 _config.CACHE_DIR = before
 
     return decorate
-
-
-def one_at_a_time(kernel: Any) -> Callable[..., Any]:
-    """A kernel with ``parallel=True``, for threads: a call waits until such calls of others end.
-
-    Each takes all cores, and without OpenMP or TBB numba ends the process if two run at once.
-    """
-
-    def run(*arguments: Any, **options: Any) -> Any:
-        with _all_cores:
-            return kernel(*arguments, **options)
-
-    return run
 
 
 def _name(function: Callable[..., Any], options: Mapping[str, Any]) -> str:

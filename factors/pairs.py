@@ -38,10 +38,10 @@ from numpy.typing import NDArray
 from factors.arrays import BlockSums, RobustBlock, contiguous, square_root
 from factors.block import ProjectionBlock
 from factors.compiled import compiled
-from factors.kernel import FAST, TILE, add_products
+from factors.kernel import FAST, TILE, add_products, weigh
 from factors.lens import Lens, ray_spreads, unproject
 from factors.lens_kernels import is_projectable, project_one, subtract_columns
-from factors.loss import loss_and_weight, loss_id
+from factors.loss import loss_id
 from factors.pose import custom_factor, keep_last
 
 Array = NDArray[np.float64]
@@ -267,32 +267,32 @@ def _sum_runs(  # type: ignore[no-untyped-def]
     kind, lens, T_a, T_b, features, loss, scale, sigma, edges, sums, costs, residuals, visible
 ):
     """Fill (r, 13, 13): H and, in the last column, b; (r,) c. Or residuals, where there is room."""
-    tile, axes = np.empty((13, 2 * TILE + 8)), 1 if kind == _EPIPOLAR else 2
+    axes, psi, rv = 1 if kind == _EPIPOLAR else 2, np.empty(TILE), np.zeros(TILE)
+    tile = np.empty((13, axes, TILE))
     for run in range(len(edges) - 1):
         T = T_a[run if len(T_a) > 1 else 0]
         M = _relative_pose(T, T_b[run if len(T_b) > 1 else 0])
         for start in range(edges[run], edges[run + 1], TILE):
-            n, cost = min(TILE, edges[run + 1] - start), 0.0
+            n = min(TILE, edges[run + 1] - start)
             for i in range(n):
-                feature = features[start + i]
+                feature, seen = features[start + i], True
                 if kind == _EPIPOLAR:
-                    seen = True
                     _fill_epipolar(M, feature, sigma, tile, i)
                 else:
-                    seen = _fill_surface(kind, lens, T, M, feature, sigma, tile, 2 * i)
-                u, v = tile[12, axes * i], tile[12, axes * i + 1] if axes > 1 else 0.0
+                    seen = _fill_surface(kind, lens, T, M, feature, sigma, tile, i)
+                    rv[i] = tile[12, 1, i]
                 if len(residuals):
-                    residuals[start + i, 0], residuals[start + i, 1] = u, v
+                    residuals[start + i, 0], residuals[start + i, 1] = tile[12, 0, i], rv[i]
                     visible[start + i] = seen
-                    continue
-                value, weight = loss_and_weight(loss, scale, u * u + v * v)
-                cost, root = cost + value, math.sqrt(weight)
-                for column in range(axes * i, axes * i + axes):
-                    for row in range(13):
-                        tile[row, column] *= root
-            if not len(residuals):
-                costs[run] += cost
-                add_products(axes * n, tile, sums[run])
+            if len(residuals):
+                continue
+            costs[run] += weigh(loss, scale, n, tile[12, 0], rv, psi)
+            for i in range(n):
+                root = math.sqrt(psi[i])
+                for row in range(13):
+                    for axis in range(axes):
+                        tile[row, axis, i] *= root
+            add_products(n, tile, sums[run])
         for i in range(12 if len(sums) else 0):
             for j in range(i):
                 sums[run, i, j] = sums[run, j, i]
@@ -300,7 +300,7 @@ def _sum_runs(  # type: ignore[no-untyped-def]
 
 @compiled(part=True)
 def _fill_surface(kind, lens, T_a, M, feature, sigma, tile, at):  # type: ignore[no-untyped-def]
-    """Fill two columns with derivatives by A and B, and residuals; whether B sees the point."""
+    """Fill in derivatives by A and B, and residuals; return whether B sees the point."""
     f0, f1, f2 = feature[0], feature[1], feature[2]
     q0, q1, q2 = feature[3], feature[4], feature[5]
     g0 = T_a[0, 0] * q0 + T_a[1, 0] * q1 + T_a[2, 0] * q2  # R_a^T q
@@ -313,25 +313,25 @@ def _fill_surface(kind, lens, T_a, M, feature, sigma, tile, at):  # type: ignore
     y1 = M[1, 0] * f0 + M[1, 1] * f1 + M[1, 2] * f2 + w * M[1, 3]
     y2 = M[2, 0] * f0 + M[2, 1] * f1 + M[2, 2] * f2 + w * M[2, 3]
     u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, y0, y1, y2)
-    tile[12, at] = subtract_columns(kind, lens, u, feature[6]) / sigma
-    tile[12, at + 1] = (v - feature[7]) / sigma
+    tile[12, 0, at] = subtract_columns(kind, lens, u, feature[6]) / sigma
+    tile[12, 1, at] = (v - feature[7]) / sigma
     for row in range(2):
         jx, jy, jz = (ux, uy, uz) if row == 0 else (vx, vy, vz)
-        jx, jy, jz, n = jx / sigma, jy / sigma, jz / sigma, at + row
+        jx, jy, jz = jx / sigma, jy / sigma, jz / sigma
         along = (jx * M[0, 3] + jy * M[1, 3] + jz * M[2, 3]) / k
         a0 = jx * M[0, 0] + jy * M[1, 0] + jz * M[2, 0] + along * g0  # in A's axes
         a1 = jx * M[0, 1] + jy * M[1, 1] + jz * M[2, 1] + along * g1
         a2 = jx * M[0, 2] + jy * M[1, 2] + jz * M[2, 2] + along * g2
-        tile[0, n], tile[1, n], tile[2, n] = _cross(f0, f1, f2, a0, a1, a2)
-        tile[3, n], tile[4, n], tile[5, n] = w * a0, w * a1, w * a2
-        tile[6, n], tile[7, n], tile[8, n] = _cross(jx, jy, jz, y0, y1, y2)
-        tile[9, n], tile[10, n], tile[11, n] = -w * jx, -w * jy, -w * jz
+        tile[0, row, at], tile[1, row, at], tile[2, row, at] = _cross(f0, f1, f2, a0, a1, a2)
+        tile[3, row, at], tile[4, row, at], tile[5, row, at] = w * a0, w * a1, w * a2
+        tile[6, row, at], tile[7, row, at], tile[8, row, at] = _cross(jx, jy, jz, y0, y1, y2)
+        tile[9, row, at], tile[10, row, at], tile[11, row, at] = -w * jx, -w * jy, -w * jz
     return w > 0.0 and is_projectable(kind, lens, y0 / w, y1 / w, y2 / w)
 
 
 @compiled(part=True)
 def _fill_epipolar(M, feature, sigma, tile, at):  # type: ignore[no-untyped-def]
-    """Fill a column with derivatives by A and B, and the residual."""
+    """Fill in derivatives by A and B, and the residual."""
     value, half, square = np.empty(7), np.zeros(6), 0.0
     for x, y in ((3, 9), (6, 9), (0, 12), (0, 15)):
         _fill_form(M, feature[x : x + 3], feature[y : y + 3], value)
@@ -343,14 +343,14 @@ def _fill_epipolar(M, feature, sigma, tile, at):  # type: ignore[no-untyped-def]
     for k in range(6 if over > 0.0 else 0):
         value[k] -= value[6] / square * half[k]
     for k in range(7):
-        tile[6 + k, at] = over * value[k]
+        tile[6 + k, 0, at] = over * value[k]
     # By A: minus the derivative by B, a row, times Ad(T_b_a), T_b_a = M.
-    v0, v1, v2 = tile[9, at], tile[10, at], tile[11, at]
+    v0, v1, v2 = tile[9, 0, at], tile[10, 0, at], tile[11, 0, at]
     w0, w1, w2 = _cross(v0, v1, v2, M[0, 3], M[1, 3], M[2, 3])
-    w0, w1, w2 = w0 + tile[6, at], w1 + tile[7, at], w2 + tile[8, at]
+    w0, w1, w2 = w0 + tile[6, 0, at], w1 + tile[7, 0, at], w2 + tile[8, 0, at]
     for k in range(3):
-        tile[k, at] = -(w0 * M[0, k] + w1 * M[1, k] + w2 * M[2, k])
-        tile[3 + k, at] = -(v0 * M[0, k] + v1 * M[1, k] + v2 * M[2, k])
+        tile[k, 0, at] = -(w0 * M[0, k] + w1 * M[1, k] + w2 * M[2, k])
+        tile[3 + k, 0, at] = -(v0 * M[0, k] + v1 * M[1, k] + v2 * M[2, k])
 
 
 @compiled(part=True)

@@ -11,10 +11,8 @@ import pytest
 
 import calibgraph
 from calibgraph import Rig
-from calibgraph.matching.cmrnext.network import Architecture
 from calibgraph.rounds import match_in_rounds
 from tests.conftest import Call
-from tests.matching.cmrnext.builders import good_content, saved
 
 pytestmark = pytest.mark.realdata
 
@@ -75,23 +73,6 @@ def test_other_rigs_and_sensors_improve_in_rotation(realdata: Path, name: str) -
     for camera, error in calibgraph.evaluate(result.rig, reference).cameras.items():
         assert error.rotation_error_deg < 1.0, camera
     assert result.verdict.status != "PASS"  # 3 frames, or 8 of one spot with 16 beams
-
-
-def test_untrained_networks_fail_on_real_frames(realdata: Path, tmp_path: Path, call: Call) -> None:
-    """Their matches agree with each other and with the guess; the verdict is FAIL all the same."""
-    weights = saved(tmp_path / "random.tar", good_content(Architecture(width=16)))
-    (folder,) = sequences(realdata, "07")
-    for start_from in ("frame", "joint"):
-        config = tmp_path / "config.yaml"
-        config.write_text(f"start_from: {start_from}\nhalf_resolution: true\n")
-        code, _, text = call(
-            "calibrate", folder, "--frames", "0,1", "--matcher", "cmrnext",
-            "--weights", weights, "--weights", weights, "--config", config,
-            "--out", tmp_path / start_from,
-        )  # fmt: skip
-        assert code == 1
-        assert "of a displaced start remains" in text
-        assert (tmp_path / start_from / "calibration.yaml").is_file()
 
 
 def test_a_camera_that_turns_half_a_degree_while_driving_is_found(

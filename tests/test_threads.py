@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -26,7 +23,7 @@ from calibgraph import (
 )
 from calibgraph.parallel import Threads, with_own_threads
 from factors import Lens, ProjectionBlock
-from tests.conftest import ROOT, SAMPLE, make_camera
+from tests.conftest import SAMPLE, make_camera
 
 RIG = Rig(
     cameras={
@@ -81,28 +78,6 @@ def test_another_thread_goes_on_while_a_kernel_runs() -> None:
             longest, last = max(longest, now - last), now
             time.sleep(0)
     assert longest < 0.5 * (last - start)
-
-
-def test_kernels_that_take_all_cores_wait_for_each_other() -> None:
-    """numba ends the process at the second of two such calls where it has no OpenMP."""
-    code = (
-        "import threading, numpy as np\n"
-        "from factors import Lens, ProjectionBlock\n"
-        "lens = Lens.pinhole(fx=700.0, fy=700.0, cx=600.0, cy=200.0)\n"
-        "points = np.tile([[1.0, 0.5, 9.0]], (2_000_000, 1))\n"
-        "block = ProjectionBlock(lens, points, points[:, :2].copy())\n"
-        "run = lambda: [block.run_norms(np.eye(4)[None]) for _ in range(2)]\n"
-        "threads = [threading.Thread(target=run) for _ in range(2)]\n"
-        "[thread.start() for thread in threads]\n"
-        "[thread.join() for thread in threads]\n"
-        "import numba; print(numba.threading_layer())"
-    )
-    environment = {**os.environ, "NUMBA_THREADING_LAYER": "workqueue", "NUMBA_NUM_THREADS": "2"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], check=False, cwd=ROOT, env=environment, capture_output=True,
-        text=True,
-    )  # fmt: skip
-    assert (done.returncode, done.stdout) == (0, "workqueue\n"), done.stderr
 
 
 def test_an_interrupt_does_not_wait_for_the_work_of_a_pool() -> None:

@@ -27,13 +27,13 @@ import numpy as np
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
-from benchmarks.accuracy.lens import values_of
 from benchmarks.accuracy.scenes import Folders
 from benchmarks.accuracy.verdicts import STATUSES, class_of
 from benchmarks.tables import ROOT, Table
 from calibgraph import Calibration, Config, Dataset, Rig, calibrate, evaluate, load_dataset, perturb
 from calibgraph.model.geometry import twist_between
 from calibgraph.model.rig import Camera
+from factors.columns import COEFFICIENT_NUMBERS
 from tests.draws.lenses import put_lens_error
 from tools.scenes.rolling_drives import WRONG, draw_wrong, load_drive, truth_of
 
@@ -153,6 +153,18 @@ def _calibrate(data: Dataset, rig: Rig, estimate: str, seed: int) -> tuple[Calib
     before = time.process_time()
     config = Config() if estimate == FIXED else Config(estimate=estimate)
     return calibrate(data, guess, config=config), time.process_time() - before
+
+
+def values_of(camera: Camera) -> dict[str, float]:
+    """Parameters of a lens and a clock, as results name them."""
+    k, packed = camera.intrinsics_px, camera.lens.packed
+    numbers = COEFFICIENT_NUMBERS[camera.lens.kind]
+    return {
+        "focal": float(np.sqrt(k.fx * k.fy)), "centre_x": k.cx,
+        "centre_y": k.cy,
+        "offset": camera.time_offset_s or 0.0, "readout": camera.readout_s or 0.0,
+        **{name: float(packed[4 + number]) for name, number in numbers.items()},
+    }  # fmt: skip
 
 
 def _to_record(result: Calibration, truth: Rig) -> Record:

@@ -245,7 +245,7 @@ def track(
         metavar="DIR",
         help="Folder for the state, the result and a picture. A state in it is resumed.",
     ),
-    step: int = Option(1, min=1, help="Take every N-th frame only."),
+    step: int = Option(1, min=1, help="With --matcher: match every N-th frame only."),
     matcher: str | None = Option(None, metavar="NAME", help="Match frames: structure or cmrnext."),
     interval_s: options.IntervalS = None,
     topic: options.Topic = None,
@@ -277,7 +277,7 @@ def track(
         require_poses_alone(settings)
         if matcher is None:
             given = {"--interval-s": interval_s, "--topic": topic or None, "--motion": motion,
-                     "--weights": weights}  # fmt: skip
+                     "--weights": weights, "--step": None if step == 1 else step}  # fmt: skip
             _require_matcher_for(source, given | rare.of_cmrnext)
             chosen = None
         else:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -29,18 +28,17 @@ _PAGES = (".html", ".htm")
 def report(
     result: Path = Argument(..., metavar="RESULT", help="Its folder, or its calibration.yaml."),
     out: Path | None = Option(
-        None, metavar="FILE.html", help="Page. (default: report.html beside, or none for viewers)"
+        None, metavar="FILE.html", help="Page. (default: report.html beside, or none with --mcap)"
     ),
-    rerun: Path | None = Option(None, metavar="FILE.rrd", help="Recording for Rerun."),
-    mcap: Path | None = Option(None, metavar="FILE.mcap", help="Recording for Foxglove."),
+    mcap: Path | None = Option(None, metavar="FILE.mcap", help="Recording for Foxglove or Rerun."),
     dataset: list[Path] | None = Option(
         None, metavar="DATASET", help="Where images and clouds are now; repeat it in their order."
     ),
     force: options.Force = False,
 ) -> None:
-    """Show a result: as one HTML page that opens without a network, or for viewers.
+    """Show a result: as one HTML page that opens without a network, or as a recording.
 
-    Viewers show clouds, images and projected points, before and after.
+    The recording shows clouds, images and projected points, before and after.
     """
     from calibgraph.files import require_new_file
     from calibgraph.io.calibrations import load_calibration
@@ -48,25 +46,20 @@ def report(
     from calibgraph.model.result_files import REPORT_FILE
     from calibgraph.report.html import relocate_frames, write_report
 
-    for path, suffixes in ((out, _PAGES), (rerun, (".rrd",)), (mcap, (".mcap",))):
+    for path, suffixes in ((out, _PAGES), (mcap, (".mcap",))):
         if path is not None:
             require_new_file(path, *suffixes, force=force)
     loaded, written = load_calibration(result), []
     if dataset:
         with checked_arguments():
             loaded = relocate_frames(loaded, load_dataset(dataset, loaded.rig))
-    if out is not None or (rerun is None and mcap is None):
+    if out is not None or mcap is None:
         folder = result if result.is_dir() else result.parent
         written.append(write_report(loaded, out or folder / REPORT_FILE))
-    os.environ.setdefault("RUST_LOG", "off")  # Rerun logs what our line states
-    with progress_bar("reading") as progress:
-        if rerun is not None:
-            from calibgraph.view.rerun_file import write_rerun
+    if mcap is not None:
+        from calibgraph.report.mcap_file import write_mcap
 
-            written.append(write_rerun(loaded, rerun, progress=progress))
-        if mcap is not None:
-            from calibgraph.view.mcap_file import write_mcap
-
+        with progress_bar("reading") as progress:
             written.append(write_mcap(loaded, mcap, progress=progress))
     for path in written:
         print_line(f"{path}: written; the verdict is {loaded.verdict.status}")

@@ -48,9 +48,6 @@ def serve(
     root: list[str] | None = Option(
         None, metavar="URI", help="Folder that jobs may read from; may be repeated."
     ),
-    database: str | None = Option(
-        None, metavar="URL", help="postgresql+psycopg://... (default: SQLite in DIR)"
-    ),
     jobs: int | None = Option(None, min=0, help="Jobs at once. (default: one per core)"),
     timeout_s: float = Option(3600.0, min=0.001, metavar="SECONDS", help="Longest time of a job."),
     memory_gb: float = Option(
@@ -68,7 +65,7 @@ def serve(
     Ctrl-C and SIGTERM lose nothing: jobs that run wait for the next start, as after a crash.
     """
     with needs_extra("service", "the server needs fastapi, hypercorn and others"):
-        for package in ("fastapi", "hypercorn", "python_multipart", "sqlalchemy"):
+        for package in ("fastapi", "hypercorn", "python_multipart"):
             import_module(package)
     from calibgraph.service.app import create_app, require_safe
     from calibgraph.service.app import serve as serve_app
@@ -81,7 +78,6 @@ def serve(
     counted = {} if jobs is None else {"jobs_at_once": jobs}
     settings = Settings(
         data=data,
-        database=database,
         tokens=tokens,
         hosts=tuple(host_name or ()),
         roots=tuple(root or ()),

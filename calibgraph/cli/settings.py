@@ -17,9 +17,7 @@ class RareSettings(StrictNumbers):
         terms: of the objective; those of ``--terms``, if it is given.
         stamps: of a bag: ``header``, those of the sensors; or ``record``, of recording.
         sync_tolerance_s: largest difference of the stamps of a cloud and its images; 0.05 if null.
-        start_from: where a network of cmrnext starts: at each ``frame``'s own pose by the network
-            before, or at the ``joint`` solve; by frame if null.
-        device: of Torch; the GPU if there is one, if null.
+        device: of Torch, for cmrnext; the GPU if there is one, if null.
         iterations: of each network's recurrent update; 12 if null.
         half_resolution: whether cmrnext halves the images; as stored with the weights, else from
             1400 px width on, if null.
@@ -29,7 +27,6 @@ class RareSettings(StrictNumbers):
     terms: Terms = "full"
     stamps: Stamps | None = None
     sync_tolerance_s: Annotated[float, Field(ge=0)] | None = None
-    start_from: Literal["frame", "joint"] | None = None
     device: Literal["auto", "cpu", "cuda"] | None = None
     iterations: Annotated[int, Field(ge=1, le=1000)] | None = None
     half_resolution: bool | None = None
@@ -43,7 +40,7 @@ class RareSettings(StrictNumbers):
     @property
     def of_cmrnext(self) -> dict[str, Any]:
         """Those of the matcher cmrnext that are given."""
-        names = ("start_from", "device", "iterations", "half_resolution", "batch")
+        names = ("device", "iterations", "half_resolution", "batch")
         values = {name: getattr(self, name) for name in names}
         return {name: value for name, value in values.items() if value is not None}
 

@@ -41,9 +41,6 @@ from factors.columns import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCA
 from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
 
 TANGENTIAL_SHARE = 0.1
-OFFSET_SIGMA_S, READOUT_SIGMA_S = 0.05, 0.03
-"""Of the prior, where the rig states none: half a turn of a LiDAR, and a usual read-out."""
-
 _TAIL_SIGMAS = 2.0  # where the Cauchy loss of a prior bends
 _PLAIN = 2  # radial coefficients that are set free in a rig without distortion
 _EXACT = 1e-3  # prior standard deviations: less would lose digits
@@ -130,8 +127,8 @@ def _prior_sigmas(camera: Camera, default: LensSigmas) -> dict[LensPart, dict[st
             for name, number in COEFFICIENT_NUMBERS[kind].items()
             if kind != PINHOLE or number < size
         },
-        "offset": {OFFSET: camera.time_offset_sigma_s or OFFSET_SIGMA_S},
-        "readout": {READOUT: camera.readout_sigma_s or READOUT_SIGMA_S},
+        "offset": {OFFSET: camera.time_offset_sigma_s or default.offset_s},
+        "readout": {READOUT: camera.readout_sigma_s or default.readout_s},
     }
 
 

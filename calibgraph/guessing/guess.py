@@ -4,7 +4,7 @@ The search is for cameras without any guess, by images and clouds.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import quote
@@ -26,6 +26,7 @@ from calibgraph.matching.structure.bodies import Body, lead, place
 from calibgraph.matching.structure.frame_cache import FrameCache, load_camera_frames
 from calibgraph.matching.structure.global_search import ALONE
 from calibgraph.matching.structure.matcher import MAX_SEARCH_DEG, MAX_SEARCH_M, SEARCH_FRAMES
+from calibgraph.matching.structure.pose_refinement import Candidate
 from calibgraph.matching.structure.pose_search import PoseSearch, SearchRange
 from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Rig
@@ -47,28 +48,6 @@ RANGE = SearchRange(float(np.radians(20.0)), 1.5)
 """About each heading: neighbours overlap."""
 
 
-@dataclass(frozen=True, eq=False)
-class FoundCamera:
-    """The best pose of a camera over all headings.
-
-    Attributes:
-        T_camera_lidar: (4, 4).
-        z_score: agreement of images and clouds there, in standard deviations of chance agreement.
-        needed: the z-score from which on that is no chance agreement.
-        seen_by: the camera that placed it, where one that was found before sees the same.
-    """
-
-    T_camera_lidar: Array
-    z_score: float
-    needed: float
-    seen_by: str | None = None
-
-    @property
-    def accepted(self) -> bool:
-        """Whether the camera was found."""
-        return self.z_score >= self.needed
-
-
 @dataclass(frozen=True)
 class CameraGuess:
     """Where a guess is from, and how good it is.
@@ -87,6 +66,10 @@ class CameraGuess:
     translation_sigma_m: float
     text: str
     z_score: float | None = None
+
+
+Guess = tuple[Array, CameraGuess]
+"""(4, 4) T_camera_lidar, and how good it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,14 +153,16 @@ def guess_rig(
     parts = files if isinstance(files, RigParts) else read_rig_parts(files)
     words = {name: parse_mounting(text, name) for name, text in (mountings or {}).items()}
     _require_cameras(parts, words, search)
-    said = {name: mounting.T_camera_lidar(axis) for name, mounting in words.items()}
-    missing = [n for n in parts.lenses if n in search or n not in {**said, **parts.T_camera_lidar}]
-    tied = {
-        name: (to, T_camera_lidar)
-        for to, T in reversed(said.items())  # the first, if several
-        for name, T_camera_lidar in parts.tied_to({to: T}).items()
-        if name in missing and name not in search
+    known: dict[str, Guess] = {
+        name: (
+            one.T_camera_lidar(axis),
+            CameraGuess("words", one.rotation_sigma_deg, one.translation_sigma_m, "by words"),
+        )
+        for name, one in words.items()
     }
+    missing = [n for n in parts.lenses if n in search or n not in {**words, **parts.T_camera_lidar}]
+    tied = _tied_to(known, parts, [name for name in missing if name not in search])
+    known |= tied
     unknown = [name for name in missing if name not in tied]
     if unknown and data is None:
         raise RigError(
@@ -186,32 +171,34 @@ def guess_rig(
             "--dataset to search over all headings",
             camera=unknown[0],
         )
-    level = {name: Mounting(0.0).T_camera_lidar(axis) for name in unknown}
-    placed = {name: T for name, (_, T) in tied.items()}
-    rig = parts.to_rig({**said, **placed, **level}, size_px=size_px)
-    found: dict[str, FoundCamera] = {}
+    level = dict.fromkeys(unknown, Mounting(0.0).T_camera_lidar(axis))
+    rig = parts.to_rig({**level, **{n: T for n, (T, _) in known.items()}}, size_px=size_px)
     if unknown and data is not None:
         dataset = load_dataset(data, rig)
         require_different_images(dataset, rig)
         dataset = hide_burnt_in(dataset, rig)
         found = search_headings(dataset, rig, unknown, forward=axis, seed=seed, progress=progress)
-        _require_found(found)
-    rig = rig.moved_to({name: one.T_camera_lidar for name, one in found.items()})
-    known = {
-        name: CameraGuess("words", one.rotation_sigma_deg, one.translation_sigma_m, "by words")
-        for name, one in words.items()
-    }
-    for name, (to, T) in tied.items():  # its rotation error moves the camera at a distance
-        deg, apart_m = known[to].rotation_sigma_deg, camera_center(T) - camera_center(said[to])
-        shift_m = float(np.linalg.norm(apart_m)) * math.radians(deg)
-        metres = math.hypot(known[to].translation_sigma_m, shift_m)
-        known[name] = CameraGuess("pair", deg, metres, f"by its pose to {to}")
-    for name, one in found.items():
-        seen = f", as {one.seen_by} sees it" if one.seen_by else ""
-        text = f"found with a z-score of {one.z_score:.1f}{seen}"
-        known[name] = CameraGuess("search", FOUND_DEG, FOUND_M, text, one.z_score)
+        rig, known = rig.moved_to({name: T for name, (T, _) in found.items()}), known | found
     by_file = CameraGuess("file", FILE_DEG, FILE_M, "by a file")
-    return RigGuess(rig, {name: known.get(name, by_file) for name in rig.cameras})
+    return RigGuess(rig, {n: known[n][1] if n in known else by_file for n in rig.cameras})
+
+
+def _tied_to(
+    known: Mapping[str, Guess], parts: RigParts, names: Collection[str]
+) -> dict[str, Guess]:
+    """Cameras that relative poses tie to one that is known; to the first, if several."""
+    tied: dict[str, Guess] = {}
+    for to, (T_to, guess) in known.items():
+        for name, T in parts.tied_to({to: T_to}).items():
+            if name not in names or name in tied:
+                continue
+            # The rotation error of the one moves the other at a distance.
+            apart_m = float(np.linalg.norm(camera_center(T) - camera_center(T_to)))
+            shift_m = apart_m * math.radians(guess.rotation_sigma_deg)
+            metres = math.hypot(guess.translation_sigma_m, shift_m)
+            text = f"by its pose to {to}"
+            tied[name] = T, CameraGuess("pair", guess.rotation_sigma_deg, metres, text)
+    return tied
 
 
 def _require_cameras(parts: RigParts, words: Mapping[str, Mounting], search: Sequence[str]) -> None:
@@ -227,26 +214,15 @@ def _require_cameras(parts: RigParts, words: Mapping[str, Mounting], search: Seq
             )
 
 
-def _require_found(found: Mapping[str, FoundCamera]) -> None:
-    missed = {name: one for name, one in found.items() if not one.accepted}
-    if missed:
-        scores = ", ".join(f"{n!r} ({one.z_score:.1f})" for n, one in missed.items())
-        least = min(one.needed for one in missed.values())
-        raise CalibrationError(
-            f"not found at any heading: {scores}; a z-score of {least:.1f} is needed; describe "
-            "them with --mount NAME=WORDS, or give frames of other places"
-        )
-
-
 def search_headings(
     dataset: Dataset,
     rig: Rig,
-    cameras: Iterable[str],
+    cameras: Sequence[str],
     *,
     forward: Forward = "+x",
     seed: int = 0,
     progress: Progress = no_progress,
-) -> dict[str, FoundCamera]:
+) -> dict[str, Guess]:
     """Find cameras without a guess: only the lens is known, and that images are upright.
 
     One after another, over headings all round, each within 20 degrees and 1.5 m per axis of a level
@@ -254,46 +230,52 @@ def search_headings(
 
     Raises:
         FileError: if an image or a cloud cannot be read.
+        CalibrationError: if a camera is not found.
     """
-    names = list(cameras)
-    lenses = {name: rig.cameras[name] for name in names}
-    only = Rig(lidar=rig.lidar, cameras=lenses)
-    found: dict[str, FoundCamera] = {}
+    only = Rig(lidar=rig.lidar, cameras={name: rig.cameras[name] for name in cameras})
+    needed, starts = least_z_score(len(HEADINGS_DEG)), len(HEADINGS_DEG)
+    found: dict[str, Guess] = {}
+    missed: list[str] = []
     with core_pool() as cores:
         chosen = spread_out(dataset.frames, SEARCH_FRAMES)
         frames = load_camera_frames(FrameCache(), chosen, only, cores)
         search = PoseSearch(only, frames, RANGE, seed=seed, out_of_time=lambda: False)
-        for index, name in enumerate(names):
-            body = {name: lenses[name]}
-            starts = [Mounting(float(deg)).T_camera_lidar(forward) for deg in HEADINGS_DEG]
-            seen = _place_by_others(search, body, found)
+        for index, (name, lens) in enumerate(only.cameras.items()):
+            placed = _place_by_others(search, {name: lens}, found)
+            if placed is not None:
+                found[name] = placed
+                continue
             candidates = []
-            for number, start in enumerate([] if seen else starts):
-                done = index * len(starts) + number
-                progress(f"searching all headings: {name}", done, len(names) * len(starts))
-                candidates.append(search.with_roll(place(body, start), 0.0, effort=1))
-            if seen is None:
-                best = max(candidates, key=lambda candidate: candidate.z_score)
-                T, needed = lead(best.body).T_camera_lidar, least_z_score(len(candidates))
-                seen = FoundCamera(T, best.z_score, needed)
-            found[name] = seen
+            for number, deg in enumerate(HEADINGS_DEG):
+                done, total = index * starts + number, starts * len(cameras)
+                progress(f"searching all headings: {name}", done, total)
+                body = place({name: lens}, Mounting(float(deg)).T_camera_lidar(forward))
+                candidates.append(search.with_roll(body, 0.0, effort=1))
+            best = max(candidates, key=lambda candidate: candidate.z_score)
+            if best.z_score >= needed:
+                found[name] = _found(best)
+            else:
+                missed.append(f"{name!r} ({best.z_score:.1f})")
+    if missed:
+        raise CalibrationError(
+            f"not found at any heading: {', '.join(missed)}; a z-score of {needed:.1f} is needed; "
+            "describe them with --mount NAME=WORDS, or give frames of other places"
+        )
     return found
 
 
-def _place_by_others(
-    search: PoseSearch, body: Body, found: dict[str, FoundCamera]
-) -> FoundCamera | None:
+def _found(candidate: Candidate, by: str | None = None) -> Guess:
+    seen = f", as {by} sees it" if by else ""
+    text = f"found with a z-score of {candidate.z_score:.1f}{seen}"
+    guess = CameraGuess("search", FOUND_DEG, FOUND_M, text, candidate.z_score)
+    return lead(candidate.body).T_camera_lidar, guess
+
+
+def _place_by_others(search: PoseSearch, body: Body, found: Mapping[str, Guess]) -> Guess | None:
     """The camera where one that was found sees it; None if that is not accepted."""
-    for by, other in found.items():
-        if not other.accepted:
-            continue
-        seen = search.seen_by({by: search.rig.cameras[by].moved_to(other.T_camera_lidar)}, body)
-        if seen is None:
-            continue
-        candidate = search.at(seen)
-        placed = FoundCamera(
-            lead(candidate.body).T_camera_lidar, candidate.z_score, least_z_score(ALONE), by
-        )
-        if placed.accepted:
-            return placed
+    for by, (T, _) in found.items():
+        seen = search.seen_by({by: search.rig.cameras[by].moved_to(T)}, body)
+        candidate = None if seen is None else search.at(seen)
+        if candidate is not None and candidate.z_score >= least_z_score(ALONE):
+            return _found(candidate, by)
     return None

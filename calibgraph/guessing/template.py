@@ -77,14 +77,14 @@ def write_rig_template(
 def cameras_of_folder(folder: Path) -> dict[str, Path]:
     """The images of each camera; arguments and errors as of :func:`write_rig_template`."""
     _require_plain_folder(folder)
-    sources = folder_layout(folder).images
+    _, sources = folder_layout(folder)
     if not sources:
         beside = ", ".join(sorted(path.name for path in folder.glob("*/"))) or "none"
         raise FileError(
             folder / "cameras", "no images; put those of each camera into cameras/NAME, named as "
             f"the clouds in lidar, found are the folders {beside}"
         )  # fmt: skip
-    return dict(sources)
+    return sources
 
 
 def _require_plain_folder(folder: Path) -> None:

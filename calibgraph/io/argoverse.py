@@ -4,20 +4,18 @@ Its clouds are of two LiDARs, in the frame of the vehicle (egovehicle), correcte
 images are undistorted.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
 from calibgraph.io.frame_files import (
     FrameFiles,
     IncompleteCamera,
     PublishedFolder,
-    describe_motion,
     files_by_stem,
 )
 from calibgraph.io.images import IMAGE_SUFFIXES
@@ -30,7 +28,6 @@ _LIDAR, _CAMERAS = Path("sensors/lidar"), Path("sensors/cameras")
 _POSES, _LENSES = (
     Path("calibration/egovehicle_SE3_sensor.feather"), Path("calibration/intrinsics.feather"),
 )  # fmt: skip
-_TRAJECTORY = Path("city_SE3_egovehicle.feather")
 _QUATERNION, _PLACE = ("qx", "qy", "qz", "qw"), ("tx_m", "ty_m", "tz_m")
 _LENS = ("fx_px", "fy_px", "cx_px", "cy_px")
 _SIZE = ("width_px", "height_px")
@@ -48,9 +45,8 @@ def argoverse(log: Path) -> PublishedFolder | None:
         return sorted(each.name for each in (log / _CAMERAS).glob("*/"))
 
     return PublishedFolder(
-        "egovehicle", cameras, lambda name: _camera(log, name), lambda names: _frames(log, names),
-        lambda: _motion(log, cameras()),
-    )  # fmt: skip
+        "egovehicle", cameras, lambda name: _camera(log, name), lambda names: _frames(log, names)
+    )
 
 
 def _camera(log: Path, name: str) -> Camera:
@@ -98,26 +94,6 @@ def _frames(log: Path, cameras: Sequence[str]) -> list[FrameFiles]:
             f"{_APART_NS // 10**6} ms; choose other cameras by --rig"
         )
     return frames
-
-
-def _motion(log: Path, cameras: Sequence[str]) -> str:
-    """How far the vehicle moves between sweeps and images; empty without a trajectory."""
-    if not (log / _TRAJECTORY).is_file():
-        return ""
-    column = read_feather(log / _TRAJECTORY)[1]
-    stamps_ns = column("timestamp_ns").astype(np.int64)
-    start, order = int(stamps_ns.min()), np.argsort(stamps_ns)
-    times_s, places = (stamps_ns[order] - start) * 1e-9, [column(axis)[order] for axis in _PLACE]
-
-    def place(stems: Iterable[str]) -> Array:
-        at_s = [(int(stem) - start) * 1e-9 for stem in stems]
-        return np.stack([np.interp(at_s, times_s, along) for along in places], axis=-1)
-
-    frames = _frames(log, cameras)
-    scans = place(frame.stem for frame in frames)
-    taken = (place(frame.images[name].stem for frame in frames) for name in cameras)
-    moved_m = np.max([np.linalg.norm(images - scans, axis=1) for images in taken], axis=0)
-    return describe_motion(log, moved_m.tolist())
 
 
 def _stamped(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:

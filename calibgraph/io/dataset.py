@@ -29,7 +29,7 @@ from calibgraph.io.clouds import (
 )
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, published_folder
 from calibgraph.io.frame import Frame, Kept, twist_by_scans
-from calibgraph.io.frame_files import RigRead, way_out
+from calibgraph.io.frame_files import way_out
 from calibgraph.io.rigs import describe_rig, read_rig
 from calibgraph.memory import available_bytes
 from calibgraph.model.rig import Camera, Rig
@@ -162,11 +162,11 @@ def load_dataset(
 
 def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -> Dataset:
     """The rig of all sources, which may differ in their extrinsics, and notes on it."""
-    read = [read_rig(path, bag) if rig is None else RigRead(rig) for path in paths]
-    first = read[0].rig
-    for path, other in zip(paths, read, strict=True):
-        _require_same_lenses(paths[0], first, path, other.rig)
-    notes = [note for each in read for note in each.notes]
+    read = [read_rig(path, bag) if rig is None else (rig, ()) for path in paths]
+    first = read[0][0]
+    for path, (other, _) in zip(paths, read, strict=True):
+        _require_same_lenses(paths[0], first, path, other)
+    notes = [note for _, of_source in read for note in of_source]
     _require_memory(paths[0], first)
     if rig is None and is_bag(paths[0]):
         notes = [*describe_rig(first), *doubtful_axes(first), *notes]
@@ -190,7 +190,7 @@ def _frames_of_files(
 ) -> FoundFrames:  # fmt: skip
     """The frames of a folder; the complete ones where names are stamps."""
     lidars = [rig.lidar, *rig.other_lidars] if rig.lidars else []
-    found = frames_of_folder(
+    files, pairing = frames_of_folder(
         path, [*rig.cameras], lidars=lidars, complete=complete, sync_tolerance_s=tolerance_s
     )
     frames = tuple(
@@ -202,13 +202,11 @@ def _frames_of_files(
             columns=rig.cloud_columns,
             lidar_paths=each.lidars,
         )
-        for n, each in enumerate(found.files)
-        if not found.pairing or rig.cameras.keys() <= each.images.keys()
+        for n, each in enumerate(files)
+        if not pairing or rig.cameras.keys() <= each.images.keys()
     )
     frames = frames if interval_s is None else _driven(frames, interval_s)
-    published = published_folder(path)
-    notes = (found.pairing, published.note() if published else "")
-    return FoundFrames(frames, frames, tuple(note for note in notes if note))
+    return FoundFrames(frames, frames, (pairing,) if pairing else ())
 
 
 def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:
@@ -257,7 +255,7 @@ def _require_folders(paths: Sequence[Path], bag: BagOptions | None) -> None:
     for number, path in enumerate(paths):
         if path.resolve() in {other.resolve() for other in paths[:number]}:
             raise DatasetError(f"{path}: is given twice, and its frames would count twice")
-        if is_bag(path) or published_folder(path) or folder_layout(path).clouds.is_dir():
+        if is_bag(path) or published_folder(path) or folder_layout(path)[0].is_dir():
             continue
         if not path.is_dir():
             unread = way_out(path) if path.is_file() else None

@@ -6,9 +6,7 @@ Folders of published data sets hold their own rig; each of their formats is one 
 import glob
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -36,49 +34,27 @@ from calibgraph.io.frame_files import (
 from calibgraph.io.images import IMAGE_SUFFIXES
 from calibgraph.io.nuscenes import nuscenes
 
-
-@dataclass(frozen=True)
-class FolderLayout:
-    """Where a dataset folder keeps its files; the files of one frame have the same stem."""
-
-    clouds: Path
-    images: Mapping[str, Path]
-
-
 LIDARS = "lidars"
 """Folder of the folders of several LiDARs, named as in the rig."""
 
 
-def folder_layout(folder: Path, lidar: str = "") -> FolderLayout:
-    """The layout of a KITTI odometry sequence, or of a dataset folder.
+def folder_layout(folder: Path, lidar: str = "") -> tuple[Path, dict[str, Path]]:
+    """The folders of clouds and of each camera's images; files of one frame have the same stem.
 
-    Of a vehicle with several LiDARs ``lidar`` is the base.
+    Of a KITTI odometry sequence, or of a dataset folder; of one with several LiDARs ``lidar`` is
+    the base.
     """
     if (folder / kitti.CALIBRATION_NAME).is_file():
-        return FolderLayout(folder / kitti.CLOUD_FOLDER, kitti.camera_folders(folder))
+        return folder / kitti.CLOUD_FOLDER, kitti.camera_folders(folder)
     cameras = sorted(path for path in (folder / "cameras").glob("*") if path.is_dir())
-    if (folder / LIDARS).is_dir():
-        return FolderLayout(folder / LIDARS / lidar, {path.name: path for path in cameras})
-    return FolderLayout(folder / "lidar", {path.name: path for path in cameras})
-
-
-class FolderFrames(NamedTuple):
-    """The frames of a folder, one per cloud, in the order of the numbers in their names.
-
-    Attributes:
-        files: of each frame.
-        pairing: how images were paired with clouds by the stamps in their names, in a line; empty
-            where both have the same names.
-    """
-
-    files: list[FrameFiles]
-    pairing: str = ""
+    clouds = folder / LIDARS / lidar if (folder / LIDARS).is_dir() else folder / "lidar"
+    return clouds, {path.name: path for path in cameras}
 
 
 def frames_of_folder(
     folder: Path, cameras: Sequence[str], *, lidars: Sequence[str] = (), complete: bool = True,
     sync_tolerance_s: float = NEAR_S,
-) -> FolderFrames:  # fmt: skip
+) -> tuple[list[FrameFiles], str]:  # fmt: skip
     """The frames of a folder; where names are stamps, those with an image near enough.
 
     Args:
@@ -89,6 +65,10 @@ def frames_of_folder(
         complete: whether every cloud must have an image of every camera, and every image a cloud,
             where names are no stamps.
         sync_tolerance_s: largest difference of the stamps that name a cloud and its images.
+
+    Returns:
+        The files of each frame, one per cloud, in the order of the numbers in their names; and how
+        images were paired with clouds by stamps, in a line, empty where both have the same names.
     """
     published = published_folder(folder)
     if published is not None:
@@ -96,27 +76,27 @@ def frames_of_folder(
         for name in cameras if complete else ():
             stems = ({f.stem for f in frames}, {f.stem for f in frames if name in f.images})
             _require_pairs(folder, name, *stems)
-        return FolderFrames(frames)
-    layout = folder_layout(folder, *lidars[:1])
-    clouds = files_by_stem(layout.clouds, CLOUD_SUFFIXES)
+        return frames, ""
+    of_clouds, of_images = folder_layout(folder, *lidars[:1])
+    clouds = files_by_stem(of_clouds, CLOUD_SUFFIXES)
     others = {name: files_by_stem(folder / LIDARS / name, CLOUD_SUFFIXES) for name in lidars[1:]}
     images = {
         name: _of_same_number(
-            clouds, files_by_stem(_image_folder(folder, layout, name), IMAGE_SUFFIXES)
+            clouds, files_by_stem(_image_folder(folder, of_images, name), IMAGE_SUFFIXES)
         )
         for name in cameras
     }
     stamped = _stamps(clouds)
     if stamped and any(found.keys() != clouds.keys() for found in images.values()):
-        of_images = {name: s for name, found in images.items() if (s := _stamps(found))}
-        if of_images.keys() == images.keys():
-            return _paired_by_stamps(folder, stamped, of_images, sync_tolerance_s=sync_tolerance_s)
+        taken = {name: s for name, found in images.items() if (s := _stamps(found))}
+        if taken.keys() == images.keys():
+            return _paired_by_stamps(folder, stamped, taken, sync_tolerance_s=sync_tolerance_s)
     for name in cameras if complete else ():
         _require_pairs(folder, name, set(clouds), set(images[name]))
     frames = frames_by_stem(clouds, images)
     for frame in frames:
         frame.lidars.update({n: of[frame.stem] for n, of in others.items() if frame.stem in of})
-    return FolderFrames(frames)
+    return frames, ""
 
 
 def _of_same_number(clouds: Mapping[str, Path], images: Mapping[str, Path]) -> dict[str, Path]:
@@ -150,7 +130,7 @@ def _stamps(files: Mapping[str, Path]) -> TopicStamps | None:
 
 def _paired_by_stamps(
     folder: Path, clouds: TopicStamps, images: Mapping[str, TopicStamps], *, sync_tolerance_s: float
-) -> FolderFrames:
+) -> tuple[list[FrameFiles], str]:
     """Each cloud with the image of every camera that is nearest by its name, as in a bag."""
     frames = [FrameFiles(path.stem, path, {}) for path in clouds.paths]
     parts = []
@@ -183,29 +163,29 @@ def _paired_by_stamps(
     )
     if not complete:
         raise DatasetError(f"{pairing}; calibrate the cameras apart")
-    return FolderFrames(frames, pairing)
+    return frames, pairing
 
 
 def describe_pairing(folder: Path) -> str:
     """How the files of a folder pair by stamps, or which do not pair; empty if all names agree."""
     try:
-        return frames_of_folder(folder, [*folder_layout(folder).images]).pairing
+        return frames_of_folder(folder, [*folder_layout(folder)[1]])[1]
     except DatasetError as error:
         return str(error)
 
 
-def _image_folder(folder: Path, layout: FolderLayout, camera: str) -> Path:
-    if camera not in layout.images:
+def _image_folder(folder: Path, images: Mapping[str, Path], camera: str) -> Path:
+    if camera not in images:
         for path in (folder / "cameras").glob(f"{glob.escape(camera)}.*"):
             if remedy := way_out(path):
                 raise FileError(path, remedy)
         raise FileError(
             folder,
             f"has no images of the rig's camera {camera!r}; it has "
-            f"{', '.join(layout.images) or 'none'}: give the folder cameras/NAME and the camera "
+            f"{', '.join(images) or 'none'}: give the folder cameras/NAME and the camera "
             "in rig.yaml the same name, or remove the camera from rig.yaml",
         )
-    return layout.images[camera]
+    return images[camera]
 
 
 def _require_pairs(folder: Path, camera: str, clouds: set[str], images: set[str]) -> None:
@@ -226,7 +206,7 @@ def _require_pairs(folder: Path, camera: str, clouds: set[str], images: set[str]
     )
 
 
-_PUBLISHED = (nuscenes, kitti.kitti_drive, kitti.kitti_object, argoverse)
+_PUBLISHED = (nuscenes, kitti.kitti_drive, argoverse)
 
 
 def published_folder(path: Path | str) -> PublishedFolder | None:

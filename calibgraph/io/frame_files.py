@@ -8,8 +8,6 @@ from pathlib import Path
 from shlex import quote
 from typing import NamedTuple
 
-import numpy as np
-
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, is_utf8, require_file
 from calibgraph.model.rig import Camera, Rig
@@ -123,13 +121,6 @@ class IncompleteCamera(FileError):
     """A camera without its lens, its pose or its images; what is there but wrong is no such."""
 
 
-class RigRead(NamedTuple):
-    """The complete cameras of a data set, and what was left out or assumed, a line each."""
-
-    rig: Rig
-    notes: tuple[str, ...] = ()
-
-
 class PublishedFolder(NamedTuple):
     """A folder of a published data set, read as far as it is asked.
 
@@ -138,17 +129,15 @@ class PublishedFolder(NamedTuple):
         cameras: their names.
         read: the lens and T_camera_lidar of one; IncompleteCamera if a part is missing.
         frames: the clouds in order, with the images of the cameras that have one.
-        note: a line for the log, or an empty text.
     """
 
     lidar: str
     cameras: Callable[[], Sequence[str]]
     read: Callable[[str], Camera]
     frames: Callable[[Sequence[str]], list[FrameFiles]]
-    note: Callable[[], str] = lambda: ""
 
-    def read_rig(self, path: Path) -> RigRead:
-        """The rig of the cameras that have all parts; the path is for errors."""
+    def read_rig(self, path: Path) -> tuple[Rig, tuple[str, ...]]:
+        """The rig of the cameras that have all parts, with notes; the path is for errors."""
         cameras: dict[str, Camera] = {}
         missing: dict[str, IncompleteCamera] = {}
         for name in self.cameras():
@@ -159,14 +148,4 @@ class PublishedFolder(NamedTuple):
         if missing and not cameras:
             raise next(iter(missing.values()))
         notes = tuple(f"{error}: camera {name!r} is left out" for name, error in missing.items())
-        return RigRead(checked_model(Rig, {"lidar": self.lidar, "cameras": cameras}, path), notes)
-
-
-def describe_motion(where: Path, moved_m: Sequence[float]) -> str:
-    """How far the vehicle moves between scans and their images, in a line; empty without poses."""
-    if not len(moved_m):
-        return ""
-    return (
-        f"{where}: the vehicle moves {np.median(moved_m):.2f} m (median), at most "
-        f"{max(moved_m):.2f} m, between a scan and its images"
-    )
+        return checked_model(Rig, {"lidar": self.lidar, "cameras": cameras}, path), notes

@@ -1,4 +1,4 @@
-"""KITTI: odometry sequences, rectified raw drives (``_sync``), and folders of the object data set.
+"""KITTI: odometry sequences, and rectified raw drives (``_sync``).
 
 Camera k projects by P_k R [T; 0 0 0 1] with P_k = K [I | b], from the frame that rectification R
 makes of the first camera's, so T_camera_lidar is translate(K^-1 P_k[:, 3]) R T.
@@ -8,14 +8,11 @@ part        calibration                             P_k                R        
 ==========  ======================================  =================  ===========  ==============
 odometry    calib.txt                               P2                 in Tr        Tr
 raw         calib_cam_to_cam, calib_velo_to_cam     P_rect_02          R_rect_00    R and T
-object      calib/FRAME.txt; the commonest counts   P2                 R0_rect      Tr_velo_to_cam
 ==========  ======================================  =================  ===========  ==============
 """
 
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +34,7 @@ from calibgraph.model.rig import Camera
 
 CALIBRATION_NAME = "calib.txt"
 CLOUD_FOLDER, _RAW_CLOUDS = "velodyne", "velodyne_points"
-_RAW, _OBJECT = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt"), "calib"
+_RAW = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"
 
 
 def camera_folders(sequence: Path) -> dict[str, Path]:
@@ -80,36 +77,6 @@ def kitti_drive(drive: Path) -> PublishedFolder | None:
     return _folder(drive, clouds, images, read)
 
 
-def kitti_object(folder: Path) -> PublishedFolder | None:
-    """The training or testing part of the object data set; None if the folder is none."""
-    is_one = (folder / _OBJECT).is_dir() and (folder / CLOUD_FOLDER).is_dir()
-    if not is_one or (folder / CALIBRATION_NAME).exists():
-        return None
-    images = camera_folders(folder)
-
-    def read(name: str) -> Camera:
-        stem = _commonest(folder)[0]
-        lines = NumberLines(folder / _OBJECT / f"{stem}.txt")
-        T = np.vstack([lines.array("Tr_velo_to_cam", 3, 4), [0.0, 0.0, 0.0, 1.0]])
-        rectified = transform(lines.array("R0_rect", 3, 3), np.zeros(3)) @ T
-        found = [images[name] / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES]
-        image = next((path for path in found if path.is_file()), found[0])
-        return _camera(lines, f"P{name[-1]}", rectified, image)
-
-    def note() -> str:
-        count, kept = len([*(folder / CLOUD_FOLDER).glob("*.bin")]), len(_commonest(folder))
-        return "" if count == kept else (
-            f"{folder}: its {count} frames have several calibrations; taken are the {kept} of the "
-            "commonest, the others need folders of their own"
-        )  # fmt: skip
-
-    whole = _folder(folder, folder / CLOUD_FOLDER, images, read)
-    return whole._replace(
-        frames=lambda names: [f for f in whole.frames(names) if f.stem in _commonest(folder)],
-        note=note,
-    )
-
-
 def _folder(
     folder: Path, clouds: Path, images: Mapping[str, Path], read: Callable[[str], Camera]
 ) -> PublishedFolder:
@@ -124,25 +91,6 @@ def _folder(
 
     name = _RAW_CLOUDS if clouds.name == "data" else CLOUD_FOLDER
     return PublishedFolder(name, cameras, read, frames)
-
-
-def _commonest(folder: Path) -> tuple[str, ...]:
-    """The stems of the frames of the commonest calibration."""
-    return _read_stems(
-        folder, *((folder / name).stat().st_mtime_ns for name in (_OBJECT, CLOUD_FOLDER))
-    )
-
-
-@lru_cache(4)
-def _read_stems(folder: Path, *_changed_ns: int) -> tuple[str, ...]:
-    texts = {}
-    for stem in files_by_stem(folder / CLOUD_FOLDER, (".bin",)):
-        path = folder / _OBJECT / f"{stem}.txt"
-        if not path.is_file():
-            raise FileError(path, f"no such file; the cloud {stem} needs its calibration")
-        texts[stem] = read_text(path)
-    commonest = Counter(texts.values()).most_common(1)[0][0]
-    return tuple(stem for stem, text in texts.items() if text == commonest)
 
 
 def _of_date(drive: Path, name: str) -> "NumberLines":

@@ -14,7 +14,6 @@ from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
 from calibgraph.io.dataset_folders import LIDARS, published_folder
-from calibgraph.io.frame_files import RigRead
 from calibgraph.io.kitti import CALIBRATION_NAME, kitti_sequence
 from calibgraph.model.geometry import angle_deg, camera_center
 from calibgraph.model.result_files import CALIBRATION_FILE
@@ -38,21 +37,21 @@ def load_rig(path: Path | str, bag: BagOptions | None = None) -> Rig:
     Raises:
         FileError, DatasetError: if there is none, or it is malformed.
     """
-    return read_rig(path, bag).rig
+    return read_rig(path, bag)[0]
 
 
-def read_rig(path: Path | str, bag: BagOptions | None = None) -> RigRead:
+def read_rig(path: Path | str, bag: BagOptions | None = None) -> tuple[Rig, tuple[str, ...]]:
     """As :func:`load_rig`, with notes on what was left out, added or taken from elsewhere."""
     path = rig_file(path)
     if is_bag(path):
         read = read_bag_rig(path, bag)
-        return RigRead(read.to_rig(), read.notes)
+        return read.to_rig(), read.notes
     published = published_folder(path)
     if published is not None:
         return published.read_rig(path)
     if path.name == CALIBRATION_NAME:
         return kitti_sequence(path.parent).read_rig(path.parent)
-    return RigRead(_rig_of_file(path))
+    return _rig_of_file(path), ()
 
 
 def _rig_of_file(path: Path) -> Rig:

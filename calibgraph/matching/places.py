@@ -21,7 +21,7 @@ from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame, seconds_between
 from calibgraph.matching.camera_pairs.find import Features, features_of, match_features
-from calibgraph.matching.camera_pairs.geometry import planes_at, relative_pose
+from calibgraph.matching.camera_pairs.geometry import points_at, relative_pose
 from calibgraph.matching.cloud_similarity import (
     LEAST_UPRIGHT,
     Z_UP,
@@ -281,11 +281,7 @@ def _motion(
     except DatasetError:  # it is to be corrected for a motion that cannot be found
         return None
     rows = match_features(before, after)
-    rays = before.rays[rows[:, 0]]
     T = lens.T_camera_lidar
-    planes = planes_at(rays, cloud @ T[:3, :3].T + T[:3, 3])
-    inverse = np.einsum("ni,ni->n", planes, rays)
-    near = inverse > 0  # false where there is no plane
-    points = rays[near] / inverse[near, None]
+    near, points = points_at(before.rays[rows[:, 0]], cloud @ T[:3, :3].T + T[:3, 3])
     T_later_earlier = relative_pose(points, after.rays[rows[near, 1]], seed=seed)
     return None if T_later_earlier is None else invert(T) @ T_later_earlier @ T

@@ -76,7 +76,6 @@ CAUSES: dict[str, Cause] = {
             "lens_aspect_ratio": "", "aspect_ratio": "",
             "lens_prior": "Check that the lens belongs to these images; then correct the named "
             "value in the rig, or state intrinsics_sigma_px and distortion_sigma.",
-            "focal_sensitivity": "Verify the focal length: here the position depends on it.",
         },
     ),
     "cameras": Cause(
@@ -144,7 +143,9 @@ CAUSES: dict[str, Cause] = {
     ),
     "error bar": Cause(
         "",
-        {"sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE,
+        {"free": "Give correspondences over the whole image, and at several distances.",
+         "no_error_bar": "Mend the camera whose pose is free, or leave it out.",
+         "sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE,
          "beyond_tolerance": _STRUCTURE},
     ),
     "other": Cause("", {}),  # of another version

@@ -162,14 +162,15 @@ class Correspondences:
 
     def select(self, rows: NDArray[Any] | slice) -> Correspondences:
         """The table with only some rows: a mask, an index array or a slice."""
-        kept = copy.copy(self)  # not checked again: rows of a valid table are valid
+        kept = object.__new__(type(self))  # not checked again: rows of a valid table are valid
+        vars(kept).update(vars(self))
         if not isinstance(rows, slice) and rows.dtype == np.bool_:
             rows = np.flatnonzero(rows)
         for name in _WIDTHS:
             column = getattr(self, name)
             if column is not None:
                 some = column[rows] if isinstance(rows, slice) else column.take(rows, axis=0)
-                object.__setattr__(kept, name, some)
+                vars(kept)[name] = some
         return kept
 
     def of_camera(self, name: str) -> Correspondences:

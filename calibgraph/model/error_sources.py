@@ -127,14 +127,13 @@ class ErrorSources:
 def left_out(config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool) -> str:
     """The errors that the bars leave out: relative poses show the clouds' scale.
 
-    By what was estimated, what the rig states of times, and whether the LiDAR's motion is known.
+    By what was estimated, and whether the LiDAR's motion is known.
     """
     free = has_new_lens and {*config.estimate} - {"offset", "readout"}
     lens = "other intrinsics" if free else "intrinsics"
-    if config.of == "mount" and config.preset == "auto":  # lenses and clocks are uncertain
-        lens += " (beyond what the rig states, or a calibration with a target leaves)"
-    stated = motion_known and all(each.time_offset_sigma_s for each in rig.cameras.values())
-    times = "offset" in config.estimate or (config.preset == "auto" and stated)
+    if config.preset == "auto":  # lenses and clocks are uncertain
+        lens += " beyond what the rig states"
+    times = "offset" in config.estimate or (config.preset == "auto" and motion_known)
     others = [] if times else ["time offset"]
     others += [] if rig.relative_poses else ["range scale"]
     return ", ".join([lens, *others])

@@ -163,21 +163,27 @@ def change_of_lens(
 
 
 class LensSigmas(NamedTuple):
-    """Standard deviations of a lens where the rig states none.
+    """Standard deviations of a lens and a clock where the rig states none.
 
     Of the logarithm of both focal lengths, of each coordinate of the centre [px],
-    and of radial coefficients; tangential ones have ``TANGENTIAL_SHARE`` of these.
+    of radial coefficients (tangential ones have ``TANGENTIAL_SHARE`` of these), of offset and
+    read-out.
     """
 
     focal: float
     centre_px: float
     radial: float
+    offset_s: float
+    readout_s: float
 
     @staticmethod
     def calibrated(camera: Camera) -> LensSigmas:
-        """Of a lens that was calibrated with a target: 0.2 %; of 1000 px, a centre to 2 px."""
+        """Of a lens calibrated with a target, and of triggered images: 0.2 %, 2 of 1000 px, 5 ms.
+
+        A read-out that the rig does not state is taken for none.
+        """
         share = _CALIBRATED
-        return LensSigmas(share, share * camera.intrinsics_px.fx, share)
+        return LensSigmas(share, share * camera.intrinsics_px.fx, share, 0.005, 0.0)
 
     def state_in(self, camera: Camera) -> Camera:
         """A camera with these sigmas, unless it states its own."""
@@ -189,8 +195,9 @@ class LensSigmas(NamedTuple):
         return camera.model_copy(update={"intrinsics_sigma_px": sigma, "distortion_sigma": radial})
 
 
-IN_DOUBT = LensSigmas(0.02, 5.0, 0.05)
-"""Of a lens that is estimated, or known from words, a spec sheet or a field of view."""
+IN_DOUBT = LensSigmas(0.02, 5.0, 0.05, 0.05, 0.03)
+"""Of a lens that is estimated, or known from words, a spec sheet or a field of view; of a clock
+that is estimated: half a turn of a LiDAR, and a usual read-out."""
 _CALIBRATED = 0.002
 
 

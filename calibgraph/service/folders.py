@@ -5,13 +5,12 @@ A root, or what is in it, is a place: its fsspec protocol and its path without l
 
 import fcntl
 import os
-import secrets
 import shutil
 from pathlib import Path
 from urllib.parse import unquote
 
 from calibgraph.errors import FileError
-from calibgraph.files import require_place_for_folder, sync_folder, write_text
+from calibgraph.files import require_place_for_folder, sync_folder
 from calibgraph.fleet.files import is_local, locate
 
 INPUT, SCRATCH, WORK, RESULT, LOG = "input", "scratch", "work", "result", "log.txt"
@@ -38,10 +37,6 @@ class DataFolder:
         shutil.rmtree(self.arriving, ignore_errors=True)
         for folder in (self.jobs, self.trackers, self.arriving):
             folder.mkdir(exist_ok=True, mode=0o700)
-        owner = self.path / "owner"
-        if not owner.exists():
-            write_text(owner, secrets.token_hex(16))
-        self.owner = owner.read_text().strip()
 
     def of_job(self, id: str) -> Path:
         """The folder of a job."""

@@ -1,13 +1,11 @@
-"""The table of jobs, in SQLite or another database: nothing that was acknowledged is lost."""
+"""The table of jobs, in SQLite: nothing that was acknowledged is lost."""
 
+import sqlite3
+import threading
 import time
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
-
-import sqlalchemy as sa
-from sqlalchemy import func, select
-from sqlalchemy.exc import SQLAlchemyError
-from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, sessionmaker
 
 from calibgraph.child_process import ErrorKind, Outcome
 from calibgraph.errors import CalibrationError
@@ -20,42 +18,38 @@ MOST_STARTS = 5
 
 DATABASE = "service.sqlite"
 _WAIT_S = 30.0
-_NUMBER = sa.Integer().with_variant(sa.BigInteger, "postgresql")
+_ENDED = "state IN ('succeeded', 'failed', 'cancelled')"
+_SCHEMA = """
+PRAGMA journal_mode = WAL;
+PRAGMA synchronous = FULL;  -- what is acknowledged is on disk
+CREATE TABLE IF NOT EXISTS calibgraph_jobs (
+    number INTEGER PRIMARY KEY, id TEXT UNIQUE, kind TEXT, state TEXT, request TEXT, name TEXT,
+    note TEXT, created_s REAL, started_s REAL, finished_s REAL, starts INTEGER, verdict TEXT,
+    cannot_tell INTEGER, error_kind TEXT, error TEXT
+);
+CREATE INDEX IF NOT EXISTS calibgraph_jobs_by_state ON calibgraph_jobs (state, number);
+"""
 
 
-class Base(DeclarativeBase):
-    """What all tables have in common."""
-
-
-class Owner(Base):
-    """Whose the database is: of one data folder."""
-
-    __tablename__ = "calibgraph_owner"
-
-    id: Mapped[str] = mapped_column(sa.String(64), primary_key=True)
-
-
-class JobRecord(Base):
+@dataclass(frozen=True)
+class JobRecord:
     """A job; times are seconds since 1970, None if not yet."""
 
-    __tablename__ = "calibgraph_jobs"
-    __table_args__ = (sa.Index("calibgraph_jobs_by_state", "state", "number"),)
-
-    number: Mapped[int] = mapped_column(_NUMBER, primary_key=True)
-    id: Mapped[str] = mapped_column(sa.String(64), unique=True)
-    kind: Mapped[JobKind] = mapped_column(sa.String(16))
-    state: Mapped[JobState] = mapped_column(sa.String(16))
-    request: Mapped[str] = mapped_column(sa.Text)
-    name: Mapped[str] = mapped_column(sa.Text)
-    note: Mapped[str] = mapped_column(sa.Text)
-    created_s: Mapped[float]
-    started_s: Mapped[float | None]
-    finished_s: Mapped[float | None]
-    starts: Mapped[int]
-    verdict: Mapped[str | None] = mapped_column(sa.String(16))
-    cannot_tell: Mapped[bool | None]
-    error_kind: Mapped[ErrorKind | None] = mapped_column(sa.String(16))
-    error: Mapped[str | None] = mapped_column(sa.Text)
+    number: int
+    id: str
+    kind: JobKind
+    state: JobState
+    request: str
+    name: str
+    note: str
+    created_s: float
+    started_s: float | None
+    finished_s: float | None
+    starts: int
+    verdict: str | None
+    cannot_tell: bool | None
+    error_kind: ErrorKind | None
+    error: str | None
 
     @property
     def is_finished(self) -> bool:
@@ -63,133 +57,113 @@ class JobRecord(Base):
         return self.state in FINISHED
 
 
-def open_database(folder: Path, url: str | None, owner: str) -> sa.Engine:
-    """The database of a server: SQLite in its folder without a URL; it belongs to one owner.
-
-    Raises:
-        CalibrationError: if it cannot be opened, or is another server's.
-    """
-    where = "the database" if url else str(folder / DATABASE)
-    try:
-        engine = _engine(folder, url)
-        Base.metadata.create_all(engine)
-        with Session(engine) as session, session.begin():
-            found = session.scalar(select(Owner.id))
-            if found is None:
-                session.add(Owner(id=owner))
-    except (SQLAlchemyError, ImportError) as error:
-        why = str(getattr(error, "orig", None) or error).split("\n")[0]
-        raise CalibrationError(f"{where}: cannot be opened ({why}); check --database") from error
-    if found not in (None, owner):
-        raise CalibrationError(f"{where}: belongs to another --data folder; take another database")
-    return engine
-
-
-def _engine(folder: Path, url: str | None) -> sa.Engine:
-    if url is not None and not url.startswith("sqlite"):
-        return sa.create_engine(url, pool_pre_ping=True)
-    engine = sa.create_engine(
-        url or f"sqlite:///{folder / DATABASE}", connect_args={"timeout": _WAIT_S}, pool_size=20
-    )
-
-    @sa.event.listens_for(engine, "connect")
-    def _prepare(connection: Any, _: object) -> None:
-        connection.execute("PRAGMA journal_mode=WAL")
-        connection.execute("PRAGMA synchronous=FULL")  # what is acknowledged is on disk
-
-    return engine
+_COLUMNS = ", ".join(each.name for each in fields(JobRecord))
 
 
 class JobTable:
-    """The jobs of a server."""
+    """The jobs of a server.
 
-    def __init__(self, engine: sa.Engine) -> None:
-        self._engine, self._sessions = engine, sessionmaker(engine, expire_on_commit=False)
+    Args:
+        folder: of the database.
+
+    Raises:
+        CalibrationError: if it cannot be opened.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        path, self._using = folder / DATABASE, threading.Lock()
+        try:
+            self._connection = sqlite3.connect(
+                path, _WAIT_S, check_same_thread=False, isolation_level=None
+            )
+            self._connection.executescript(_SCHEMA)
+        except sqlite3.Error as error:
+            raise CalibrationError(f"{path}: cannot be opened ({error}); move it away") from error
+
+    def run(self, statement: str, **values: Any) -> list[Any]:
+        """The rows of a statement; what it changes is on disk when this returns."""
+        with self._using:
+            return self._connection.execute(statement, values).fetchall()
+
+    def close(self) -> None:
+        """Close the database."""
+        self._connection.close()
 
     def add(self, id: str, job: Job) -> JobRecord:
         """Add a job; it is durable when this returns."""
-        record = JobRecord(
-            id=id, kind=job.kind, state="queued", request=job.model_dump_json(), name=job.name,
-            note=job.note, created_s=time.time(), starts=0,
+        (row,) = self.run(
+            "INSERT INTO calibgraph_jobs (id, kind, state, request, name, note, created_s, starts) "
+            f"VALUES (:id, :kind, 'queued', :request, :name, :note, :now, 0) RETURNING {_COLUMNS}",
+            id=id, kind=job.kind, request=job.model_dump_json(), name=job.name, note=job.note,
+            now=time.time(),
         )  # fmt: skip
-        with self._sessions.begin() as session:
-            session.add(record)
-        return record
+        return JobRecord(*row)
 
     def get(self, id: str) -> JobRecord | None:
         """A job; None if there is none."""
-        with self._sessions() as session:
-            return session.scalar(select(JobRecord).filter_by(id=id))
+        found = self._select("WHERE id = :id", id=id)
+        return found[0] if found else None
 
     def newest(self, most: int, before: int | None = None) -> list[JobRecord]:
         """The newest jobs, before a number."""
-        query = select(JobRecord).order_by(JobRecord.number.desc()).limit(most)
-        if before is not None:
-            query = query.where(JobRecord.number < before)
-        with self._sessions() as session:
-            return [*session.scalars(query)]
+        where = "" if before is None else "WHERE number < :before"
+        return self._select(f"{where} ORDER BY number DESC LIMIT :most", most=most, before=before)
+
+    def _select(self, where: str, **values: Any) -> list[JobRecord]:
+        rows = self.run(f"SELECT {_COLUMNS} FROM calibgraph_jobs {where}", **values)
+        return [JobRecord(*row) for row in rows]
 
     def counts(self) -> dict[JobState, int]:
         """How many jobs are in each state."""
-        query = select(JobRecord.state, func.count()).group_by(JobRecord.state)
-        with self._engine.connect() as connection:
-            return {state: count for state, count in connection.execute(query)}
+        return dict(self.run("SELECT state, count(*) FROM calibgraph_jobs GROUP BY state"))
 
     def start_next(self) -> JobRecord | None:
-        """Take the job that has waited longest; None if there is none. One thread at a time."""
-        first = select(func.min(JobRecord.number)).where(JobRecord.state == "queued")
-        start = (
-            sa.update(JobRecord)
-            .where((JobRecord.number == first.scalar_subquery()) & (JobRecord.state == "queued"))
-            .values(state="running", started_s=time.time(), starts=JobRecord.starts + 1)
-            .returning(JobRecord)
-            .execution_options(synchronize_session=False)
-        )
-        with self._sessions.begin() as session:
-            return session.scalar(start)
+        """Take the job that has waited longest; None if there is none."""
+        rows = self.run(
+            "UPDATE calibgraph_jobs SET state = 'running', started_s = :now, starts = starts + 1 "
+            "WHERE number = (SELECT min(number) FROM calibgraph_jobs WHERE state = 'queued') "
+            f"RETURNING {_COLUMNS}", now=time.time()
+        )  # fmt: skip
+        return JobRecord(*rows[0]) if rows else None
 
     def finish(self, id: str, outcome: Outcome) -> None:
         """Give a running job its final state, unless it was cancelled."""
         verdict, cannot_tell = outcome.result or (None, None)
-        values = {
-            "state": "succeeded" if outcome.error_kind is None else "failed",
-            "verdict": verdict, "cannot_tell": cannot_tell,
-            "error_kind": outcome.error_kind, "error": outcome.error, "finished_s": time.time(),
-        }  # fmt: skip
-        self._change(_is(id, "running"), values)
+        self.run(
+            "UPDATE calibgraph_jobs SET state = :state, verdict = :verdict, error = :error, "
+            "cannot_tell = :cannot_tell, error_kind = :kind, finished_s = :now "
+            "WHERE id = :id AND state = 'running'",
+            state="succeeded" if outcome.error_kind is None else "failed", id=id, verdict=verdict,
+            cannot_tell=cannot_tell, kind=outcome.error_kind, error=outcome.error, now=time.time(),
+        )  # fmt: skip
 
     def cancel(self, id: str) -> bool:
         """Cancel a job; False if it is finished."""
-        values = {"state": "cancelled", "finished_s": time.time()}
-        return self._change(_is(id, "queued", "running"), values) > 0
+        changed = self.run(
+            "UPDATE calibgraph_jobs SET state = 'cancelled', finished_s = :now "
+            f"WHERE id = :id AND NOT {_ENDED} RETURNING id", id=id, now=time.time()
+        )  # fmt: skip
+        return bool(changed)
 
     def put_back(self, id: str | None = None) -> int:
         """Let a running job, or all, wait again, and count them; those started too often fail."""
-        which = JobRecord.state == "running" if id is None else _is(id, "running")
-        text = f"its process or the server ended {MOST_STARTS} times while it ran"
-        self._change(
-            which & (JobRecord.starts >= MOST_STARTS),
-            {"state": "failed", "error_kind": "worker died", "error": text,
-             "finished_s": time.time()},
+        which = "WHERE state = 'running' AND coalesce(id = :id, 1)"
+        self.run(
+            "UPDATE calibgraph_jobs SET state = 'failed', error_kind = 'worker died', "
+            f"error = :text, finished_s = :now {which} AND starts >= {MOST_STARTS}",
+            id=id, now=time.time(),
+            text=f"its process or the server ended {MOST_STARTS} times while it ran",
         )  # fmt: skip
-        return self._change(which, {"state": "queued", "started_s": None})
+        again = (
+            f"UPDATE calibgraph_jobs SET state = 'queued', started_s = NULL {which} RETURNING id"
+        )
+        return len(self.run(again, id=id))
 
     def remove_finished(self, before_s: float) -> list[str]:
         """Forget the jobs that ended before a time; their ids."""
-        ended = JobRecord.state.in_(FINISHED) & (JobRecord.finished_s < before_s)
-        with self._engine.begin() as connection:
-            return [*connection.scalars(sa.delete(JobRecord).where(ended).returning(JobRecord.id))]
+        ended = f"DELETE FROM calibgraph_jobs WHERE {_ENDED} AND finished_s < :before RETURNING id"
+        return [id for (id,) in self.run(ended, before=before_s)]
 
     def states(self) -> dict[str, JobState]:
         """The states of all jobs, by their ids."""
-        with self._engine.connect() as connection:
-            query = select(JobRecord.id, JobRecord.state)
-            return {id: state for id, state in connection.execute(query)}
-
-    def _change(self, where: sa.ColumnElement[bool], values: dict[str, Any]) -> int:
-        with self._engine.begin() as connection:
-            return connection.execute(sa.update(JobRecord).where(where).values(values)).rowcount
-
-
-def _is(id: str, *states: JobState) -> sa.ColumnElement[bool]:
-    return (JobRecord.id == id) & JobRecord.state.in_(states)
+        return dict(self.run("SELECT id, state FROM calibgraph_jobs"))

@@ -3,13 +3,13 @@
 import errno
 import logging
 import secrets
+import sqlite3
 from collections.abc import Mapping
 from http import HTTPStatus
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
@@ -44,7 +44,7 @@ def add_problem_handlers(app: FastAPI) -> None:
         return problem_response(_problem_of(request, error))
 
     for kind in (Problem, CalibrationError, RequestValidationError, HTTPException, OSError,
-                 SQLAlchemyError, ClientDisconnect, Exception):  # fmt: skip
+                 sqlite3.Error, ClientDisconnect, Exception):  # fmt: skip
         app.add_exception_handler(kind, answer)
 
 
@@ -65,9 +65,9 @@ def _problem_of(request: Request, error: Exception) -> Problem:
             found = Problem(error.status_code, str(error.detail), error.headers)
         case ClientDisconnect():
             found = Problem(400, "the request broke off")
-        case OSError() | SQLAlchemyError() if is_full:
+        case OSError() | sqlite3.Error() if is_full:
             found = Problem(507, "the server's disk is full; try again later")
-        case SQLAlchemyError():
+        case sqlite3.Error():
             found = Problem(503, "the server's database cannot be used; try again later")
     if found.status in (500, 503):
         log.error("%s: %s", request.url.path, found.detail, exc_info=error)

@@ -127,7 +127,6 @@ class Settings(StrictNumbers):
 
     Attributes:
         data: folder for jobs and trackers, of one server at a time.
-        database: URL of SQLAlchemy for the table of jobs; SQLite in ``data`` if None.
         tokens: file of the tokens that may call; None: anyone on this machine may.
         hosts: names by which the server is called; others are refused. Empty: without a token file
             the names of this machine for itself, else any.
@@ -145,7 +144,6 @@ class Settings(StrictNumbers):
     """
 
     data: Path
-    database: str | None = None
     tokens: Path | None = None
     hosts: tuple[str, ...] = ()
     roots: tuple[str, ...] = ()

@@ -13,7 +13,7 @@ from fastapi import Request
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
 from calibgraph.errors import CalibrationError
 from calibgraph.service.folders import DataFolder, open_roots
-from calibgraph.service.jobs import JobRecord, JobTable, open_database
+from calibgraph.service.jobs import JobRecord, JobTable
 from calibgraph.service.problems import Problem
 from calibgraph.service.request_guard import load_tokens
 from calibgraph.service.requests import Job, Settings
@@ -34,11 +34,10 @@ class Service:
         self.tokens = None if settings.tokens is None else load_tokens(settings.tokens)
         self.folder = DataFolder(settings.data)
         try:
-            self.engine = open_database(self.folder.path, settings.database, self.folder.owner)
+            self.jobs = JobTable(self.folder.path)
         except CalibrationError:
             self.folder.close()
             raise
-        self.jobs = JobTable(self.engine)
         self.runner = Runner(self.jobs, self.folder, settings)
         self.trackers = Trackers(
             self.folder.trackers, settings.tracker_processes, settings.memory_bytes
@@ -54,7 +53,7 @@ class Service:
         self.begin_stop()
         self.runner.stop(self.settings.grace_s)
         self.trackers.close()
-        self.engine.dispose()
+        self.jobs.close()
         self.folder.close()
 
     def require_room(self, size: int) -> None:

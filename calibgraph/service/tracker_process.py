@@ -4,27 +4,23 @@ import gc
 import json
 import shutil
 import sys
-from collections.abc import Iterator
+from io import BytesIO
+from itertools import chain
 from pathlib import Path
 
 import pyarrow as pa
 
 from calibgraph.child_process import answer_requests, describe_failure, memory_limit
+from calibgraph.errors import CalibrationError, MotionError
 from calibgraph.files import sync_folder, write_bytes, write_text
 from calibgraph.io.rigs import load_rig
+from calibgraph.io.tables import from_arrow
 from calibgraph.model.config import config_from
 from calibgraph.report.as_json import finite, result_summary
-from calibgraph.tracking import DurableCalibrator, Update, update_all, warm_up_tracker
+from calibgraph.tracking import DurableCalibrator, warm_up_tracker
 from calibgraph.tracking.assessment import json_lines
 from calibgraph.tracking.state import require_poses_alone
-from calibgraph.tracking.streams import (
-    Item,
-    Refused,
-    frames_in_table,
-    frames_of_lines,
-    in_groups,
-    require_schema,
-)
+from calibgraph.tracking.streams import Item, frames_of_lines, frames_of_table
 
 Held = dict[Path, DurableCalibrator]
 _ARROW = b"\xff\xff\xff\xff"
@@ -68,41 +64,33 @@ def answer(held: Held, request: tuple[str, Path, bytes, str]) -> tuple[int, str]
     return status, text
 
 
-def _frames_of(body: bytes) -> Iterator[Item]:
+def _frames_of(body: bytes) -> list[Item]:
     """The frames of JSON lines, or of a table of correspondences as an Arrow IPC stream."""
     if not body.startswith(_ARROW):
-        return frames_of_lines([body], "frames")
+        return [*frames_of_lines(BytesIO(body), "frames")]
     try:
         table = pa.ipc.open_stream(body).read_all()
         table.validate(full=True)  # what is sent may be damaged
     except (pa.ArrowException, OSError) as error:
         raise ValueError(f"not a whole Arrow IPC stream ({error}); send it again") from error
-    require_schema("frames", table.schema)
-    return frames_in_table(table, "frames")
+    return [*frames_of_table(from_arrow(table))]
 
 
 def _take_frames(calibrator: DurableCalibrator, body: bytes) -> str:
-    """Take in frames, ten by one write; one with a motion of no vehicle refuses all of them."""
-    items = [*_frames_of(body)]
-    updates, refused, known = list[Update](), list[str](), 0
-    for item in items:  # slower frames look right, and are not
-        if isinstance(item, Refused) and item.by_motion:
-            raise ValueError(f"{item.message}; none of these frames was taken in")
-    for group in in_groups(items, 10):
-        if isinstance(group, Refused):
-            refused.append(group.message)
-            continue
-        last = calibrator.tracker.frame
-        new = [one for one in group if last is None or one.frame > last]
-        known += len(group) - len(new)
-        with calibrator.in_one_write():
-            for found in update_all(calibrator, new):
-                if isinstance(found, Refused):
-                    refused.append(found.message)
-                else:
-                    updates += found
-    lines = ", ".join(json_lines(updates))
-    return f'{{"updates": [{lines}], "known": {known}, "refused": {json.dumps(refused)}}}'
+    """Take in frames by one write; one with a motion of no vehicle refuses all of them."""
+    try:
+        items = _frames_of(body)
+    except MotionError as error:  # slower frames look right, and are not
+        raise ValueError(f"{error}; none of these frames was taken in") from error
+    frames = [one for one in items if not isinstance(one, CalibrationError)]
+    last = calibrator.tracker.frame
+    new = [one for one in frames if last is None or one.frame > last]
+    found = calibrator.update_all(new)
+    errors = [one for one in (*items, *found) if isinstance(one, CalibrationError)]
+    groups = (one for one in found if not isinstance(one, CalibrationError))
+    lines = ", ".join(json_lines([*chain.from_iterable(groups)]))
+    known, refused = len(frames) - len(new), json.dumps([*map(str, errors)])
+    return f'{{"updates": [{lines}], "known": {known}, "refused": {refused}}}'
 
 
 if __name__ == "__main__":

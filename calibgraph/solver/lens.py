@@ -22,11 +22,11 @@ from calibgraph.model.config import LensPart
 from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens import LensEstimate, LensSigmas
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Rig
 from calibgraph.solver.covariance import FittedObjective, positive_part
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
-from factors import to_runs
+from factors import ProjectionBlock, to_runs, unproject
 from factors.columns import CENTRE_X, CENTRE_Y, FOCAL, OFFSET, READOUT
 
 Lenses = Mapping[str, LensVariable]
@@ -38,6 +38,10 @@ lens."""
 _LENS: tuple[LensPart, ...] = "focal", "centre", "distortion"
 _WEAK_PRIOR = 0.01  # information: a lens that is ten sigmas off is hardly held back
 _MOST_STEPS, _MINIMAL = 20, 1e-4  # of Gauss-Newton; decrease of the cost by the last
+_SCENES = 0.7, 1.4  # times as far are the things of another recording: so streets scatter
+_DEPTHS = 0.5, 1.0, 2.0  # of a scene, over its mean
+_GRID = 9, 6  # columns and rows of things in an image
+_NEAREST_M = 0.1
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
 _UNITS = {FOCAL: "px", CENTRE_X: "px", CENTRE_Y: "px", OFFSET: "s", READOUT: "s"}
 
@@ -112,16 +116,18 @@ def _by_place_at_minimum(
 def lens_errors(at: FittedObjective) -> dict[int, Array]:
     """Per number of a camera, (6, 6) covariance of its pose by what is not estimated of its lens.
 
-    Of the pose that fits the matches of a lens which errs as that of a calibrated camera, or as the
-    rig states, and of a clock whose errors the rig states; in the tangent of T_lidar_camera. An
-    alignment makes up for a lens alike in every recording, but for a clock by the speed.
+    Of the pose that fits the matches of a lens which errs as the rig states, or as that of a
+    calibrated camera, and, where the motion of the LiDAR is known, of a clock that errs so; in the
+    tangent of T_lidar_camera. An alignment makes up for a lens, in every recording nearly alike: it
+    errs by what other scenes would give. For a clock it makes up by the speed.
     """
     found, is_mount = {}, at.objective.config.of == "mount"
     for name, block in at.projections.items():
         camera = at.objective.rig.cameras[name]
-        clock = _stated_clock(camera) if is_mount or block.motion is not None else []
-        lens_of = _LENS if is_mount and camera.model != "equirectangular" else ()
-        lens = LensVariable.of(camera, [*lens_of, *clock], LensSigmas.calibrated(camera))
+        parts: list[LensPart] = [] if camera.model == "equirectangular" else [*_LENS]
+        if block.motion is not None:
+            parts += ["offset", "readout"] if camera.readout_sigma_s else ["offset"]
+        lens = LensVariable.of(camera, parts, LensSigmas.calibrated(camera))
         estimated = at.objective.lenses[name].free.parameters if name in at.objective.lenses else ()
         names = enumerate(lens.free.parameters, start=6)
         rows = [row for row, parameter in names if parameter not in estimated]
@@ -129,18 +135,37 @@ def lens_errors(at: FittedObjective) -> dict[int, Array]:
             T = at.T_camera_lidar[name][None]
             hessian = block.summarize(T, None, lens.free, lens.values).hessian[0]
             hessian[:6, :6] += WEAK
-            follow = _given_in(hessian, rows)
-            found[at.cameras.index(name)] = follow @ follow.T + EXACT**2 * np.eye(6)
+            errors = _given_in(hessian, rows)[None]
+            if not is_mount:
+                errors = errors - _in_other_scenes(lens, block, at.T_camera_lidar[name], rows)
+            covariance = (errors @ errors.transpose(0, 2, 1)).mean(axis=0)
+            found[at.cameras.index(name)] = covariance + EXACT**2 * np.eye(6)
     return found
 
 
-def _stated_clock(camera: Camera) -> list[LensPart]:
-    """Of clocks nothing is usual."""
-    stated: dict[LensPart, float | None] = {
-        "offset": camera.time_offset_sigma_s,
-        "readout": camera.readout_sigma_s,
-    }
-    return [part for part, sigma in stated.items() if sigma]
+def _in_other_scenes(
+    lens: LensVariable, block: ProjectionBlock, T_camera_lidar: Array, rows: list[int]
+) -> Array:
+    """(2, 6, m) by how much a pose makes up for a lens where things fill the image, for a clock 0.
+
+    At distances around those of the matches, once all nearer and once all farther.
+    """
+    camera = lens.camera
+    points = block.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
+    usual_m = np.exp(np.log(np.linalg.norm(points, axis=1) + _NEAREST_M).mean())
+    x, y = ((np.arange(n) + 0.5) / n for n in _GRID)
+    size = camera.width_px, camera.height_px
+    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) * size - 0.5
+    rays, known = unproject(camera.lens, pixels)
+    rays, pixels = rays[known] / np.linalg.norm(rays[known], axis=1)[:, None], pixels[known]
+    found = np.zeros((len(_SCENES), 6, len(rows)))
+    for number, scale in enumerate(_SCENES):
+        spread = np.concatenate([usual_m * scale * depth * rays for depth in _DEPTHS])
+        scene = ProjectionBlock(camera.lens, spread, np.tile(pixels, (len(_DEPTHS), 1)), loss="l2")
+        hessian = scene.summarize(np.eye(4)[None], None, lens.free, lens.values).hessian[0]
+        hessian[:6, :6] += WEAK
+        found[number] = _given_in(hessian, rows)
+    return found
 
 
 def weak_information(lens: LensVariable | None) -> Array:

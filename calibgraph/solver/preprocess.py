@@ -91,10 +91,10 @@ def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config)
             kept = [_merge(rig, kept, config)]
             merged_rows = len(kept[0])
     table = _merge(rig, kept, config)
-    camera = _camera_numbers(rig, table)
+    camera = camera_numbers(rig, table)
     counts[3] = np.bincount(camera, minlength=len(rig.cameras))
     table, camera, repeated = _count_repeats_once(rig, table, camera, config)
-    rows = _within_cap(table, camera, config)
+    rows = within_cap(table, camera, config)
     if rows is not None:
         table, camera = table.select(rows), camera[rows]
     counts[4] = np.bincount(camera, minlength=len(rig.cameras))
@@ -146,8 +146,8 @@ def _filter(
 
     And (3, N) per camera, how many are given, projectable, confident.
     """
-    camera = _camera_numbers(rig, table)
-    projectable = _projectable(rig, table, camera)
+    camera = camera_numbers(rig, table)
+    projectable = are_projectable(rig, table, camera)
     confident = projectable & (table.confidence >= config.confidence_min)
     furthest = projectable.view(np.int8) + confident.view(np.int8)  # the last filter passed
     reached = np.bincount(3 * camera + furthest, minlength=3 * len(rig.cameras)).reshape(-1, 3)
@@ -160,10 +160,10 @@ def _merge(rig: Rig, kept: Sequence[Correspondences], config: Config) -> Corresp
     if len(kept) == 1:
         return kept[0]
     table = concatenate(kept)
-    return table.select(best_in_cell(rig, table, _camera_numbers(rig, table), config))
+    return table.select(best_in_cell(rig, table, camera_numbers(rig, table), config))
 
 
-def _camera_numbers(rig: Rig, table: Correspondences) -> NDArray[np.int64]:
+def camera_numbers(rig: Rig, table: Correspondences) -> NDArray[np.int64]:
     """(n,) index of each row's camera in the rig."""
     for name in table.cameras:
         if name not in rig.cameras:
@@ -176,7 +176,9 @@ def _camera_numbers(rig: Rig, table: Correspondences) -> NDArray[np.int64]:
     return numbers.take(table.camera_index) if len(table) else np.empty(0, np.int64)
 
 
-def _projectable(rig: Rig, table: Correspondences, camera: NDArray[np.int64]) -> NDArray[np.bool_]:
+def are_projectable(
+    rig: Rig, table: Correspondences, camera: NDArray[np.int64]
+) -> NDArray[np.bool_]:
     """(n,) depth filter: Z > 0 and inside the lens' domain, under the rig's current extrinsic."""
     keep = np.empty(len(table), dtype=np.bool_)
     for number, model in enumerate(rig.cameras.values()):
@@ -187,7 +189,7 @@ def _projectable(rig: Rig, table: Correspondences, camera: NDArray[np.int64]) ->
     return keep
 
 
-def _within_cap(
+def within_cap(
     table: Correspondences, camera: NDArray[np.int64], config: Config
 ) -> NDArray[np.int64] | None:
     """The rows that are the most confident ``matches_max`` of their camera and frame; None: all.

@@ -3,7 +3,7 @@
 from calibgraph.tracking.assessment import Update
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.streams import StreamFrame, update_all
+from calibgraph.tracking.frame_order import StreamFrame
 from calibgraph.tracking.tracker import IncrementalCalibrator, warm_up_tracker
 
 __all__ = [
@@ -12,6 +12,5 @@ __all__ = [
     "IncrementalCalibrator",
     "StreamFrame",
     "Update",
-    "update_all",
     "warm_up_tracker",
 ]

@@ -15,33 +15,36 @@ from calibgraph.pipeline import solve
 from calibgraph.solver.columns import distortion_evidence
 from calibgraph.solver.matches import BlockResiduals, CameraBlock, camera_blocks, merge
 from calibgraph.solver.preprocess import preprocess
+from calibgraph.solver.robust import quantiles
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.cause import chance_limit
 from calibgraph.tracking.estimate import EpochGraph, states_places
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import PLACE, Incoming
-from calibgraph.tracking.gate import Gated, agrees, find_outlier_frame
+from calibgraph.tracking.frame_order import StreamFrame, findings_of
+from calibgraph.tracking.gate import Gated, agrees, find_outlier_frame, sums_of
 from calibgraph.tracking.noise import add_residuals, median, scale_of
-from calibgraph.tracking.state import BEND, HISTORY, OutlierFrame, State
+from calibgraph.tracking.state import BEND, COUNTS, HISTORY, OutlierFrame, State
 from calibgraph.tracking.sums import Sums
+from factors import to_runs
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
+_ABSORBED = np.array([[name == one for one in ("given", "used", "absorbed")] for name in COUNTS])
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
 _TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
 _TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt to start
 
 
-def begin_frames(state: State, frames: Sequence[Incoming]) -> None:
+def begin_frames(state: State, frames: Sequence[StreamFrame]) -> None:
     """Begin frames, none of whose matches is absorbed."""
     last, n = frames[-1], len(state.names)
-    found = [one.table.findings for one in frames if len(one.table)]
-    state.frame, state.stamp_ns = last.number, last.stamp_ns
+    found = [one.table.findings for one in frames if len(one.table)][-1:]
+    state.frame, state.stamp_ns = last.frame, last.stamp_ns
     state.updates += len(frames)
-    if found and found[-1] != state.findings:
-        state.findings = found[-1]
-    numbers = np.array([one.number for one in frames], dtype=np.int64)
+    if found and found[0] != state.findings and (new := findings_of(found[0])) != state.findings:
+        state.findings = new
+    numbers = np.array([one.frame for one in frames], dtype=np.int64)
     state.numbers = np.concatenate([state.numbers, numbers])
-    state.at = (*state.at, *(one.table.metadata.get(PLACE, "") for one in frames))
+    state.at = (*state.at, *(str(one.place) for one in frames))
     state.sizes = (*state.sizes[:-1], state.sizes[-1] + len(frames))
     none = Sums.zeros(len(frames), n).packed
     state.sums = Sums(np.concatenate([state.sums.packed, none]))
@@ -53,35 +56,44 @@ def absorb(state: State, gated: Mapping[int, Gated]) -> list[dict[int, int]]:
     Frames of a camera with too few are left out.
     """
     used = [dict[int, int]() for _ in range(state.sizes[-1])]
-    packed, first = state.sums.packed.copy(), state.closed
-    for camera, every in gated.items():
-        one = every.select(every.enough)
-        numbers = one.raw.frame_numbers
-        if not len(numbers):
-            continue
-        rows = np.searchsorted(state.numbers, numbers)
-        packed[rows, camera] = one.sums(state, camera, state.references[camera]).packed
-        for row, count in zip((rows - first).tolist(), one.counts.tolist(), strict=True):
-            used[row][camera] = int(count)
-        keep_matches(state, camera, one)
-        agreed = (*state.agreements[camera], *((number, True) for number in numbers.tolist()))
-        state.put(camera, agreements=agreed[-_LAST_FRAMES:])
+    kept = {camera: one.select(one.enough) for camera, one in gated.items()}
+    kept = {camera: one for camera, one in kept.items() if len(one.counts)}
+    if not kept:
+        return used
+    cameras = np.repeat([*kept], [len(one.counts) for one in kept.values()])
+    numbers = np.concatenate([one.raw.frame_numbers for one in kept.values()])
+    rows = np.searchsorted(state.numbers, numbers)
+    sums, packed = sums_of(state, kept), state.sums.packed.copy()
+    packed[rows, cameras] = sums.packed
     state.sums = Sums(packed)
+    counts = sums.matches.astype(np.int64)
+    for row, camera, count in zip(rows.tolist(), cameras.tolist(), counts.tolist(), strict=True):
+        used[row - state.closed][camera] = count
+    agreements = [*state.agreements]
+    for camera, one in kept.items():
+        agreed = (*agreements[camera], *((n, True) for n in one.raw.frame_numbers.tolist()))
+        agreements[camera] = agreed[-_LAST_FRAMES:]
+    state.agreements = tuple(agreements)
+    keep_matches(state, kept)
     return used
 
 
-def keep_matches(state: State, camera: int, gated: Gated) -> None:
+def keep_matches(state: State, gated: Mapping[int, Gated]) -> None:
     """Keep the matches of absorbed frames, and count them."""
-    blocks, inliers = (*state.blocks[camera], gated.raw), (*state.inliers[camera], gated.inliers)
-    state.put(camera, blocks=blocks, inliers=inliers)
-    given, used = len(gated.inliers), int(gated.counts.sum())
-    state.count(camera, absorbed=gated.raw.frames, given=given, used=used)
+    blocks, inliers, counts = [*state.blocks], [*state.inliers], state.counts.copy()
+    for camera, one in gated.items():
+        blocks[camera], inliers[camera] = (
+            (*blocks[camera], one.raw),
+            (*inliers[camera], one.inliers),
+        )
+        counts[camera] += _ABSORBED @ [len(one.inliers), int(one.counts.sum()), len(one.counts)]
+    state.blocks, state.inliers, state.counts = tuple(blocks), tuple(inliers), counts
 
 
 def count_residuals(state: State, camera: int, gated: Gated) -> None:
     """Count the residuals of frames, and which of them are within the gate."""
-    raw, errors_px = gated.raw, gated.residuals.errors_px
-    medians = [median(part) for part in np.split(errors_px, raw.frame_edges[1:-1])]
+    raw = gated.raw
+    medians = quantiles(gated.residuals.errors_px, to_runs(raw.frame_edges), 0.5)
     new = np.column_stack([gated.counts / raw.frame_counts, medians])
     recent = np.concatenate([state.recent[camera], new])[-HISTORY:]
     histogram = add_residuals(state.histogram[camera], gated.residuals)
@@ -141,8 +153,7 @@ def _at_its_place(state: State, graph: EpochGraph, camera: int, own: OutlierFram
     if not gated.enough.all():
         return None
     tried = state.draft()
-    (sums,) = gated.sums(state, camera, state.references[camera]).packed
-    tried.sums = state.sums.replace_at((-1, camera), Sums(sums))
+    tried.sums = state.sums.replace_at((-1, camera), sums_of(state, {camera: gated})[0])
     squared, T = graph.at_its_place(tried)
     if squared[0] + squared[1 + camera] > chance_limit():
         return None
@@ -181,7 +192,7 @@ def count_repeats(state: State, given: Correspondences, new: Correspondences) ->
         state.count(camera, repeated=1 if number in again else -before)
 
 
-def count_absent(state: State, used: Collection[int], frame: Incoming) -> list[Event]:
+def count_absent(state: State, used: Collection[int], frame: StreamFrame) -> list[Event]:
     """Count the frames without usable matches; the events ``blind`` and ``back``.
 
     Args:
@@ -189,7 +200,7 @@ def count_absent(state: State, used: Collection[int], frame: Incoming) -> list[E
         used: the cameras whose matches of the frame were absorbed, by their places in the rig.
         frame: this one.
     """
-    events, limit, number = [], state.config.tracking.blind_frames, frame.number
+    events, limit, number = [], state.config.tracking.blind_frames, frame.frame
     absent = np.where(state.started, state.absent + 1, state.absent)
     absent[[*used]] = 0
     for camera in np.flatnonzero(state.started & (absent != state.absent)).tolist():
@@ -227,7 +238,8 @@ def start_cameras(state: State, table: Correspondences, seen: Collection[int]) -
 
 def _try_to_start(state: State, camera: int, table: Correspondences) -> None:
     name = state.names[camera]
-    waiting = (*state.waiting[camera], table.of_camera(name))
+    own = table.of_camera(name).with_metadata(findings_of(table.findings).to_metadata())
+    waiting = (*state.waiting[camera], own)
     count, waiting = len(waiting), waiting[-HISTORY:]
     state.put(camera, waiting=waiting)
     if not _is_attempt_due(count, state.config.tracking.start_frames):
@@ -289,9 +301,9 @@ def absorb_again(
         gated = gated.select(gated.enough)
         if len(gated.raw):
             rows = np.searchsorted(state.numbers, gated.raw.frame_numbers)
-            sums = gated.sums(state, camera, T_camera_lidar)
+            sums = sums_of(state, {camera: gated})
             state.sums = state.sums.replace_at((rows, camera), sums)
-            keep_matches(state, camera, gated)
+            keep_matches(state, {camera: gated})
     if any(state.findings.bend_sigmas):
         for epoch in range(len(state.sizes)):
             bend_epoch(state, epoch, camera)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import chain
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from calibgraph.arrays import Array
+from calibgraph.arrays import Array, Mask
 from calibgraph.model.calibration import Calibration, Residuals
+from calibgraph.model.config import Config
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import invert_each, pair_covariances, pose_rows
 from calibgraph.model.pose_kernel import logarithms
 from calibgraph.model.summary import summarize
@@ -19,9 +22,10 @@ from calibgraph.report.as_json import finite
 from calibgraph.solver.error_model import Conflict
 from calibgraph.tracking.estimate import EpochGraph, Estimate, error_sources, pairs_that_count
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import Incoming
+from calibgraph.tracking.frame_order import StreamFrame
 from calibgraph.tracking.noise import median
-from calibgraph.tracking.state import State
+from calibgraph.tracking.state import COUNTS, State
+from calibgraph.tracking.sums import Numbers, Sums
 from calibgraph.trust.evidence import Estimate as Checked
 from calibgraph.trust.pose_posterior import (
     MAX_FRAMES,
@@ -32,7 +36,6 @@ from calibgraph.trust.pose_posterior import (
 )
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
-from factors.conditioning import sigmas_of_hessian
 
 MeasureOnFrames = Callable[
     [Sequence[int], Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
@@ -42,19 +45,61 @@ MeasureOnFrames = Callable[
 NOT_COMPARED = "its images were not compared with the clouds: no frame that is at hand shows it"
 
 
-def assess(state: State, estimate: Estimate) -> Estimate:
-    """The present estimates with their verdicts."""
-    verdicts = {}
-    for camera, name in enumerate(state.names):
-        own = tuple(c for c in estimate.conflicts.values() if name in (c.pair.a, c.pair.b))
-        verdicts[name] = _verdict(state, estimate, camera, conflicts=own)
-    return replace(estimate, verdicts=verdicts)
+class Verdicts(Mapping[str, Verdict]):
+    """The verdict of each camera, made when it is read, from what it holds on to of the state."""
+
+    def __init__(self, state: State, estimate: Estimate) -> None:
+        self._judged = _Judged.of(state, estimate)
+        self._known: dict[str, Verdict] = {}
+
+    def __getitem__(self, name: str) -> Verdict:
+        """The verdict of a camera."""
+        if name not in self._known:
+            self._known[name] = _verdict(self._judged, self._judged.names.index(name))
+        return self._known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """The cameras' names."""
+        return iter(self._judged.names)
+
+    def __len__(self) -> int:
+        """How many cameras there are."""
+        return len(self._judged.names)
+
+
+class _Judged(NamedTuple):
+    """The small parts of a state and an estimate that verdicts are made of, named as there."""
+
+    names: tuple[str, ...]
+    config: Config
+    findings: MatcherFindings
+    started: Mask
+    counts: Numbers
+    absent: Numbers
+    walk: Numbers
+    agreements: tuple[tuple[tuple[int, bool], ...], ...]
+    refused: tuple[tuple[str, ...], ...]
+    waiting: tuple[int, ...]
+    covariance: Array
+    sums: Sums
+    conflicts: tuple[Conflict, ...]
+
+    @staticmethod
+    def of(state: State, estimate: Estimate) -> _Judged:
+        return _Judged(
+            state.names, state.config, state.findings, state.started, state.counts, state.absent,
+            state.walk, state.agreements, state.refused, tuple(map(len, state.waiting)),
+            estimate.covariance, estimate.sums, tuple(estimate.conflicts.values()),
+        )  # fmt: skip
+
+    def counted(self, camera: int, name: str) -> int:
+        return int(self.counts[camera, COUNTS.index(name)])
 
 
 def with_images(
     state: State, estimate: Estimate, measure: MeasureOnFrames | None
-) -> tuple[Estimate, ImagePosteriors]:
-    """Error bars and verdicts by the posteriors of cameras with error bars, too.
+) -> tuple[Estimate, dict[str, Verdict], ImagePosteriors]:
+    """Error bars and verdicts, by the posteriors of cameras with error bars, too.
 
     Without ``measure`` they stay as they are.
     """
@@ -67,7 +112,7 @@ def with_images(
             posteriors |= measure(frames, known, of_frames)
     images = ImagePosteriors(state.names, estimate.covariance, posteriors)
     row, flatness, verdicts = threshold("beyond_tolerance"), images.check_flatness(), {}
-    for name, verdict in estimate.verdicts.items():
+    for name, verdict in Verdicts(state, estimate).items():
         more = []
         if name in flatness:
             beyond = images.probability_beyond(name, state.config.tolerance)
@@ -76,27 +121,41 @@ def with_images(
             more = [Check("image evidence", "WARN", NOT_COMPARED)]
         verdicts[name] = Verdict((*verdict.checks, *more))
     covariance = images.widen(estimate.covariance)
-    return replace(estimate, covariance=covariance, verdicts=verdicts), images
+    return replace(estimate, covariance=covariance), verdicts, images
 
 
-def _verdict(
-    state: State, estimate: Estimate, camera: int, *, conflicts: tuple[Conflict, ...]
-) -> Verdict:
+def _verdict(state: _Judged, camera: int) -> Verdict:
+    name = state.names[camera]
+    conflicts = tuple(one for one in state.conflicts if name in (one.pair.a, one.pair.b))
     if not state.started[camera]:
         return _start_check(state, camera)
-    rows, sums = pose_rows(camera), estimate.sums
-    own = estimate.covariance[rows, rows]
+    rows, sums = pose_rows(camera), state.sums
+    own = state.covariance[rows, rows]
     found = Checked(
         has_matches=True,
         used=state.counted(camera, "used"),
         frames=int(sums.frames[camera]),
-        covariance=None if np.isnan(own).any() else own,
-        data_sigmas=sigmas_of_hessian(sums.hessian[camera]),
+        has_error_bar=not np.isnan(own).any(),
+        is_free=bool(np.isnan(own).any()),
         conflicts=conflicts,
         scatter_only=not state.findings.states_common_error,
         tolerance=state.config.tolerance,
     )
-    return Verdict((*check_estimate(found), *_recent_checks(state, camera)))
+    checks = check_estimate(found), _sigma_checks(found, own), _recent_checks(state, camera)
+    return Verdict(tuple(chain.from_iterable(checks)))
+
+
+def _sigma_checks(found: Checked, covariance: Array) -> list[Check]:
+    """The error bar about its worst axes: the probability of an error is not known while driving.
+
+    Of a (6, 6) covariance: rotation [rad], translation [m].
+    """
+    if not found.has_error_bar:
+        return []
+    sigmas = np.sqrt(np.diag(covariance))
+    degrees, centimetres = np.degrees(sigmas[:3].max()), 100 * sigmas[3:].max()
+    values = ("sigma_rotation", degrees), ("sigma_translation", centimetres)
+    return [threshold(key, found.tolerance).check(float(value)) for key, value in values]
 
 
 def _stuck_check(repeated: int, status: Status) -> Check:
@@ -104,16 +163,16 @@ def _stuck_check(repeated: int, status: Status) -> Check:
     return Check("stuck", status, f"{text}: its stream is stuck, or sends them again")
 
 
-def _start_check(state: State, camera: int) -> Verdict:
+def _start_check(state: _Judged, camera: int) -> Verdict:
     needed, repeated = state.config.tracking.start_frames, state.counted(camera, "repeated")
     if repeated >= state.config.tracking.blind_frames:
         return Verdict((_stuck_check(repeated, "FAIL"),))
-    waiting = (f"{len(state.waiting[camera])} of {needed} frames with matches",)
+    waiting = (f"{state.waiting[camera]} of {needed} frames with matches",)
     reasons = (f"no estimate yet: {reason}" for reason in state.refused[camera] or waiting)
     return Verdict(tuple(Check(START, "WARN", reason) for reason in reasons))
 
 
-def _recent_checks(state: State, camera: int) -> list[Check]:
+def _recent_checks(state: _Judged, camera: int) -> list[Check]:
     """Checks of a camera's last frames."""
     checks, absent = [], int(state.absent[camera])
     limit, repeated = state.config.tracking.blind_frames, state.counted(camera, "repeated")
@@ -147,12 +206,11 @@ def recent_residuals(state: State, camera: int) -> Residuals:
 
 def covariance_by_camera(estimate: Estimate, names: tuple[str, ...]) -> dict[str, Array | None]:
     """Per camera (6, 6); None with too few frames."""
-    covariance: dict[str, Array | None] = {}
-    for camera, name in enumerate(names):
-        rows = pose_rows(camera)
-        own = estimate.covariance[rows, rows]
-        covariance[name] = None if np.isnan(own).any() else own
-    return covariance
+    known = ~np.isnan(np.diagonal(estimate.covariance)[::6])
+    return {
+        name: estimate.covariance[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] if known[c] else None
+        for c, name in enumerate(names)
+    }
 
 
 def _counts(state: State, camera: int) -> dict[str, int]:
@@ -208,7 +266,7 @@ def to_calibration(
     sources: bool = False,
 ) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
-    estimate, images = with_images(state, estimate, measure)
+    estimate, verdicts, images = with_images(state, estimate, measure)
     joint = estimate.covariance
     known = None if np.isnan(joint).any() else joint
     mounts = None if known is None else images.widen(second_moments(estimate))
@@ -219,7 +277,7 @@ def to_calibration(
         covariance=covariance_by_camera(estimate, state.names),
         joint_covariance=known,
         pair_covariance=pair_covariances(mounts, rig.T_camera_lidar),
-        camera_verdicts=dict(estimate.verdicts),
+        camera_verdicts=verdicts,
         residuals={n: recent_residuals(state, c) for c, n in cameras if state.started[c]},
         counts={name: _counts(state, camera) for camera, name in cameras},
         timings_s={},
@@ -238,12 +296,12 @@ class Update:
 
     Attributes:
         frame: its number.
-        stamp_ns: its time, or that of the last frame that had one, or None.
+        stamp_ns: its time, or None.
         T_camera_lidar: per camera, (4, 4): p_camera = T_camera_lidar * p_lidar. The guess, as long
             as the camera has no estimate.
         covariance: per camera, (6, 6) of xi in T_camera_lidar = exp(xi) estimate, xi = (rotation
             [rad], translation [m]) in the camera's axes; None until the camera has enough frames.
-        verdicts: per camera, whether its estimate can be used now, with reasons.
+        verdicts: per camera, whether its estimate can be used now, with reasons; made when read.
         events: the events detected with this frame.
         used: per camera whose matches were absorbed, how many.
         left_out: cameras whose matches disagree with the estimate, and were not absorbed.
@@ -253,7 +311,7 @@ class Update:
     stamp_ns: int | None
     T_camera_lidar: dict[str, Array]
     covariance: dict[str, Array | None]
-    verdicts: dict[str, Verdict]
+    verdicts: Mapping[str, Verdict]
     events: tuple[Event, ...]
     used: dict[str, int]
     left_out: tuple[str, ...]
@@ -262,42 +320,34 @@ class Update:
 def make_updates(
     state: State,
     estimate: Estimate,
-    taken: Sequence[tuple[Incoming, Sequence[Event], Mapping[int, int]]],
+    taken: Sequence[tuple[StreamFrame, Sequence[Event], Mapping[int, int]]],
 ) -> list[Update]:
     """The updates after the last frames of a state.
 
     Args:
         state: after the frames.
-        estimate: with its verdicts.
+        estimate: of them.
         taken: the frames that were taken in at once; the events detected with each, and per camera,
             by its place in the rig, how many of its matches were absorbed.
     """
-    names = state.names
-    poses = dict(zip(names, estimate.T_camera_lidar, strict=True))
+    names, verdicts = state.names, Verdicts(state, estimate)
     covariance = covariance_by_camera(estimate, names)
-    for array in (*poses.values(), *covariance.values()):
-        if array is not None:
-            array.setflags(write=False)  # the updates share them
+    estimate.T_camera_lidar.setflags(write=False)  # the updates share them
+    estimate.covariance.setflags(write=False)
     last = {n: own[-1:] for n, own in zip(names, state.agreements, strict=True)}
     return [
         Update(
-            frame=one.number,
+            frame=one.frame,
             stamp_ns=one.stamp_ns,
-            T_camera_lidar=dict(poses),
+            T_camera_lidar=dict(zip(names, estimate.T_camera_lidar, strict=True)),
             covariance=dict(covariance),
-            verdicts=dict(estimate.verdicts),
+            verdicts=verdicts,
             events=tuple(events),
             used={names[camera]: count for camera, count in used.items()},
-            left_out=tuple(n for n in names if last[n] == ((one.number, False),)),
+            left_out=tuple(n for n in names if last[n] == ((one.frame, False),)),
         )
         for one, events, used in taken
     ]
-
-
-def shared_parts(update: Update) -> tuple[int, ...]:
-    """Identities of what frames that are taken in at once share."""
-    parts = update.T_camera_lidar, update.covariance, update.verdicts
-    return tuple(id(value) for part in parts for value in part.values())
 
 
 def json_lines(updates: Sequence[Update]) -> list[str]:
@@ -305,10 +355,10 @@ def json_lines(updates: Sequence[Update]) -> list[str]:
 
     What frames that were taken in at once share is encoded once.
     """
-    estimates: dict[tuple[int, ...], dict[str, str]] = {}
+    estimates: dict[int, dict[str, str]] = {}
     lines = []
     for update in updates:
-        if (shared := shared_parts(update)) not in estimates:
+        if (shared := id(update.verdicts)) not in estimates:
             estimates[shared] = {name: _estimate(update, name) for name in update.T_camera_lidar}
         cameras = ", ".join(
             f"{text}, {_of_frame(update, name)}}}" for name, text in estimates[shared].items()

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import gc
 import signal
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from types import FrameType
 
-from calibgraph.errors import (
-    CalibrationError,
-    CorrespondenceError,
-    DatasetError,
-    FileError,
-    MotionError,
-)
+from calibgraph.errors import CalibrationError, DatasetError, FileError
 from calibgraph.io.bags import BagOptions
 from calibgraph.io.dataset import load_dataset
 from calibgraph.matching.burnt_in import hide_burnt_in
@@ -25,142 +20,20 @@ from calibgraph.matching.protocol import FullMatcher, Matcher
 from calibgraph.matching.same_images import require_different_images
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
-from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.places import as_groups
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import START, Verdict
 from calibgraph.report.as_json import print_line, require_stdout
 from calibgraph.tracking.assessment import Update, json_lines
 from calibgraph.tracking.dataset_frames import DatasetDrive, Stop
 from calibgraph.tracking.durable import DurableCalibrator
-from calibgraph.tracking.frame_order import place_of
 from calibgraph.tracking.history import History
-from calibgraph.tracking.streams import Item, Refused, StreamFrame, frames_of, in_groups, update_all
+from calibgraph.tracking.streams import Item, frames_of
 from calibgraph.tracking.tracker import UNSOLVABLE, IncrementalCalibrator, warm_up_tracker
 
 Notify = Callable[[str], None]
 
-MOTION_FRAMES = 100
-"""Once in so many frames, a motion that no vehicle has is an outlier of the odometry: its frame is
-left out. Earlier or oftener, its unit or order is wrong, and slower frames are wrong unseen."""
-
-
-@dataclass
-class Run:
-    """Frames in, updates out.
-
-    Attributes:
-        calibrator: takes the frames in.
-        history: of the extrinsics; each update is added.
-        write: called with each update as a line of JSON, once it is on disk; after a crash, first
-            with those of the last write before it, which may have been written already. A
-            BrokenPipeError ends the run.
-        notify: called with warnings and events as sentences.
-        together: frames that may be taken in at once; a source that does not wait has more.
-        updates: frames taken in.
-        refused: input that was not a frame, or a frame that was left out.
-        skipped: frames at the beginning that an earlier run had taken in already.
-        sound: how many updates have come since a motion that no vehicle has.
-        places: by name, the frames of each; where none has a name, all are of one.
-    """
-
-    calibrator: DurableCalibrator
-    history: History
-    write: Notify
-    notify: Notify
-    together: int = 1
-    updates: int = 0
-    refused: int = 0
-    skipped: int = 0
-    sound: int = 0
-    places: dict[str, list[int]] = field(default_factory=dict)
-
-    def follow(self, items: Iterable[Item], *, every: int, stop: Callable[[], bool]) -> None:
-        """Update with each frame until there are no more, or ``stop()``.
-
-        Args:
-            items: the frames.
-            every: take every so-many-th frame.
-            stop: called after each frame, or frames that come together.
-
-        Raises:
-            MotionError: if several of ``MOTION_FRAMES`` have a motion that no vehicle has, or one
-                of the first.
-        """
-        known = self.calibrator.tracker.frame if self.calibrator.resumed else None
-        try:
-            self._report(self.calibrator.last_repeated)  # their lines may not have been printed
-            for some in in_groups(_every(items, every), self.together):
-                if isinstance(some, Refused):
-                    self._refuse(some.message, by_motion=some.by_motion)
-                else:
-                    self._take(some, known)
-                if stop():  # before waiting for the next one, or matching it
-                    break
-        except BrokenPipeError:
-            self.notify("stopped: the reader of standard output is gone; all updates are on disk")
-
-    def report_counts(self) -> None:
-        """Notify of what became of the frames."""
-        self.notify(
-            f"{self.updates} updates, {self.refused} left out, {self.skipped} known from before"
-        )
-        if self.skipped and not self.updates:
-            found = f"no frame comes after {self.calibrator.tracker.frame}"
-            self.notify(f"warning: {found}; if that number is wrong, choose another --out")
-
-    def _take(self, frames: Sequence[StreamFrame], known: int | None) -> None:
-        """Update with frames, but for those that an earlier run has, or that are refused."""
-        tables = {one.frame: one.table for one in frames}
-        if known is not None and not self.updates:
-            old = [one.frame for one in frames if one.frame <= known]
-            if old and not self.skipped:
-                self.notify(f"frame {old[0]} and others up to {known} are known: skipped")
-            self.skipped += len(old)
-            self._add_to_places(map(tables.__getitem__, old))
-            frames = frames[len(old) :]
-        for found in update_all(self.calibrator, frames):
-            if isinstance(found, Refused):
-                self._refuse(found.message)
-            else:
-                self.updates += len(found)
-                self.sound += len(found)
-                self._report(found)
-                self._add_to_places(tables[update.frame] for update in found)
-
-    def _add_to_places(self, tables: Iterable[Correspondences]) -> None:
-        for table in filter(len, tables):
-            with suppress(CorrespondenceError):  # of an earlier run, which has left it out
-                self.places.setdefault(place_of(table), []).append(int(table.frame[0]))
-
-    def _refuse(self, message: str, *, by_motion: bool = False) -> None:
-        if by_motion and self.sound < MOTION_FRAMES:
-            raise MotionError(
-                f"{message}; correct the motion of all frames, and take another --out"
-            )
-        self.sound = 0 if by_motion else self.sound
-        self.refused += 1
-        self.notify(f"left out: {message}")
-
-    def _report(self, updates: Sequence[Update]) -> None:
-        for update, line in zip(updates, json_lines(updates), strict=True):
-            self.history.add(update)
-            self.write(line)
-            for event in update.events:
-                self.notify(f"frame {event.detected_frame}: {event}")
-
-
-def _every(items: Iterable[Item], every: int) -> Iterator[Item]:
-    """The items without all but every so-many-th frame."""
-    count = 0
-    for item in items:
-        if isinstance(item, Refused) or count % every == 0:
-            yield item
-        count += isinstance(item, StreamFrame)
-
-
 STATE_FOLDER, PICTURE = "state", "track.png"
-_TOGETHER = 50  # frames of a table that are read before they are taken in
+_TOGETHER = 50  # frames of a table that are taken in by one write
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +44,7 @@ class Tracking:
         rig: the initial guess.
         config: settings.
         out: folder for the state, the result and the picture.
-        every: take every so-many-th frame.
+        every: of datasets, match every so-many-th frame.
         matcher: for the frames of datasets; None for tables.
         interval_s: between neighbouring clouds of folders, whose registration shows the motion.
         bag: how bags are read.
@@ -184,6 +57,90 @@ class Tracking:
     matcher: Matcher | None = None
     interval_s: float | None = None
     bag: BagOptions | None = None
+
+
+@dataclass
+class Run:
+    """Frames in, updates out, and what became of the frames.
+
+    Attributes:
+        calibrator: takes the frames in.
+        notify: called with warnings and events as sentences.
+        updates: frames taken in.
+        left_out: input that was not a frame, or a frame that was left out.
+        skipped: frames at the beginning that an earlier run had taken in already.
+    """
+
+    calibrator: DurableCalibrator
+    notify: Notify
+    updates: int = 0
+    left_out: int = 0
+    skipped: int = 0
+
+    def __post_init__(self) -> None:
+        self.history = History()
+
+    def follow(self, items: Iterator[Item], together: int, stop: Stop) -> None:
+        """Update with each frame until there are no more, or ``stop()``.
+
+        Each update is printed once it is on disk; after a crash, those of the last write come
+        first, since they may not have been printed. A reader that goes away ends the run.
+
+        Args:
+            items: the frames.
+            together: how many are taken in by one write, if they are at hand.
+            stop: interrupts the wait for the next frame.
+        """
+        known = self.calibrator.tracker.frame if self.calibrator.resumed else None
+        try:
+            self._report(self.calibrator.repeated)
+            while some := _next(items, together, stop):
+                new = [one for one in some if not self._is_known(one, known)]
+                frames = [one for one in new if not isinstance(one, CalibrationError)]
+                errors = [one for one in new if isinstance(one, CalibrationError)]
+                for found in [*errors, *self.calibrator.update_all(frames)]:
+                    if isinstance(found, CalibrationError):
+                        self.left_out += 1
+                        self.notify(f"left out: {found}")
+                    else:
+                        self.updates += len(found)
+                        self._report(found)
+        except BrokenPipeError:
+            self.notify("stopped: the reader of standard output is gone; all updates are on disk")
+
+    def report_counts(self) -> None:
+        """Notify of what became of the frames."""
+        self.notify(
+            f"{self.updates} updates, {self.left_out} left out, {self.skipped} known from before"
+        )
+        if self.skipped and not self.updates:
+            found = f"no frame comes after {self.calibrator.tracker.frame}"
+            self.notify(f"warning: {found}; if that number is wrong, choose another --out")
+
+    def _is_known(self, item: Item, known: int | None) -> bool:
+        """Whether an earlier run has a frame that comes before the first new one."""
+        if self.updates or known is None or isinstance(item, CalibrationError):
+            return False
+        if item.frame <= known and not self.skipped:
+            self.notify(f"frame {item.frame} and others up to {known} are known: skipped")
+        self.skipped += item.frame <= known
+        return item.frame <= known
+
+    def _report(self, updates: Sequence[Update]) -> None:
+        for update, line in zip(updates, json_lines(updates), strict=True):
+            self.history.add(update)
+            print_line(line)
+            for event in update.events:
+                self.notify(f"frame {event.detected_frame}: {event}")
+
+
+def _next(items: Iterator[Item], most: int, stop: Stop) -> list[Item]:
+    """The next items; none at the end, or if a signal has come or comes while they are awaited."""
+    try:
+        with stop.interruptible():
+            return [*islice(items, most)]
+    except KeyboardInterrupt:
+        return []
 
 
 def track(
@@ -204,27 +161,28 @@ def track(
     """
     require_stdout()
     settings.rig.require_cameras()
-    history = History()
     waits = str(source[0]) == "-"  # frames come at their own times
     with _stopped_by_signals() as stop:
         if waits:
             warm_up_tracker()
         items, calibrator, result_of = _opened(settings, source, stop, notify)
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
-        together = 1 if waits or settings.matcher is not None else _TOGETHER
-        run = Run(calibrator, history, print_line, notify, together)
+        run = Run(calibrator, notify)
         with calibrator:
-            run.follow(items, every=settings.every if settings.matcher is None else 1, stop=stop)
+            run.follow(items, 1 if waits or settings.matcher is not None else _TOGETHER, stop)
             if calibrator.tracker.frame is None and not stop():
-                held = f"held no frame that could be used ({run.refused} left out); check it"
-                raise FileError("standard input" if str(source[0]) == "-" else source[0], held)
+                held = f"held no frame that could be used ({run.left_out} left out); check it"
+                raise FileError("standard input" if waits else source[0], held)
             result = _result(calibrator.tracker, result_of, settings.out / STATE_FOLDER)
     run.report_counts()
-    named = as_groups([*run.places.values()]) if any(run.places) else ()
     # The guess, not where the first batch has located it.
     verdicts = {name: _at_the_end(one) for name, one in result.camera_verdicts.items()}
-    result = replace(result, initial_rig=settings.rig, places=named, camera_verdicts=verdicts)
-    return result, _write_results(settings.out, result, history if run.updates else None)
+    result = replace(result, initial_rig=settings.rig, camera_verdicts=verdicts)
+    written = [result.save(settings.out)]
+    if run.updates:
+        run.history.draw(settings.out / PICTURE)
+        written.append(settings.out / PICTURE)
+    return result, written
 
 
 def _at_the_end(verdict: Verdict) -> Verdict:
@@ -251,14 +209,6 @@ def _result(
         ) from error
 
 
-def _write_results(folder: Path, result: Calibration, history: History | None) -> list[Path]:
-    written = [result.save(folder)]
-    if history is not None:
-        history.draw(folder / PICTURE)
-        written.append(folder / PICTURE)
-    return written
-
-
 def _opened(
     settings: Tracking, source: Sequence[Path], stop: Stop, notify: Notify
 ) -> tuple[Iterator[Item], DurableCalibrator, Callable[[IncrementalCalibrator], Calibration]]:
@@ -267,20 +217,14 @@ def _opened(
     result_of = partial(IncrementalCalibrator.calibration, sources=True)
     folder = settings.out / STATE_FOLDER
     if settings.matcher is None:
-        items = frames_of(str(source[0]), stop=stop)
+        items = frames_of(str(source[0]))
         calibrator = DurableCalibrator(folder, settings.rig, settings.config)
     else:
         drive = _drive(settings, settings.matcher, source)
-        calibrator = DurableCalibrator(
-            folder,
-            settings.rig,
-            drive.config,
-            begin=lambda: _first_rig(drive, settings.rig, notify),
-        )
+        begin = partial(_first_rig, drive, settings.rig, notify)
+        calibrator = DurableCalibrator(folder, settings.rig, drive.config, begin=begin)
         items = drive.items(calibrator.tracker)
         result_of = partial(drive.result, stop=stop, notify=notify)
-    for damage in calibrator.damages:
-        notify(f"warning: {damage}")
     if calibrator.resumed:
         notify(f"going on after frame {calibrator.tracker.frame}")
     return items, calibrator, result_of

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -23,8 +24,8 @@ from calibgraph.model.rig import Rig
 from calibgraph.pipeline import calibrate
 from calibgraph.progress import no_progress
 from calibgraph.solver.joint import solve_joint
-from calibgraph.tracking.frame_order import with_place
-from calibgraph.tracking.streams import Item, Refused, StreamFrame
+from calibgraph.tracking.frame_order import StreamFrame
+from calibgraph.tracking.streams import Item, frames_of_table
 from calibgraph.tracking.sums import MOST_PLACES
 from calibgraph.tracking.tracker import IncrementalCalibrator
 from calibgraph.trust.pose_posterior import PosePosterior, measure_posteriors
@@ -51,6 +52,17 @@ class Stop:
     def __call__(self) -> bool:
         """Whether it has come."""
         return self.received
+
+    @contextmanager
+    def interruptible(self) -> Iterator[None]:
+        """Within, the signal raises KeyboardInterrupt; so does one that has come before."""
+        self.interrupts = True
+        try:
+            if self.received:
+                raise KeyboardInterrupt
+            yield
+        finally:
+            self.interrupts = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +100,7 @@ class DatasetDrive:
         return with_places(self._frames(tracker), self.dataset, finder, tracker.places)
 
     def result(
-        self,
-        tracker: IncrementalCalibrator,
-        *,
-        stop: Stop,
-        notify: Callable[[str], None],
+        self, tracker: IncrementalCalibrator, *, stop: Stop, notify: Callable[[str], None]
     ) -> Calibration:
         """The estimate, with its error bar and verdict by the images of its last frames, too.
 
@@ -101,20 +109,14 @@ class DatasetDrive:
             stop: whether the result is wanted at once, without the images; it interrupts them.
             notify: called with a sentence if they are left out, or cannot be scored.
         """
-        if not self.matcher.image_checks_can_fail:  # may use what the scores do not
-            return tracker.calibration(sources=True)
-        try:
-            stop.interrupts = True
-            if not stop():
-                return tracker.calibration(partial(self._measure, tracker.rig), sources=True)
-        except KeyboardInterrupt:
-            pass
-        except _UNSCORED as error:
-            notify(f"warning: the images could not be checked: {error}")
-            return tracker.calibration(sources=True)
-        finally:
-            stop.interrupts = False
-        notify("stopped: the images were not compared with the clouds")
+        if self.matcher.image_checks_can_fail:  # others may use what the scores do not
+            try:
+                with stop.interruptible():
+                    return tracker.calibration(partial(self._measure, tracker.rig), sources=True)
+            except KeyboardInterrupt:
+                notify("stopped: the images were not compared with the clouds")
+            except _UNSCORED as error:
+                notify(f"warning: the images could not be checked: {error}")
         return tracker.calibration(sources=True)
 
     def _measure(
@@ -124,8 +126,7 @@ class DatasetDrive:
         covariances: Mapping[str, Array],
         groups: Sequence[Sequence[str]],
     ) -> Mapping[str, PosePosterior]:
-        wanted = {*numbers}
-        frames = tuple(frame for frame in self.dataset.frames if frame.index in wanted)
+        frames = tuple(frame for frame in self.dataset.frames if frame.index in {*numbers})
         if not frames:
             return {}
         data = replace(self.dataset, frames=frames)
@@ -137,8 +138,7 @@ class DatasetDrive:
             # Also after a crash among the first frames: they continue from the same batch.
             table = self.start.correspondences
             assert table is not None  # calibrate keeps those of its last round
-            for number in np.unique(table.frame):
-                yield StreamFrame(int(number), table.select(table.frame == number))
+            yield from frames_of_table(table)
         for frame in self.dataset.frames[len(head) :]:
             if taken is None or frame.index > taken:
                 yield self._match(frame, tracker.rig)
@@ -152,10 +152,11 @@ class DatasetDrive:
                 table = self.matcher.match(alone, rig, round_index=index, progress=no_progress)
                 table = with_motion(table, alone)
                 if index != rounds[-1]:
-                    rig = _refined(rig, table, self.config.changed(estimate=()))
+                    rig = _refined(rig, table, self.config)
+        except MotionError:  # slower frames look right, and are not
+            raise
         except (CalibrationError, OSError) as error:
-            message = f"frame {frame.name} ({frame.index}): {error}"
-            return Refused(message, by_motion=isinstance(error, MotionError))
+            return CalibrationError(f"frame {frame.name} ({frame.index}): {error}")
         return StreamFrame(frame.index, table)
 
 
@@ -176,27 +177,26 @@ def with_places(
     """
     frames = {frame.index: frame for frame in dataset.frames}
     first = [int(name) for name in known if name.isdigit() and int(name) in frames]
-    again = bool(first)
     for item in items:
-        if isinstance(item, Refused) or not item.table.findings.place_variance:
+        if isinstance(item, CalibrationError) or not item.table.findings.place_variance:
             yield item
             continue
-        if again:
+        if first:
             for number in first:
                 finder.remember(frames[number])
             for number in [n for n in frames if max(first) <= n < item.frame][-MOST_AGAIN:]:
                 finder.first_of_place(frames[number])
-            again = False
+            first = []
         place = finder.first_of_place(frames[item.frame])
-        yield replace(item, table=with_place(item.table, place))
+        yield replace(item, place=str(place))
 
 
 def _refined(rig: Rig, table: Correspondences, config: Config) -> Rig:
     """The rig with each camera solved from one frame, where it has enough matches."""
     for name in table.cameras:
-        one = Rig(cameras={name: rig.cameras[name]})
+        one, own = Rig(cameras={name: rig.cameras[name]}), table.of_camera(name)
         try:
-            rig = rig.moved_to(solve_joint(one, table.of_camera(name), config).T_camera_lidar)
+            rig = rig.moved_to(solve_joint(one, own, config).T_camera_lidar)
         except CorrespondenceError:  # too few matches: the next round starts from the same rig
             continue
     return rig

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from itertools import chain
-from operator import index
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,17 +13,12 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.tracking.assessment import Update
-from calibgraph.tracking.frame_order import (
-    require_number,
-    with_metadata_per_frame,
-    with_place,
-)
+from calibgraph.tracking.frame_order import StreamFrame, as_kept, frame_of
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 from calibgraph.tracking.state_database import StateDatabase
-from calibgraph.tracking.streams import StreamFrame
-from calibgraph.tracking.tracker import IncrementalCalibrator
+from calibgraph.tracking.tracker import IncrementalCalibrator, Outcome
 
-_SNAPSHOT_EVERY = 50  # updates: a restart repeats up to so many, and those of two writes
+_STATE_EVERY = 50  # updates, of which a restart repeats up to so many and those of one write
 
 
 class DurableCalibrator:
@@ -36,11 +29,8 @@ class DurableCalibrator:
 
     Attributes:
         tracker: the calibrator that is kept on disk.
-        damages: one line for each damaged part of the state that was found and is not used.
         resumed: whether there was a state to continue from.
-        repeated: after a crash, the updates since a snapshot, of which those of the last write may
-            not have returned then; none after a :meth:`close`.
-        last_repeated: those of the last call among them.
+        repeated: after a crash, the updates of the last write, which may not have returned then.
 
     Args:
         folder: where the state is kept; one process at a time.
@@ -50,7 +40,7 @@ class DurableCalibrator:
 
     Raises:
         FileError: if another process uses the folder, or the state in it is damaged, of another
-            layout, another rig or other settings. The state is left as it was.
+            version, another rig or other settings.
     """
 
     def __init__(
@@ -61,28 +51,39 @@ class DurableCalibrator:
         *,
         begin: Callable[[], Rig] | None = None,
     ) -> None:
-        self._database = StateDatabase(Path(folder))
+        folder = Path(folder)
+        self._database = StateDatabase(folder)
+        self.tracker: IncrementalCalibrator
+        self.repeated: list[Update] = []
+        self._since = 0  # updates since the state that is on disk
         try:
-            recovered = self._database.recovered
-            self.damages = recovered.damages
-            self._unwritten: tuple[bytes, int] | None = None
-            if recovered.snapshot is None:
-                self.tracker = IncrementalCalibrator(begin() if begin else rig, config)
-                self._snapshot()
+            if self._database.rows:
+                self._resume(folder, *self._database.rows)
+                _require_same(folder, self.tracker, rig, config or Config())
             else:
-                with _of_this_version(Path(folder)):
-                    self.tracker = IncrementalCalibrator.from_bytes(recovered.snapshot)
-                _require_same(Path(folder), self.tracker, rig, config or Config())
-            self._held: list[bytes] | None = None
-            with _of_this_version(Path(folder)):
-                inputs = [*map(self._repeat, recovered.inputs)]
-            self.repeated = tuple(chain.from_iterable(inputs))
-            self.last_repeated = inputs[-1] if inputs else []
-            self._pending = len(self.repeated)
+                self.tracker = IncrementalCalibrator(begin() if begin else rig, config)
+                self._write_state()
         except BaseException:
             self._database.close()
             raise
         self.resumed = self.tracker.frame is not None
+
+    def _resume(self, folder: Path, state: bytes, *inputs: bytes) -> None:
+        """Go on from a state, with the inputs after it as they were taken in together."""
+        try:
+            self.tracker = IncrementalCalibrator.from_bytes(state)
+            for row in inputs:
+                groups = decode(row, tuple)
+                updates = [self.tracker.update_together(group) for group in groups]
+                if [*map(len, updates)] != [*map(len, groups)]:
+                    raise StateError("frames of one input do not go together")
+                self.repeated = [*chain.from_iterable(updates)]
+                self._since += len(self.repeated)
+        except (StateError, CorrespondenceError) as error:
+            advice = "choose another folder, or restore it from a copy"
+            raise FileError(
+                folder, f"holds a state that is damaged or of another version ({error}); {advice}"
+            ) from error
 
     def update(
         self, table: Correspondences, *, frame: int | None = None, place: str | int | None = None
@@ -93,96 +94,46 @@ class DurableCalibrator:
             CorrespondenceError: as there. Nothing has changed then.
             OSError: if it cannot be written; then close this, and make a new one.
         """
-        table = _as_kept(table, place)
-        record = _record((frame, table))
-        with self._write() as held:
-            update = self.tracker.update(table, frame=frame)
-            held.append(record)
-            self._pending += 1
-            return update
+        (found,) = self.update_all([frame_of(table, frame, place)])
+        if isinstance(found, CorrespondenceError):
+            raise found
+        return found[0]
 
-    def update_together(self, frames: Sequence[StreamFrame]) -> list[Update]:
-        """As :meth:`IncrementalCalibrator.update_together`; they are on disk then.
+    def update_all(self, frames: Sequence[StreamFrame]) -> list[Outcome]:
+        """As :meth:`IncrementalCalibrator.update_all`; all are on disk then, by one write.
 
         Raises:
             OSError: if they cannot be written; then close this, and make a new one.
         """
-        with self._write() as held:
-            updates = self.tracker.update_together(frames)
-            if updates:
-                taken = frames[: len(updates)]
-                held.append(_record(*((one.frame, _as_kept(one.table, None)) for one in taken)))
-                self._pending += len(updates)
-            return updates
-
-    def _repeat(self, record: bytes) -> list[Update]:
-        """Take in again what a row of the journal has."""
-        frames = [StreamFrame(frame, table) for frame, table in decode(record, "input")]
-        if len(frames) == 1:
-            return [self.tracker.update(frames[0].table, frame=frames[0].frame)]
-        updates = self.tracker.update_together(frames)
-        if len(updates) < len(frames):
-            raise StateError("frames of one input do not go together")
-        return updates
-
-    @contextmanager
-    def _write(self) -> Iterator[list[bytes]]:
-        """The records of a write that is open, or of one of its own."""
-        if self._held is not None:
-            yield self._held
-            return
-        with self.in_one_write():
-            assert self._held is not None
-            yield self._held
-
-    @contextmanager
-    def in_one_write(self) -> Iterator[None]:
-        """Updates inside are on disk when this has ended, and not before: by one write for all.
-
-        A snapshot waits for the end, so a restart after a kill repeats all of a long block.
-
-        Raises:
-            OSError: if they cannot be written; then close this, and make a new one.
-        """
-        self._continue_snapshot()  # before the updates: the journal always holds the last one
-        held: list[bytes] = []
-        self._held = held
-        try:
-            yield
-        finally:
-            self._held = None
-            if held:
-                self._database.append(*held)
-
-    def _continue_snapshot(self) -> None:
-        """Encode the state when it is due, write it with the next update: neither waits long."""
-        if self._unwritten is not None:
-            self._write_snapshot(*self._unwritten)
-        elif self._pending >= _SNAPSHOT_EVERY:
-            self._unwritten = self.tracker.to_bytes(), self._database.number
-            self._pending = 0
+        state = self.tracker.to_bytes() if self._since >= _STATE_EVERY else None
+        before, left, groups = self._since, frames, []
+        found = [*self.tracker.update_all(frames)]
+        for one in found:
+            taken = 1 if isinstance(one, CorrespondenceError) else len(one)
+            if not isinstance(one, CorrespondenceError):
+                groups.append(tuple(map(as_kept, left[:taken])))
+            left = left[taken:]
+        if groups:
+            self._database.write([encode(tuple(groups))], state)
+            self._since = sum(map(len, groups)) + (0 if state else before)
+        return found
 
     def close(self) -> None:
-        """Write a last snapshot and release the folder."""
+        """Write the state and release the folder: a restart has nothing to repeat."""
         try:
-            self._snapshot()
+            self._write_state()
         finally:
             self.abandon()
 
     def abandon(self) -> None:
-        """Release the folder without a last snapshot: the journal has every update that returned.
+        """Release the folder without the state: the inputs of all updates that returned are there.
 
         For a tracker that may be in the middle of an update, as after an error.
         """
         self._database.close()
 
-    def _snapshot(self) -> None:
-        self._write_snapshot(self.tracker.to_bytes(), self._database.number)
-        self._pending = 0
-
-    def _write_snapshot(self, state: bytes, number: int) -> None:
-        self._database.snapshot(state, number)
-        self._unwritten = None
+    def _write_state(self) -> None:
+        self._database.write([], self.tracker.to_bytes())
 
     def __enter__(self) -> Self:
         return self
@@ -197,31 +148,6 @@ class DurableCalibrator:
             self.close()
         else:
             self.abandon()
-
-
-def _as_kept(table: Correspondences, place: str | int | None) -> Correspondences:
-    return with_metadata_per_frame(with_place(table, place))
-
-
-def _record(*frames: tuple[int | None, Correspondences]) -> bytes:
-    """An input as the journal keeps it."""
-    for frame, _ in frames:
-        require_number(frame)
-    try:
-        return encode(tuple((None if n is None else index(n), t) for n, t in frames), "input")
-    except UnicodeEncodeError as error:  # of a camera, which no rig has
-        raise CorrespondenceError(f"a camera's name cannot be written ({error})") from error
-
-
-@contextmanager
-def _of_this_version(folder: Path) -> Iterator[None]:
-    """Refuse what is not damaged, by its checksum in the database, but cannot be continued."""
-    try:
-        yield
-    except (StateError, CorrespondenceError) as error:
-        raise FileError(
-            folder, f"holds a state of another version; choose another folder ({error})"
-        ) from error
 
 
 def _require_same(folder: Path, tracker: IncrementalCalibrator, rig: Rig, config: Config) -> None:

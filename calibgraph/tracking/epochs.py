@@ -9,11 +9,9 @@ from calibgraph.model.geometry import (
     invert_each,
     local_coordinates,
     retract_all,
-    to_T_camera_lidar,
     to_T_lidar_camera,
 )
 from calibgraph.model.pose_kernel import logarithms
-from calibgraph.solver.matches import merge
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import add_to_totals, bend_epoch, count_residuals
 from calibgraph.tracking.estimate import EpochGraph, locate_places
@@ -67,28 +65,30 @@ def _newest(state: State, graph: EpochGraph) -> Array:
     before. Of a camera that drifts, or has none, that of Eq. 5, which later epochs have a part in.
     """
     newest = retract_all(state.references, graph.equation_5(state.all_sums()))
-    for camera in np.flatnonzero(state.walk == 0).tolist():
-        own, pose = state.matches_of(camera), to_T_lidar_camera(state.references[camera])
-        if own is None:
-            continue
-        block, older = own[0].with_scale(state.scales[camera]), state.ungated[camera]
-        reference = pose
-        for _ in range(_GATE_STEPS):
-            sums, step = block.sums(pose), reference.localCoordinates(pose)
-            pull = sums.gradient + older.gradient + older.hessian @ step
-            whole = sums.hessian + older.hessian + WEAK
-            pose = pose.retract(-np.linalg.solve(whole, pull))
-        newest[camera] = to_T_camera_lidar(pose)
+    own = {c: state.matches_of(c) for c in np.flatnonzero(state.walk == 0).tolist()}
+    blocks = {c: one[0].with_scale(state.scales[c]) for c, one in own.items() if one is not None}
+    cameras = [*blocks]
+    older, start = state.ungated[cameras], state.references[cameras]
+    at = start
+    for _ in range(_GATE_STEPS if cameras else 0):
+        poses = map(to_T_lidar_camera, at)
+        found = [block.sums(T) for block, T in zip(blocks.values(), poses, strict=True)]
+        steps = logarithms(start @ invert_each(at))[..., None]
+        pull = np.array([sums.gradient for sums in found]) + older.gradient
+        pull += (older.hessian @ steps)[..., 0]
+        whole = np.array([sums.hessian for sums in found]) + older.hessian + WEAK
+        at = retract_all(at, np.asarray(-np.linalg.solve(whole, pull[..., None])[..., 0]))
+    newest[cameras] = at
     return newest
 
 
 def _count_epoch(state: State, camera: int) -> None:
     """Count the residuals of a camera's frames in the last epoch."""
-    first, own = int(state.numbers[state.closed]), state.blocks[camera]
-    recent = [raw.select(raw.frame >= first) for raw in own if raw.frame[-1] >= first]
-    if recent:
+    own, first = state.matches_of(camera), int(state.numbers[state.closed])
+    if own is not None and own[0].frame[-1] >= first:
+        recent = own[0].select(own[0].frame >= first)
         pose, scale = state.references[camera], state.scales[camera]
-        count_residuals(state, camera, Gated.at(pose, merge(recent), scale))
+        count_residuals(state, camera, Gated.at(pose, recent, scale))
 
 
 def _set_references(state: State, references: Array) -> None:
@@ -161,8 +161,7 @@ def _summarize_oldest(state: State) -> None:
     epoch = frames.total()
     drifted = state.walk > 0
     by_places = shift_between(state, 0, size)
-    for camera in range(len(state.names)):
-        update_evidence(state, camera, epoch[camera], by_places)
+    update_evidence(state, epoch, by_places)
     for camera in range(len(state.names)):
         select_walk(state, camera)
     ungated = Sums.stack([_ungated(state, camera) for camera in range(len(state.names))])

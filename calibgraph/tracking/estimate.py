@@ -8,8 +8,8 @@ update eliminates the places of the open epoch and exchanges one factor of that 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import gtsam
 import numpy as np
@@ -24,7 +24,6 @@ from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import pose_rows, retract_all, to_T_lidar_camera
 from calibgraph.model.rig import RelativePose
-from calibgraph.model.verdict import Verdict
 from calibgraph.solver.components import (
     Component,
     Evidence,
@@ -143,9 +142,9 @@ class Terms:
         names, weighted = tuple(sums.names[row] for row in rows), own.reweighted + WEAK
         stated = (0.0 if by_scatter else findings.place_variance) * spread.efficiency
         excess = spread.excess + (stated * frames / places)[..., None, None] * np.eye(6)
-        of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
         alike = np.where(seen, places, np.inf).min(axis=1)
-        cloud = np.linalg.inv(state.ratios.cloud * pose_covariance(*of_place))
+        sizes = findings.place_rotation_rad, findings.place_translation_m
+        cloud = _cloud_information(*sizes, state.ratios.cloud)
         return Terms(
             names,
             seen,
@@ -206,6 +205,12 @@ class Terms:
         return weights
 
 
+@lru_cache
+def _cloud_information(rotation_rad: float, translation_m: float, ratio: float) -> Array:
+    """(6, 6) of the displacement of the cloud at a place."""
+    return np.asarray(np.linalg.inv(ratio * pose_covariance(rotation_rad**2, translation_m**2)))
+
+
 def _minimum(state: State, own: Sums, names: tuple[str, ...], weighted: Array) -> Array:
     """(P, n, 6) from the references to the minima of quadratics with the Hessian by weights.
 
@@ -232,7 +237,6 @@ class Estimate:
         sums: (n,) over all frames.
         conflicts: of relative poses with the correspondences, by their places in the rig.
         window: the graph of what all places share.
-        verdicts: per camera, once it is assessed.
     """
 
     T_camera_lidar: Array
@@ -240,7 +244,6 @@ class Estimate:
     sums: Sums
     conflicts: Mapping[int, Conflict]
     window: Window
-    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
 
 
 class EpochGraph:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from calibgraph.arrays import Array, Mask
 from calibgraph.graph.objective import projection_graph
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.model.geometry import invert_each
+from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.matches import MIN_MATCHES, BlockResiduals, CameraBlock
 from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.robust import ResidualScale
@@ -18,7 +20,8 @@ from calibgraph.solver.two_pass import optimize
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.state import OutlierFrame, State
 from calibgraph.tracking.sums import Sums
-from factors import BlockSums, ProjectionBlock
+from factors import BlockSums, to_runs
+from factors.arrays import unpack_sums
 
 _AGREEMENT = 0.7
 """A frame agrees with an estimate that explains this share of the usual share of its matches."""
@@ -31,27 +34,28 @@ class Gated:
     """Frames of a camera, gated at one T_camera_lidar.
 
     Attributes:
-        residuals: of all their matches, there.
+        T_camera_lidar: (4, 4).
+        raw: all their matches.
         inliers: (m,) which of them are within the gate.
         counts: (f,) how many are, in each frame.
     """
 
-    residuals: BlockResiduals
+    T_camera_lidar: Array
+    raw: CameraBlock
     inliers: Mask
     counts: Array
 
     @staticmethod
     def at(T_camera_lidar: Array, raw: CameraBlock, scale: ResidualScale) -> Gated:
         """Gate all matches of some frames."""
-        residuals = BlockResiduals.at(T_camera_lidar, raw)
-        inliers = residuals.inliers(scale)
+        inliers = raw.within_gate(T_camera_lidar, scale.gate_px)
         counts = np.add.reduceat(inliers, raw.frame_edges[:-1], dtype=np.float64)
-        return Gated(residuals, inliers, counts)
+        return Gated(T_camera_lidar, raw, inliers, counts)
 
-    @property
-    def raw(self) -> CameraBlock:
-        """All matches."""
-        return self.residuals.block
+    @cached_property
+    def residuals(self) -> BlockResiduals:
+        """Of all their matches."""
+        return BlockResiduals.at(self.T_camera_lidar, self.raw)
 
     @property
     def enough(self) -> Mask:
@@ -68,46 +72,47 @@ class Gated:
         if frames.all():
             return self
         rows = np.flatnonzero(np.repeat(frames, self.raw.frame_counts))
-        residuals, raw = self.residuals, self.raw.select(rows)
-        chosen = BlockResiduals(
-            raw, residuals.T_lidar_camera, residuals.residuals_px[rows], residuals.projectable[rows]
-        )
-        return Gated(chosen, self.inliers[rows], self.counts[frames])
-
-    def sums(
-        self, state: State, camera: int, T_camera_lidar: Array, *, together: bool = False
-    ) -> Sums:
-        """(f,) sums of the inliers, linearized here.
-
-        Args:
-            state: with the scale of the residuals, and how curved their cost is.
-            camera: by its place in the rig.
-            T_camera_lidar: (4, 4) the reference.
-            together: whether all frames are one.
-        """
-        pose, counts = self.residuals.T_lidar_camera, self.counts
-        counts = np.array([counts.sum()]) if together else counts
-        inside = np.concatenate([[0], counts.cumsum().astype(np.int64)])
-        here = self._block(state.scales[camera]).frame_sums(pose, inside)
-        step = pose.localCoordinates(to_T_lidar_camera(T_camera_lidar))
-        return frame_sums(here, state.curvature[camera], np.tile(step, (len(counts), 1)), counts)
+        raw = self.raw.select(rows)
+        return Gated(self.T_camera_lidar, raw, self.inliers[rows], self.counts[frames])
 
     def curvature(self, scale: ResidualScale) -> Array:
         """(6, 6) M: with the Hessian by weights L L^T, the true one is L M L^T, of all inliers.
 
         With what the gate's moving with the extrinsic adds.
         """
-        edges = np.array([0, int(self.counts.sum())])
-        pose = self.residuals.T_lidar_camera
-        here = self._block(scale).frame_sums(pose, edges, curvature=True)
+        runs = np.array([[0, int(self.counts.sum())]])
+        block = self.raw.with_scale(scale).select(self.inliers)
+        here = block.summarize(self.T_camera_lidar[None], runs, curvature=True)
         assert here.curvature is not None
         true = here.curvature[0] + self.residuals.gate_hessians(scale)[0]
         inverse = np.linalg.inv(np.linalg.cholesky(here.hessian[0] + WEAK))
         values, vectors = np.linalg.eigh(inverse @ true @ inverse.T)
         return np.asarray((vectors * np.clip(values, *_CURVATURES)) @ vectors.T)
 
-    def _block(self, scale: ResidualScale) -> ProjectionBlock:
-        return self.raw.with_scale(scale).select(self.inliers)
+
+def sums_of(state: State, gated: Mapping[int, Gated], *, together: bool = False) -> Sums:
+    """(f,) sums of the inliers in the frames of each camera in turn, about its reference.
+
+    Args:
+        state: with the scales of the residuals, and how curved their cost is.
+        gated: by camera; linearized where they are gated.
+        together: whether all frames of a camera are one.
+    """
+    packed, counts, cameras = [], [], list[int]()
+    for camera, one in gated.items():
+        own = np.array([one.counts.sum()]) if together else one.counts
+        edges = np.concatenate([[0], own.cumsum().astype(np.int64)])
+        block = one.raw.with_scale(state.scales[camera]).select(one.inliers)
+        packed.append(block.packed_run_sums(one.T_camera_lidar[None], to_runs(edges)))
+        counts.append(own)
+        cameras += [camera] * len(own)
+    at, to = np.array([one.T_camera_lidar for one in gated.values()]), state.references[[*gated]]
+    steps = np.zeros((len(at), 6))
+    if not np.array_equal(at, to):
+        steps = logarithms(at @ invert_each(to))
+    step = steps.repeat([*map(len, counts)], axis=0)
+    here = unpack_sums(np.concatenate(packed))
+    return frame_sums(here, state.curvature[cameras], step, np.concatenate(counts))
 
 
 def frame_sums(here: BlockSums, curvature: Array, steps: Array, matches: Array) -> Sums:
@@ -118,7 +123,7 @@ def frame_sums(here: BlockSums, curvature: Array, steps: Array, matches: Array) 
 
     Args:
         here: where they are linearized.
-        curvature: (6, 6) M of :meth:`Gated.curvature`.
+        curvature: (6, 6), or (f, 6, 6), M of :meth:`Gated.curvature`.
         steps: (f, 6) from there to the reference.
         matches: (f,) how many.
     """

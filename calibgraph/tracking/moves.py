@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -41,7 +40,7 @@ from calibgraph.tracking.cause import (
 )
 from calibgraph.tracking.eliminate import block_diagonal
 from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.gate import Gated, agrees, refine
+from calibgraph.tracking.gate import Gated, agrees, refine, sums_of
 from calibgraph.tracking.noise import add_epoch
 from calibgraph.tracking.state import DriftWatch, OutlierFrame, State, rows_of
 from calibgraph.tracking.sums import Sums
@@ -203,29 +202,37 @@ def report_drift(state: State) -> list[Event]:
     return [event]
 
 
-def update_evidence(state: State, camera: int, epoch: Sums, by_places: Array) -> None:
-    """Update the evidence of a camera's walks by how well each predicts an epoch.
+def update_evidence(state: State, epoch: Sums, by_places: Array) -> None:
+    """Update the evidence of the cameras' walks by how well each predicts an (n,) epoch.
 
     The scatter of epochs is updated here too: by now, a move within the epoch has been detected.
     """
-    alone, noise = state.scatter_of_frames(camera), state.frame_noise(camera)
-    if noise is None or alone is None or not epoch.frames:
+    noises = {}
+    for camera in np.flatnonzero(epoch.frames).tolist():
+        alone, noise = state.scatter_of_frames(camera), state.frame_noise(camera)
+        if noise is None or alone is None:
+            continue
+        score, frames = epoch.score[camera], float(epoch.frames[camera])
+        state.put(camera, groups=add_epoch(state.groups[camera], score, frames, alone))
+        if (state.walks.frames[camera] >= _LEAST_FRAMES).all():
+            own, hessian = pose_rows(camera), epoch.hessian[camera]
+            noises[camera] = noise * frames + hessian @ by_places[own, own] @ hessian
+    if not noises:
         return
-    frames = float(epoch.frames)
-    state.put(camera, groups=add_epoch(state.groups[camera], epoch.score, frames, alone))
-    walks, rows = state.walks[camera], pose_rows(camera)
-    if not (walks.frames >= _LEAST_FRAMES).all():
-        return
-    noise = noise * frames + epoch.hessian @ by_places[rows, rows] @ epoch.hessian
-    steps = np.linalg.solve(walks.hessian, -walks.gradient[..., None])[..., 0]
-    score = epoch.gradient + steps @ epoch.hessian
-    spread = np.linalg.solve(walks.hessian, epoch.hessian[None])
-    covariance = noise + spread.transpose(0, 2, 1) @ walks.scatter @ spread
-    whitened = np.linalg.solve(covariance, score[..., None])[..., 0]
-    distance = (score * whitened).sum(axis=1)
+    cameras = [*noises]
+    walks, seen = state.walks[cameras], epoch[cameras].hessian[:, None]
+    steps = np.linalg.solve(walks.hessian, -walks.gradient[..., None])
+    score = epoch.gradient[cameras][:, None, :, None] + seen @ steps
+    spread = np.linalg.solve(walks.hessian, seen)
+    covariance = np.array([*noises.values()])[:, None]
+    covariance = covariance + spread.swapaxes(-1, -2) @ walks.scatter @ spread
+    distance = (score * np.linalg.solve(covariance, score)).sum(axis=(-1, -2))
     logarithm = np.linalg.slogdet(covariance)[1]
-    gain = -0.5 * (np.minimum(distance, _DISTANCE_CAP) + logarithm - logarithm.min())
-    state.put(camera, evidence=_EVIDENCE_KEPT * state.evidence[camera] + gain)
+    logarithm -= logarithm.min(axis=1, keepdims=True)
+    gain = -0.5 * (np.minimum(distance, _DISTANCE_CAP) + logarithm)
+    evidence = state.evidence.copy()
+    evidence[cameras] = _EVIDENCE_KEPT * evidence[cameras] + gain
+    state.evidence = evidence
 
 
 def best_walk(state: State, camera: int) -> int:
@@ -352,8 +359,7 @@ def detect_small_step(state: State) -> DetectedStep | None:
     if any(_is_pending(state, camera) for camera in range(len(state.names))):
         return None
     edges, detected, best = state.edges, None, 1.0
-    epochs = [state.sums[first:end].total().packed for first, end in pairwise(edges)]
-    after = Sums(np.cumsum(epochs[::-1], axis=0)[::-1])
+    after = Sums(np.cumsum(state.sums_of_epochs()[::-1], axis=0)[::-1])
     before = Sums.stack(state.sums_before_epochs()[:-1])
     ready = state.started & (state.groups[:, 0] >= _LEAST_EPOCHS)
     tested = (before.frames >= _BEFORE) & (after.frames > 0) & ready
@@ -568,7 +574,7 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         T = refine(raw, start, scale, state.config)
         gated = Gated.at(T, raw, scale)
         if gated.counts.sum() >= MIN_MATCHES:
-            own = gated.sums(state, camera, state.references[camera], together=True)[0]
+            own = sums_of(state, {camera: gated}, together=True)[0]
             frames = np.array(float(raw.frames))
             found = found.replace_at(camera, own.change(frames=frames))
     return found

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
-from itertools import accumulate, chain
+from dataclasses import dataclass, field, replace
+from itertools import accumulate, chain, pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -331,11 +331,16 @@ class State:
         return np.flatnonzero(self.walk).tolist()
 
     def matches_of(self, camera: int) -> tuple[CameraBlock, Mask] | None:
-        """A camera's matches in all frames, and which are within the gate; None if it has none."""
-        own = self.blocks[camera]
-        if not own:
+        """A camera's matches in all frames, and which are within the gate; None if it has none.
+
+        They are joined, and remain so.
+        """
+        if not self.blocks[camera]:
             return None
-        return own[0] if len(own) == 1 else merge(own), np.concatenate(self.inliers[camera])
+        if len(self.blocks[camera]) > 1:
+            joined = merge(self.blocks[camera]), np.concatenate(self.inliers[camera])
+            self.put(camera, blocks=joined[:1], inliers=joined[1:])
+        return self.blocks[camera][0], self.inliers[camera][0]
 
     def first_row(self, number: int) -> int:
         """The first of the frames that is not before a number."""
@@ -390,6 +395,12 @@ class State:
 
     # Sums over epochs, older ones discounted by the random walk of a camera that drifts.
 
+    def sums_of_epochs(self, before: int | None = None) -> list[Array]:
+        """(E,) packed sums of each epoch, of frames before a number."""
+        end = len(self.numbers) if before is None else self.first_row(before)
+        edges, packed = np.minimum(self.edges, end).tolist(), self.sums.packed
+        return [np.add.reduce(packed[first:last], axis=0) for first, last in pairwise(edges)]
+
     def sums_before_epochs(self, before: int | None = None) -> list[Sums]:
         """(n,) over the frames before each epoch, the older ones too; and over all of them.
 
@@ -397,43 +408,19 @@ class State:
             before: number of a frame from which on none counts.
         """
         sums = self.walks[np.arange(len(self.walk)), self.walk]
-        end = len(self.numbers) if before is None else self.first_row(before)
-        found, edges = [sums], np.minimum(self.edges, end)
-        for size, first, last in zip(self.sizes[:-1], edges[:-2], edges[1:-1], strict=True):
-            sums = sums + self.sums[first:last].total()
-            if self.walk.any():
-                variance = self.walk_variance(STRENGTHS[self.walk], size)
-                sums = sums.after_walk(variance, self.overconfidence)[0]
+        of_epochs = self.sums_of_epochs(before)
+        if not self.walk.any():
+            return [*map(Sums, np.cumsum([sums.packed, *of_epochs], axis=0))]
+        found = [sums]
+        for size, epoch in zip(self.sizes[:-1], of_epochs[:-1], strict=True):
+            variance = self.walk_variance(STRENGTHS[self.walk], size)
+            sums = (sums + Sums(epoch)).after_walk(variance, self.overconfidence)[0]
             found.append(sums)
-        return [*found, sums + self.sums[edges[-2] : edges[-1]].total()]
+        return [*found, sums + Sums(of_epochs[-1])]
 
     def all_sums(self, before: int | None = None) -> Sums:
         """(n,) over all frames, or those before a frame's number."""
         return self.sums_before_epochs(before)[-1]
-
-    def require_consistent(self) -> None:
-        """Check that the parts of a state that was read fit together.
-
-        Raises:
-            ValueError: with the first that does not.
-        """
-        n, rows, places = len(self.names), len(self.numbers), len(self.settled)
-        epochs, blank = len(self.sizes), State.initial(self.rig, self.config)
-        first = {"numbers": rows, "sums": rows, "poses": epochs, "bends": 1 + epochs,
-                 "steps": places, "weights": places}  # fmt: skip
-        for one in fields(State):
-            found, known = getattr(self, one.name), getattr(blank, one.name)
-            if isinstance(known, Sums):
-                found, known = found.packed, known.packed
-            if not isinstance(known, np.ndarray):
-                continue
-            shape = first.get(one.name, len(known)), *known.shape[1:]
-            if (found.shape, found.dtype) != (shape, known.dtype):
-                raise ValueError(f"{one.name} has the shape {found.shape}, expected {shape}")
-        by_camera = self.blocks, self.inliers, self.scales, self.waiting, self.refused
-        cameras = {*map(len, (*by_camera, self.outliers, self.agreements))}
-        if cameras != {n} or {len(self.at), sum(self.sizes)} != {rows}:
-            raise ValueError("its cameras or frames differ in number")
 
 
 def require_poses_alone(config: Config) -> None:

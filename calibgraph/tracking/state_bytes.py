@@ -10,16 +10,13 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import fields
-from itertools import takewhile
-from typing import Annotated, Any, Literal
+from typing import Any, TypeVar
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, InstanceOf, TypeAdapter, ValidationError
 
 from calibgraph.errors import CalibrationError, in_words
-from calibgraph.files import describe
 from calibgraph.graph.components import VarianceRatios
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
@@ -28,22 +25,15 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.robust import ResidualScale
 from calibgraph.tracking.events import Event, Size
+from calibgraph.tracking.frame_order import StreamFrame
 from calibgraph.tracking.state import DriftWatch, OutlierFrame, Spread, State
 from calibgraph.tracking.sums import PlaceSums, Sums
 from factors import Lens, ProjectionBlock
 
-Kind = Literal["state", "input"]
+Kind = TypeVar("Kind")
 
-_VERSION = 13
-"""Earlier ones held other sums, or were of another encoding."""
-
-_DIGEST = hashlib.sha256().digest_size
-_TREES: dict[Kind, TypeAdapter[Any]] = {
-    "state": TypeAdapter(InstanceOf[State]),
-    "input": TypeAdapter(
-        Annotated[tuple[tuple[int | None, InstanceOf[Correspondences]], ...], Field(min_length=1)]
-    ),
-}
+_MARK = b"calibgraph-tracker/14\n"
+_BODY = len(_MARK) + hashlib.sha256().digest_size
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
 
 
@@ -51,50 +41,39 @@ class StateError(CalibrationError):
     """Bytes that :func:`encode` has not written, or that are damaged."""
 
 
-def encode(content: Any, kind: Kind) -> bytes:
+def encode(content: object) -> bytes:
     """Bytes of a tree of tuples, dicts, plain values, arrays and the tracker's dataclasses.
-
-    Args:
-        content: the tree.
-        kind: of which it is; :func:`decode` takes no other.
 
     Raises:
         TypeError: if the tree holds any other value, or a number of more than 64 bits.
-        ValueError: if it is too deep.
     """
     body = _pack(content)
-    return _mark(kind) + hashlib.sha256(body).digest() + body
+    return _MARK + hashlib.sha256(body).digest() + body
 
 
-def decode(data: bytes, kind: Kind) -> Any:
-    """The tree that :func:`encode` has written: of a state or an input.
+def decode(data: bytes, kind: type[Kind]) -> Kind:
+    """The tree of some kind that :func:`encode` has written.
 
     Raises:
-        StateError: if the bytes are damaged, of another format or of another kind.
+        StateError: if the bytes are damaged, of another version or of another kind.
     """
-    mark = _mark(kind)
-    if not data.startswith(mark):
-        found = data[: len(mark)].decode("ascii", "replace")
-        text = "".join(takewhile(str.isprintable, found.partition("\ufffd")[0]))
-        expected = f"expected {mark[:-1].decode()!r}"
-        raise StateError(f"is no tracker's {kind}: it begins with {text!r}, {expected}")
-    start = len(mark) + _DIGEST
-    digest, body = data[len(mark) : start], data[start:]
-    if hashlib.sha256(body).digest() != digest:
+    if not data.startswith(_MARK):
+        begin = data[: len(_MARK)].partition(b"\n")[0].decode("ascii", "replace")
+        expected = _MARK.decode().strip()
+        raise StateError(f"is of another version: it begins with {begin!r}, expected {expected!r}")
+    body = data[_BODY:]
+    if hashlib.sha256(body).digest() != data[len(_MARK) : _BODY]:
         raise StateError("is damaged: its checksum is wrong")
     try:
-        return _TREES[kind].validate_python(_unpack(body), strict=True)
-    except ValidationError as error:
-        raise StateError(f"is no tracker's {kind} ({describe(error)})") from error
+        content = _unpack(body)
     except Exception as error:  # of any kind: the bytes choose what is built, and of what
-        raise StateError(f"is no tracker's {kind} ({in_words(error)})") from error
+        raise StateError(f"is no tracker's state ({in_words(error)})") from error
+    if not isinstance(content, kind):
+        raise StateError(f"is no tracker's {kind.__name__.lower()}")
+    return content
 
 
-def _mark(kind: Kind) -> bytes:
-    return f"calibgraph-tracker-{kind}/{_VERSION}\n".encode()
-
-
-def _pack(value: Any) -> bytes:
+def _pack(value: object) -> bytes:
     packed: bytes = msgpack.packb(value, default=_extension)
     return packed
 
@@ -123,9 +102,8 @@ def _array(value: NDArray[Any]) -> tuple[str, tuple[int, ...], bytes]:
 
 def _to_array(held: tuple[str, tuple[int, ...], bytes]) -> NDArray[Any]:
     dtype, shape, data = held
-    return (
-        np.frombuffer(data, _DTYPES[_DTYPES.index(dtype)], math.prod(shape)).reshape(shape).copy()
-    )
+    kind = _DTYPES[_DTYPES.index(dtype)]
+    return np.frombuffer(data, kind, math.prod(shape)).reshape(shape).copy()
 
 
 def _fields_of(kind: type) -> Callable[[Any], dict[str, Any]]:
@@ -140,6 +118,6 @@ _KINDS: tuple[tuple[type, Callable[[Any], Any], Callable[[Any], Any]], ...] = (
     *((kind, _fields_of(kind), lambda held, kind=kind: kind(**held))
       for kind in (State, DriftWatch, OutlierFrame, Spread, Sums, PlaceSums, MatcherFindings,
                    VarianceRatios, ResidualScale, Correspondences, CameraBlock, ProjectionBlock,
-                   Lens, Event, Size)),
+                   Lens, Event, Size, StreamFrame)),
 )  # fmt: skip
 _CODES = {kind: code for code, (kind, _, _) in enumerate(_KINDS)}

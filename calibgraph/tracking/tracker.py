@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import takewhile
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
-from calibgraph.errors import CorrespondenceError, FileError, in_words
+from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file, write_bytes
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
@@ -18,8 +18,14 @@ from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.rig import Rig
 from calibgraph.simulation.correspondences import simulate_correspondences
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.solver.matches import MIN_MATCHES, CameraBlock, camera_blocks
-from calibgraph.solver.preprocess import preprocess
+from calibgraph.solver.matches import MIN_MATCHES, CameraBlock, camera_block
+from calibgraph.solver.preprocess import (
+    are_projectable,
+    best_in_cell,
+    camera_numbers,
+    number_repeats,
+    within_cap,
+)
 from calibgraph.tracking.absorption import (
     absorb,
     begin_frames,
@@ -31,7 +37,6 @@ from calibgraph.tracking.absorption import (
 from calibgraph.tracking.assessment import (
     MeasureOnFrames,
     Update,
-    assess,
     make_updates,
     to_calibration,
 )
@@ -47,11 +52,11 @@ from calibgraph.tracking.estimate import (
 )
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import (
-    Incoming,
-    incoming,
+    StreamFrame,
+    frame_of,
+    prepared,
     share_last_points,
     unsolvable,
-    with_place,
     without_repeats,
 )
 from calibgraph.tracking.gate import Gated
@@ -63,10 +68,11 @@ from calibgraph.tracking.moves import (
 )
 from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import StateError, decode, encode
-from calibgraph.tracking.streams import StreamFrame
 
 UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
-Taken = list[tuple[Incoming, list[Event], Mapping[int, int]]]
+Taken = list[tuple[StreamFrame, list[Event], Mapping[int, int]]]
+Outcome = list[Update] | CorrespondenceError
+"""Updates of frames that were taken in at once, or why one frame is left out."""
 
 
 class IncrementalCalibrator:
@@ -117,7 +123,8 @@ class IncrementalCalibrator:
     ) -> Calibration:
         """The present estimate as a batch's result; posteriors by images widen its error bars."""
         graph = self._graph_of(self._state)
-        return to_calibration(self._state, graph, self._assess(), measure, sources=sources)
+        self._estimate = self._estimate or graph.solve(self._state)
+        return to_calibration(self._state, graph, self._estimate, measure, sources=sources)
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -149,68 +156,76 @@ class IncrementalCalibrator:
                 have, a frame that does not come after the last one, or wrong metadata. Nothing has
                 changed then.
         """
-        return self._take([incoming(self._state, with_place(table, place), frame)])[0]
+        return self.update_together([frame_of(table, frame, place)])[0]
+
+    def update_all(self, frames: Sequence[StreamFrame]) -> Iterator[Outcome]:
+        """Take in frames, together where nothing is unusual; what became of them, in order."""
+        while frames:
+            try:
+                updates = self.update_together(frames)
+            except CorrespondenceError as error:
+                yield error
+                frames = frames[1:]
+            else:
+                yield updates
+                frames = frames[len(updates) :]
 
     def update_together(self, frames: Sequence[StreamFrame]) -> list[Update]:
-        """Take in the first of some frames at once; none if the first is refused.
+        """Take in the first of some frames at once: as many as show nothing unusual.
 
-        As many as show nothing unusual, up to the end of an epoch. All their updates have the
-        estimate after the last of them, which is as of one by one.
+        At most up to the end of an epoch. All their updates have the estimate after the last of
+        them, which is as of one by one.
+
+        Raises:
+            CorrespondenceError: if the first cannot be taken in, as of :meth:`update`.
         """
         group = self._alike(frames)
+        state = self._state.draft()
         try:
-            return self._take(group) if group else []
-        except CorrespondenceError:
-            return []
+            graph, taken = self._take_in(state, group)
+            graph, estimate = _estimated(state, graph)
+            updates = make_updates(state, estimate, taken)
+        except BaseException as error:
+            self._graph = self._estimate = None
+            if isinstance(error, UNSOLVABLE):
+                raise unsolvable(group[0].frame, error) from error
+            raise
+        self._state, self._graph, self._estimate = state, graph, estimate
+        return updates
 
-    def _alike(self, frames: Sequence[StreamFrame]) -> list[Incoming]:
+    def _alike(self, frames: Sequence[StreamFrame]) -> list[StreamFrame]:
         """The first frames, up to the end of the epoch, that state the same of their errors.
 
         None but the first repeats a frame of before: a camera may have its first matches in any of
         them.
         """
-        group, state = list[Incoming](), self._state
+        state = self._state
+        group = [prepared(state, frames[0], state.frame)]
         room = state.config.tracking.epoch_frames - state.sizes[-1]
-        last = state.frame, state.stamp_ns
-        for frame, _ in zip(frames, range(room), strict=False):
+        for frame in frames[1:room]:
             try:
-                one = incoming(state, frame.table, frame.frame, last)
+                one = prepared(state, frame, group[-1].frame)
             except CorrespondenceError:
                 break
-            known = {*one.table.cameras} <= {*state.names}
-            if not known or (group and _columns(group[0].table) != _columns(one.table)):
+            if not {*one.table.cameras, *group[0].table.cameras} <= {*state.names}:
+                break
+            if _columns(group[0].table) != _columns(one.table):
                 break
             group.append(one)
-            last = one.number, one.stamp_ns
-        if not group or not share_last_points(state, [one.table for one in group]):
+        if not any(share_last_points(state, one.table) for one in group[1:]):
             return group
         alone = [*takewhile(lambda one: without_repeats(state, one.table) is one.table, group)]
         return alone or group[:1]
 
-    def _take(self, group: Sequence[Incoming]) -> list[Update]:
-        """Take in the first frames of a group, at least one; after any error, none."""
-        state = self._state.draft()
-        try:
-            graph, taken = self._take_in(state, group)
-            graph, estimate = _estimated(state, graph)
-            updates = make_updates(state, assess(state, estimate), taken)
-        except BaseException as error:
-            self._graph = self._estimate = None
-            if isinstance(error, UNSOLVABLE):
-                raise unsolvable(group[0].number, error) from error
-            raise
-        self._state, self._graph, self._estimate = state, graph, estimate
-        return updates
-
-    def _take_in(self, state: State, group: Sequence[Incoming]) -> tuple[EpochGraph, Taken]:
+    def _take_in(self, state: State, group: Sequence[StreamFrame]) -> tuple[EpochGraph, Taken]:
         """Absorb the matches that agree, set aside the others, detect events."""
         group, table, blocks = _preprocessed(state, group, self._graph_of(state).rig)
         gated = _gate(state, blocks)
         usual = _count_usual(state, group, blocks, gated)
         if usual < len(group):
             group = group[: max(usual, 1)]
-            table = table.select(table.frame <= group[-1].number)
-            blocks = {c: raw.select(raw.frame <= group[-1].number) for c, raw in blocks.items()}
+            table = table.select(table.frame <= group[-1].frame)
+            blocks = {c: raw.select(raw.frame <= group[-1].frame) for c, raw in blocks.items()}
             blocks = {camera: raw for camera, raw in blocks.items() if len(raw)}
             gated = _gate(state, blocks)
         begin_frames(state, group)
@@ -250,15 +265,9 @@ class IncrementalCalibrator:
             self._graph = EpochGraph(state)
         return self._graph
 
-    def _assess(self) -> Estimate:
-        """Assess the present estimates."""
-        if self._estimate is None:
-            self._estimate = self._graph_of(self._state).solve(self._state)
-        return assess(self._state, self._estimate)
-
     def to_bytes(self) -> bytes:
         """The tracker as bytes, from which :meth:`from_bytes` continues with the same numbers."""
-        return encode(self._state, "state")
+        return encode(self._state)
 
     @staticmethod
     def from_bytes(data: bytes) -> IncrementalCalibrator:
@@ -267,14 +276,9 @@ class IncrementalCalibrator:
         Raises:
             CalibrationError: if the bytes are damaged or of another format.
         """
-        state = decode(data, "state")
-        try:
-            state.require_consistent()
-            tracker = IncrementalCalibrator(state.rig, state.config)
-            tracker._state = state
-            tracker._assess()
-        except Exception as error:  # of any kind: parts of the state may contradict each other
-            raise StateError(f"is no tracker's state ({in_words(error)})") from error
+        state = decode(data, State)
+        tracker = IncrementalCalibrator(state.rig, state.config)
+        tracker._state = state
         return tracker
 
     def save(self, path: Path | str) -> None:
@@ -312,8 +316,8 @@ def _columns(table: Correspondences) -> tuple[object, ...]:
 
 
 def _preprocessed(
-    state: State, group: Sequence[Incoming], rig: Rig
-) -> tuple[Sequence[Incoming], Correspondences, dict[int, CameraBlock]]:
+    state: State, group: Sequence[StreamFrame], rig: Rig
+) -> tuple[Sequence[StreamFrame], Correspondences, dict[int, CameraBlock]]:
     """Frames that can be taken in at once; their matches as given, and preprocessed by camera.
 
     The first alone, without what it repeats, where one of them repeats another one.
@@ -323,18 +327,31 @@ def _preprocessed(
         group: the frames.
         rig: at the estimates.
     """
-    for frames in (group, group[:1]):
-        alone = len(frames) == 1
-        table = frames[0].table
-        table = without_repeats(state, table) if alone else concatenate([f.table for f in frames])
-        if not len(table):
-            return frames, table, {}
-        kept = preprocess(rig, table, state.config)
-        if alone or not any(kept.repeated_frames.values()):
-            break
-    blocks = camera_blocks(state.rig, kept.table, state.config)
-    found = {state.names.index(name): _with_enough(block) for name, block in blocks.items()}
-    return frames, table, {camera: block for camera, block in found.items() if len(block)}
+    if len(group) == 1:
+        table = without_repeats(state, group[0].table)
+    else:
+        table = concatenate([one.table for one in group])
+    found = dict[int, CameraBlock]()
+    if not len(table):
+        return group, table, found
+    config, cameras = state.config, [*state.rig.cameras.values()]
+    usable = table.without_cameras(config.excluded_cameras)
+    numbers = camera_numbers(rig, usable)
+    confident = are_projectable(rig, usable, numbers) & (usable.confidence >= config.confidence_min)
+    rows = best_in_cell(rig, usable, numbers, config, among=confident)
+    kept, numbers = usable.select(rows), numbers[rows]
+    if len(group) > 1 and not np.array_equal(number_repeats(kept, numbers), kept.frame):
+        return _preprocessed(state, group[:1], rig)
+    capped = within_cap(kept, numbers, config) if len(kept) > config.matches_max else None
+    if capped is not None:
+        kept, numbers = kept.select(capped), numbers[capped]
+    edges = np.searchsorted(numbers, np.arange(len(cameras) + 1)).tolist()
+    for camera, (first, end) in enumerate(pairwise(edges)):
+        if end - first >= MIN_MATCHES:
+            block = camera_block(cameras[camera], kept.select(slice(first, end)), config)
+            block = block if len(group) == 1 else _with_enough(block)
+            found |= {camera: block} if len(block) else {}
+    return group, table, found
 
 
 def _with_enough(block: CameraBlock) -> CameraBlock:
@@ -353,7 +370,7 @@ def _gate(state: State, blocks: Mapping[int, CameraBlock]) -> dict[int, Gated]:
 
 def _count_usual(
     state: State,
-    group: Sequence[Incoming],
+    group: Sequence[StreamFrame],
     blocks: Mapping[int, CameraBlock],
     gated: Mapping[int, Gated],
 ) -> int:
@@ -366,7 +383,7 @@ def _count_usual(
         first += numbers[:1].tolist()
     if not first:
         return len(group)
-    return sum(one.number < min(first) for one in group)
+    return sum(one.frame < min(first) for one in group)
 
 
 _FRAMES, _MATCHES = 24, 250  # enough to start a camera, close two epochs and fill a large block

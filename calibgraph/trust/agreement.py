@@ -19,13 +19,13 @@ from calibgraph.model.geometry import (
     twist_between,
 )
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import Check
+from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.solver.matches import camera_block
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Evidence
-from calibgraph.trust.thresholds import limit, threshold
+from calibgraph.trust.thresholds import threshold
 
 ONE_POSE_DEG, ONE_POSE_CM = 0.1, 1.0
 """Housings do not fit closer; two results of one device's images end as near."""
@@ -155,8 +155,8 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
         return row.describe(0.0, "PASS", f"{row.name}: none")
     theirs = block.within_gate(T, gate_px)
     degrees, centimetres = pose_difference(T, solution.T_camera_lidar[camera])
-    same = degrees < limit("competing_rotation", tolerance)
-    same = same and centimetres < limit("competing_translation", tolerance)
+    apart = zip((degrees, centimetres), tolerance, TOLERANCE, strict=True)
+    same = all(far < max(stated, usual) for far, stated, usual in apart)
     only_theirs, only_ours = int((theirs & ~ours).sum()), int((ours & ~theirs).sum())
     share = 0.0 if same else only_theirs / max(only_ours, 1)
     advice = f"the other is {degrees:.2g} deg, {centimetres:.2g} cm away; which one is right?"

@@ -44,8 +44,8 @@ class Estimate:
         has_matches: whether it had correspondences; else it was solved through relative poses.
         used: correspondences in the final solve.
         frames: frames that they come from.
-        covariance: (6, 6) of (rotation [rad], translation [m]), or None.
-        data_sigmas: (6,) the standard deviations if every correspondence were independent, or None.
+        has_error_bar: whether it has a covariance.
+        is_free: whether its correspondences do not determine it.
         conflicts: of the relative poses that name this camera.
         held: whether nothing determines it.
         excluded: whether the settings exclude its correspondences.
@@ -57,8 +57,7 @@ class Estimate:
     has_matches: bool
     used: int
     frames: int
-    covariance: Array | None
-    data_sigmas: Array | None
+    has_error_bar: bool
     conflicts: tuple[Conflict, ...]
     converged: bool = True
     terms: Terms = "full"
@@ -67,6 +66,7 @@ class Estimate:
     scatter_only: bool = False
     tolerance: tuple[float, float] = TOLERANCE
     lens: tuple[LensEstimate, ...] = ()
+    is_free: bool = False
 
 
 @dataclass(frozen=True, eq=False)

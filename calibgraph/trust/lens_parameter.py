@@ -113,6 +113,10 @@ class LensParameter:
         twist = freed.compensating[:, -count:] @ values
         return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, units)
 
+    def with_error(self, sigma: float) -> LensParameter:
+        """With a further error of each value, in standard deviations of a calibrated lens."""
+        return replace(self, sigmas=np.hypot(self.sigmas, sigma))
+
     @cached_property
     def moved(self) -> tuple[float, float]:
         """How far the camera turns [deg] and its centre moves [cm]."""
@@ -131,42 +135,48 @@ class LensParameter:
         along = (value / size for value in self.values.tolist())
         return max(math.hypot(*map(mul, along, self.sigmas.tolist())), _TINY)
 
-    def probability(self, tolerance: tuple[float, float] = TOLERANCE) -> float:
+    @cached_property
+    def evidence(self) -> float:
+        """Log likelihood ratio of a wrong value against none at all, to compare parameters by."""
+        if not math.isfinite(self.sigma):  # not determined
+            return 0.0
+        total = math.hypot(self.sigma, limit("lens_wrong"))
+        z_score = min(self.size / self.sigma, _MOST_SIGMAS)
+        return (z_score * limit("lens_wrong") / total) ** 2 / 2 + math.log(self.sigma / total)
+
+    def probability(
+        self, tolerance: tuple[float, float] = TOLERANCE, others: Sequence[LensParameter] = ()
+    ) -> float:
         """That the parameter is wrong and displaces the camera beyond a tolerance [deg, cm].
 
         What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
-        wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. An
-        aspect ratio that no lens has counts even if the camera moves little when it is set free:
-        matches from rounds have followed it. At the default tolerance any size of it counts.
-        At a wider one it counts if half of it, as an angle, exceeds what the tolerance adds to the
-        default rotation.
+        wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. What
+        usual ones do to the pose is in its error bar. Where one of several was wrong, the others
+        look wrong, too, if each is set free alone; it is the one that explains most. An aspect
+        ratio that no lens has counts even if the camera moves little when it is set free: matches
+        from rounds have followed it. At the default tolerance any size of it counts. At a wider one
+        it counts if half of it, as an angle, exceeds what the tolerance adds to the default
+        rotation.
         """
         if not math.isfinite(self.sigma):  # not determined
             return 0.0
         moves = max(moved / most for moved, most in zip(self.moved, tolerance, strict=True))
-        tolerated = self.size / moves if moves else math.inf
-        counted = tolerated
+        counted = self.size / moves if moves else math.inf
         if self.name == ASPECT_RATIO:
             wider = min(one / usual for one, usual in zip(tolerance, TOLERANCE, strict=True)) - 1
             counted = math.radians(TOLERANCE[0]) * max(wider, 0.0) / (self.units[0] / 2)
         wrong, share = limit("lens_wrong"), limit("lens_wrong_share")
         odds = logit(share) + self._log_density(wrong) - self._log_density(1.0)
-        is_wrong = float(expit(odds))
-        after, before = self._shares_beyond(counted, wrong)
-        if_wrong = max(is_wrong * after - share * before, 0.0)
-        after, before = self._shares_beyond(tolerated, 1.0)
-        return float(if_wrong + (1 - is_wrong) * max(after - before, 0.0))
+        is_this = softmax([self.evidence, *(other.evidence for other in others)])[0]
+        gain = wrong / math.hypot(self.sigma, wrong)
+        after = _share_beyond(counted, gain**2 * self.size, gain * self.sigma)
+        before = _share_beyond(counted, 0.0, wrong)
+        return max(float(expit(odds) * is_this) * after - share * before, 0.0)
 
     def _log_density(self, spread: float) -> float:
         """The log density of the values among parameters that spread so."""
         total = math.hypot(self.sigma, spread)
         return -(min(self.size / total, _MOST_SIGMAS) ** 2) / 2 - math.log(total)
-
-    def _shares_beyond(self, size: float, spread: float) -> tuple[float, float]:
-        """After and before the estimate, how many parameters that spread so are beyond a size."""
-        gain = spread / math.hypot(self.sigma, spread)
-        after = _share_beyond(size, gain**2 * self.size, gain * self.sigma)
-        return after, _share_beyond(size, 0.0, spread)
 
     def describe(self) -> str:
         """The lens that would be right, in words."""
@@ -219,13 +229,20 @@ def _with_sigma(value: float, sigma: float) -> str:
 
 
 def check_parameter(
-    found: LensParameter, by: str, tolerance: tuple[float, float] = TOLERANCE, options: str = ""
+    found: LensParameter,
+    by: str,
+    tolerance: tuple[float, float] = TOLERANCE,
+    options: str = "",
+    *,
+    others: Sequence[LensParameter] = (),
 ) -> Check:
     """Whether a lens parameter is wrong, by RESIDUALS or IMAGES: the value is the probability.
 
-    For a tolerance [deg, cm]; ``options`` are those that its estimate needs, " --interval-s 0.1".
+    For a tolerance [deg, cm]; ``options`` are those that its estimate needs, " --interval-s 0.1";
+    ``others`` of its lens have been set free alone, too.
     """
-    row, probability, (deg, cm) = threshold("lens"), found.probability(tolerance), found.moved
+    row, probability = threshold("lens"), found.probability(tolerance, others)
+    deg, cm = found.moved
     status, (part, *_) = row.grade(probability), _WORDS[found.name]
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
     if status != "PASS":

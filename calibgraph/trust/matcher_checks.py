@@ -15,22 +15,14 @@ from calibgraph.model.geometry import pose_difference
 from calibgraph.model.verdict import FAIL_ABOVE, TOLERANCE, WENT_ON, Check
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.inputs import describe_copies, describe_repeats
-from calibgraph.trust.solution_checks import check_sigmas
 from calibgraph.trust.thresholds import threshold
 
 _OF_FEW_FRAMES = replace(SEARCH, sigma=0.0)  # in which the search has measured the location
 
 
 def matcher_checks(evidence: Evidence) -> Checks:
-    """The checks of every camera's matches, by what its matcher states.
-
-    The error that all frames share is part of the error bar, with which it is checked; where there
-    is no error bar it is checked alone.
-    """
+    """The checks of every camera's matches, by what its matcher states."""
     table, findings = evidence.solution.correspondences, evidence.findings
-    known = evidence.joint_covariance is not None
-    sigmas = None if known else np.repeat(findings.systematic_sigmas, 3)
-    what, tolerance = "error that the matcher's frames share", evidence.solution.config.tolerance
     checks = {}
     for name in evidence.cameras:
         chance = findings.chance.get(name)
@@ -39,7 +31,6 @@ def matcher_checks(evidence: Evidence) -> Checks:
         checks[name] = [
             *_search_checks(findings, name, chance),
             *_share_checks(findings, name),
-            *check_sigmas(what, sigmas, tolerance),
             *_agreement_checks(findings, name, chance),
         ]
     return checks

@@ -90,9 +90,9 @@ def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:
     """The worst of (kind, severity) pairs per kind of check, and of all, as ``WORST``.
 
     Checks of the lens and of chance are left out, whose value is a probability, and those that are
-    no sign of an error. The worst of all is of checks that can show an error: what counts data, or
-    is the error bar, is in the posterior. Where the
-    probability to find as much by chance is known, checks that count data are left out of all.
+    no sign of an error. The worst of all is of checks that can show an error: what counts data is
+    in the error bar. Where the probability to find as much by chance is known, checks that count
+    data are left out of all.
     """
     worst: dict[str, float] = {}
     for kind, severity in checks:

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibgraph.arrays import Array
 from calibgraph.model.calibration import Residuals
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.verdict import COMMON_ERROR, Check
@@ -25,16 +24,15 @@ def estimate_checks(evidence: Evidence) -> Checks:
 
 
 def _estimate_of(evidence: Evidence, camera: str) -> Estimate:
-    """By the matches alone: flat images widen the error bar, and fail no check."""
     solution, block = evidence.solution, evidence.solution.inliers.blocks.get(camera)
-    sigmas, conflicts = solution.data_sigmas, solution.conflicts
+    sigmas = None if evidence.joint_covariance is not None else solution.data_sigmas
     return Estimate(
         has_matches=camera in solution.objective.blocks,
         used=0 if block is None else len(block.frame),
         frames=0 if block is None else len(block.frame_edges) - 1,
-        covariance=evidence.covariance_by_matches(camera),
-        data_sigmas=None if sigmas is None else sigmas[evidence.cameras.index(camera)],
-        conflicts=tuple(c for c in conflicts if camera in (c.pair.a, c.pair.b)),
+        has_error_bar=evidence.joint_covariance is not None,
+        is_free=sigmas is not None and np.isinf(sigmas[evidence.cameras.index(camera)]).any(),
+        conflicts=tuple(c for c in solution.conflicts if camera in (c.pair.a, c.pair.b)),
         converged=solution.optimum.converged,
         terms=solution.terms,
         held=camera in solution.held,
@@ -68,11 +66,8 @@ def check_estimate(estimate: Estimate) -> list[Check]:
     """The checks of one camera's estimate, from a batch solve or while driving."""
     if estimate.held or not estimate.has_matches:
         return [_check_unmeasured(estimate)]
-    own, lower = estimate.covariance, "lower bound of sigma by the data alone"
-    sigmas = None if own is None else np.sqrt(np.diag(own))
-    checks = check_sigmas("sigma", sigmas, estimate.tolerance)
-    checks += check_sigmas(lower, estimate.data_sigmas, estimate.tolerance)
-    if estimate.scatter_only and sigmas is not None:
+    checks = []
+    if estimate.scatter_only and estimate.has_error_bar:
         text = (
             "scatter only: the table states no error that its frames share, so that the true error "
             "may be many times the error bar"
@@ -82,6 +77,8 @@ def check_estimate(estimate: Estimate) -> list[Check]:
     if estimate.terms in ("stage1", "priors"):
         text = f"the terms {estimate.terms!r} do not fit the correspondences: no error bar"
         checks.append(Check("terms", "WARN", text))
+    elif not estimate.has_error_bar:
+        checks.append(_check_free(estimate.is_free))
     counts = threshold("correspondences_used"), threshold("frames")
     checks += [counts[0].check(estimate.used), counts[1].check(estimate.frames)]
     checks += map(_check_lens_prior, estimate.lens)
@@ -89,20 +86,13 @@ def check_estimate(estimate: Estimate) -> list[Check]:
     return [*checks, Check("convergence", "PASS" if estimate.converged else "FAIL", text)]
 
 
-def check_sigmas(what: str, sigmas: Array | None, tolerance: tuple[float, float]) -> list[Check]:
-    """Standard deviations (6,), rotation [rad] and translation [m], against their limits.
-
-    Those of ``what``, in words, for a tolerance [deg, cm]; no checks of unknown ones.
-    """
-    if sigmas is None:
-        return []
-    of_rotation, of_translation = (
-        threshold(f"sigma_{part}", tolerance) for part in ("rotation", "translation")
-    )
-    return [
-        of_rotation.check(float(np.degrees(sigmas[:3].max())), name=f"{what}, rotation"),
-        of_translation.check(100 * float(sigmas[3:].max()), name=f"{what}, translation"),
-    ]
+def _check_free(is_free: bool) -> Check:
+    """The check of an estimate without an error bar."""
+    if is_free:
+        text = "the correspondences leave directions of the pose free"
+        return Check("error bar", "FAIL", text, kind="free")
+    text = "no error bar: the correspondences leave the pose of another camera free"
+    return Check("error bar", "WARN", text, kind="no_error_bar")
 
 
 def _check_relative_pose(conflict: Conflict) -> Check:

@@ -13,7 +13,7 @@ from functools import lru_cache
 from statistics import NormalDist
 
 from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE
-from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Threshold, ratio_of
+from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Threshold
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.solver.lens import MATCH_SHARE
 
@@ -43,8 +43,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
     # the estimate
     # 0.15 deg displaces a point at 20 m by 5 cm.
     Threshold("sigma_rotation", "sigma, rotation", "at most", 0.15, 0.5, "deg",
-              "How large is the standard deviation about the worst axis; its lower bound from the "
-              "data alone; the error that the matcher's frames share?", of_tolerance=True),
+              "While driving: how large is the standard deviation about the worst axis?",
+              of_tolerance=True),
     Threshold("sigma_translation", "sigma, translation", "at most", 5.0, 15.0, "cm",
               "The same, along the worst axis.", of_tolerance=True),
     # Sigmas of the measurement and the estimate together.
@@ -105,7 +105,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
     # the frames
     Threshold("competing_solution", "matches of a competing solution over those of this one",
               "at most", 0.25, 0.5, "share",
-              "Do the matches that were left out agree on another extrinsic?"),
+              "Do the matches that were left out agree on another extrinsic, farther away than "
+              "the tolerance?"),
     Threshold("outlier_frames", "share of outlier frames", "at most", 0.35, 0.9, "share",
               "How many frames lie far from where frames are densest?",
               "a minority of the frames decides; check what differs between them"),
@@ -133,15 +134,12 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("prior_share", "share of the priors in the result", "at most", 0.5, 1.0, "share",
               "How much of the result comes from priors and relative poses?"),
     # the lens, from the residuals and the images
-    # The verdict's own cuts. By the posterior of a free lens or clock, once from the residuals and
-    # once from the images, and by `lens_wrong` etc.
-    Threshold("lens", "probability of a wrong one", "at most", 0.005, 0.2, "share",
+    # By the posterior of a free lens or clock, once from the residuals and once from the images,
+    # and by `lens_wrong` etc. What is under the first limit is no reason: right lenses reach it.
+    Threshold("lens", "probability of a wrong one", "at most", FAIL_ABOVE, 0.8, "share",
               "Is focal length, principal point, distortion, fx / fy or time of the images wrong, "
               "so that the camera is off by more than the tolerance?", "check the intrinsics, the "
               "image size, and that images are not undistorted twice, cropped or scaled"),
-    Threshold("focal_sensitivity", "motion of the camera per 1 % of the focal length", "at most",
-              15.0, math.inf, "cm", "How much depends on the focal length?",
-              "verify the intrinsics, or give matches at more distances", of_tolerance=True),
     # By `lens_wrong` and `lens_wrong_share`, 0.5 % of all parameters err by more than the first,
     # and 0.5 % of the wrong ones by more than the second.
     Threshold("lens_prior", "distance from the rig", "at most", _WRONG_SIGMAS * _BEYOND[0],
@@ -191,7 +189,7 @@ THRESHOLDS: tuple[Threshold, ...] = (
 
 LIMITS: Mapping[str, float] = {
     # The error of a wrong lens parameter, in standard deviations of a calibrated one: 0.2 % of the
-    # focal length and of fx / fy, 0.002 focal lengths of the principal point, 0.002 of k1, 2 ms of
+    # focal length and of fx / fy, 0.002 focal lengths of the principal point, 0.002 of k1, 5 ms of
     # the time of an image, or as the rig states; and the share of those that are wrong.
     "lens_wrong": _WRONG_SIGMAS,
     "lens_wrong_share": _WRONG_SHARE,
@@ -205,9 +203,6 @@ LIMITS: Mapping[str, float] = {
     # clouds do not belong together; at the second and less the lens is not checked.
     "frames_best": 0.8,
     "lens_frames_best": 0.5,
-    # A competing solution nearer than both is the same one: it differs in matches at the gate.
-    "competing_rotation": 0.3,  # deg, at the default tolerance
-    "competing_translation": 10.0,  # cm, likewise
     # A result that is turned farther [deg] from its guess, and beyond sqrt(3) times the matcher's
     # range, is compared with its convention errors.
     "guess_rotation": 30.0,
@@ -223,7 +218,6 @@ LIMITS: Mapping[str, float] = {
 """Numbers that decide whether a check counts, or that something is compared with."""
 
 _ROWS = {row.key: row for row in THRESHOLDS}
-_OF_TOLERANCE = {"competing_rotation": "deg", "competing_translation": "cm"}
 
 
 @lru_cache
@@ -232,7 +226,6 @@ def threshold(key: str, tolerance: tuple[float, float] = TOLERANCE) -> Threshold
     return _ROWS[key].at(tolerance)
 
 
-def limit(key: str, tolerance: tuple[float, float] = TOLERANCE) -> float:
-    """One of ``LIMITS``; some grow with a tolerance [deg, cm] above the default."""
-    unit = _OF_TOLERANCE.get(key)
-    return LIMITS[key] * (max(ratio_of(unit, tolerance), 1.0) if unit else 1.0)
+def limit(key: str) -> float:
+    """One of ``LIMITS``."""
+    return LIMITS[key]

@@ -33,7 +33,7 @@ def test_weights_are_checked_and_converted(weights: Path, tmp_path: Path, call: 
 
 
 def test_rare_settings_are_read_from_a_file(tmp_path: Path) -> None:
-    values = {"stamps": "record", "sync_tolerance_s": 0.1, "start_from": "joint", "device": "cpu",
+    values = {"stamps": "record", "sync_tolerance_s": 0.1, "device": "cpu",
               "iterations": 2, "half_resolution": True, "batch": 3, "terms": "stage1"}  # fmt: skip
     assert values.keys() == RareSettings.model_fields.keys()
     config = tmp_path / "config.yaml"

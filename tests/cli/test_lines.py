@@ -27,10 +27,9 @@ calibrate {sample} --search-deg few | '--search-deg': Input should be a valid nu
 calibrate {sample} --search-deg nan | should be greater than or equal to 0
 calibrate {sample} --matcher t.csv --search-m 1 | --search-m is for --matcher structure only
 calibrate {sample} --weights a.tar | --weights is for --matcher cmrnext only
-calibrate {sample} --config joint.yaml | start_from is for --matcher cmrnext only
+calibrate {sample} --config cpu.yaml | device is for --matcher cmrnext only
 calibrate {sample} --matcher cmrnext | needs weights
 calibrate {sample} --matcher cmrnext --weights none.tar | no such file of weights
-calibrate {sample} --config both.yaml | start_from: Input should be 'frame' or 'joint'
 calibrate {sample} --config tpu.yaml | device: Input should be 'auto', 'cpu' or 'cuda'
 calibrate bag --topic lidar | give NAME=/TOPIC
 calibrate bag --topic lidar=/a --topic lidar=/b | given 2 times
@@ -96,7 +95,7 @@ track rig.yaml table.parquet table.parquet | several go with --matcher only
 weights bad.tar | bad.tar
 """
 CONFIGS = {
-    "joint": "start_from: joint", "both": "start_from: both", "tpu": "device: tpu",
+    "cpu": "device: cpu", "tpu": "device: tpu",
     "stamps": "stamps: best", "lambda": "lambda: 3",
     "negative": "gate_px: -1", "preset": "preset: best",
 }  # fmt: skip

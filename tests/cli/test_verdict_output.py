@@ -87,18 +87,6 @@ def test_a_warning_for_lack_of_data_is_told_from_one_that_looks_odd(
     assert content["camera_verdicts"]["left"]["cannot_tell"] is True
 
 
-def test_a_result_of_before_the_distinction_is_read_and_has_it(tmp_path: Path, pair: Rig) -> None:
-    table = simulate_correspondences(pair, frames=3, matches=60)
-    path = calibgraph.solve(pair, table).save(tmp_path)
-    content = yaml.safe_load(path.read_text())
-    for verdict in (content["verdict"], *content["camera_verdicts"].values()):
-        del verdict["cannot_tell"]
-    path.write_text(yaml.safe_dump(content, sort_keys=False))
-    loaded = calibgraph.load_calibration(tmp_path)
-    assert loaded.verdict.cannot_tell
-    assert loaded.camera_verdicts["left"].cannot_tell
-
-
 def test_a_fail_shows_three_reasons_and_what_to_do_and_folds_the_rest(
     call: Call, tmp_path: Path, pair: Rig
 ) -> None:

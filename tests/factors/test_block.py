@@ -229,26 +229,6 @@ def test_every_point_behind_the_camera_is_finite_and_bounded() -> None:
     assert graph.error(found) <= graph.error(at(backwards))
 
 
-def test_sums_do_not_depend_on_the_number_of_threads() -> None:
-    import numba
-
-    from factors.block import _WORTH_SHARING
-
-    few = with_loss(world(LENSES["radtan"], 20_000), "cauchy")
-    copies = _WORTH_SHARING // len(few) + 1
-    points, pixels = (np.tile(a, (copies, 1)) for a in (few.points_lidar_m, few.pixels_px))
-    block = ProjectionBlock(few.lens, points, pixels)
-    whole = block.sums(TRUTH)
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        alone = block.sums(TRUTH)
-    finally:
-        numba.set_num_threads(threads)
-    assert whole.cost == alone.cost
-    assert (whole.hessian == alone.hessian).all()
-
-
 def test_bad_blocks_are_refused() -> None:
     lens = LENSES["pinhole"]
     with pytest.raises(ValueError, match="shape"):

@@ -187,14 +187,13 @@ def test_a_covariance_that_is_none_is_refused(
             read(path)
 
 
-def test_a_camera_whose_verdict_was_edited_is_named(
-    calibrated_sample: CommandRun, tmp_path: Path
-) -> None:
-    content = content_of(calibrated_sample)
-    verdicts = content["camera_verdicts"]
-    verdicts["left"]["status"] = {"PASS": "WARN"}.get(verdicts["left"]["status"], "PASS")
-    with pytest.raises(FileError, match="of camera 'left', its checks give .* edited"):
-        load_calibration(edited({"camera_verdicts": verdicts}, calibrated_sample, tmp_path))
+def test_a_verdict_that_was_edited_is_named(calibrated_sample: CommandRun, tmp_path: Path) -> None:
+    for key, of in (("camera_verdicts", "of camera 'left'"), ("verdict", "of the rig")):
+        part = content_of(calibrated_sample)[key]
+        verdict = part if key == "verdict" else part["left"]
+        verdict["status"] = {"PASS": "WARN"}.get(verdict["status"], "PASS")
+        with pytest.raises(FileError, match=f"{of}, its checks give .* edited"):
+            load_calibration(edited({key: part}, calibrated_sample, tmp_path))
 
 
 def test_whether_an_error_bar_holds_is_true_or_false(

@@ -127,17 +127,6 @@ def test_profiles_in_a_png_print_nothing(tmp_path: Path, capfd: pytest.CaptureFi
     assert capfd.readouterr().err == ""
 
 
-def test_a_png_may_be_followed_by_other_bytes(tmp_path: Path) -> None:
-    camera = make_camera()
-    data = png(
-        camera.width_px, camera.height_px, bytes((3 * camera.width_px + 1) * camera.height_px)
-    )
-    (tmp_path / "more.png").write_bytes(data + b"more")
-    (tmp_path / "plain.png").write_bytes(data)
-    more, plain = (load_image(tmp_path / f"{name}.png", camera) for name in ("more", "plain"))
-    np.testing.assert_array_equal(more, plain)
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_an_image_that_states_more_pixels_than_its_bytes_hold_is_refused(
     suffix: str, tmp_path: Path
@@ -331,13 +320,6 @@ TURNING = (0.02, -0.05, 0.4, 12.0, 0.3, -0.1)
 
 def pose_at(twist: tuple[float, ...], seconds: float) -> np.ndarray:
     return np.asarray(gtsam.Pose3.Expmap(np.array(twist) * seconds).matrix())
-
-
-def test_a_point_ahead_of_a_vehicle_that_drives_towards_it() -> None:
-    """At 10 m/s, what is 20 m ahead at the end of a scan was 21 m ahead 0.1 s before."""
-    motion = ScanMotion((0, 0, 0, 10.0, 0, 0), to_s=0.1)
-    moved = motion.correct(np.array([[21.0, 1, 2], [20.0, 1, 2]]), np.array([0.0, 0.1]))
-    np.testing.assert_allclose(moved, [[20, 1, 2], [20, 1, 2]], atol=1e-12)
 
 
 def test_a_point_beside_a_vehicle_that_turns() -> None:

@@ -65,8 +65,8 @@ def pose(T: np.ndarray) -> dict[str, Any]:
     return {"translation": T[:3, 3].tolist(), "rotation": [w, x, y, z]}
 
 
-def tables_of(data: Dataset, *, scene: str = "scene-0001", moved_m: float = 0.0) -> Tables:
-    """The tables; the vehicle moves so far between a scan and its images."""
+def tables_of(data: Dataset, *, scene: str = "scene-0001") -> Tables:
+    """The tables of a scene."""
     sensors = {"LIDAR_TOP": "lidar", **dict.fromkeys(data.rig.cameras, "camera"), "RADAR": "radar"}
     poses = {"LIDAR_TOP": T_EGO_LIDAR, "RADAR": np.eye(4)}
     for name, camera in data.rig.cameras.items():
@@ -85,7 +85,7 @@ def tables_of(data: Dataset, *, scene: str = "scene-0001", moved_m: float = 0.0)
             for name, T in poses.items()
         ],
         "scene": [{"token": scene, "name": scene, "log_token": "log"}],
-        "sample": [], "sample_data": [], "ego_pose": [],
+        "sample": [], "sample_data": [],
     }  # fmt: skip
     for number, frame in enumerate(data.frames):
         stamp, sample = START_US + number * PERIOD_US, f"{scene}-{number}"
@@ -94,13 +94,8 @@ def tables_of(data: Dataset, *, scene: str = "scene-0001", moved_m: float = 0.0)
         files |= {name: f"{sample}{path.suffix}" for name, path in frame.image_paths.items()}
         for name, file in files.items():
             camera = data.rig.cameras.get(name)
-            tables["ego_pose"].append(
-                {"token": f"{sample}-{name}", "timestamp": stamp,
-                 "translation": [10.0 * number + moved_m * (camera is not None), 0.0, 0.0],
-                 "rotation": [1.0, 0.0, 0.0, 0.0]}
-            )  # fmt: skip
             record = {
-                "sample_token": sample, "ego_pose_token": f"{sample}-{name}",
+                "sample_token": sample,
                 "calibrated_sensor_token": f"{scene}-{name}", "timestamp": stamp,
                 "filename": f"samples/{name}/{file}", "fileformat": "pcd",
                 "width": camera.width_px if camera else 0,

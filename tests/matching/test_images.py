@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Dataset, DatasetError, dataset_from_arrays
+from calibgraph import Dataset, dataset_from_arrays
 from calibgraph.matching.burnt_in import describe_burnt_in, find_burnt_in, hide_burnt_in
 from calibgraph.matching.camera_pairs.find import features_of, match_features
 from calibgraph.matching.same_images import find_same_images, require_different_images
-from calibgraph.progress import no_progress
-from calibgraph.rounds import match_in_rounds
 from tests.conftest import SAMPLE, Call
 
 Image = np.ndarray
@@ -190,11 +188,7 @@ def test_what_cannot_be_compared_is_not_accused() -> None:
     assert not find_same_images(blank, blank.rig)
 
 
-def test_nothing_is_searched_for_in_the_same_images() -> None:
-    with pytest.raises(DatasetError, match="front_left and front_right have the same images"):
-        match_in_rounds(copied(as_it_is), progress=no_progress)
-
-
+@pytest.mark.usefixtures("no_image_checks")
 @pytest.mark.parametrize(
     "command",
     [

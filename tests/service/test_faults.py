@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import errno
+import sqlite3
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
 from calibgraph.errors import CalibrationError
@@ -60,11 +60,10 @@ def test_a_database_that_fails_later_is_503_and_heals(
     app: Any = client.app
 
     def broken(*_: object, **__: object) -> Any:
-        raise OperationalError("select", {}, Exception("disk I/O error"))
+        raise sqlite3.OperationalError("disk I/O error")
 
     with monkeypatch.context() as patch:
-        patch.setattr(app.state.service.engine, "connect", broken)
-        patch.setattr(app.state.service.engine, "begin", broken)
+        patch.setattr(app.state.service.jobs, "run", broken)
         statuses = {
             client.get(f"/v1/jobs/{id}").status_code,
             client.post("/v1/jobs/solve", files=small.files).status_code,

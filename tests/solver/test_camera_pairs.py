@@ -25,6 +25,7 @@ from calibgraph.solver.pairs import MIN_PAIR_MATCHES, PairTerm, pair_graph, pair
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.two_pass import optimize
 from factors import EpipolarBlock, pose_sigmas
+from tests.draws.lenses import with_known_lenses
 
 FRAMES = 8
 
@@ -206,8 +207,9 @@ def test_a_calibration_takes_them_and_its_pair_is_better_known(rig: Rig) -> None
     table = simulate_correspondences(rig, frames=FRAMES, errors=errors, seed=0)
     shared = {"systematic_rotation_rad": 0.002, "systematic_translation_m": 0.02}
     table = replace(table, metadata={**table.metadata, **shared})
+    known = with_known_lenses(rig)
     results = [
-        calibgraph.solve(rig, table, camera_matches=matches)
+        calibgraph.solve(known, table, camera_matches=matches)
         for matches in (None, simulated_pairs(rig))
     ]
     a, b = list(rig.cameras)[:2]

@@ -37,6 +37,7 @@ from calibgraph.solver.sources import variances_by_source
 from calibgraph.solver.within_place import block_by_place
 from calibgraph.trust.evidence import Evidence, gather
 from factors import pose_sigmas
+from tests.draws.lenses import with_known_lenses
 from tests.draws.places import displaced
 from tests.solver.latent import all_values, place_keys
 from tests.solver.test_camera_pairs import simulated_pairs
@@ -71,7 +72,7 @@ def test_a_known_matcher_has_its_usual_one(pair: Rig, matcher: str) -> None:
     assert found.place_variance == usual.place_variance
     assert not common_checks(pair, stating(pair, {"matcher": matcher}))
     silent, known = (
-        solve(pair, stating(pair, metadata)).sigmas("left")
+        solve(with_known_lenses(pair), stating(pair, metadata)).sigmas("left")
         for metadata in ({}, {"matcher": matcher})
     )
     assert known[0].max() > 3 * silent[0].max() and known[1].max() > 3 * silent[1].max()

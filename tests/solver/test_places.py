@@ -33,6 +33,7 @@ from calibgraph.solver.pairs import pair_terms
 from calibgraph.solver.places import ErrorFit, fit_latent_poses, start_values
 from factors import ProjectionBlock, placed_pair_factor
 from tests.conftest import stereo_relative_pose
+from tests.draws.lenses import with_known_lenses
 from tests.solver.latent import all_values, linearized
 from tests.solver.test_camera_pairs import simulated_pairs
 
@@ -245,7 +246,7 @@ def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Ri
     """Of what is stated, of the scatter of frames, and of independent matches."""
     table = table_of(pair, 8, False, [])
     metadata = {**table.metadata, "place_variance": 0.0}
-    errors = solve_model(pair, replace(table, metadata=metadata), pairs=False)
+    errors = solve_model(with_known_lenses(pair), replace(table, metadata=metadata), pairs=False)
     parts, Ad = errors.model.components, gtsam.Pose3(errors.T_camera_lidar["left"]).AdjointMap()
     cloud = parts.cloud + parts.cloud_at_place
     block = errors.model.blocks["left"]

@@ -20,7 +20,7 @@ from calibgraph import (
     Rig,
 )
 from calibgraph.tracking.assessment import json_lines
-from calibgraph.tracking.streams import StreamFrame, in_groups, update_all
+from calibgraph.tracking.frame_order import StreamFrame
 from calibgraph.trust.pose_posterior import PosePosterior
 from factors import pose_sigmas
 from tests.conftest import make_camera
@@ -93,9 +93,8 @@ def expected_lines(rig: Rig, *parts: Sequence[Correspondences], together: int = 
     tracker, lines = IncrementalCalibrator(rig), list[str]()
     for tables in parts:
         frames = [StreamFrame(int(table.frame[0]), table) for table in tables]
-        for group in in_groups(frames, together):
-            assert isinstance(group, list)
-            for updates in update_all(tracker, group):
+        for first in range(0, len(frames), together):
+            for updates in tracker.update_all(frames[first : first + together]):
                 assert isinstance(updates, list)
                 lines += json_lines(updates)
     return lines
@@ -130,10 +129,6 @@ class World:
     tables: list[Correspondences]
     lines: list[str]
     file_lines: list[str]  # of whole files, whose frames come together
-
-
-def files_in(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
 class Crashed(BaseException):

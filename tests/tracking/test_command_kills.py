@@ -33,18 +33,18 @@ from tests.tracking.drives import (
     pair_of,
 )
 
-MOST_TOGETHER = 10  # frames of one write, up to the end of an epoch: all its lines come again
+MOST_TOGETHER = 50  # frames of one write: all its lines come again
 
 pytestmark = pytest.mark.usefixtures("no_picture")
 
 
-def _command(arguments: list[str], lines: Path, snapshot_every: int) -> None:
+def _command(arguments: list[str], lines: Path, state_every: int) -> None:
     """In a process of its own: ``track`` with standard output appended to a file."""
     for descriptor, path in ((1, lines), (2, lines.with_suffix(".err"))):
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
         os.dup2(file, descriptor)
     sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
-    durable._SNAPSHOT_EVERY = snapshot_every
+    durable._STATE_EVERY = state_every
     History.draw = lambda self, path: path.write_bytes(b"")  # type: ignore[method-assign]
     sys.argv = ["calibgraph", "track", *arguments]
     app.main()
@@ -56,7 +56,7 @@ class Killed:
 
     arguments: list[str]
     path: Path
-    snapshot_every: int = 7
+    state_every: int = 7
 
     def run(self, when: Callable[[], bool] | None) -> bool:
         """Start it, and kill it when that is so; whether it ended by itself, and well."""
@@ -67,7 +67,7 @@ class Killed:
             ["tests.tracking.test_command_kills", "pyarrow.parquet", "calibgraph.report.tables"]
         )
         process = context.Process(
-            target=_command, args=(self.arguments, self.path, self.snapshot_every)
+            target=_command, args=(self.arguments, self.path, self.state_every)
         )
         process.start()
         while process.is_alive() and not (when is not None and when()):

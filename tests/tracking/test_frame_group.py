@@ -19,7 +19,7 @@ from calibgraph import (
 )
 from calibgraph.model.correspondences import concatenate
 from calibgraph.tracking.assessment import Update
-from calibgraph.tracking.streams import Refused, StreamFrame, update_all
+from calibgraph.tracking.frame_order import StreamFrame
 from tests.tracking.drives import drive, drive_at, pair_of
 
 EPOCH = 10
@@ -38,7 +38,7 @@ def together(
     tracker: IncrementalCalibrator, frames: Sequence[StreamFrame]
 ) -> tuple[list[Update], list[int]]:
     """The updates, and how many frames were taken in at once each time."""
-    groups = [found for found in update_all(tracker, frames) if isinstance(found, list)]
+    groups = [found for found in tracker.update_all(frames) if isinstance(found, list)]
     return [update for group in groups for update in group], [*map(len, groups)]
 
 
@@ -61,7 +61,7 @@ def test_frames_that_come_together_give_the_numbers_of_one_by_one() -> None:
         update = alone.update(table)
         states[update.frame] = alone.to_bytes(), update
     tracker, groups = IncrementalCalibrator(guess_of(rig)), list[int]()
-    for found in update_all(tracker, frames_of(tables)):
+    for found in tracker.update_all(frames_of(tables)):
         assert isinstance(found, list)
         groups.append(len(found))
         state, expected = states[found[-1].frame]
@@ -132,9 +132,9 @@ def test_frames_that_stand_out_are_taken_in_by_themselves() -> None:
     wrong = replace(tables[35], cameras=("left", "other"))
     frames[35:36] = [StreamFrame(35, wrong), StreamFrame(7, tables[7]), frames[35]]
     expected, refused = one_by_one(IncrementalCalibrator(guess_of(rig)), frames)
-    results = [*update_all(IncrementalCalibrator(guess_of(rig)), frames)]
+    results = [*IncrementalCalibrator(guess_of(rig)).update_all(frames)]
     found = [update for group in results if isinstance(group, list) for update in group]
-    assert [one.message for one in results if isinstance(one, Refused)] == refused
+    assert [str(one) for one in results if isinstance(one, CorrespondenceError)] == refused
     assert len(refused) == 2
     assert [(u.frame, u.left_out, {*u.used}) for u in found] == [
         (u.frame, u.left_out, {*u.used}) for u in expected

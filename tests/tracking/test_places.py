@@ -62,6 +62,7 @@ def sigmas_of_pair(T: dict[str, Array], joint: Array) -> Array:
 def drawn_of(places: int, frames: int, rounds: int, *, tie: bool) -> Drawn:
     rng = np.random.default_rng(places)
     drawn = draw_places(places, 100, rng, frames=frames, rounds=rounds)
+    drawn = replace(drawn, rig=with_known_lenses(drawn.rig))
     return tied(drawn, rng, deg=0.02, cm=0.3) if tie else drawn
 
 

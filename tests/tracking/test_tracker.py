@@ -206,7 +206,7 @@ def test_an_update_that_fails_leaves_nothing_behind(
     tracker, _ = tracked(pair, tables[:19])
     before = tracker.to_bytes()
 
-    judge, calls = tracker_module.assess, []
+    judge, calls = tracker_module.make_updates, []
 
     def broken_once(*arguments: object, **options: object) -> object:
         calls.append(arguments)
@@ -214,7 +214,7 @@ def test_an_update_that_fails_leaves_nothing_behind(
             raise RuntimeError("broken")
         return judge(*arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(tracker_module, "assess", broken_once)
+    monkeypatch.setattr(tracker_module, "make_updates", broken_once)
     with pytest.raises(CorrespondenceError, match=r"frame 19: .*broken.*left out"):
         tracker.update(tables[19])
     assert tracker.to_bytes() == before

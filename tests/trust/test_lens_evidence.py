@@ -75,7 +75,7 @@ def statuses(lens: tuple[LensParameter, ...]) -> dict[str, str]:
         (FOCAL, 0.03, "focal length"),
         (RADIAL, -0.1, "distortion"),
         (CENTRE_X, 0.04, "principal point"),
-        (ASPECT, 0.04, "aspect ratio"),
+        (ASPECT, 0.06, "aspect ratio"),
     ],
 )
 def test_a_wrong_lens_is_named_and_measured(

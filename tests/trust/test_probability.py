@@ -29,7 +29,7 @@ from calibgraph.trust.probability import (
     probability_of_checks,
     probability_outside,
 )
-from calibgraph.trust.thresholds import THRESHOLDS, limit, threshold
+from calibgraph.trust.thresholds import THRESHOLDS, threshold
 from tests.conftest import ROOT
 from tests.trust.conftest import simulated
 
@@ -109,7 +109,7 @@ def test_error_bars_of_runs_state_more_than_held_and_a_sure_one_is_sure() -> Non
 
 
 def test_a_wide_error_bar_and_few_frames_are_no_signs_of_an_error_in_runs() -> None:
-    rows = {"sigma_translation": 60.0, "frames": 1.0, "focal_sensitivity": 90.0}
+    rows = {"sigma_translation": 60.0, "frames": 1.0, "prior_share": 0.9}
     checks = [threshold(kind).check(value) for kind, value in rows.items()]
     assert {check.status for check in checks} > {"FAIL"}
     assert probability_of_checks(checks, STRUCTURE) == probability_of_checks([], STRUCTURE)
@@ -175,12 +175,6 @@ def test_the_tolerance_is_a_setting_and_the_probability_is_kept(pair: Rig, tmp_p
     assert "off by more than 0.001 deg or 0.01 cm" in strict.verdict.reasons[0]
     strict.save(tmp_path / "out")
     assert load_calibration(tmp_path / "out").camera_verdicts == strict.camera_verdicts
-
-
-def test_a_limit_grows_with_the_tolerance_and_is_exact_at_the_default() -> None:
-    assert [limit("competing_rotation", (deg, 10.0)) for deg in (0.1, 0.5, 1.0)] == [0.3, 0.3, 0.6]
-    assert limit("competing_translation", (0.1, 30.0)) == pytest.approx(30.0)
-    assert limit("swap_slack", (5.0, 100.0)) == limit("swap_slack")
 
 
 OFF_DEG, OFF_CM = 0.5, 10.0

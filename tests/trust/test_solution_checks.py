@@ -31,6 +31,7 @@ from calibgraph.trust.evidence import Checks
 from calibgraph.trust.matcher_checks import repeated_file_checks
 from calibgraph.trust.observability import weakest_direction
 from tests.conftest import SAMPLE
+from tests.draws.lenses import with_known_lenses
 from tests.trust.conftest import named, simulated
 
 
@@ -293,7 +294,7 @@ def test_the_share_of_the_priors_is_their_influence(pair: Rig) -> None:
 
 
 def test_the_bootstrap_agrees_with_the_reported_covariance(pair: Rig) -> None:
-    table = simulated(pair, frames=30)
+    table, pair = simulated(pair, frames=30), with_known_lenses(pair)
     result = solve(pair, table, Config(bootstrap=100))
     one, again = (solve(pair, table, Config(bootstrap=5)).bootstrap for _ in range(2))
     for name, covariance in result.bootstrap.items():

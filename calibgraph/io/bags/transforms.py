@@ -7,8 +7,6 @@ with the parent in ``header.frame_id``.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,109 +22,97 @@ _LEAST_LENGTH = 1e-6  # of a quaternion that is one
 _SAME = 1e-6  # of the entries of a transform that does not change
 
 
-@dataclass
-class _Tree:
-    """Links, with notes on their source if it is not the own bag; and why frames are left out."""
-
-    links: dict[str, Link] = field(default_factory=dict)
-    invalid: dict[str, str] = field(default_factory=dict)
-    moving: set[str] = field(default_factory=set)
-
-    def widened(self, *others: _Tree) -> _Tree:
-        """With what others have of frames that are missing here; of several, the first counts."""
-        found = _Tree()
-        for tree in (*reversed(others), self):
-            found.links |= tree.links
-            found.invalid |= tree.invalid
-            found.moving |= tree.moving
-        return found
-
-
 class Transforms:
     """The static transforms of a bag, the first of its drive.
 
     Where they do not connect two frames, those of other bags of the drive serve, and then those on
-    /tf that never change, as ROS 1 may have them.
+    /tf that never change, as ROS 1 may have them. Each is read only when it is needed.
+
+    Attributes:
+        links: those that were read; of several for a frame, the first counts.
     """
 
     def __init__(self, drive: Sequence[Bag]) -> None:
-        self._drive = drive
-        self._read = cache(_read_tree)  # once, and only as far as trees are needed
-        self._used: dict[str, set[str]] = {}
-        self.links: dict[str, Link] = {}  # of the trees that were needed
-
-    def _trees(self) -> Iterator[_Tree]:
-        """Wider and wider trees: of the bag, with another bag, ..., with /tf of all."""
-        tree = self._read(self._drive[0], STATIC, "")
-        yield tree
-        for bag in self._drive[1:]:
-            tree = tree.widened(self._read(bag, STATIC, f"/{STATIC} of {bag.path}"))
-            yield tree
+        self._path = drive[0].path
+        self._unread = [
+            (bag, STATIC, "" if bag is drive[0] else f"/{STATIC} of {bag.path}") for bag in drive
+        ]
         never = "/{} of {}, on which they never change"
-        yield tree.widened(
-            *(self._read(bag, MOVING, never.format(MOVING, bag.path)) for bag in self._drive)
-        )
+        self._unread += [(bag, MOVING, never.format(MOVING, bag.path)) for bag in drive]
+        self.links: dict[str, Link] = {}
+        self._invalid: dict[str, str] = {}  # why frames are left out
+        self._moving: set[str] = set()
+        self._used: dict[str, set[str]] = {}
+        self._read_next()
+        self._left_out = [f"{why}; it is left out" for why in self._invalid.values()]
+
+    def _read_next(self) -> None:
+        links, invalid, moving = _read_tree(*self._unread.pop(0))
+        self.links, self._invalid = links | self.links, invalid | self._invalid
+        self._moving |= moving
 
     def between(self, target: str, source: str) -> Array | None:
         """(4, 4) T_target_source through the frame that both hang from; None if there is none."""
-        for tree in self._trees():
-            T_target_source = T_between(tree.links, target, source)
-            if T_target_source is not None:
-                self.links |= tree.links
-                for link in links_between(tree.links, target, source):
-                    self._used.setdefault(link.note, set()).add(link.child)
-                return T_target_source
-        return None
+        while (T := T_between(self.links, target, source)) is None and self._unread:
+            self._read_next()
+        if T is not None:
+            for link in links_between(self.links, target, source):
+                self._used.setdefault(link.note, set()).add(link.child)
+        return T
 
     @property
     def moving(self) -> set[str]:
         """The frames on /tf that move against their parents."""
-        *_, widest = self._trees()
-        return widest.moving
+        while self._unread:
+            self._read_next()
+        return self._moving
 
     @property
     def notes(self) -> list[str]:
         """A line for each transform that was left out, and each source beside /tf_static."""
-        left_out = [f"{why}; it is left out" for why in next(self._trees()).invalid.values()]
         used = [
-            f"{self._drive[0].path}: the transforms of {_listed(frames)} are from {source}"
+            f"{self._path}: the transforms of {_listed(frames)} are from {source}"
             for source, frames in self._used.items()
             if source
         ]
-        return [*left_out, *used]
+        return [*self._left_out, *used]
 
     def why_apart(self, *frames: str) -> str:
         """Why frames are not connected, and which frames there are."""
-        *_, tree = self._trees()
+        moving = f"; {_listed(self.moving)} move on /{MOVING}" if self.moving else ""
         for frame in frames:
-            *_, top = ancestors(tree.links, frame)
-            if top in tree.invalid:
-                return f"{tree.invalid[top]}, and {frame!r} hangs by it"
-        moving = f"; {_listed(tree.moving)} move on /{MOVING}" if tree.moving else ""
-        return f"its frames are {_listed({*tree.links})}{moving}"
+            *_, top = ancestors(self.links, frame)
+            if top in self._invalid:
+                return f"{self._invalid[top]}, and {frame!r} hangs by it"
+        return f"its frames are {_listed({*self.links})}{moving}"
 
 
 def _listed(frames: set[str]) -> str:
     return ", ".join(sorted(frames)) or "none"
 
 
-def _read_tree(bag: Bag, name: str, source: str) -> _Tree:
-    """The last transform to each child, as in tf; on /tf, those that are the same throughout."""
-    tree = _Tree()
+def _read_tree(
+    bag: Bag, name: str, source: str
+) -> tuple[dict[str, Link], dict[str, str], set[str]]:
+    """By child: the last transform to each, as in tf; why others are none; and which move.
+
+    On /tf, those that are the same throughout. The source is noted on each link.
+    """
+    links, invalid, moving = dict[str, Link](), dict[str, str](), set[str]()
     for each in stamped_transforms(bag, name):
         if each.T_parent_child is None:
-            tree.invalid[each.child] = each.text
+            invalid[each.child] = each.text
             continue
         link = Link(each.parent, each.child, each.T_parent_child, source)
-        first = tree.links.setdefault(each.child, link)
+        first = links.setdefault(each.child, link)
         change = np.abs(link.T_parent_child - first.T_parent_child).max()
         if name == STATIC:
-            tree.links[each.child] = link
+            links[each.child] = link
         elif link.parent != first.parent or change > _SAME:
-            tree.moving.add(each.child)
-    for child in tree.moving:
-        del tree.links[child]
-    return tree
+            moving.add(each.child)
+    for child in moving:
+        del links[child]
+    return links, invalid, moving
 
 
 class StampedTransform(NamedTuple):

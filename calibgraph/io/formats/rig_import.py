@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
-from pydantic import ConfigDict, Field
+from pydantic import AliasPath, ConfigDict, Field
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, FileError
@@ -107,33 +107,18 @@ def _is_number(word: str) -> bool:
     return True
 
 
-class _Vector(Foreign):
-    x: float
-    y: float
-    z: float
-
-
-class _Quaternion(_Vector):
-    w: float
-
-
-class _Transform(Foreign):
-    translation: _Vector
-    rotation: _Quaternion
-
-
-class _TfHeader(Foreign):
-    frame_id: str
-
-
 class _Stamped(Foreign):
-    header: _TfHeader
-    child_frame_id: str
-    transform: _Transform
+    """A TransformStamped."""
 
-
-class _TfMessage(Foreign):
-    transforms: list[_Stamped]
+    parent: str = Field(validation_alias=AliasPath("header", "frame_id"))
+    child: str = Field(validation_alias="child_frame_id")
+    x: float = Field(validation_alias=AliasPath("transform", "translation", "x"))
+    y: float = Field(validation_alias=AliasPath("transform", "translation", "y"))
+    z: float = Field(validation_alias=AliasPath("transform", "translation", "z"))
+    qx: float = Field(validation_alias=AliasPath("transform", "rotation", "x"))
+    qy: float = Field(validation_alias=AliasPath("transform", "rotation", "y"))
+    qz: float = Field(validation_alias=AliasPath("transform", "rotation", "z"))
+    qw: float = Field(validation_alias=AliasPath("transform", "rotation", "w"))
 
 
 def is_tf2(content: dict[str, Any]) -> bool:
@@ -148,18 +133,20 @@ def read_tf2(documents: list[dict[str, Any]], path: Path) -> RigParts:
     """
     links: dict[str, Link] = {}
     notes: list[str] = []
+    listed: list[Any] = []
     for content in documents:
-        listed = content if "transforms" in content else {"transforms": [content]}
-        for stamped in checked_model(_TfMessage, listed, path).transforms:
-            t, q = stamped.transform.translation, stamped.transform.rotation
-            names = stamped.header.frame_id.lstrip("/"), stamped.child_frame_id.lstrip("/")
-            try:
-                if not np.isfinite([t.x, t.y, t.z]).all():
-                    raise ValueError(f"translation [{t.x}, {t.y}, {t.z}] is not finite")
-                T = pose_of_quaternion((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
-                links[names[1]] = Link(*names, T)
-            except ValueError as error:
-                notes.append(f"{path}: frame {stamped.child_frame_id!r} is left out: {error}")
+        several = content.get("transforms")
+        listed += several if isinstance(several, list) else [content]
+    for stamped in listed:
+        s = checked_model(_Stamped, stamped, path)
+        parent, child = s.parent.lstrip("/"), s.child.lstrip("/")
+        try:
+            if not np.isfinite([s.x, s.y, s.z]).all():
+                raise ValueError(f"translation [{s.x}, {s.y}, {s.z}] is not finite")
+            T = pose_of_quaternion((s.x, s.y, s.z), (s.qx, s.qy, s.qz, s.qw))
+            links[child] = Link(parent, child, T)
+        except ValueError as error:
+            notes.append(f"{path}: frame {child!r} is left out: {error}")
     return RigParts(path, links=tuple(links.values()), notes=tuple(notes))
 
 

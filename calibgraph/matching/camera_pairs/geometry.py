@@ -205,6 +205,13 @@ def planes_at(rays: Array, points_camera_m: Array) -> Array:
     return _fit_planes(rays, directions[rows], inverse[rows], chords)
 
 
+def points_at(rays: Array, points_camera_m: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Which of the rays (n, 3) meet a plane of the cloud, and (k, 3) where; see `planes_at`."""
+    inverse = np.einsum("ni,ni->n", planes_at(rays, points_camera_m), rays)
+    near = inverse > 0  # false where there is no plane
+    return near, rays[near] / inverse[near, None]
+
+
 def _near_rays(directions: Array, rays: Array) -> NDArray[np.bool_]:
     """(m,) the directions inside the cone about the rays, with a margin."""
     axis = rays.mean(axis=0)

@@ -43,8 +43,7 @@ class _Config(BaseModel):
     use_reflectance: StrictBool
     fourier_levels: Annotated[int, Field(strict=True)] = -1
     context_encoder: Literal["lidar", "rgb"] = "rgb"
-    uncertainty: StrictBool = False
-    unc_freeze: StrictBool = False
+    uncertainty: Literal[False] = False
     al_contrario: Literal[False] = False
     normalize_images: StrictBool
     half_resolution: StrictBool | None = None
@@ -142,12 +141,10 @@ def _architecture(config: _Config, tensors: Mapping[str, Tensor]) -> Architectur
     first = tensors.get("fnet_img.conv1.weight")
     if first is None or first.ndim != 4:  # noqa: PLR2004 - a convolution
         raise ValueError("these are not the weights of a CMRNext network")
-    head: Literal["nll", "nll_frozen"] = "nll_frozen" if config.unc_freeze else "nll"
     return Architecture(
         fourier_levels=config.fourier_levels,
         reflectance=config.use_reflectance,
         context=config.context_encoder,
-        uncertainty=head if config.uncertainty else "none",
         width=len(first),
     )
 

@@ -1,9 +1,8 @@
 """Matches of one network: images and clouds in, a table of correspondences per image out.
 
 And the outcome of each image, with the matcher's findings from all of them. The confidence of a
-match, 0 to 1, follows the predicted standard deviations, if there is an uncertainty head. Without
-one it is a product of three factors: convergence, correlation peak, and agreement with the frame's
-pose. It ranks matches, but is not calibrated: it is no probability.
+match, 0 to 1, is a product of three factors: convergence, correlation peak, and agreement with the
+frame's pose. It ranks matches, but is not calibrated: it is no probability.
 """
 
 from collections.abc import Mapping, Sequence
@@ -109,7 +108,7 @@ class FlowMatcher:
     def _flow(
         self, jobs: Sequence[MatchingJob], lidar_images: Sequence[LidarImage], halved: bool
     ) -> tuple[Maps, Maps]:
-        """(B, 2 or 4, H, W) flow and standard deviations, (B, 2, h, w) last step and peak."""
+        """(B, 2, H, W) flow, (B, 2, h, w) last step and peak."""
         checkpoint, device = self.checkpoint, next(self.model.parameters()).device
         rgbs, lidars = [], []
         for job, lidar in zip(jobs, lidar_images, strict=True):
@@ -124,11 +123,9 @@ class FlowMatcher:
             rgb, raw = torch.stack(rgbs).to(device), torch.stack(lidars).to(device)
             inputs = encode_depth(raw, checkpoint.architecture)
             flow = self.model(rgb, inputs, iterations=self.iterations)
-            maps = [upscale(flow.flow_px, halved=halved)]
-            if flow.sigma_px is not None:
-                maps.append(upscale(flow.sigma_px, halved=halved, is_flow=False))
+            full = upscale(flow.flow_px, halved=halved)
             coarse = torch.stack([flow.step_px * (1 + halved), flow.peak], dim=1)
-            return torch.cat(maps, dim=1).cpu().numpy(), coarse.cpu().numpy()
+            return full.cpu().numpy(), coarse.cpu().numpy()
 
 
 def to_table(
@@ -139,32 +136,24 @@ def to_table(
     Args:
         job: the camera and frame.
         lidar: the points in the network's input.
-        full: (2 or 4, H, W) flow, and its standard deviations if there are any [px].
+        full: (2, H, W) flow [px].
         coarse: (2, h, w) last step [px] and correlation peak.
         cell: pixels per coarse cell.
     """
     rows, columns = lidar.cells.T
     values = full[:, rows, columns].T.astype(np.float64)
-    pixels, on_image = job.view.distort(lidar.pixels_px + np.nan_to_num(values[:, :2], nan=1e9))
+    pixels, on_image = job.view.distort(lidar.pixels_px + np.nan_to_num(values, nan=1e9))
     kept = on_image & np.isfinite(values).all(axis=1)
     index = lidar.point_index[kept]
     step, peak = coarse[:, rows[kept] // cell, columns[kept] // cell].astype(np.float64)
-    information = None
-    if values.shape[1] == 2:  # noqa: PLR2004 - no uncertainty head
-        converged = 1.0 / (1.0 + (step / STEP_PX) ** 2)
-        confidence = converged * peak / (peak + 1.0 / WINDOW**2)  # a peak of chance halves it
-    else:
-        sigma = values[kept, 2:]
-        confidence = 2.0 / sigma.sum(axis=1)  # 1 for the least, 1 px per axis
-        diagonal = sigma**-2.0
-        information = np.column_stack([diagonal[:, 0], np.zeros(len(sigma)), diagonal[:, 1]])
+    converged = 1.0 / (1.0 + (step / STEP_PX) ** 2)
+    confidence = converged * peak / (peak + 1.0 / WINDOW**2)  # a peak of chance halves it
     return Correspondences.from_arrays(
         camera=job.name,
         frame=job.frame.index,
         pixels_px=pixels[kept].reshape(-1, 2),
         points_lidar_m=job.cloud[index, :3],
         confidence=_bound(confidence),
-        information_px=information,
         point_index=index,
     )
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -37,12 +37,12 @@ _BEYOND = 2.0  # times the range of training, corner to corner: no network corre
 class CmrNextMatcher:
     """Matching by CMRNext networks, from coarse to fine.
 
+    Each network starts at the pose of the same image by the network before, by PnP, as in the
+    original; frames that fail are left out.
+
     Args:
         weights: files of weights, in the order in which the networks are run; a file may be given
             more than once.
-        start_from: where a network starts. ``frame``: the pose of the same image by the network
-            before, by PnP, as in the original; frames that fail are left out. ``joint``: the joint
-            solve over all frames and cameras.
         device: ``cpu``, ``cuda``, or ``auto``.
         iterations: of the recurrent update.
         half_resolution: whether images are halved; None: as the weights choose, or from 1400
@@ -55,13 +55,13 @@ class CmrNextMatcher:
         ValueError: on a wrong argument.
     """
 
+    rounds = 1
     stage1: Stage1Source = "pnp"
 
     def __init__(
         self,
         weights: Sequence[Path | str],
         *,
-        start_from: Literal["frame", "joint"] = "frame",
         device: str = "auto",
         iterations: int = 12,
         half_resolution: bool | None = None,
@@ -70,47 +70,38 @@ class CmrNextMatcher:
     ) -> None:
         if not weights:
             raise ValueError("no weights given: --weights iter1.tar --weights iter5.tar")
-        if start_from not in ("frame", "joint"):
-            raise ValueError(f"start_from {start_from!r}: known are frame, joint")
         if iterations < 1 or (batch is not None and batch < 1):
             raise ValueError(f"iterations {iterations}, batch {batch}: expected at least 1")
         self.device = torch_device(device)
-        self.start_from = start_from
         self.iterations = iterations
         self.half_resolution = half_resolution
         self.batch = batch or _BATCH[self.device.type]
         self.seed = seed
         loaded = {path: self._load(path) for path in dict.fromkeys(map(str, weights))}
         self.networks = [loaded[str(path)] for path in weights]
-        self.rounds = len(self.networks) if start_from == "joint" else 1
 
     def match(
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
     ) -> Correspondences:
         """Match every camera in every frame, from the rig's extrinsics."""
-        schedule = self.networks
-        if self.start_from == "joint":
-            schedule = schedule[round_index : round_index + 1]
-        is_last = round_index == self.rounds - 1
-        probed = spread_out(dataset.frames, _PROBED_FRAMES) if is_last else []
-        probed_frames = {frame.index for frame in probed}
+        last = self.networks[-1]
+        probed = {frame.index for frame in spread_out(dataset.frames, _PROBED_FRAMES)}
         total = len(rig.cameras) * len(dataset.frames)
         results: dict[str, list[ImageResult]] = {name: [] for name in rig.cameras}
         done = 0
         for jobs in self._batches(dataset, rig):
-            what = f"round {round_index + 1} of {self.rounds}: {jobs[0].frame.name}"
-            progress(what, round_index * total + done, self.rounds * total)
-            for result in self._run(jobs, schedule):
-                if result.job.frame.index in probed_frames:
-                    result = self._probe(result, schedule[-1])  # noqa: PLW2901
+            progress(f"matching {jobs[0].frame.name}", done, total)
+            for result in self._run(jobs):
+                if result.job.frame.index in probed:
+                    result = self._probe(result, last)  # noqa: PLW2901
                 results[result.job.name].append(result)
             done += len(jobs)
         # Of a camera whose images all failed, all are given: the solve reports the failure.
         good = [[r for r in each if not r.failed] or each for each in results.values()]
         tables = [result.matches for each in good for result in each]
-        findings = to_findings(results, schedule[-1].checkpoint)
+        findings = to_findings(results, last.checkpoint)
         metadata = {
-            **self._metadata(schedule[-1].checkpoint, round_index),
+            **self._metadata(),
             "failed_frames": {
                 n: [r.job.frame.name for r in e if r.failed] for n, e in results.items()
             },
@@ -140,12 +131,10 @@ class CmrNextMatcher:
                 yield [load_job(frame, name, rig.cameras[name], views[name])
                        for frame, name in pairs[start : start + self.batch]]  # fmt: skip
 
-    def _run(
-        self, jobs: Sequence[MatchingJob], schedule: Sequence[FlowMatcher]
-    ) -> list[ImageResult]:
+    def _run(self, jobs: Sequence[MatchingJob]) -> list[ImageResult]:
         """Run the networks on a batch, each from the estimates of the one before."""
         failed = [False] * len(jobs)
-        for network in schedule:
+        for network in self.networks:
             tables = network.match(jobs)
             results = [
                 self._estimate(job, table, network.checkpoint, before)
@@ -186,22 +175,19 @@ class CmrNextMatcher:
         )
         return replace(result, start_dependence=dependence, memorization=1.0 - kept)
 
-    def _metadata(self, last: Checkpoint, round_index: int) -> dict[str, Any]:
+    def _metadata(self) -> dict[str, Any]:
         return {
             "matcher": "cmrnext",
-            "round": round_index,
             "schedule": [
                 {"file": n.checkpoint.path.name, "sha256": n.checkpoint.sha256,
                  "range_deg_m": n.checkpoint.range_deg_m}
                 for n in self.networks
             ],
-            "start_from": self.start_from,
             "iterations": self.iterations,
             "half_resolution": self.half_resolution,
             "device": self.device.type,
             "seed": self.seed,
-            "confidence": "uncalibrated" if last.architecture.uncertainty == "none"
-                          else "predicted",
+            "confidence": "uncalibrated",
         }  # fmt: skip
 
 
@@ -216,9 +202,7 @@ def _is_within_range(checkpoint: Checkpoint, job: MatchingJob, T_camera_lidar: A
 
 
 def _weigh(job: MatchingJob, table: Correspondences, T_camera_lidar: Array) -> Correspondences:
-    """The matches with their confidence lowered by their residuals, unless it is predicted."""
-    if table.information_px is not None:
-        return table
+    """The matches with their confidence lowered by their residuals."""
     points = table.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
     projected, valid = job.camera.lens.project(points)
     residuals = np.linalg.norm(projected - table.pixels_px, axis=1)

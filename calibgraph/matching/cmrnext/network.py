@@ -1,8 +1,8 @@
 """The CMRNext network: recurrent optical flow from a LiDAR depth image to a camera image.
 
-RAFT with two feature encoders of its own, a context encoder that may read the LiDAR, and optional
-uncertainty (Cattaneo and Valada, "CMRNext"; Teed and Deng, "RAFT"). Parameters are named and
-shaped as in the published checkpoints.
+RAFT with two feature encoders of its own, and a context encoder that may read the LiDAR (Cattaneo
+and Valada, "CMRNext"; Teed and Deng, "RAFT"). Parameters are named and shaped as in the published
+checkpoints.
 """
 
 from dataclasses import dataclass
@@ -50,15 +50,12 @@ class Architecture:
         fourier_levels: of the depth encoding; -1: plain depth.
         reflectance: whether the LiDAR image has a channel of intensities.
         context: which image the context encoder reads.
-        uncertainty: ``nll``: the flow head also predicts standard deviations; ``nll_frozen``: a
-            second update block does.
         width: channels of the first layer, a multiple of 8; published networks have 64.
     """
 
     fourier_levels: int = 12
     reflectance: bool = False
     context: Literal["lidar", "rgb"] = "lidar"
-    uncertainty: Literal["none", "nll", "nll_frozen"] = "none"
     width: int = FULL_WIDTH
 
     def __post_init__(self) -> None:
@@ -90,13 +87,11 @@ class Flow:
 
     Attributes:
         flow_px: (B, 2, H, W) from LiDAR pixels to image pixels, x and y.
-        sigma_px: (B, 2, H, W) its standard deviations, or None without an uncertainty head.
         step_px: (B, h, w) length of the last iteration's change, per cell.
         peak: (B, h, w) softmax share of the correlation at the target among its 9 x 9 cells.
     """
 
     flow_px: Tensor
-    sigma_px: Tensor | None
     step_px: Tensor
     peak: Tensor
 
@@ -212,10 +207,10 @@ class _SeparableGru(nn.Module):
 
 
 class _FlowHead(nn.Module):
-    def __init__(self, architecture: Architecture, outputs: int) -> None:
+    def __init__(self, architecture: Architecture) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(architecture.scale(128), architecture.scale(256), 3, padding=1)
-        self.conv2 = nn.Conv2d(architecture.scale(256), outputs, 3, padding=1)
+        self.conv2 = nn.Conv2d(architecture.scale(256), 2, 3, padding=1)
 
     def forward(self, h: Tensor) -> Tensor:
         out: Tensor = self.conv2(F.relu(self.conv1(h)))
@@ -225,11 +220,11 @@ class _FlowHead(nn.Module):
 class UpdateBlock(nn.Module):
     """One iteration: motion encoder, GRU and flow head; and the mask of the upsampling."""
 
-    def __init__(self, architecture: Architecture, outputs: int) -> None:
+    def __init__(self, architecture: Architecture) -> None:
         super().__init__()
         self.encoder = _MotionEncoder(architecture)
         self.gru = _SeparableGru(architecture)
-        self.flow_head = _FlowHead(architecture, outputs)
+        self.flow_head = _FlowHead(architecture)
         self.mask = nn.Sequential(
             nn.Conv2d(architecture.scale(128), architecture.scale(256), 3, padding=1),
             nn.ReLU(),
@@ -241,7 +236,7 @@ class UpdateBlock(nn.Module):
     def forward(
         self, h: Tensor, terms: list[Tensor], windows: Tensor, flow: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The next hidden state, and the head's output."""
+        """The next hidden state, and the step of the flow."""
         h = self.gru(h, terms, self.encoder(flow, windows))
         return h, self.flow_head(h)
 
@@ -258,9 +253,7 @@ class CmrNext(nn.Module):
             architecture, architecture.lidar_channels, features, nn.InstanceNorm2d
         )
         self.cnet = Encoder(architecture, architecture.context_channels, 2 * hidden, nn.BatchNorm2d)
-        self.update_block = UpdateBlock(architecture, 4 if architecture.uncertainty == "nll" else 2)
-        if architecture.uncertainty == "nll_frozen":
-            self.update_block_unc = UpdateBlock(architecture, 2)
+        self.update_block = UpdateBlock(architecture)
 
     def forward(self, rgb: Tensor, lidar: Tensor, *, iterations: int = 12) -> Flow:
         """The flow after some iterations.
@@ -274,30 +267,19 @@ class CmrNext(nn.Module):
         correlation = Correlation(self.fnet_lidar(lidar), self.fnet_img(rgb))
         h, context = self.cnet(lidar if self.architecture.context == "lidar" else rgb).chunk(2, 1)
         h, context = torch.tanh(h), F.relu(context)
-        blocks = [self.update_block]
-        if self.architecture.uncertainty == "nll_frozen":
-            blocks.append(self.update_block_unc)
-        terms = [block.gru.context_terms(context) for block in blocks]
-        hiddens = [h for _ in blocks]
+        terms = self.update_block.gru.context_terms(context)
         grid = _identity_grid(h)
         flow = torch.zeros_like(grid).expand(len(h), -1, -1, -1)
         for _ in range(iterations):
-            windows = correlation.window(grid + flow)
-            outputs = []
-            for i, block in enumerate(blocks):
-                hiddens[i], output = block(hiddens[i], terms[i], windows, flow)
-                outputs.append(output)
-            both = torch.cat(outputs, dim=1)  # the flow's step, and raw uncertainty if there is one
-            step, raw_sigma = both[:, :2], both[:, 2:]
+            h, step = self.update_block(h, terms, correlation.window(grid + flow), flow)
             flow = flow + step
         # (B, 1, 9, 8, 8, h, w) of the 3 x 3 neighbours of every pixel's cell.
-        mask = 0.25 * self.update_block.mask(hiddens[0])
+        mask = 0.25 * self.update_block.mask(h)
         weights = mask.view(len(mask), 1, 9, CELL, CELL, *mask.shape[2:]).softmax(dim=2)
         # The softmax share of the target itself in its window of the finest level.
         window = correlation.window(grid + flow)[:, : WINDOW**2]
         return Flow(
             flow_px=_upsample(CELL * flow, weights),
-            sigma_px=_upsample(F.elu(raw_sigma) + 2, weights) if raw_sigma.shape[1] else None,
             step_px=CELL * step.norm(dim=1),
             peak=window.softmax(dim=1)[:, WINDOW**2 // 2],
         )
@@ -332,9 +314,8 @@ def _upsample(cells: Tensor, weights: Tensor) -> Tensor:
     return pixels.permute(0, 1, 4, 2, 5, 3).reshape(batch, channels, CELL * height, CELL * width)
 
 
-def upscale(maps: Tensor, *, halved: bool, is_flow: bool = True) -> Tensor:
-    """(B, C, H, W) network output at the image's own resolution; flows grow with it."""
+def upscale(flow_px: Tensor, *, halved: bool) -> Tensor:
+    """(B, 2, H, W) flow at the image's own resolution."""
     if not halved:
-        return maps
-    larger = F.interpolate(maps, scale_factor=2, mode="bilinear", align_corners=False)
-    return 2 * larger if is_flow else larger
+        return flow_px
+    return 2 * F.interpolate(flow_px, scale_factor=2, mode="bilinear", align_corners=False)

@@ -10,7 +10,7 @@ from calibgraph.arrays import Array
 from calibgraph.matching.camera_pairs.find import Features, features_of, match_features
 from calibgraph.matching.camera_pairs.geometry import (
     agree_on_epipolar_geometry,
-    planes_at,
+    points_at,
     relative_pose,
 )
 from calibgraph.matching.structure.pose_refinement import CameraFrames
@@ -42,12 +42,9 @@ class CommonFeatures:
         for number, *both in self._matches[pair]:
             seen_by_other, seen_by_this = both[::-1] if swap else both
             cloud = self._frames[other].clouds[number].points_lidar_m
-            planes = planes_at(
-                seen_by_other, cloud @ T_other_lidar[:3, :3].T + T_other_lidar[:3, 3]
-            )
-            inverse = np.einsum("ni,ni->n", planes, seen_by_other)
-            near = inverse > 0  # false where there is no plane
-            points.append(seen_by_other[near] / inverse[near, None])
+            in_other_m = cloud @ T_other_lidar[:3, :3].T + T_other_lidar[:3, 3]
+            near, met = points_at(seen_by_other, in_other_m)
+            points.append(met)
             rays.append(seen_by_this[near])
         T_this_other = relative_pose(np.concatenate(points), np.concatenate(rays), seed=self._seed)
         return None if T_this_other is None else T_this_other @ T_other_lidar

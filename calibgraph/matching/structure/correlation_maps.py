@@ -22,7 +22,7 @@ from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.score_kernel import pad, score_windows
-from calibgraph.matching.structure.shift_scores import name_cells
+from calibgraph.matching.structure.shift_scores import group_windows, mean_by_group
 from calibgraph.matching.structure.visibility import find_visible
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.model.rig import Camera
@@ -172,8 +172,9 @@ def _correlate_frame(
         nothing = np.zeros((0, *image.inside.shape), np.float32)
         return CorrelationMaps(nothing, np.zeros((0, 3)), image.origin_rad, float(STEP_RAD))
     R = camera.T_camera_lidar[:3, :3]
-    order, group, centres = _group_windows(windows.rays_m[:, 0] @ R.T)
-    windows = windows.select(order)
+    centres_m = windows.rays_m[:, 0] @ R.T
+    order, group, counts = group_windows(centres_m, GROUP_RAD, OCTAVES_PER_BIN)
+    windows, centres = windows.select(order), mean_by_group(centres_m[order], group, counts)
     turned = windows.rays_m @ R.T
     angles = view_angles(turned.reshape(-1, 3)).reshape(*turned.shape[:2], 2)
     off_centre = angles - view_angles(centres)[group][:, None]
@@ -249,17 +250,3 @@ def _to_angular_image(image: PreparedImage, camera: Camera) -> _AngularImage:
     )
     origin_rad = np.array([azimuth[columns[0]], elevation[rows[0]]])
     return _AngularImage(np.asarray(remapped, dtype=np.float32), seen[part], origin_rad)
-
-
-def _group_windows(centres_m: Array) -> tuple[NDArray[np.intp], NDArray[np.int32], Array]:
-    """Group windows by direction and distance.
-
-    Returns:
-        The windows (w,), by group; the group of each (w,); the groups' mean points (g, 3).
-    """
-    octaves = np.log2(np.linalg.norm(centres_m, axis=1)) / OCTAVES_PER_BIN
-    cells = np.column_stack([view_angles(centres_m) / GROUP_RAD, octaves])
-    _, group, counts = np.unique(name_cells(cells), return_inverse=True, return_counts=True)
-    sums = [np.bincount(group, column, minlength=len(counts)) for column in centres_m.T]
-    order = np.argsort(group, kind="stable")
-    return order, group[order].astype(np.int32), np.stack(sums, axis=1) / counts[:, None]

@@ -39,31 +39,6 @@ OCCLUSION_SPACINGS = 1.5  # occlusion cell in sample spacings: about one sample 
 
 
 @dataclass(frozen=True, eq=False)
-class ViewedWindows:
-    """The windows of a cloud that one image shows, by groups of one direction and depth.
-
-    Attributes:
-        camera: where it is when it takes the middle row, see :func:`when_taken`.
-        windows: w of them, by group.
-        group: (w,) the group of each.
-        image: logarithm of gray, a pixel per step, padded.
-        steps_per_px: (2,) of u and v.
-        places: (w, l, 2) where the image shows their members [steps].
-        points_lidar_m: (g, 3) each group's mean point, in the LiDAR frame of the cloud.
-        seen_lidar_m: (g, 3) the same, where a rolling shutter sees it.
-    """
-
-    camera: Camera
-    windows: Windows
-    group: NDArray[np.int32]
-    image: NDArray[np.float32]
-    steps_per_px: Array
-    places: NDArray[np.int32]
-    points_lidar_m: Array
-    seen_lidar_m: Array
-
-
-@dataclass(frozen=True, eq=False)
 class ShiftScores:
     """Score grids of the groups of one camera.
 
@@ -112,61 +87,32 @@ def score_frame(  # noqa: PLR0913 - what is scored, and how
 
     With the twist of the LiDAR, (6,), when the camera takes it.
     """
-    seen = view_windows(
-        gray, cloud, camera, level, max_windows=max_windows, twist_per_s=twist_per_s
-    )
-    scale, weight = seen.steps_per_px, seen.windows.weight
-    reach, groups = _reach_steps(camera, level, scale), len(seen.points_lidar_m)
-    grids: Grids = mmap_zeros((groups, 2 * reach + 1, 2 * reach + 1), np.float32)
-    _add_scores(grids, seen, likelihood=level.fine)
-    lens, T = Columns(seen.camera.lens), seen.camera.T_camera_lidar
-    pixels_px, fields_of_pose = fields_px(seen.seen_lidar_m, T, lens)
-    jacobian_px = np.ascontiguousarray(fields_of_pose.transpose(2, 1, 0))
-    return ShiftScores(
-        grids=grids,
-        jacobian=jacobian_px * scale[:, None],
-        points_lidar_m=seen.points_lidar_m,
-        pixels_px=pixels_px,
-        frame=np.full(groups, frame, np.int64),
-        weights=np.bincount(seen.group, weight, minlength=groups).astype(np.float64),
-        steps_per_px=scale,
-    )
-
-
-def view_windows(  # noqa: PLR0913 - what is seen, and how
-    gray: PreparedImage,
-    cloud: PreparedCloud,
-    camera: Camera,
-    level: Level,
-    *,
-    max_windows: int,
-    twist_per_s: Array | None = None,
-) -> ViewedWindows:
-    """Select and group the windows that an image shows, and find where it shows them.
-
-    With the twist of the LiDAR, (6,), when the camera takes it.
-    """
     camera = when_taken(camera, twist_per_s)
     image, scale = gray.padded_log_gray(camera, level.step_rad, level.blur_steps)
     windows = select_windows(cloud, camera, level, max_windows=max_windows)
     T, viewpoint_m = camera.T_camera_lidar, cloud.viewpoint_lidar_m(camera)
-    centres_lidar_m = windows.rays_m[:, 0] + viewpoint_m
-    kept, group, groups = group_windows(centres_lidar_m @ T[:3, :3].T + T[:3, 3], level.group_rad)
-    windows, centres_lidar_m = windows.select(kept), centres_lidar_m[kept]
-    rays_m, seen_m = windows.rays_m, centres_lidar_m
-    if twist_per_s is not None and camera.readout_s:
+    centres_m = windows.rays_m[:, 0] + viewpoint_m
+    kept, group, counts = group_windows(
+        centres_m @ T[:3, :3].T + T[:3, 3], level.group_rad, OCTAVES_PER_BIN, MIN_GROUP_WINDOWS
+    )
+    windows, centres_m = windows.select(kept), centres_m[kept]
+    rays_m, seen_m = windows.rays_m, centres_m
+    if twist_per_s is not None and camera.readout_s:  # where a rolling shutter sees them
         moved_m = seen_at_rows(camera, rays_m + viewpoint_m, twist_per_s)
         rays_m, seen_m = (moved_m - viewpoint_m).astype(np.float32), moved_m[:, 0]
-    counts = np.bincount(group, minlength=groups)
-    return ViewedWindows(
-        camera=camera,
-        windows=windows,
-        group=group,
-        image=image,
+    side = 2 * _reach_steps(camera, level, scale) + 1
+    grids: Grids = mmap_zeros((len(counts), side, side), np.float32)
+    places = find_places(rays_m, viewpoint_m, camera, scale)
+    _add_scores(grids, image, places, windows, group, likelihood=level.fine)
+    pixels_px, fields = fields_px(mean_by_group(seen_m, group, counts), T, Columns(camera.lens))
+    return ShiftScores(
+        grids=grids,
+        jacobian=np.ascontiguousarray(fields.transpose(2, 1, 0)) * scale[:, None],
+        points_lidar_m=mean_by_group(centres_m, group, counts),
+        pixels_px=pixels_px,
+        frame=np.full(len(counts), frame, np.int64),
+        weights=np.bincount(group, windows.weight, minlength=len(counts)).astype(np.float64),
         steps_per_px=scale,
-        places=find_places(rays_m, viewpoint_m, camera, scale),
-        points_lidar_m=_mean_by_group(centres_lidar_m, group, counts),
-        seen_lidar_m=_mean_by_group(seen_m, group, counts),
     )
 
 
@@ -241,21 +187,21 @@ def pad_grids(scores: Sequence[ShiftScores]) -> list[ShiftScores]:
 
 
 def group_windows(
-    centres_camera_m: Array, cell_rad: float
-) -> tuple[NDArray[np.intp], NDArray[np.int32], int]:
-    """Group windows by direction and depth; groups of too few windows are dropped.
+    centres_m: Array, cell_rad: float, octaves_per_bin: float, least: int = 1
+) -> tuple[NDArray[np.intp], NDArray[np.int32], NDArray[np.int64]]:
+    """Group windows by direction and distance; groups of less than ``least`` are dropped.
 
     Returns:
-        The kept windows (k,), by group; the group of each (k,); and the number of groups.
+        The kept windows (k,), by group; the group of each (k,); and the windows of each (g,).
     """
-    octaves = np.log2(np.linalg.norm(centres_camera_m, axis=1)) / OCTAVES_PER_BIN
-    cells = np.column_stack([view_angles(centres_camera_m) / cell_rad, octaves])
+    octaves = np.log2(np.linalg.norm(centres_m, axis=1)) / octaves_per_bin
+    cells = np.column_stack([view_angles(centres_m) / cell_rad, octaves])
     _, cell, sizes = np.unique(name_cells(cells), return_inverse=True, return_counts=True)
-    full = sizes >= MIN_GROUP_WINDOWS
+    full = sizes >= least
     kept = np.flatnonzero(full[cell])
     group = (np.cumsum(full) - 1)[cell[kept]]
     order = np.argsort(group, kind="stable")
-    return kept[order], group[order].astype(np.int32), int(np.count_nonzero(full))
+    return kept[order], group[order].astype(np.int32), sizes[full]
 
 
 def name_cells(places: Array) -> NDArray[np.int64]:
@@ -268,22 +214,30 @@ def name_cells(places: Array) -> NDArray[np.int64]:
     return np.asarray((cells[:, 0] * rows + cells[:, 1]) * columns + cells[:, 2])
 
 
-def _mean_by_group(points: Array, group: NDArray[np.int32], counts: NDArray[np.int64]) -> Array:
+def mean_by_group(points: Array, group: NDArray[np.int32], counts: NDArray[np.int64]) -> Array:
+    """(g, 3) the mean of each group's points."""
     sums = [np.bincount(group, column, minlength=len(counts)) for column in points.T]
     return np.stack(sums, axis=1) / counts[:, None]
 
 
-def _add_scores(grids: Grids, seen: ViewedWindows, *, likelihood: bool) -> None:
+def _add_scores(
+    grids: Grids,
+    image: NDArray[np.float32],
+    places: NDArray[np.int32],
+    windows: Windows,
+    group: NDArray[np.int32],
+    *,
+    likelihood: bool,
+) -> None:
     """Add the windows' scores to their groups' grids, above their mean.
 
     At coarse levels that is of all shifts: poses that take few windows out of the image are better
     ones to propose.
     """
-    windows, reach = seen.windows, (grids.shape[1] - 1) // 2
-    at = seen.places, windows.counts
-    origin, shape = np.array([-reach, -reach]), np.subtract(seen.image.shape, (LINES, LANES))
-    score_windows(seen.image, *at, windows.basis, seen.group, origin, likelihood, grids)
+    at, reach = (places, windows.counts), (grids.shape[1] - 1) // 2
+    origin, shape = np.array([-reach, -reach]), np.subtract(image.shape, (LINES, LANES))
+    score_windows(image, *at, windows.basis, group, origin, likelihood, grids)
     if likelihood:
-        centre_grids(shape, *at, seen.group, origin, grids)
+        centre_grids(shape, *at, group, origin, grids)
     else:
         grids -= grids.mean(axis=(1, 2), keepdims=True)

@@ -9,9 +9,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from calibgraph import BagOptions, DatasetError, calibrate, evaluate, load_dataset, load_rig
+from calibgraph import BagOptions, DatasetError, load_dataset, load_rig
 from calibgraph.io.bags.point_clouds import timed_points_of
-from calibgraph.io.frame import ScanMotion, frame_of_entry
+from calibgraph.io.frame import frame_of_entry
 from calibgraph.matching import places
 from calibgraph.model.geometry import invert
 from calibgraph.trust.inputs import find_doubts
@@ -206,57 +206,3 @@ def test_times_that_are_none_are_refused() -> None:
     rows["time"] = 7.0, np.nan
     with pytest.raises(DatasetError, match="time: times from .* are not those of one scan"):
         timed_points_of(MAKE.cloud(rows, START_NS), "here")
-
-
-def driven_sample(folder: Path) -> Path:
-    """The sample as a bag of a vehicle that drives at 8 to 12 m/s in every frame, and turns."""
-    data, rng = load_dataset(SAMPLE), np.random.default_rng(7)
-    tree = MAKE.transforms(tree_of(RIG))
-    written = [Stamped("/tf_static", "tf2_msgs/msg/TFMessage", START_NS, tree)]
-    for name, camera in RIG.cameras.items():
-        info = MAKE.camera_info(camera, f"{name}_optical")
-        topic = f"/{name}/camera_info"
-        written.append(Stamped(topic, "sensor_msgs/msg/CameraInfo", START_NS, info))
-    for number, frame in enumerate(data.frames):
-        stamp_ns = START_NS + number * 10 * 10**9
-        twist = np.array([0, 0, rng.uniform(-0.4, 0.4), rng.uniform(8, 12), 0, 0])
-        cloud = MAKE.cloud(turned_scan(frame.load_cloud(), twist), stamp_ns)
-        written.append(Stamped("/points", "sensor_msgs/msg/PointCloud2", stamp_ns, cloud))
-        for name, path in frame.image_paths.items():
-            taken_ns = stamp_ns + int(IMAGE_S * 1e9)
-            jpeg = MAKE.compressed(path.read_bytes(), "jpeg", taken_ns)
-            topic = f"/{name}/image_raw/compressed"
-            written.append(Stamped(topic, "sensor_msgs/msg/CompressedImage", stamp_ns, jpeg))
-        for tick in range(-10, 20):
-            T = gtsam.Pose3.Expmap(twist * tick * 0.02).matrix()
-            stamped = MAKE.transforms([("odom", "base", T)]).transforms[0]
-            tick_ns = stamp_ns + tick * 20_000_000
-            stamped.header.stamp = MAKE.header(tick_ns, "").stamp
-            written.append(Stamped("/odom", "nav_msgs/msg/Odometry", tick_ns, odometry_of(stamped)))
-    return write_bag(folder, "mcap", sorted(written, key=lambda each: each.record_ns))
-
-
-def turned_scan(cloud: np.ndarray, twist_base: np.ndarray) -> np.ndarray:
-    """A cloud of the instant of the images, as a LiDAR that moves sees it in a turn of 0.1 s."""
-    times = (np.pi - np.arctan2(cloud[:, 1], cloud[:, 0])) / (2 * np.pi) * 0.1
-    twist = gtsam.Pose3(invert(T_BASE_LIDAR)).AdjointMap() @ twist_base
-    at_image = ScanMotion(tuple(-twist), to_s=0.0)  # the inverse of the correction
-    rows = np.zeros(
-        len(cloud),
-        [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("time", "<f4")],
-    )
-    moved = at_image.correct(cloud[:, :3], times - IMAGE_S)
-    rows["x"], rows["y"], rows["z"] = moved.T
-    rows["intensity"], rows["time"] = cloud[:, 3], times
-    return rows
-
-
-@pytest.mark.slow
-def test_a_calibration_while_driving_is_right_if_scans_are_corrected(tmp_path: Path) -> None:
-    bag, truth = driven_sample(tmp_path), load_rig(SAMPLE / "reference.yaml")
-    errors = {}
-    for motion in ("none", "odometry"):
-        data = load_dataset(bag, bag=BagOptions(motion=motion))  # type: ignore[arg-type]
-        found = evaluate(calibrate(data).rig, truth).cameras.values()
-        errors[motion] = max(error.translation_error_cm for error in found)
-    assert errors["odometry"] < 2.0 < errors["none"]

@@ -20,7 +20,6 @@ from calibgraph import (
     Dataset,
     DatasetError,
     FileError,
-    calibrate,
     load_dataset,
     load_rig,
 )
@@ -62,27 +61,6 @@ def test_frames_of_a_bag_equal_those_of_the_folder(tmp_path: Path, kind: str, ra
     require_same_frames(data.select("::5"), folder.select("::5"))
     paths = [frame.cloud_path for frame in data.frames]
     assert len({hash_source(path) for path in paths}) == len(paths)
-
-
-@pytest.mark.realdata
-@pytest.mark.parametrize("kind", KINDS)
-def test_recorded_frames_are_the_same_from_a_bag(tmp_path: Path, realdata: Path, kind: str) -> None:
-    folder = load_dataset(realdata / "kitti_odometry" / "sequences" / "05", frames="0:3")
-    for raw in (False, True):
-        bag = sample_bag(tmp_path / str(raw), kind, data=folder, raw=raw)
-        require_same_frames(load_dataset(bag), folder)
-
-
-@pytest.mark.slow
-def test_a_calibration_from_a_bag_equals_that_from_the_folder(tmp_path: Path) -> None:
-    rig = load_rig(SAMPLE)
-    results = [calibrate(data, rig) for data in (sample_bag(tmp_path, "mcap"), SAMPLE)]
-    for name in rig.cameras:
-        one, two = (result.T_camera_lidar[name] for result in results)
-        np.testing.assert_array_equal(one, two)
-        np.testing.assert_array_equal(*(result.covariance[name] for result in results))
-    assert results[0].verdict.status == results[1].verdict.status
-    assert list(results[0].inputs) != list(results[1].inputs)
 
 
 Change = Callable[[Stamped], Stamped | None]
@@ -206,23 +184,6 @@ def test_bags_and_folders_form_one_problem(tmp_path: Path) -> None:
     assert numbers(data) == list(range(12))
     assert data.frames[6].name == f"drive.bag/{START_NS}"
     assert data.neighbour(data.frames[5], 1) is None
-
-
-def test_times_of_points_are_noticed(tmp_path: Path) -> None:
-    make = Messages("mcap")
-
-    def with_times(each: Stamped) -> Stamped:
-        if each.topic != POINTS:
-            return each
-        points = np.zeros(50, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4")])
-        points["x"] = 5.0
-        return replace(each, content=make.cloud(points, stamp_of(each)))
-
-    data = load_dataset(recording(tmp_path, with_times))
-    assert data.notes[-1].endswith(
-        "points have a t: unless they are corrected for motion, give --motion odometry, tf or "
-        "scans, or stand still"
-    )
 
 
 @pytest.mark.parametrize(

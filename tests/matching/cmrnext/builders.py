@@ -32,11 +32,6 @@ def good_content(architecture: Architecture | None = None, **config: Any) -> dic
     return {"config": CONFIG | config, "epoch": 150, "state_dict": state, "train_loss": 0.5}
 
 
-def nll_content() -> dict[str, Any]:
-    """The content of a checkpoint with an uncertainty head."""
-    return good_content(Architecture(width=8, uncertainty="nll"), uncertainty=True)
-
-
 def saved(path: Path, content: Any) -> Path:
     torch.save(content, path)
     return path

@@ -101,9 +101,7 @@ def upsampled(s: State, h: Tensor, values: Tensor) -> Tensor:
     return out
 
 
-def flow_and_sigma(
-    state: State, rgb: Tensor, lidar: Tensor, *, context: str, iterations: int
-) -> tuple[Tensor, Tensor | None]:
+def flow_of(state: State, rgb: Tensor, lidar: Tensor, *, context: str, iterations: int) -> Tensor:
     f_lidar, f_image = (
         encoder(part(state, "fnet_lidar"), lidar),
         encoder(part(state, "fnet_img"), rgb),
@@ -111,22 +109,14 @@ def flow_and_sigma(
     raw = encoder(part(state, "cnet"), lidar if context == "lidar" else rgb)
     h, c = raw.chunk(2, dim=1)
     h, c = h.tanh(), c.relu()
-    h_frozen = h
-    s, frozen = part(state, "update_block"), part(state, "update_block_unc")
+    s = part(state, "update_block")
     rows, columns = torch.meshgrid(
         torch.arange(h.shape[2]), torch.arange(h.shape[3]), indexing="ij"
     )
     grid = torch.stack([columns, rows])[None].float().expand(len(h), -1, -1, -1)
-    flow, raw_sigma = torch.zeros_like(grid), None
+    flow = torch.zeros_like(grid)
     for _ in range(iterations):
         corr = lookup(f_lidar, f_image, grid + flow)
-        if frozen:
-            h_frozen = update(frozen, h_frozen, c, corr, flow)
-            raw_sigma = head(frozen, h_frozen)
         h = update(s, h, c, corr, flow)
-        delta = head(s, h)
-        flow = flow + delta[:, :2]
-        if delta.shape[1] == 4:
-            raw_sigma = delta[:, 2:]
-    sigma = None if raw_sigma is None else upsampled(s, h, F.elu(raw_sigma) + 2)
-    return upsampled(s, h, 8 * flow), sigma
+        flow = flow + head(s, h)
+    return upsampled(s, h, 8 * flow)

@@ -92,7 +92,7 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "another context than in its config": (
         changed_config(context_encoder="rgb"), "context rgb",
     ),
-    "uncertainty that is not there": (changed_config(uncertainty=True), "uncertainty nll"),
+    "an uncertainty head": (changed_config(uncertainty=True), "uncertainty: "),
     "reflectance that is not there": (changed_config(use_reflectance=True), "reflectance True"),
     "flow of the other sign": (changed_config(al_contrario=True), "al_contrario"),
     "an evidential head": (

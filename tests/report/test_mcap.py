@@ -1,8 +1,7 @@
-"""Recordings for Rerun and Foxglove, read back by the formats' own readers."""
+"""Recordings for viewers, read back by the format's own reader."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,18 +22,15 @@ from calibgraph import (
     solve,
 )
 from calibgraph.model.geometry import invert
-from calibgraph.view.scene import project_cloud
+from calibgraph.report.mcap_file import project_cloud
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
 
-pytest.importorskip("rerun")
 pytest.importorskip("foxglove")
 pytest.importorskip("mcap_protobuf")  # reads what foxglove-sdk writes
 
 FRAMES = 2
 CAMERA = "left"
-Entities = Mapping[tuple[str, int | None], Mapping[str, Any]]
-"""The components of each entity at each frame; frame None: at all times."""
 
 
 @pytest.fixture(scope="module")
@@ -45,19 +41,6 @@ def result() -> Calibration:
     solved = solve(perturb(truth, rotation_deg=2, translation_m=0.2, seed=1), table)
     frames = load_dataset(SAMPLE, truth).frames[:FRAMES]
     return replace(solved, frames=tuple(frame.entry() for frame in frames))
-
-
-def read_rerun(path: Path) -> Entities:
-    from rerun.chunk import RrdReader
-
-    reader = RrdReader(path)
-    assert [entry.application_id for entry in reader.recordings()] == ["calibgraph"]
-    found: dict[tuple[str, int | None], dict[str, Any]] = {}
-    for chunk in reader.stream().to_chunks():
-        for row in chunk.to_record_batch().to_pylist():
-            place = found.setdefault((chunk.entity_path, row.get("frame")), {})
-            place.update({name: value for name, value in row.items() if value is not None})
-    return found
 
 
 def read_mcap(path: Path) -> list[tuple[str, str, int, Any]]:
@@ -75,11 +58,6 @@ def read_mcap(path: Path) -> list[tuple[str, str, int, Any]]:
 
 
 @pytest.fixture(scope="module")
-def entities(result: Calibration, tmp_path_factory: pytest.TempPathFactory) -> Entities:
-    return read_rerun(calibgraph.write_rerun(result, tmp_path_factory.mktemp("rerun") / "view.rrd"))
-
-
-@pytest.fixture(scope="module")
 def messages(
     result: Calibration, tmp_path_factory: pytest.TempPathFactory
 ) -> list[tuple[str, str, int, Any]]:
@@ -89,36 +67,6 @@ def messages(
 def cloud_of(result: Calibration, number: int) -> np.ndarray:
     cloud = np.load(result.frames[number]["cloud"])[:, :3]
     return cloud[np.isfinite(cloud).all(axis=1)]
-
-
-def test_rerun_has_the_cloud_and_image_of_every_frame(
-    entities: Entities, result: Calibration
-) -> None:
-    for number in range(FRAMES):
-        points = np.array(entities["/lidar", number]["Points3D:positions"])
-        np.testing.assert_array_equal(points, cloud_of(result, number))
-        (blob,) = entities[f"/images/{CAMERA}", number]["EncodedImage:blob"]
-        image = cv2.imdecode(np.frombuffer(bytes(blob), np.uint8), cv2.IMREAD_COLOR)
-        recorded = cv2.imread(result.frames[number]["images"][CAMERA])
-        assert np.abs(image.astype(int) - recorded).mean() < 3  # encoded once more
-    assert {frame for entity, frame in entities if entity == "/lidar"} == {None, 0, 1}
-
-
-@pytest.mark.parametrize("when", ["before", "after"])
-def test_rerun_draws_points_where_the_lens_projects_them(
-    when: str, entities: Entities, result: Calibration
-) -> None:
-    rig = result.initial_rig if when == "before" else result.rig
-    expected, _ = project_cloud(rig.cameras[CAMERA], cloud_of(result, 1))
-    pixels = np.array(entities[f"/images/{CAMERA}/{when}", 1]["Points2D:positions"])
-    # Rerun counts pixels from the corner of the first one; float32.
-    np.testing.assert_allclose(pixels, expected + 0.5, atol=1e-4)
-    assert len(pixels) > 1000
-    (T,) = entities[f"/lidar/{when}/{CAMERA}", None]["Transform3D:translation"]
-    np.testing.assert_allclose(T, invert(rig.T_camera_lidar[CAMERA])[:3, 3], atol=1e-6)
-    (R,) = entities[f"/lidar/{when}/{CAMERA}", None]["Transform3D:mat3x3"]
-    columns = np.reshape(R, (3, 3)).T  # stored column by column
-    np.testing.assert_allclose(columns, invert(rig.T_camera_lidar[CAMERA])[:3, :3], atol=1e-6)
 
 
 def test_mcap_has_cloud_image_lens_and_points(
@@ -166,20 +114,21 @@ def test_mcap_places_the_optical_frames_in_the_lidar_s(
 
 
 def test_a_result_without_frames_has_nothing_to_show(result: Calibration, tmp_path: Path) -> None:
-    for write in (calibgraph.write_rerun, calibgraph.write_mcap):
-        with pytest.raises(CalibrationError, match="names no images and clouds"):
-            write(replace(result, frames=()), tmp_path / "file")
+    with pytest.raises(CalibrationError, match="names no images and clouds"):
+        calibgraph.write_mcap(replace(result, frames=()), tmp_path / "file")
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_writes_both(call: Call, result: Calibration, tmp_path: Path) -> None:
+def test_the_command_writes_it_in_place_of_the_page(
+    call: Call, result: Calibration, tmp_path: Path
+) -> None:
     result.save(tmp_path / "result")
-    rrd, mcap = tmp_path / "a.rrd", tmp_path / "a.mcap"
-    code, _, err = call("report", tmp_path / "result", "--rerun", rrd, "--mcap", mcap)
+    mcap = tmp_path / "a.mcap"
+    code, _, err = call("report", tmp_path / "result", "--mcap", mcap)
     assert code == 0
-    assert f"{rrd}: written; the verdict is {result.verdict.status}\n" in err
+    assert f"{mcap}: written; the verdict is {result.verdict.status}\n" in err
     assert not (tmp_path / "result" / "report.html").exists()
     assert len(read_mcap(mcap)) == FRAMES * (3 + 4 * len(result.rig.cameras))
-    assert "is there already" in error_line(*call("report", tmp_path / "result", "--rerun", rrd))
+    assert "is there already" in error_line(*call("report", tmp_path / "result", "--mcap", mcap))
     said = error_line(*call("report", tmp_path / "result", "--mcap", tmp_path / "a.bag"))
     assert "must end in .mcap" in said

@@ -1,19 +1,24 @@
-"""An MCAP file of a result for Foxglove, with Foxglove's own message types."""
+"""An MCAP file of a result for Foxglove, with Foxglove's own message types. Rerun opens it, too."""
 
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from calibgraph.errors import needs_extra
+from calibgraph.arrays import Array
+from calibgraph.errors import CalibrationError, needs_extra
 from calibgraph.files import write_atomically
+from calibgraph.io.frame import Frame, frame_of_entry
 from calibgraph.io.rig_parts import quaternion_xyzw
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.clock import when_taken
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
 from calibgraph.progress import Progress, no_progress
-from calibgraph.view.scene import Projected, ViewFrame, read_frames, state_verdict
+from calibgraph.report.page_overlays import Image, depth_colours, visible_points
 
 with needs_extra("view", "--mcap needs foxglove-sdk"):
     import foxglove
@@ -27,6 +32,8 @@ LIDAR_FRAME = "lidar"
 _DISTORTIONS = {"fisheye": "kannala_brandt"}
 _RATIONAL = 8  # coefficients
 _DOT_PX = 3.0
+_MAX_POINTS = 20_000  # on an image: viewers draw each
+_JPEG_QUALITY = 90
 _LEVELS = {"PASS": "Info", "WARN": "Warning", "FAIL": "Error"}
 _XYZ_RGBA = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)])
 
@@ -40,8 +47,14 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
     (ImageAnnotations), ``/verdict`` (Log).
 
     Raises:
-        CalibrationError: if foxglove-sdk is missing, or an image or cloud cannot be read.
+        CalibrationError: if foxglove-sdk is missing, the result names no frames, or an image or
+            cloud cannot be read.
     """
+    if not result.frames:
+        raise CalibrationError(
+            "the result names no images and clouds, as that of a table; give those that the table "
+            "was made from with --dataset"
+        )
     path, context, opened = Path(path), foxglove.Context(), dict[str, Any]()
 
     def write(temporary: Path) -> None:
@@ -50,10 +63,10 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
             temporary.open("wb") as file,
             foxglove.open_mcap(file, context=context, writer_options=options),
         ):
-            for done, frame in enumerate(read_frames(result)):
-                progress(f"frame {frame.name}", done, len(result.frames))
+            for done, entry in enumerate(result.frames):
+                progress(f"frame {done}", done, len(result.frames))
                 at = m.Timestamp(done * SECONDS_PER_FRAME, 0)
-                for topic, message in _messages(frame, at, result):
+                for topic, message in _messages(frame_of_entry(entry), at, result):
                     if topic not in opened:
                         kind = getattr(channels, f"{type(message).__name__}Channel")
                         opened[topic] = kind(topic, context=context)
@@ -63,28 +76,47 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
     return path
 
 
-def _messages(frame: ViewFrame, at: m.Timestamp, result: Calibration) -> Iterator[tuple[str, Any]]:
+def _messages(frame: Frame, at: m.Timestamp, result: Calibration) -> Iterator[tuple[str, Any]]:
     """The topics and messages of a frame."""
     level = getattr(m.LogLevel, _LEVELS[result.verdict.status])
-    text = state_verdict(result)
+    text = "\n".join([result.verdict.status, *result.verdict.reasons])
+    points = frame.load_cloud()[:, :3]
+    points = np.ascontiguousarray(points[np.isfinite(points).all(axis=1)], np.float32)
     yield "/tf", _transforms(result, at)
-    yield "/lidar", _cloud(frame, at)
+    yield "/lidar", _cloud(points, at)
     yield "/verdict", m.Log(timestamp=at, level=level, message=text, name="calibgraph")
-    for name, jpeg in frame.images.items():
+    rigs = {"before": result.initial_rig, "after": result.rig}
+    for name in filter(frame.image_paths.__contains__, result.rig.cameras):
         camera, optical = result.rig.cameras[name], f"{name}_optical_frame"
-        yield (
-            f"/{name}/image",
-            m.CompressedImage(timestamp=at, frame_id=optical, format="jpeg", data=jpeg),
-        )
+        image = frame.load_image(name, camera)
+        _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        jpeg = m.CompressedImage(timestamp=at, frame_id=optical, format="jpeg", data=data.tobytes())
+        yield f"/{name}/image", jpeg
         if camera.model in ("pinhole", "fisheye"):  # Foxglove has no others
             yield f"/{name}/calibration", _lens(camera, optical, at)
-        for when, points in frame.projected[name].items():
-            yield f"/{name}/{when}", _annotations(points, at)
+        for when, rig in rigs.items():
+            seen = project_cloud(when_taken(rig.cameras[name], frame.twist_per_s), points)
+            yield f"/{name}/{when}", _annotations(*seen, at)
 
 
-def _cloud(frame: ViewFrame, at: m.Timestamp) -> Any:
-    packed = np.empty(len(frame.points_lidar_m), _XYZ_RGBA)
-    packed["xyz"], packed["rgba"][:, :3] = frame.points_lidar_m, frame.colours
+def project_cloud(camera: Camera, points_lidar_m: NDArray[np.float32]) -> tuple[Array, Image]:
+    """The points of a cloud (n, 3) on a camera's image, an even choice of very many.
+
+    Returns:
+        (k, 2) pixels, and (k, 3) RGB colours by distance, 0 to 255.
+    """
+    points, pixels = visible_points(points_lidar_m.astype(np.float64), camera)
+    step = max(1, -(-len(pixels) // _MAX_POINTS))
+    return pixels[::step], _by_distance(points[::step])
+
+
+def _by_distance(points: NDArray[np.floating]) -> Image:
+    return depth_colours(np.asarray(np.linalg.norm(points, axis=1), np.float64))[:, ::-1]
+
+
+def _cloud(points: NDArray[np.float32], at: m.Timestamp) -> Any:
+    packed = np.empty(len(points), _XYZ_RGBA)
+    packed["xyz"], packed["rgba"][:, :3] = points, _by_distance(points)
     packed["rgba"][:, 3] = 255
     number, byte = m.PackedElementFieldNumericType.Float32, m.PackedElementFieldNumericType.Uint8
     numbers = [(name, 4 * i, number) for i, name in enumerate("xyz")]
@@ -135,8 +167,7 @@ def _lens(camera: Camera, frame_id: str, at: m.Timestamp) -> Any:
     )
 
 
-def _annotations(points: Projected, at: m.Timestamp) -> Any:
-    pixels_px, colours = points
+def _annotations(pixels_px: Array, colours: Image, at: m.Timestamp) -> Any:
     one = m.PointsAnnotation(
         timestamp=at,
         type=m.PointsAnnotationType.Points,

@@ -1,1 +1,0 @@
-"""A result for viewers: Rerun recordings, and MCAP files for Foxglove."""
