@@ -146,7 +146,8 @@ def load_dataset(
         prefix = f"{path.name}/" if len(data.folders) > 1 else ""
         start = 1 + max((frame.index for frame in recorded), default=-1)
         found = (
-            frames_of_bag(path, data.rig.cameras, bag, start=start, prefix=prefix) if is_bag(path)
+            frames_of_bag(path, data.rig.cameras, bag, lidars=data.rig.all_lidars, start=start,
+                          prefix=prefix) if is_bag(path)
             else _frames_of_files(path, data.rig, start, prefix, complete=frames is None,
                                   tolerance_s=bag.sync_tolerance_s, interval_s=interval_s)
         )  # fmt: skip
@@ -189,9 +190,8 @@ def _frames_of_files(
     complete: bool, tolerance_s: float, interval_s: float | None,
 ) -> FoundFrames:  # fmt: skip
     """The frames of a folder; the complete ones where names are stamps."""
-    lidars = [rig.lidar, *rig.other_lidars] if rig.lidars else []
     files, pairing = frames_of_folder(
-        path, [*rig.cameras], lidars=lidars, complete=complete, sync_tolerance_s=tolerance_s
+        path, [*rig.cameras], lidars=rig.all_lidars, complete=complete, sync_tolerance_s=tolerance_s
     )
     frames = tuple(
         Frame(

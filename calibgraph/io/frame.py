@@ -193,7 +193,10 @@ class Frame:
 
     def load_lidar(self, name: str) -> NDArray[np.float32]:
         """(n, 4) the cloud of another LiDAR, as it was recorded, in its own frame."""
-        return load_cloud(self.lidar_paths[name])
+        path = self.lidar_paths[name]
+        if path.suffix == MESSAGE_SUFFIX:
+            return with_intensity(load_bag_cloud(path))
+        return load_cloud(path)
 
     def describe_cloud(self) -> list[str]:
         """Notes about its cloud; none if it cannot be read, which is named where it is loaded."""

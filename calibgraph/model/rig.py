@@ -399,6 +399,11 @@ class Rig(_Model):
         return {name: T for name, T in known.items() if T is not None}
 
     @property
+    def all_lidars(self) -> tuple[str, ...]:
+        """Names of several LiDARs, the base first; empty if the rig names none."""
+        return (self.lidar, *self.other_lidars) if self.lidars else ()
+
+    @property
     def other_lidars(self) -> tuple[str, ...]:
         """Names of the LiDARs but the base."""
         return tuple(name for name in self.lidars or {} if name != self.lidar)
