@@ -74,9 +74,6 @@ def print_result(
         )
     if result.vehicle_sigmas is not None:
         console.print(vehicle_table(result))
-        for line in result.warnings:
-            if line.startswith("the recording cannot tell"):
-                console.out(line, highlight=False)
     console.out(f"{elapsed_s:.1f} s; written:", highlight=False)
     for path in written:
         console.out(f"  {path}", highlight=False)

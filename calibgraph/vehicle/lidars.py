@@ -39,7 +39,8 @@ PLACE_SIGMAS = np.repeat([np.radians(0.1), 0.015], 3)
 """(6,) [rad, m]: prior of what a LiDAR's pose differs between places, beyond what cells show: a car
 whose clouds are 10 ms apart at 1.5 m/s. Results of tilted domes differ by 1 to 2 cm, 0.2 deg."""
 _PLACE_DOF = 3.0  # of that prior: one place
-_GUESS_SIGMAS = np.repeat([np.radians(10.0), 1.0], 3)  # of a direction that no plane determines
+GUESS_SIGMAS = np.repeat([np.radians(10.0), 1.0], 3)
+"""(6,) [rad, m] of a direction that no plane determines."""
 _EXACT = 1e-18  # [m^2, rad^2] least variance, for rounding
 _SETTLED, _MOST_STEPS = 0.01, 50  # of REML
 
@@ -58,7 +59,6 @@ class LidarPoses:
             base's axes: R = exp(rotation) R_estimate, t = t_estimate + translation, t being the
             position of the LiDAR.
         joint_covariance: (6 k, 6 k) of them all, in their order.
-        loose: per LiDAR but the base, the share of each axis of xi that no plane determines (0-1).
         matched: per LiDAR, the share of its planes near others' that lie on them (0-1).
         places: their number.
         place_ratios: variance of rotation and translation between places over its prior.
@@ -68,7 +68,6 @@ class LidarPoses:
     T_base_lidar: Mapping[str, Array]
     covariance: Mapping[str, Array]
     joint_covariance: Array
-    loose: Mapping[str, Array]
     matched: Mapping[str, float]
     places: int
     place_ratios: tuple[float, float]
@@ -92,10 +91,10 @@ def calibrate_lidars(clouds: Clouds, T_base_lidar: Mapping[str, Array], *, base:
     _require_alike(clouds, T_base_lidar, names)
     planes = [[find_planes(cloud) for cloud in clouds[name]] for name in names]
     T = np.array([np.eye(4), *(np.asarray(T_base_lidar[name], np.float64) for name in names[1:])])
-    T, sums = refine_poses(planes, T, names)
+    T, _ = refine_poses(planes, T, names)
     places = [_at_place([of[i : i + 1] for of in planes], T, names) for i in range(len(planes[0]))]
     step, joint, ratios = _over_places(places)
-    T, loose = _moved(T, step), _loose(sums)
+    T = _moved(T, step)
     near, on = count_matched(planes, T)
     rows = [slice(6 * row, 6 * row + 6) for row in range(len(names) - 1)]
     return LidarPoses(
@@ -103,7 +102,6 @@ def calibrate_lidars(clouds: Clouds, T_base_lidar: Mapping[str, Array], *, base:
         dict(zip(names, T, strict=True)),
         {name: joint[of, of] for name, of in zip(names[1:], rows, strict=True)},
         joint,
-        {name: np.diag(loose)[of] for name, of in zip(names[1:], rows, strict=True)},
         dict(zip(names, (on / near).tolist(), strict=True)),
         len(places),
         ratios,
@@ -234,14 +232,6 @@ def _step(sums: Sums) -> Array:
     return np.asarray(-basis @ np.linalg.solve(hessian, basis.T @ sums.gradient.sum(axis=0)))
 
 
-def _loose(sums: Sums) -> Array:
-    """(d, d) projection onto the steps that no pair determines, across the others."""
-    hessian = sums.hessian.sum(axis=0)
-    return np.asarray(
-        np.eye(len(hessian)) - np.linalg.pinv(hessian, 1e-9, hermitian=True) @ hessian
-    )
-
-
 def _at_place(
     planes: Sequence[Sequence[Planes]], T_base_lidar: Array, names: Sequence[str]
 ) -> tuple[Array, Array]:
@@ -261,10 +251,24 @@ def _at_place(
     hessian, cells = basis.T @ whole, basis.T @ sums.hessian @ basis
     gradients = (sums.gradient @ basis)[:, :, None]
     apart = np.linalg.solve(hessian - cells, gradients)[:, :, 0]  # of a fit without the cell
-    root = np.linalg.cholesky(apart.T @ apart + _EXACT * np.eye(len(hessian)))
+    root = np.linalg.cholesky(_shrunk(apart, hessian) + _EXACT * np.eye(len(hessian)))
     seen = np.linalg.solve(hessian, whole.T)
     by = scipy.linalg.solve_triangular(root, seen, lower=True)  # (q, d)
     return by.T @ by, by.T @ by @ _steps_between(T_base_lidar, T)
+
+
+def _shrunk(apart: Array, hessian: Array) -> Array:
+    """(q, q) covariance by the (n, q) deviations of fits without each cell.
+
+    Of few cells its smallest eigenvalues are far too small. So it is shrunk towards that of
+    independent residuals, H^-1, of the same mean size, which counts as twice as many cells as there
+    are directions.
+    """
+    size, inverse = len(hessian), np.linalg.inv(hessian)
+    each = np.einsum("ni,ij,nj->n", apart, hessian, apart)
+    cells = each.sum() ** 2 / max(float((each**2).sum()), float(np.finfo(float).tiny))
+    model = each.sum() / size * (inverse + inverse.T) / 2
+    return np.asarray((cells * apart.T @ apart + 2 * size * model) / (cells + 2 * size))
 
 
 def _steps_between(T_base_lidar: Array, others: Array) -> Array:
@@ -282,7 +286,7 @@ def _over_places(
     size = len(vectors[0])
     is_turn = np.tile([True] * 3 + [False] * 3, size // 6)
     prior = np.tile(PLACE_SIGMAS**2, size // 6)
-    guess = np.tile(_GUESS_SIGMAS**-2.0, size // 6)
+    guess = np.tile(GUESS_SIGMAS**-2.0, size // 6)
     ratios = np.ones(2)
     for _ in range(_MOST_STEPS):
         variance = prior * np.where(is_turn, *ratios)

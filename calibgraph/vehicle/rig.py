@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,19 +14,20 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Lidar, Rig, Vehicle
-from calibgraph.model.verdict import Check, Verdict
+from calibgraph.model.verdict import ABOUT_THE_DATA, Check, Verdict
 from calibgraph.progress import Progress
 from calibgraph.trust.probability import TABLES, judge, probability_beyond
 from calibgraph.trust.thresholds import threshold
 from calibgraph.vehicle.frame import Road, find_road, find_vehicle
-from calibgraph.vehicle.lidars import LidarPoses, calibrate_lidars
+from calibgraph.vehicle.lidars import GUESS_SIGMAS, LidarPoses, calibrate_lidars
 from calibgraph.vehicle.start import locate_lidars
 from calibgraph.vehicle.travel import POSE_FILES, Travel, direction_of_travel, read_poses
 
 MOST_INSTANTS = 20
 """Of a recording, spread over it: more hardly narrow what places differ by."""
 
-_LOOSE = 0.01  # share of an axis that no plane determines
+_LOOSE = 0.3  # sigma of an axis over that of the guess: planes hardly determine it
+_OPEN = 0.98  # probability of an error by a bar alone: what is open is not known to be wrong
 _AXES = ("roll x", "pitch y", "yaw z", "x", "y", "z")
 _log = logging.getLogger(__name__)
 
@@ -105,7 +106,7 @@ def calibrate_rig_lidars(
         {name: lidars[name] for name in rig.lidars or {}},
         vehicle,
         poses,
-        {name: _verdict(poses, name, config.tolerance) for name in rig.other_lidars},
+        {name: judge_lidar(poses, name, config.tolerance) for name in rig.other_lidars},
         tuple(warnings),
     )
 
@@ -144,33 +145,38 @@ def _complete(frames: Sequence[Frame], rig: Rig) -> list[Frame]:
     return complete
 
 
-def _verdict(poses: LidarPoses, name: str, tolerance: tuple[float, float]) -> Verdict:
+def judge_lidar(poses: LidarPoses, name: str, tolerance: tuple[float, float]) -> Verdict:
+    """The verdict of one LiDAR for a tolerance [deg, cm].
+
+    What counts data is in the error bar, and no sign of an error.
+    """
     covariance = poses.covariance[name]
     checks = [
         threshold("lidar_matched").check(poses.matched[name]),
         threshold("lidar_instants").check(poses.places),
-        *_loose(poses.loose[name]),
+        *(_loose(covariance, poses.base) or _wide(covariance, tolerance)),
     ]
     if poses.places > 1:
         apart = float(np.sqrt(max(poses.place_ratios)))
         checks.append(threshold("lidar_places").check(apart))
-    sigmas = (
-        np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]),
-        np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]),
-    )
-    checks += [
-        threshold("sigma_rotation", tolerance).check(float(np.degrees(sigmas[0]))),
-        threshold("sigma_translation", tolerance).check(100.0 * float(sigmas[1])),
+    beyond = min(probability_beyond(covariance, tolerance), _OPEN)
+    signs = [check for check in checks if (check.kind or check.name) not in ABOUT_THE_DATA]
+    return replace(judge(signs, beyond, tolerance, TABLES), checks=tuple(checks))
+
+
+def _wide(covariance: Array, tolerance: tuple[float, float]) -> list[Check]:
+    turn, shift = (np.linalg.eigvalsh(covariance[of, of])[-1] for of in (slice(3), slice(3, 6)))
+    return [
+        threshold("sigma_rotation", tolerance).check(float(np.degrees(np.sqrt(turn)))),
+        threshold("sigma_translation", tolerance).check(100.0 * float(np.sqrt(shift))),
     ]
-    return judge(checks, probability_beyond(covariance, tolerance), tolerance, TABLES)
 
 
-def _loose(shares: Array) -> list[Check]:
-    """The axes that no plane determines, if there are any."""
-    axes = [axis for axis, share in zip(_AXES, shares, strict=True) if share > _LOOSE]
+def _loose(covariance: Array, base: str) -> list[Check]:
+    """The axes that planes hardly determine, if there are any."""
+    ratios = np.sqrt(np.diag(covariance)) / GUESS_SIGMAS
+    axes = [axis for axis, ratio in zip(_AXES, ratios, strict=True) if ratio > _LOOSE]
     if not axes:
         return []
-    text = (
-        f"no plane that two LiDARs share determines {', '.join(axes)} of the base: the guess stays"
-    )
+    text = f"no plane that LiDARs share determines {', '.join(axes)} in {base}: the guess stays"
     return [Check("undetermined direction", "WARN", text, kind="lidar_loose")]

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.vehicle.planes import Planes
 
-CELL_M = 2.0
+CELL_M = 4.0
 """Edge of the cells within which residuals err alike: the independent units."""
 
 _RELIABLE = 0.8  # of H over H without errors of normals: at places that determine all, over 0.9

@@ -82,7 +82,12 @@ def test_a_result_is_read_as_it_was_written(result: Calibration, tmp_path: Path)
 def test_the_report_has_a_table_of_lidars(result: Calibration):
     page = render_page(result)
     assert "Can this calibration of 2 LiDARs to the LiDAR top be used?" in page
-    assert "T_base_lidar of left" in page and "All LiDARs" in page and "All cameras" not in page
+    assert (
+        "T_base_lidar of left" in page
+        and "top in base_link" in page
+        and "All LiDARs" in page
+        and "All cameras" not in page
+    )
 
 
 def test_the_command_writes_and_prints_all_lidars(tmp_path: Path, call: Call):
