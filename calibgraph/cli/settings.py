@@ -19,8 +19,7 @@ class RareSettings(StrictNumbers):
         sync_tolerance_s: largest difference of the stamps of a cloud and its images; 0.05 if null.
         device: of Torch, for cmrnext; the GPU if there is one, if null.
         iterations: of each network's recurrent update; 12 if null.
-        half_resolution: whether cmrnext halves the images; as stored with the weights, else from
-            1400 px width on, if null.
+        half_resolution: whether cmrnext halves the images; from 1400 px width on, if null.
         batch: images per batch; 1 on a CPU and 4 on a GPU, if null.
     """
 

@@ -351,37 +351,30 @@ def make_updates(
 
 
 def json_lines(updates: Sequence[Update]) -> list[str]:
-    """A line of JSON of each update; units are in the keys, matrices row by row.
-
-    What frames that were taken in at once share is encoded once.
-    """
-    estimates: dict[int, dict[str, str]] = {}
+    """A line of JSON of each update; units are in the keys, matrices row by row."""
+    estimates: dict[int, dict[str, dict[str, Any]]] = {}  # of frames taken in at once: the same
     lines = []
     for update in updates:
         if (shared := id(update.verdicts)) not in estimates:
             estimates[shared] = {name: _estimate(update, name) for name in update.T_camera_lidar}
-        cameras = ", ".join(
-            f"{text}, {_of_frame(update, name)}}}" for name, text in estimates[shared].items()
-        )
-        stamp = "null" if update.stamp_ns is None else update.stamp_ns
-        head = f'"frame": {update.frame}, "stamp_ns": {stamp}'
-        events = _json([*map(_event, update.events)]) if update.events else "[]"
-        lines.append(f'{{{head}, "cameras": {{{cameras}}}, "events": {events}}}')
+        cameras = {
+            name: {**own, "used": update.used.get(name, 0), "left_out": name in update.left_out}
+            for name, own in estimates[shared].items()
+        }
+        head = {"frame": update.frame, "stamp_ns": update.stamp_ns}
+        content = {**head, "cameras": cameras, "events": [*map(_event, update.events)]}
+        try:
+            lines.append(json.dumps(content, allow_nan=False))
+        except ValueError:  # of numbers that JSON does not have
+            lines.append(json.dumps(finite(content), allow_nan=False))
     return lines
 
 
-def _json(content: Any) -> str:
-    try:
-        return json.dumps(content, allow_nan=False)
-    except ValueError:  # of numbers that JSON does not have
-        return json.dumps(finite(content), allow_nan=False)
-
-
-def _estimate(update: Update, name: str) -> str:
-    """A camera's name, and the first members of its object: those that hold for all frames."""
+def _estimate(update: Update, name: str) -> dict[str, Any]:
+    """What holds for all frames that were taken in at once."""
     covariance, verdict = update.covariance[name], update.verdicts[name]
     sigmas = None if covariance is None else np.sqrt(np.diag(covariance))
-    content = {
+    return {
         "T_camera_lidar": update.T_camera_lidar[name].tolist(),
         "covariance": None if covariance is None else covariance.tolist(),
         "rotation_sigma_deg": None if sigmas is None else np.degrees(sigmas[:3]).tolist(),
@@ -391,12 +384,6 @@ def _estimate(update: Update, name: str) -> str:
         "reasons": list(verdict.reasons),
         "actions": list(summarize({name: verdict}).actions),
     }
-    return f"{_json(name)}: {_json(content)[:-1]}"
-
-
-def _of_frame(update: Update, name: str) -> str:
-    """The other members."""
-    return f'"used": {update.used.get(name, 0)}, "left_out": {str(name in update.left_out).lower()}'
 
 
 def _event(event: Event) -> dict[str, Any]:

@@ -26,14 +26,14 @@ CLEARLY = 15.0
 _POSE = 6
 
 
-def alarm_limit(frames: float) -> float:
+def alarm_limit(frames: Array) -> Array:
     """Squared sigmas that a six-vector exceeds by chance with ALARM_CHANCE.
 
     Its covariance comes from so many frames, so this is Hotelling's distribution, not chi squared.
     """
-    freedom = max(frames - _POSE, 4.0)
-    quantile = float(fdtri(_POSE, freedom, 1 - ALARM_CHANCE))
-    return _POSE * (freedom + _POSE - 1) / freedom * quantile
+    freedom = np.maximum(frames - _POSE, 4.0)
+    quantile = fdtri(_POSE, freedom, 1 - ALARM_CHANCE)
+    return np.asarray(_POSE * (freedom + _POSE - 1) / freedom * quantile)
 
 
 def chance_limit() -> float:

@@ -57,8 +57,8 @@ class DurableCalibrator:
         self.repeated: list[Update] = []
         self._since = 0  # updates since the state that is on disk
         try:
-            if self._database.rows:
-                self._resume(folder, *self._database.rows)
+            if rows := self._database.read():
+                self._resume(folder, *rows)
                 _require_same(folder, self.tracker, rig, config or Config())
             else:
                 self.tracker = IncrementalCalibrator(begin() if begin else rig, config)

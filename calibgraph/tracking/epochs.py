@@ -49,8 +49,10 @@ def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
         _count_epoch(state, camera)
         scale = scale_of(state.histogram[camera], float(state.least[camera]), state.config)
         state.put(camera, scales=scale)
+    row_of = {name: row for row, name in enumerate(state.settled)}
+    places = np.array([row_of.get(name, -1) for name in state.at], dtype=np.int64)
     for camera in range(len(state.names)):
-        _regate(state, camera)
+        _regate(state, camera, places)
         if any(state.findings.bend_sigmas):
             bend_epoch(state, len(state.sizes) - 1, camera)
     state.sizes, state.poses = (*state.sizes, 0), np.concatenate([state.poses, newest[None]])
@@ -108,16 +110,21 @@ def _set_references(state: State, references: Array) -> None:
         state.drift = state.drift.about(steps)
 
 
-def _regate(state: State, camera: int) -> None:
+def _regate(state: State, camera: int, places: Numbers) -> None:
     """Gate and linearize a camera's frames at the newest estimates.
 
     Each at the pose that its place has, if that is known; of a drifting camera, at its epoch's.
     Frames with too few matches within the gate keep those that were.
+
+    Args:
+        state: of the tracker.
+        camera: by its place in the rig.
+        places: (R,) rows of the frames' places in ``state.steps``; -1: not known.
     """
     own, scale = state.matches_of(camera), state.scales[camera]
     if own is None:
         return
-    raw, within = own
+    raw, within = own[0], own[1].copy()
     rows = np.searchsorted(state.numbers, raw.frame_numbers)
     epochs = np.repeat(np.arange(len(state.sizes)), state.sizes)[rows]
     groups = np.where(state.walk[camera] > 0, epochs, 0)  # that are gated at one pose
@@ -130,7 +137,7 @@ def _regate(state: State, camera: int) -> None:
         if gated.enough.any():
             state.put(camera, curvature=gated.curvature(scale))
     counts = np.add.reduceat(within, raw.frame_edges[:-1], dtype=np.int64)
-    steps = _linearized_at(state, camera, rows, epochs)
+    steps = _linearized_at(state, camera, epochs, places[rows])
     poses = retract_all(np.tile(state.references[camera], (len(steps), 1, 1)), steps)
     runs = to_runs(np.concatenate([[0], counts.cumsum()]))
     here = raw.with_scale(scale).select(within).run_sums(poses, runs)
@@ -139,15 +146,13 @@ def _regate(state: State, camera: int) -> None:
     state.sums = state.sums.replace_at((rows, camera), sums)
 
 
-def _linearized_at(state: State, camera: int, rows: Numbers, epochs: Numbers) -> Array:
+def _linearized_at(state: State, camera: int, epochs: Numbers, places: Numbers) -> Array:
     """(f, 6) steps from a camera's reference to where the matches of frames are linearized."""
     if state.walk[camera]:
         poses = invert_each(state.poses[epochs, camera])
         return local_coordinates(state.references[camera], poses)
     if state.config.preset != "auto":  # Eq. 5 knows no places
-        return np.zeros((len(rows), 6))
-    row_of = {name: row for row, name in enumerate(state.settled)}
-    places = [row_of.get(state.at[row], -1) for row in rows]
+        return np.zeros((len(epochs), 6))
     return np.concatenate([state.steps[:, camera], np.zeros((1, 6))])[places]
 
 

@@ -80,7 +80,7 @@ def steps_between(
     covariance *= np.outer(inflation, inflation)
     if by_places is not None:
         covariance += by_places[np.ix_(rows, rows)]
-    limits = np.array([alarm_limit(state.total_frames[camera]) for camera in cameras])
+    limits = alarm_limit(state.total_frames[cameras])
     references = tuple(map(to_T_lidar_camera, state.references[cameras]))
     apart = np.ravel(ends[1] - ends[0])
     return (
@@ -368,8 +368,9 @@ def detect_small_step(state: State) -> DetectedStep | None:
     tested[tested] = before[tested].are_determined
     begun, cameras = (index.tolist() for index in np.nonzero(tested))
     score, covariance = _scores(before[tested], after[tested])
-    covariance *= np.array([*map(state.inflation, cameras)])[:, None, None]
-    limits = np.array([*map(alarm_limit, before.frames[tested])])
+    inflations = np.array([*map(state.inflation, range(len(state.names)))])
+    covariance *= inflations[cameras][:, None, None]
+    limits = alarm_limit(before.frames[tested])
     sigmas = np.linalg.solve(covariance, score[..., None])[..., 0]
     excess = (score * sigmas).sum(axis=1) / limits
     for row in np.flatnonzero(excess > 1.0):

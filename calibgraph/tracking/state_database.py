@@ -36,10 +36,6 @@ class StateDatabase:
     Args:
         folder: where the state is kept; made if it is not there.
 
-    Attributes:
-        rows: what the database held when it was opened: the state and the inputs after it, the last
-            of which may not have been acknowledged; nothing in a new one.
-
     Raises:
         FileError: if another process uses the folder, or its database is damaged or of another
             program.
@@ -60,13 +56,12 @@ class StateDatabase:
         except sqlite3.Error as error:
             raise cannot_write(self._path, error) from error
         try:
-            _require_own(self._path, self._connection)
+            is_new = self._is_new()
             self._connection.executescript(_OPEN)
-            if not self._schema():
+            if is_new:
                 self._connection.execute(_TABLE)
                 self._connection.execute(f"PRAGMA user_version={_VERSION}")
             self._connection.execute("COMMIT")
-            self.rows = self._read()
         except BaseException as error:
             self.close()
             if isinstance(error, sqlite3.Error):
@@ -105,18 +100,34 @@ class StateDatabase:
         """Release the folder; nothing is left to write."""
         self._connection.close()
 
-    def _read(self) -> list[bytes]:
-        (state,) = self._connection.execute("PRAGMA integrity_check(1)").fetchone()
+    def read(self) -> list[bytes]:
+        """The state and the inputs after it; nothing of a new database.
+
+        The last input may be one whose write has not returned.
+
+        Raises:
+            FileError: if it is damaged.
+        """
+        try:
+            (state,) = self._connection.execute("PRAGMA integrity_check(1)").fetchone()
+            rows = self._connection.execute("SELECT * FROM kept ORDER BY number").fetchall()
+        except sqlite3.Error as error:
+            raise self._unusable(error) from error
         if state != "ok":
             raise _damaged(self._path, state)
-        rows = self._connection.execute("SELECT * FROM kept ORDER BY number").fetchall()
         for expected, (number, content) in enumerate(rows, rows[0][0] if rows else 0):
             if number != expected or not isinstance(content, bytes):
                 raise _damaged(self._path, f"row {expected} is missing")
         return [content for _, content in rows]
 
-    def _schema(self) -> list[tuple[str]]:
-        return self._connection.execute("SELECT sql FROM sqlite_schema").fetchmany(2)
+    def _is_new(self) -> bool:
+        """Whether there is nothing yet; the database of another is refused before it is changed."""
+        schema = self._connection.execute("SELECT sql FROM sqlite_schema").fetchmany(2)
+        (version,) = self._connection.execute("PRAGMA user_version").fetchone()
+        if schema and (schema, version) != ([(_TABLE,)], _VERSION):
+            message = "is of another program or version; choose another folder"
+            raise FileError(self._path, message)
+        return not schema
 
     def _unusable(self, error: sqlite3.Error) -> Exception:
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF
@@ -126,14 +137,6 @@ class StateDatabase:
         if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
             return _damaged(self._path, error)
         return cannot_write(self._path, error)
-
-
-def _require_own(path: Path, connection: sqlite3.Connection) -> None:
-    """Check that a database is new or a tracker's, before it is changed."""
-    schema = connection.execute("SELECT sql FROM sqlite_schema").fetchmany(2)
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if schema and (schema, version) != ([(_TABLE,)], _VERSION):
-        raise FileError(path, "is of another program or version; choose another folder")
 
 
 def _damaged(path: Path, why: object) -> FileError:

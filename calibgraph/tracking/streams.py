@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import from_json
 
 from calibgraph.errors import CalibrationError, CorrespondenceError, FileError, MotionError
-from calibgraph.files import describe
+from calibgraph.files import decode_text, describe
 from calibgraph.io.bags.storage import is_bag
 from calibgraph.io.tables import load_correspondences
 from calibgraph.model.correspondences import (
@@ -168,7 +168,7 @@ def frames_of_lines(file: BinaryIO, where: str) -> Iterator[Item]:
         place = f"{where}, line {number}"
         if len(line) > MAX_LINE_BYTES:
             raise FileError(place, f"is longer than {MAX_LINE_BYTES} bytes; send a frame a line")
-        if number == 1 and b"\0" in line:
+        if number == 1 and "\0" in decode_text(line, where):
             raise FileError(where, "is not text; send a line of JSON per frame, in UTF-8")
         if line.strip():
             yield _parse(line.removeprefix(b"\xef\xbb\xbf"), place)

@@ -176,6 +176,9 @@ class IncrementalCalibrator:
         At most up to the end of an epoch. All their updates have the estimate after the last of
         them, which is as of one by one.
 
+        Args:
+            frames: in the order of their numbers, at least one.
+
         Raises:
             CorrespondenceError: if the first cannot be taken in, as of :meth:`update`.
         """
@@ -212,7 +215,7 @@ class IncrementalCalibrator:
             if _columns(group[0].table) != _columns(one.table):
                 break
             group.append(one)
-        if not any(share_last_points(state, one.table) for one in group[1:]):
+        if not group[1:] or not any(share_last_points(state, one.table) for one in group):
             return group
         alone = [*takewhile(lambda one: without_repeats(state, one.table) is one.table, group)]
         return alone or group[:1]

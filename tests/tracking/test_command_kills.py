@@ -1,17 +1,14 @@
-"""The command `track` under `kill -9`, and with a slow reader."""
+"""The command `track` under `kill -9`."""
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import signal
-import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +22,6 @@ from calibgraph.cli import app
 from calibgraph.tracking import durable
 from calibgraph.tracking.history import History
 from tests.tracking.drives import (
-    FRAMES,
-    World,
-    as_lines,
     drive,
     frames_in,
     pair_of,
@@ -144,66 +138,3 @@ def kill_often(folder: Path, kills: int, longest_s: float, seed: int) -> int:
 def test_random_kills_lose_nothing_and_change_nothing(tmp_path: Path) -> None:
     kills = int(os.environ.get("CALIBGRAPH_TEST_KILLS", "5"))
     assert kill_often(tmp_path, kills, longest_s=0.6, seed=int.from_bytes(os.urandom(4))) >= 1
-
-
-@pytest.fixture
-def running(world: World, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
-    arguments = [world.rig, "-", "--out", tmp_path / "out"]
-    program = "from calibgraph.cli import app; app.main()"
-    with subprocess.Popen(
-        [sys.executable, "-c", program, "track", *map(str, arguments)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    ) as process:
-        yield process
-        process.kill()
-
-
-@pytest.mark.slow
-def test_a_slow_reader_slows_an_endless_writer_down_in_constant_memory(
-    world: World, running: subprocess.Popen[bytes]
-) -> None:
-    """Between the two are pipes of 64 kB each, a chunk of 64 kB, and the frame at hand."""
-    assert running.stdin is not None and running.stdout is not None
-    sent = [0]
-
-    def write_endlessly() -> None:
-        assert running.stdin is not None
-        try:
-            for number in range(10**9):
-                table = world.tables[number % FRAMES]
-                table = replace(table, frame=np.full(len(table), number))
-                sent[0] += running.stdin.write(as_lines([table]))
-                running.stdin.flush()
-        except OSError:  # it has ended
-            return
-
-    def memory_kb() -> int:
-        status = Path(f"/proc/{running.pid}/status").read_text()
-        return int(next(s.split()[1] for s in status.splitlines() if s.startswith("VmRSS")))
-
-    def settled() -> int:
-        """Bytes sent, once no more are taken."""
-        before, quiet = -1, 0
-        while quiet < 6:
-            quiet = quiet + 1 if sent[0] == before else 0
-            before = sent[0]
-            time.sleep(0.1)
-        return before
-
-    writer = threading.Thread(target=write_endlessly)
-    writer.start()
-    running.stdout.readline()
-    held = settled()
-    memory = memory_kb()
-    taken = sum(len(running.stdout.readline()) for _ in range(100))
-    assert taken > 100_000
-    # What was printed and not read: 64 kB are some 30 frames of 10 kB each.
-    assert settled() - held < 2_500_000
-    assert memory_kb() - memory < 50_000
-    running.send_signal(signal.SIGTERM)
-    rest = running.stdout.read()
-    assert running.wait() in (0, 1)
-    assert all(json.loads(line) for line in rest.splitlines())
-    writer.join()

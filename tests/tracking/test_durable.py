@@ -209,7 +209,7 @@ from pathlib import Path
 from calibgraph.tracking.state_database import StateDatabase
 
 database = StateDatabase(Path(sys.argv[1]))
-lines = b"\\n".join(database.rows).splitlines()
+lines = b"\\n".join(database.read()).splitlines()
 while True:
     line = b"%d %s" % (len(lines), b"x" * random.randrange(50_000))
     state = b"\\n".join(lines) if random.random() < 0.2 and lines else None
@@ -230,7 +230,7 @@ def test_every_input_acknowledged_before_a_sigkill_is_there(tmp_path: Path) -> N
             process.send_signal(signal.SIGKILL)
             acknowledged = int([acknowledged, *process.stdout.read().split()][-1])
         with closing(StateDatabase(tmp_path)) as database:
-            lines = b"\n".join(database.rows).splitlines()
+            lines = b"\n".join(database.read()).splitlines()
         assert [int(line.split()[0]) for line in lines] == [*range(len(lines))]
         assert len(lines) in (acknowledged + 1, acknowledged + 2)
 
@@ -313,4 +313,4 @@ def test_a_full_disk_is_named_and_costs_nothing(
                     database.write([bytes(100_000)], state)
                 assert error.value.filename == str(tmp_path / DATABASE)
     with closing(StateDatabase(tmp_path)) as database:
-        assert database.rows == [b"begin", b"first"]
+        assert database.read() == [b"begin", b"first"]

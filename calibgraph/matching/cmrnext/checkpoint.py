@@ -38,15 +38,12 @@ class _Config(BaseModel):
     max_depth: Annotated[_Number, Field(ge=1, le=10_000)]
     max_r: Annotated[_Number, Field(le=180)] | None = None
     max_t: Annotated[_Number, Field(le=1000)] | None = None
-    systematic_rotation_rad: Annotated[_Number, Field(le=10)] | None = None
-    systematic_translation_m: Annotated[_Number, Field(le=1000)] | None = None
     use_reflectance: StrictBool
     fourier_levels: Annotated[int, Field(strict=True)] = -1
     context_encoder: Literal["lidar", "rgb"] = "rgb"
     uncertainty: Literal[False] = False
     al_contrario: Literal[False] = False
     normalize_images: StrictBool
-    half_resolution: StrictBool | None = None
 
 
 _MAX_TEXT, _MAX_INTEGER = 200, 2**53

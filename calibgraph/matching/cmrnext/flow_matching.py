@@ -34,8 +34,8 @@ from calibgraph.model.rig import Camera
 Maps = NDArray[np.float32]
 
 HALVED_FROM_PX = 1400
-"""Images at least this wide are halved unless the weights or the user choose: the networks were
-trained at 1241 pixels, and on larger images halved."""
+"""Images at least this wide are halved unless the user chooses: the networks were trained at 1241
+pixels, and on larger images halved."""
 
 STEP_PX = 1.0
 """A last iteration that moves the match by this halves its confidence."""
@@ -83,8 +83,7 @@ class FlowMatcher:
         checkpoint: its weights and config.
         model: the network, on its device.
         iterations: of the recurrent update.
-        half_resolution: whether images are halved; None: as the weights choose, or from
-            ``HALVED_FROM_PX`` on.
+        half_resolution: whether images are halved; None: from ``HALVED_FROM_PX`` on.
     """
 
     checkpoint: Checkpoint
@@ -94,9 +93,8 @@ class FlowMatcher:
 
     def match(self, jobs: Sequence[MatchingJob]) -> list[Correspondences]:
         """Match a batch of images of one size; the tables do not depend on a frame's pose."""
-        given = self.half_resolution, self.checkpoint.config.get("half_resolution")
-        is_wide = jobs[0].camera.width_px >= HALVED_FROM_PX
-        halved = next((each for each in given if each is not None), is_wide)
+        is_wide, given = jobs[0].camera.width_px >= HALVED_FROM_PX, self.half_resolution
+        halved = is_wide if given is None else given
         lidar_images = [LidarImage.render(j.cloud, j.T_camera_lidar, j.view) for j in jobs]
         full, coarse = self._flow(jobs, lidar_images, halved)
         cell = CELL * (1 + halved)
@@ -188,15 +186,13 @@ class ImageResult:
     memorization: float | None = None
 
 
-def to_findings(results: Mapping[str, Sequence[ImageResult]], last: Checkpoint) -> MatcherFindings:
-    """Failed frames, in the last round the probes, and the shared error of the last network."""
-    prior = error_components().matchers["cmrnext"]
-    stated = {key: last.config[key] for key in prior if last.config.get(key) is not None}
+def to_findings(results: Mapping[str, Sequence[ImageResult]]) -> MatcherFindings:
+    """Failed frames, the probes, and the error that all matches share."""
     return MatcherFindings(
         failed_share={name: float(np.mean([r.failed for r in e])) for name, e in results.items()},
         start_dependence=_medians(results, "start_dependence"),
         memorization=_medians(results, "memorization"),
-        **{**prior, **stated},
+        **error_components().matchers["cmrnext"],
     )
 
 

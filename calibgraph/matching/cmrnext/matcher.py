@@ -45,8 +45,7 @@ class CmrNextMatcher:
             more than once.
         device: ``cpu``, ``cuda``, or ``auto``.
         iterations: of the recurrent update.
-        half_resolution: whether images are halved; None: as the weights choose, or from 1400
-            pixels width on.
+        half_resolution: whether images are halved; None: from 1400 pixels width on.
         batch: images at once; None: 1 on a CPU, 4 on a GPU.
         seed: of PnP.
 
@@ -99,7 +98,7 @@ class CmrNextMatcher:
         # Of a camera whose images all failed, all are given: the solve reports the failure.
         good = [[r for r in each if not r.failed] or each for each in results.values()]
         tables = [result.matches for each in good for result in each]
-        findings = to_findings(results, last.checkpoint)
+        findings = to_findings(results)
         metadata = {
             **self._metadata(),
             "failed_frames": {

@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -243,6 +244,7 @@ BOMB_BYTES = 2**31 - 2**20
 BLOCK = bytes(2**20)
 
 
+@cache
 def zstd_bomb(size: int = BOMB_BYTES) -> bytes:
     packer = zstandard.ZstdCompressor().compressobj()
     parts = [packer.compress(BLOCK) for _ in range(size // len(BLOCK))]
