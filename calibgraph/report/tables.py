@@ -69,12 +69,12 @@ def print_result(
     if result.lidar_verdicts:
         console.print(lidar_table(result))
         console.print(
-            "moved: change from the guess. 1 sigma about and along the axes of "
-            f"{result.rig.lidar}; T_base_lidar: p_base = T_base_lidar * p_lidar."
+            f"moved: change from the guess. 1 sigma about and along the axes of {result.rig.lidar}."
         )
     if result.vehicle_sigmas is not None:
         console.print(vehicle_table(result))
-    console.out(f"{elapsed_s:.1f} s; written:", highlight=False)
+    frames = FRAMES_SENTENCE if result.rig.cameras else "p_base = T_base_lidar * p_lidar"
+    console.out(f"{elapsed_s:.1f} s; {frames}; written:", highlight=False)
     for path in written:
         console.out(f"  {path}", highlight=False)
 
@@ -101,7 +101,6 @@ def _print_cameras(console: Console, result: Calibration) -> None:
         console.out(result.unstated_lenses, highlight=False)
     if result.lens:
         console.print(lens_table(result))
-    console.out(FRAMES_SENTENCE, highlight=False)
 
 
 def print_summary(console: Console, summary: Summary, details: str) -> None:

@@ -33,6 +33,7 @@ _LEAST_SCALE_M = 0.003  # of the Cauchy loss: simulated scans have none
 _CONVERGED = 1e-6  # rad and m
 _REACH_M = 3.0  # between the centres of two pieces of one plane
 _LEAST_MATCHES = 100
+_STANDS = 0.95  # share of upright planes in place from which the vehicle has not moved
 _UPRIGHT = np.cos(np.radians(45.0))  # of a normal against up: below, the plane is upright
 
 PLACE_SIGMAS = np.repeat([np.radians(0.1), 0.015], 3)
@@ -60,7 +61,7 @@ class LidarPoses:
             position of the LiDAR.
         joint_covariance: (6 k, 6 k) of them all, in their order.
         matched: per LiDAR, the share of its planes near others' that lie on them (0-1).
-        places: their number.
+        places: instants between which the vehicle has moved.
         place_ratios: variance of rotation and translation between places over its prior.
     """
 
@@ -76,7 +77,8 @@ class LidarPoses:
 def calibrate_lidars(clouds: Clouds, T_base_lidar: Mapping[str, Array], *, base: str) -> LidarPoses:
     """The poses of LiDARs from what they see in common, at all instants at once.
 
-    The vehicle stands at each instant, or the clouds have been brought to one time.
+    The vehicle stands at each instant, or the clouds have been brought to one time. Of instants
+    between which it has not moved the first is taken: their errors are the same.
 
     Args:
         clouds: of at least two LiDARs, the base among them.
@@ -90,6 +92,8 @@ def calibrate_lidars(clouds: Clouds, T_base_lidar: Mapping[str, Array], *, base:
     names = [base, *(name for name in clouds if name != base)]
     _require_alike(clouds, T_base_lidar, names)
     planes = [[find_planes(cloud) for cloud in clouds[name]] for name in names]
+    kept = _distinct(planes[0])
+    planes = [[of[i] for i in kept] for of in planes]
     T = np.array([np.eye(4), *(np.asarray(T_base_lidar[name], np.float64) for name in names[1:])])
     T, _ = refine_poses(planes, T, names)
     places = [_at_place([of[i : i + 1] for of in planes], T, names) for i in range(len(planes[0]))]
@@ -133,6 +137,20 @@ def refine_poses(
         if is_last and np.abs(step).max() < _CONVERGED:
             break
     return T, sums
+
+
+def _distinct(planes: Sequence[Planes]) -> list[int]:
+    """The instants of which the base sees upright planes elsewhere than at those before."""
+    kept: list[int] = []
+    for number, own in enumerate(planes):
+        up = np.linalg.eigh(own.normals.T @ own.normals)[1][:, 2]  # most planes are ground
+        stands = False
+        for other in kept:
+            near, on = count_matched([[planes[other]], [own]], np.array([np.eye(4)] * 2), up=up)
+            stands |= bool(on[0] > _STANDS * max(near[0], 1.0))
+        if not stands:
+            kept.append(number)
+    return kept
 
 
 def _require_alike(clouds: Clouds, guess: Mapping[str, Array], names: Sequence[str]) -> None:

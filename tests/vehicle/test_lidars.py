@@ -93,6 +93,13 @@ def test_places_that_differ_widen_the_error_bar_and_places_that_agree_narrow_it(
         assert ratios[2.0][kind] > 2.0
 
 
+def test_instants_in_which_the_vehicle_stands_count_once():
+    rng, boxes = np.random.default_rng(9), draw_place(np.random.default_rng(1))
+    ats = [transform(np.eye(3), [x, 0.0, HEIGHT_M]) for x in (0.0, 0.0, 5.0, 0.0)]
+    clouds = {n: [scan(boxes, at @ MOUNTS[n], rng) for at in ats] for n in ("top", "front")}
+    assert calibrate_lidars(clouds, MOUNTS, base="top").places == 2
+
+
 def test_a_lidar_that_moved_between_places_shows_in_what_places_differ_by():
     T = MOUNTS["left"].copy()
     T[1, 3] += 0.15
