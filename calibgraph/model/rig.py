@@ -368,6 +368,8 @@ class Rig(_Model):
             raise ValueError(
                 f"lidar: the base {self.lidar!r} is none of the lidars {', '.join(names)}"
             )
+        if self.vehicle is not None and len(names) <= 1:
+            raise ValueError("vehicle: is found with several lidars; name them, or leave it out")
         if both := [name for name in names if name in self.cameras]:
             raise ValueError(f"lidars: {both[0]!r} is a camera, too; rename one")
         T = self.lidars[self.lidar].T_base_lidar if self.lidars else None

@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,10 +19,13 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import transform
 from calibgraph.report.html import render_page
 from calibgraph.report.tables import print_result
-from tests.conftest import Call
+from tests.conftest import SAMPLE, Call
 from tests.vehicle.scenes import MOUNTS, record
 
 RIG = {"format": "calibgraph-rig/1", "lidar": "top", "lidars": {name: {} for name in MOUNTS}}
+
+
+SAMPLE_RIG = (SAMPLE / "rig.yaml").read_text()
 
 
 def write_vehicle(folder: Path, seed: int = 1, places: int = 3, **more: object) -> Path:
@@ -137,6 +141,11 @@ def test_transforms_of_lidars_and_vehicle_are_exported(result: Calibration, tmp_
         ({"lidars": {**RIG["lidars"], "top": {"T_base_lidar": MOUNTS["left"].tolist()}}},
          "lidars.top.T_base_lidar: of the base it is the identity"),
         ({"lidars": {"top": {}, "left": {"T_lidar_base": 1}}}, "unknown key 'lidars.left.T_lidar"),
+        (
+            {"lidars": None, "vehicle": {}, "cameras": yaml.safe_load(SAMPLE_RIG)["cameras"],
+             "lidar": "lidar"},
+            "vehicle: is found with several lidars",
+        ),
         ({"vehicle": {"rotation_sigma_rad": [1, 2]}}, "vehicle.rotation_sigma_rad"),
         ({"vehicle": {"translation_sigma_m": -1}}, "vehicle.translation_sigma_m"),
     ],
@@ -200,3 +209,27 @@ def test_a_bag_has_a_topic_of_clouds_per_lidar(tmp_path: Path):
         calibgraph.load_dataset(bag, rig.model_copy(update={"lidars": lidars}))
     with pytest.raises(DatasetError, match="several LiDARs are not corrected for motion"):
         calibgraph.load_dataset(bag, rig, bag=calibgraph.BagOptions(motion="scans"))
+
+
+@pytest.mark.slow
+def test_cameras_and_lidars_are_one_result(tmp_path: Path):
+    T, rng = MOUNTS["left"], np.random.default_rng(0)
+    for frame in calibgraph.load_dataset(SAMPLE).frames:
+        cloud = frame.load_cloud()
+        other = cloud[rng.random(len(cloud)) < 0.7].copy()
+        other[:, :3] = (other[:, :3] - T[:3, 3]) @ T[:3, :3] + rng.normal(0, 0.01, (len(other), 3))
+        for name, points in (("lidar", cloud), ("second", other)):
+            (tmp_path / "lidars" / name).mkdir(parents=True, exist_ok=True)
+            np.save(tmp_path / "lidars" / name / frame.cloud_path.stem, points)
+    shutil.copytree(SAMPLE / "cameras", tmp_path / "cameras")
+    rig = {**yaml.safe_load(SAMPLE_RIG), "lidars": {"lidar": {}, "second": {}}}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
+    both, alone = calibgraph.calibrate(tmp_path), calibgraph.calibrate(SAMPLE)
+    assert both.joint_names == (*alone.rig.cameras, "second")
+    cameras = 6 * len(alone.rig.cameras)
+    np.testing.assert_array_equal(
+        both.joint_covariance[:cameras, :cameras], alone.joint_covariance
+    )  # cameras are calibrated to the base as without the other LiDAR
+    for name, pose in alone.T_camera_lidar.items():
+        np.testing.assert_array_equal(both.T_camera_lidar[name], pose)
+    assert np.abs(both.T_base_lidar["second"] - T).max() < 0.005
