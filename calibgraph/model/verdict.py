@@ -32,6 +32,9 @@ and keeps from a PASS, since the same posterior cannot vouch for it."""
 FLAT_EVIDENCE = "flat_evidence"
 """Kind of the check that compares the error bars by images and by matches. The wider one is in the
 result, so that the check itself changes no verdict."""
+ERROR_BAR = frozenset({FLAT_EVIDENCE, "sigma_rotation", "sigma_translation"})
+"""Kinds of checks of the error bar: they decide nothing where the probability of an error, which
+has the bar, is known."""
 BRIGHTNESS = "brightness of the images"
 """Kind of the check that explains all others of a camera: its images show too little."""
 IMAGES_ELSEWHERE = "images"
@@ -218,7 +221,7 @@ class Verdict:
     def _kinds_beyond(self) -> set[str]:
         """The kinds of the checks that are beyond a limit, but for those that decide nothing."""
         beyond = {check.kind or check.name for check in self.checks if check.status != "PASS"}
-        return beyond - {FLAT_EVIDENCE}
+        return beyond - (ERROR_BAR if self.error_probability else {FLAT_EVIDENCE})
 
     @property
     def cannot_tell(self) -> bool:

@@ -36,6 +36,8 @@ MATCH_SHARE = 0.01
 lens."""
 
 _LENS: tuple[LensPart, ...] = "focal", "centre", "distortion"
+_MAY_ERR = FOCAL, CENTRE_X, CENTRE_Y, "k1", OFFSET, READOUT
+"""Further coefficients of a calibration err together with k1, which stands for all."""
 _WEAK_PRIOR = 0.01  # information: a lens that is ten sigmas off is hardly held back
 _MOST_STEPS, _MINIMAL = 20, 1e-4  # of Gauss-Newton; decrease of the cost by the last
 _SCENES = 0.7, 1.4  # times as far are the things of another recording: so streets scatter
@@ -130,7 +132,7 @@ def lens_errors(at: FittedObjective) -> dict[int, Array]:
         lens = LensVariable.of(camera, parts, LensSigmas.calibrated(camera))
         estimated = at.objective.lenses[name].free.parameters if name in at.objective.lenses else ()
         names = enumerate(lens.free.parameters, start=6)
-        rows = [row for row, parameter in names if parameter not in estimated]
+        rows = [row for row, name in names if name in _MAY_ERR and name not in estimated]
         if rows:
             T = at.T_camera_lidar[name][None]
             hessian = block.summarize(T, None, lens.free, lens.values).hessian[0]

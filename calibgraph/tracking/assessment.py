@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -135,27 +134,13 @@ def _verdict(state: _Judged, camera: int) -> Verdict:
         has_matches=True,
         used=state.counted(camera, "used"),
         frames=int(sums.frames[camera]),
-        has_error_bar=not np.isnan(own).any(),
+        covariance=None if np.isnan(own).any() else own,
         is_free=bool(np.isnan(own).any()),
         conflicts=conflicts,
         scatter_only=not state.findings.states_common_error,
         tolerance=state.config.tolerance,
     )
-    checks = check_estimate(found), _sigma_checks(found, own), _recent_checks(state, camera)
-    return Verdict(tuple(chain.from_iterable(checks)))
-
-
-def _sigma_checks(found: Checked, covariance: Array) -> list[Check]:
-    """The error bar about its worst axes: the probability of an error is not known while driving.
-
-    Of a (6, 6) covariance: rotation [rad], translation [m].
-    """
-    if not found.has_error_bar:
-        return []
-    sigmas = np.sqrt(np.diag(covariance))
-    degrees, centimetres = np.degrees(sigmas[:3].max()), 100 * sigmas[3:].max()
-    values = ("sigma_rotation", degrees), ("sigma_translation", centimetres)
-    return [threshold(key, found.tolerance).check(float(value)) for key, value in values]
+    return Verdict((*check_estimate(found), *_recent_checks(state, camera)))
 
 
 def _stuck_check(repeated: int, status: Status) -> Check:

@@ -15,15 +15,14 @@ All places at once: (P, n, 6, 6) arrays and no loop. Ad is that of T_camera_lida
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from calibgraph.arrays import Array
 
 
-@dataclass(frozen=True, eq=False)
-class Eliminated:
+class Eliminated(NamedTuple):
     """Some places without their poses.
 
     Attributes:

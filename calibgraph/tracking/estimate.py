@@ -197,8 +197,10 @@ class Terms:
 
     def open_weights(self, state: State, adjoint: Array) -> Array:
         """(P, 1 + n) weights while an epoch is open: of new places, from a non-robust start."""
+        if not np.isfinite(self.robust_scale):
+            return np.ones((len(self.names), 1 + self.seen.shape[1]))
         weights, new = self.known_weights(state)
-        for _ in range(_OPEN_WEIGHINGS if np.isfinite(self.robust_scale) and new.any() else 0):
+        for _ in range(_OPEN_WEIGHINGS if new.any() else 0):
             found, at_place = self.eliminate(weights, adjoint), self.weighted_at_place(weights)
             apart = found.displacements(state.shared, at_place)
             weights[new] = self.weigh(self.squared(*apart))[new]

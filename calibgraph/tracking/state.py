@@ -328,7 +328,8 @@ class State:
     @property
     def drifting(self) -> list[int]:
         """The cameras that are followed by a random walk, by their places in the rig."""
-        return np.flatnonzero(self.walk).tolist()
+        found: list[int] = self.walk.nonzero()[0].tolist()
+        return found
 
     def matches_of(self, camera: int) -> tuple[CameraBlock, Mask] | None:
         """A camera's matches in all frames, and which are within the gate; None if it has none.

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import ABOUT_THE_DATA, BRIGHTNESS, FAIL_ABOVE, Check
+from calibgraph.model.verdict import ABOUT_THE_DATA, BRIGHTNESS, Check
 from calibgraph.trust import (
     agreement,
     guess,
@@ -26,7 +26,6 @@ from calibgraph.trust.evidence import Checks, Evidence, concatenate
 from calibgraph.trust.image_record import RunChecks
 from calibgraph.trust.inputs import describe_brightness
 from calibgraph.trust.lens_parameter import advise_together
-from calibgraph.trust.probability import probability_beyond
 
 _LOOKED_AT = 6  # frames whose brightness is measured
 
@@ -77,7 +76,7 @@ def assess_run(run: MatchingRun, evidence: Evidence) -> RunChecks:
     checks = concatenate([of_solution, of_run], evidence.cameras)
     causes = (
         _brightness_checks(run, checks),
-        _intended_guess_checks(run, evidence, checks),
+        _intended_guess_checks(run, checks),
         implausible_checks(run.guess, checks),
     )
     return RunChecks(of_solution, of_run, concatenate(causes, evidence.cameras))
@@ -102,18 +101,12 @@ def _brightness_checks(run: MatchingRun, checks: Checks) -> Checks:
     return found
 
 
-def _intended_guess_checks(run: MatchingRun, evidence: Evidence, checks: Checks) -> Checks:
+def _intended_guess_checks(run: MatchingRun, checks: Checks) -> Checks:
     """Whether a convention error in the guess explains the failure of cameras.
 
     It takes seconds, so that a time limit that has passed does not prevent it.
     """
-    tolerance = run.solution.config.tolerance
-    failed = [
-        name
-        for name, each in checks.items()
-        if any(check.status == "FAIL" for check in each)
-        or probability_beyond(evidence.covariance_by_matches(name), tolerance) > FAIL_ABOVE
-    ]
+    failed = [n for n, each in checks.items() if any(check.status == "FAIL" for check in each)]
     error = likely_intended_guess(run.dataset, run.guess) if failed else None
     found = [] if error is None else [Check("convention of the guess", "FAIL", error)]
     return dict.fromkeys(failed, found)

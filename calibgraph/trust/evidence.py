@@ -44,7 +44,7 @@ class Estimate:
         has_matches: whether it had correspondences; else it was solved through relative poses.
         used: correspondences in the final solve.
         frames: frames that they come from.
-        has_error_bar: whether it has a covariance.
+        covariance: (6, 6) of (rotation [rad], translation [m]), or None.
         is_free: whether its correspondences do not determine it.
         conflicts: of the relative poses that name this camera.
         held: whether nothing determines it.
@@ -57,7 +57,7 @@ class Estimate:
     has_matches: bool
     used: int
     frames: int
-    has_error_bar: bool
+    covariance: Array | None
     conflicts: tuple[Conflict, ...]
     converged: bool = True
     terms: Terms = "full"

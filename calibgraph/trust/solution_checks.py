@@ -30,7 +30,7 @@ def _estimate_of(evidence: Evidence, camera: str) -> Estimate:
         has_matches=camera in solution.objective.blocks,
         used=0 if block is None else len(block.frame),
         frames=0 if block is None else len(block.frame_edges) - 1,
-        has_error_bar=evidence.joint_covariance is not None,
+        covariance=evidence.covariance_by_matches(camera),
         is_free=sigmas is not None and np.isinf(sigmas[evidence.cameras.index(camera)]).any(),
         conflicts=tuple(c for c in solution.conflicts if camera in (c.pair.a, c.pair.b)),
         converged=solution.optimum.converged,
@@ -66,8 +66,8 @@ def check_estimate(estimate: Estimate) -> list[Check]:
     """The checks of one camera's estimate, from a batch solve or while driving."""
     if estimate.held or not estimate.has_matches:
         return [_check_unmeasured(estimate)]
-    checks = []
-    if estimate.scatter_only and estimate.has_error_bar:
+    checks = [] if estimate.covariance is None else _check_sigmas(estimate)
+    if estimate.scatter_only and checks:
         text = (
             "scatter only: the table states no error that its frames share, so that the true error "
             "may be many times the error bar"
@@ -77,13 +77,21 @@ def check_estimate(estimate: Estimate) -> list[Check]:
     if estimate.terms in ("stage1", "priors"):
         text = f"the terms {estimate.terms!r} do not fit the correspondences: no error bar"
         checks.append(Check("terms", "WARN", text))
-    elif not estimate.has_error_bar:
+    elif estimate.covariance is None:
         checks.append(_check_free(estimate.is_free))
     counts = threshold("correspondences_used"), threshold("frames")
     checks += [counts[0].check(estimate.used), counts[1].check(estimate.frames)]
     checks += map(_check_lens_prior, estimate.lens)
     text = f"the optimizer {'converged' if estimate.converged else 'did not converge'}"
     return [*checks, Check("convergence", "PASS" if estimate.converged else "FAIL", text)]
+
+
+def _check_sigmas(estimate: Estimate) -> list[Check]:
+    """The error bar about its worst axes, of rotation and of translation."""
+    sigmas = np.sqrt(np.diag(estimate.covariance))  # type: ignore[arg-type]
+    values = ("rotation", np.degrees(sigmas[:3].max())), ("translation", 100 * sigmas[3:].max())
+    rows = [(threshold(f"sigma_{part}", estimate.tolerance), float(v)) for part, v in values]
+    return [row.check(value) for row, value in rows]
 
 
 def _check_free(is_free: bool) -> Check:

@@ -43,8 +43,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
     # the estimate
     # 0.15 deg displaces a point at 20 m by 5 cm.
     Threshold("sigma_rotation", "sigma, rotation", "at most", 0.15, 0.5, "deg",
-              "While driving: how large is the standard deviation about the worst axis?",
-              of_tolerance=True),
+              "How large is the standard deviation about the worst axis? Of a batch it decides "
+              "nothing by itself: the probability of an error has it.", of_tolerance=True),
     Threshold("sigma_translation", "sigma, translation", "at most", 5.0, 15.0, "cm",
               "The same, along the worst axis.", of_tolerance=True),
     # Sigmas of the measurement and the estimate together.
